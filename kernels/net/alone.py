@@ -35,7 +35,8 @@ NODE, ANGLE, VERTEX, EDGE = 0, 2, 4, 6  # of `places`, where the two rows of eac
 
 @cache
 def rod_kernels(kind: ChainKind, real):
-    """gather(...) the rods of worlds that are tried from the blocks of a net, scatter(...) them to these; columns as of `Group`.
+    """gather(...) the rods of worlds that are tried from the blocks of a net, put(...) their positions back and what became of them,
+    scatter(...) all else; columns as of `Group`.
 
     Of `last`, strains of the last step, those of elements that span two edges, then those that span one; of no term of this kind that
     is damped, any array stands for them.
@@ -132,28 +133,15 @@ def rod_kernels(kind: ChainKind, real):
                     last_out[wp.static(vertex_row) + d, k, c] = strains[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def scatter(
+    def put(
         places: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
         sizes: wp.vec4i,
-        nodes: int,
         x: wp.array2d(dtype=V),
-        v: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        omega: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
-        last: wp.array3d(dtype=real),
-        a: wp.array2d(dtype=V),
-        alpha: wp.array2d(dtype=real),
         flags: wp.array2d(dtype=int),
         told: wp.array2d(dtype=int),
         q_out: wp.array(dtype=V),
-        v_out: wp.array(dtype=V),
-        a_out: wp.array(dtype=V),
-        frame_out: wp.array2d(dtype=real),
-        lag_out: wp.array2d(dtype=real),
-        vertex_last: wp.array2d(dtype=real),
-        edge_last: wp.array2d(dtype=real),
     ):
         start, c = wp.tid()
         rods = places.shape[1]
@@ -170,12 +158,46 @@ def rod_kernels(kind: ChainKind, real):
             if flags[LOST, c] > 0:
                 wp.atomic_add(told, wp.static(PIVOTS), w, flags[LOST, c])
         for k in range(start, until(start, n)):
+            q_out[place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))] = x[k, c]
+            if wp.static(twist):
+                if k < n - 1:
+                    angle = V(theta[k, c], real(0.0), real(0.0))
+                    q_out[place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))] = angle
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def scatter(
+        places: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        sizes: wp.vec4i,
+        nodes: int,
+        v: wp.array2d(dtype=V),
+        omega: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        a: wp.array2d(dtype=V),
+        alpha: wp.array2d(dtype=real),
+        told: wp.array2d(dtype=int),
+        v_out: wp.array(dtype=V),
+        a_out: wp.array(dtype=V),
+        frame_out: wp.array2d(dtype=real),
+        lag_out: wp.array2d(dtype=real),
+        vertex_last: wp.array2d(dtype=real),
+        edge_last: wp.array2d(dtype=real),
+    ):
+        start, c = wp.tid()
+        rods = places.shape[1]
+        w = c / rods
+        r, n = c - w * rods, count[c]
+        if told[wp.static(TRIED), w] == 0 or start >= n:
+            return
+        for k in range(start, until(start, n)):
             # read before anything is written, as above
-            here, speed, change = x[k, c], v[k, c], a[k, c]
+            speed, change = v[k, c], a[k, c]
             angle, directors, own, strains = V(), Frame(), real(0.0), Strains()
             if k < n - 1:
                 if wp.static(twist):
-                    angle = V(theta[k, c], omega[k, c], alpha[k, c])
+                    angle[0] = omega[k, c]
+                    angle[1] = alpha[k, c]
                     for d in range(6):
                         directors[d] = frame[d, k, c]
                 for d in range(wp.static(edge_rows)):
@@ -186,15 +208,13 @@ def rod_kernels(kind: ChainKind, real):
                 for d in range(wp.static(vertex_rows)):
                     strains[d] = last[wp.static(vertex_row) + d, k, c]
             i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
-            q_out[i] = here
             v_out[i] = speed
             a_out[i] = change
             if k < n - 1:
                 if wp.static(twist):
                     j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
-                    q_out[j] = V(angle[0], real(0.0), real(0.0))
-                    v_out[j] = V(angle[1], real(0.0), real(0.0))
-                    a_out[j] = V(angle[2], real(0.0), real(0.0))
+                    v_out[j] = V(angle[0], real(0.0), real(0.0))
+                    a_out[j] = V(angle[1], real(0.0), real(0.0))
                     f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
                         frame_out[d, f] = directors[d]
@@ -209,7 +229,7 @@ def rod_kernels(kind: ChainKind, real):
                 for d in range(wp.static(vertex_rows)):
                     vertex_last[d, e] = strains[d]
 
-    return gather, scatter
+    return gather, put, scatter
 
 
 @cache

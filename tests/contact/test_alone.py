@@ -300,7 +300,7 @@ def test_a_quiet_run_that_is_resumed_takes_the_same_steps(device):
 
 
 def test_a_quiet_step_launches_little_more_than_one_without_contact(device, monkeypatch):
-    """Four kernels of its own, the states of rods there and back among them, and no condition but those of any step."""
+    """Five kernels of its own, the states of rods there and back among them, and no condition but those of any step."""
     counts = {}
     for contact in (False, True):
         state, integrator, _ = run(device, rods(contact=contact), 10)
@@ -317,7 +317,7 @@ def test_a_quiet_step_launches_little_more_than_one_without_contact(device, monk
         counts[contact] = {name: log.count(name) for name in set(log)}
     own, other = counts[True], counts[False]
     assert own["capture_while"] == 1 and own["capture_if"] == 1 and other["capture_while"] == 2
-    assert own["launch"] - other["launch"] <= 4 and own["zero_"] == 1 and "fill_" not in own
+    assert own["launch"] - other["launch"] <= 5 and own["zero_"] == 1 and "fill_" not in own
 
 
 def test_statistics_count_a_step_as_any_other(device):

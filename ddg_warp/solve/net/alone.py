@@ -87,8 +87,7 @@ class Alone:
             self._by_pairs(before, after)
             wp.capture_if(step.remaining, lambda: step.go_on(before, after))
             return
-        self._try(before, after)
-        self.runs.hold(before.q, after.q, self._tried)
+        self._try(before, after, lambda: self.runs.hold(before.q, after.q, self._tried))
         self._judge_by(0)
         wp.capture_if(step.remaining, lambda: self._ask(before, after))
 
@@ -128,26 +127,35 @@ class Alone:
         if self.runs:
             self.runs.look(before.q, after.q, self._tried)
 
-    def _try(self, before, after) -> None:
-        """One solve of the rods of worlds that are tried."""
-        for each in zip(self.chains, self._states, self._places, self._kernels, strict=True):
+    def _try(self, before, after, then=None) -> None:
+        """One solve of the rods of worlds that are tried; `then` reads positions alone, and is launched beside what copies all else."""
+        rods = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))
+        for each in rods:
             self._solve(before, after, *each)
+        self._move(before, after)
+        rest = [lambda: [self._hand_back(after, *each) for each in rods]]
+        arrays.side_by_side([then, *rest] if then else rest, self.model.wp_device)
         if self._mixed:
             self.net.update_strains(after)
-        self._move(before, after)
 
     def _solve(self, before, after, chain, state, places, own) -> None:
-        """One solve of the rods of a group."""
-        gather, scatter = own
+        """One solve of the rods of a group, and their positions."""
+        gather, put, _ = own
         group, told = chain.group, self._told
         lists = [places.rows, group.count]
-        sizes = [places.sizes, self.net.host.nodes]
         of_rods = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
-        inputs = [*lists, told, *sizes, before.q, before.v, before.a, *places.lagged(before)]
+        inputs = [*lists, told, places.sizes, self.net.host.nodes, before.q, before.v, before.a, *places.lagged(before)]
         self._launch(gather, group.node_threads, inputs, [*of_rods, *chain.islands.arrays])
         chain.attempt(state, state)
-        inputs = [*lists, *sizes, *of_rods, chain.islands.arrays[0]]
-        self._launch(scatter, group.node_threads, inputs, [told, after.q, after.v, after.a, *places.lagged(after)])
+        inputs = [*lists, places.sizes, state.x, state.theta, chain.islands.arrays[0]]
+        self._launch(put, group.node_threads, inputs, [told, after.q])
+
+    def _hand_back(self, after, chain, state, places, own) -> None:
+        """All but positions of the rods of a group after a solve."""
+        *_, scatter = own
+        group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.net.host.nodes]
+        inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
+        self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])
 
     def _move(self, before, after) -> None:
         """Put obstacles where they are after the step."""
