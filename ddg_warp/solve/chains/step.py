@@ -59,6 +59,11 @@ class ChainStep(PartStep):
 
     def attempt(self, before, after) -> None:
         """One solve of every rod that has not finished the step, from state `before` to `after`."""
+        self.move(before, after)
+        self.complete(before, after)
+
+    def move(self, before, after) -> None:
+        """Positions of an attempt, and their rates."""
         group, newton = self.group, self.newton
         self._launch(
             self._begin,
@@ -91,6 +96,10 @@ class ChainStep(PartStep):
         )
         if self.drag:
             self.drag.settle(after, newton, self.islands)
+
+    def complete(self, before, after) -> None:
+        """Frames and strains that go with the positions."""
+        group, newton = self.group, self.newton
         if self._frames:
             self._launch(
                 self._frames,

@@ -128,13 +128,17 @@ class Alone:
             self.runs.look(before.q, after.q, self._tried)
 
     def _try(self, before, after, then=None) -> None:
-        """One solve of the rods of worlds that are tried; `then` reads positions alone, and is launched beside what copies all else."""
+        """One solve of the rods of worlds that are tried; `then` reads positions alone, and is launched beside what makes all else."""
         rods = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))
         for each in rods:
             self._solve(before, after, *each)
         self._move(before, after)
-        rest = [lambda: [self._hand_back(after, *each) for each in rods]]
-        arrays.side_by_side([then, *rest] if then else rest, self.model.wp_device)
+
+        def complete() -> None:
+            for each in rods:
+                self._complete(after, *each)
+
+        arrays.side_by_side([then, complete] if then else [complete], self.model.wp_device)
         if self._mixed:
             self.net.update_strains(after)
 
@@ -146,13 +150,14 @@ class Alone:
         of_rods = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
         inputs = [*lists, told, places.sizes, self.net.host.nodes, before.q, before.v, before.a, *places.lagged(before)]
         self._launch(gather, group.node_threads, inputs, [*of_rods, *chain.islands.arrays])
-        chain.attempt(state, state)
+        chain.move(state, state)
         inputs = [*lists, places.sizes, state.x, state.theta, chain.islands.arrays[0]]
         self._launch(put, group.node_threads, inputs, [told, after.q])
 
-    def _hand_back(self, after, chain, state, places, own) -> None:
+    def _complete(self, after, chain, state, places, own) -> None:
         """All but positions of the rods of a group after a solve."""
         *_, scatter = own
+        chain.complete(state, state)
         group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.net.host.nodes]
         inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
         self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])
