@@ -2,16 +2,17 @@
 
     python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR] [--name NAME]
 
-Prints a table; writes NAME_DEVICE.csv and .json, crowds_apart_DEVICE, and crowds_tolerance_DEVICE. Each case runs to its end or
-for `limit` seconds of wall time; a row is a sixth of that, from start to the time `until`: seconds of wall time for each simulated
-one, means a step of solves (more than one where steps were taken in parts), of Newton and of conjugate gradient iterations and of
-searches, pairs in contact and the smallest gap over the range so far. `refused` are pairs that would have passed through each other
-in parts of steps that were not taken. What is said of errors: `rtol`, to which forces balance, over the weight of a rod, but those on
-`outliers`, a part of all rods; `astray`, the largest estimate of `StepControl` [m/s], by which the steps of some scenes are halved;
-`gained`, the energy that was created over what was lost so far, of the scenes that nothing drives. `dt` is the mean of steps [s].
-`search_share` is what searches take of the wall time, from one that is timed after them. Of scenes in which nothing touches, the ratio
-of a step with contact to one without. Of tolerances, for noodles and hair that land, how far nodes are from where the tightest one has
-them, and where steps half as long have them, or those under control.
+Prints a table; writes NAME_DEVICE.csv and .json, crowds_apart_DEVICE, crowds_tolerance_DEVICE, and crowds_control_DEVICE. Each case
+runs to its end or for `limit` seconds of wall time; a row is a sixth of that, from start to the time `until`: seconds of wall time for
+each simulated one, means a step of solves (more than one where steps were taken in parts), of Newton and of conjugate gradient
+iterations and of searches, pairs in contact and the smallest gap over the range so far. `refused` are pairs that would have passed
+through each other in parts of steps that were not taken. What is said of errors: `rtol`, to which forces balance, over the weight of a
+rod, but those on `outliers`, a part of all rods; `astray`, the largest estimate of `StepControl` [m/s], by which the steps of some
+scenes are halved; `gained`, the energy that was created over what was lost so far, of the scenes that nothing drives. `dt` is the mean
+of steps [s]. `search_share` is what searches take of the wall time, from one that is timed after them. Of scenes in which nothing
+touches, the ratio of a step with contact to one without. Of tolerances, for noodles and hair that land, how far nodes are from where
+the tightest one has them, and where steps half as long have them, or those under control. Of control, the same for the first second of
+hair that hangs as drawn, by its errors and tolerances.
 """
 
 import argparse
@@ -62,6 +63,15 @@ LANDING = {  # arguments of a scene, steps of 1/960 s until things land, and tha
     "noodles": ({"count": 49, "nodes": 241, "bowl": 0.45}, 420, 40, ()),
     "strands": ({"count": 256, "contact": True}, 270, 40, (1e-2, 5e-2, 2e-1)),
 }
+CONTROLS = (  # error and halvings of `StepControl`, rtol, outliers; what others are compared with first
+    ((1e-3, 4), 3e-2, 0.0),
+    ((2.5e-3, 4), 3e-1, 5e-2),
+    ((5e-3, 3), 3e-1, 5e-2),
+    ((5e-3, 3), 3e-1, 2e-1),
+    ((5e-3, 3), 1.0, 5e-2),
+    ((1e-2, 3), 3e-1, 5e-2),
+    ((2e-2, 3), 3e-1, 5e-2),
+)
 APART, NODES = (100, 1_000, 10_000), 50  # rods of so many nodes that do not touch
 WARM, TIMED, TURN = 64, 80, 5  # steps: before time counts, until all graphs are captured, that are timed, and in turn
 
@@ -212,29 +222,46 @@ def _tolerances(name: str, device) -> list[dict]:
     integrator = ddg.Integrator(model, rtol=OTHERWISE)
     for _ in range(before):
         start = integrator.step(start, dt)
+    settings = [
+        *((ONE_LENGTH, rtol, 0.0, dt) for rtol in TOLERANCES),
+        *((ONE_LENGTH, TOLERANCES[-1], outliers, dt) for outliers in few),
+        (ONE_LENGTH, TOLERANCES[0], 0.0, dt / 2),
+        *([(CONTROL[name], RTOL[name], 0.0, 4 * dt)] if name in CONTROL else []),
+    ]
+    return _compared(name, model, start, count * dt, settings)
+
+
+def controls(device) -> list[dict]:
+    """What the error of `StepControl`, and tolerances, cost and do to hair on its moving head that hangs as drawn."""
+    count = 10_000 if device.is_cuda else 512
+    model = import_module("ddg_warp.scenes.strands").build(count=count, contact=True, sag_free=True).build(device)
+    start = ddg.Integrator(model).step(model.state(), 1e-4)  # so that all is compiled
+    return _compared("strands", model, start, 1.0, [(*of, 1 / 240) for of in CONTROLS])
+
+
+def _compared(name: str, model, start, duration: float, settings: list[tuple]) -> list[dict]:
+    """Runs from a state by (error and halvings of `StepControl`, rtol, outliers, longest step), each compared with the first."""
     rows, points = [], None
-    for rtol, outliers, length, halvings in [
-        *((rtol, 0.0, dt, 0) for rtol in TOLERANCES),
-        *((TOLERANCES[-1], outliers, dt, 0) for outliers in few),
-        (TOLERANCES[0], 0.0, dt / 2, 0),
-        *([(RTOL[name], 0.0, 4 * dt, CONTROL[name][1])] if name in CONTROL else []),
-    ]:
-        integrator, state = ddg.Integrator(model, rtol=rtol, outliers=outliers), start
-        steps = ddg.StepControl(integrator, CONTROL["noodles"][0], halvings)
-        wp.synchronize_device(device)
+    for control, rtol, outliers, length in settings:
+        integrator, state, astray = ddg.Integrator(model, rtol=rtol, outliers=outliers), start, 0.0
+        steps = ddg.StepControl(integrator, *control)
+        wp.synchronize_device(model.device)
         began = time.perf_counter()
-        for _ in range(round(count * dt / length)):
+        for _ in range(round(duration / length)):
             state = steps.advance(state, length)
-        wp.synchronize_device(device)
+            astray = max(astray, steps.estimate)
+        wp.synchronize_device(model.device)
         wall, found, number = time.perf_counter() - began, integrator.statistics(), steps.lengths.total()
         points = state.points() if points is None else points
         off = np.linalg.norm(state.points() - points, axis=1)
         rows.append(
             {
                 "case": name,
+                "error": control[0] if control[1] else None,
                 "rtol": rtol,
                 "outliers": outliers,
-                "dt": count * dt / number,
+                "dt": duration / number,
+                "astray": astray,
                 "wall": wall,
                 "newton": _newton(found) / number,
                 "cg": found["pcg_iterations"] / number,
@@ -246,7 +273,7 @@ def _tolerances(name: str, device) -> list[dict]:
     return rows
 
 
-OTHERS = {"apart": apart, "tolerance": tolerances}
+OTHERS = {"apart": apart, "tolerance": tolerances, "control": controls}
 
 
 def main() -> int:
