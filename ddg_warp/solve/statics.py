@@ -124,9 +124,6 @@ def solve(
     validate.check_model("statics", model)
     if state is not None:
         validate.check_state("statics", model, state)
-    for name, value in (("start", start), ("end", end)):
-        arguments.number(f"statics: {name}", value)
-    load_steps = arguments.count("load_steps", load_steps)
     equilibrium = Equilibrium(model, StaticsOptions(**options))
     return equilibrium.load(state or model.state(), load_steps, start, end, controls, way)
 
@@ -198,13 +195,16 @@ class Equilibrium:
     def load(
         self,
         state: State,
-        load_steps: int,
+        load_steps: int = 1,
         start: float = 0.0,
         end: float = 1.0,
         controls: Controls | None = None,
         way: list[State] | None = None,
     ) -> State:
         """Load stepping; see `solve`."""
+        for name, value in (("start", start), ("end", end)):
+            arguments.number(f"statics: {name}", value)
+        load_steps = arguments.count("load_steps", load_steps)
         if self._rubs and start == end:
             raise SceneError(
                 f"contact: friction acts against what slides along an increment of the load parameter, and from {start:g} to {end:g} "

@@ -108,7 +108,7 @@ class Difference:
     """The loss `product(after, weights)` of steps from a state, as a function of what they read.
 
     Args:
-        advance: state -> state after all steps, with solvers of its own.
+        advance: state -> state after all steps, with a solver of its own.
     """
 
     def __init__(self, model, state, weights, advance):
@@ -164,9 +164,10 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
 def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
     """Derivatives of the loss of some steps by the first state, what each step read, the last first, and the loss's `Difference`."""
     weights = directions(model, state, 5)
+    # one for all differences, as a graph takes longer than its steps
+    integrator = ddg.Integrator(model, scheme=scheme, **TIGHT)
 
     def advance(start):
-        integrator = ddg.Integrator(model, scheme=scheme, **TIGHT)
         for _ in range(steps):
             start = integrator.step(start, dt)
         return start

@@ -31,16 +31,7 @@ def differentiated(name: str, law: str, steps: int, speed: float = 0.0, ways=Non
     state = touching(model, along=speed)
     model.touch.at(state.net.q)
     assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
-    gradient, inputs, difference = pulled(model, state, DT, steps)
-    integrator = ddg.Integrator(model, **TIGHT)  # one for all differences, as a graph takes longer than its steps
-
-    def advance(start):
-        for _ in range(steps):
-            start = integrator.step(start, DT)
-        return start
-
-    difference.advance = advance
-    return model, gradient, inputs, difference
+    return model, *pulled(model, state, DT, steps)
 
 
 def by_number(inputs: list, name: str) -> np.ndarray:

@@ -72,7 +72,8 @@ def solved(name: str, law: str):
     assert np.abs(model.contacts(state).force).max() > 1e-4
     weights = position_weights(model, state)
     inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
-    difference = Difference(model, state, weights, lambda start: statics.solve(model, start, start=1.0, rtol=RTOL))
+    solver = statics.Equilibrium(model, statics.StaticsOptions(rtol=RTOL))
+    difference = Difference(model, state, weights, lambda start: solver.load(start, start=1.0))
     return model, inputs, difference
 
 
@@ -106,7 +107,8 @@ def rubbing(name: str, law: str, velocity: float, **contact):
     weights = {name: values * (name == "net/q") for name, values in position_weights(model, state).items()}
     weights["net/q"][np.arange(len(weights["net/q"])) % model.net.blocks >= model.net.host.nodes] = 0.0
     inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
-    difference = Difference(model, model.state(), weights, lambda start: statics.solve(model, start, rtol=RTOL))
+    solver = statics.Equilibrium(model, statics.StaticsOptions(rtol=RTOL))
+    difference = Difference(model, model.state(), weights, solver.load)
     return model, state, inputs, difference
 
 

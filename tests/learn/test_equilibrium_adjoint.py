@@ -43,7 +43,8 @@ def solved(name: str):
     state = statics.solve(model, rtol=RTOL)
     weights = position_weights(model, state)
     inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
-    difference = Difference(model, state, weights, lambda start: statics.solve(model, start, start=1.0, rtol=RTOL))
+    solver = statics.Equilibrium(model, statics.StaticsOptions(rtol=RTOL))
+    difference = Difference(model, state, weights, lambda start: solver.load(start, start=1.0))
     return model, state, inputs, difference
 
 
