@@ -98,6 +98,7 @@ LONG = (
     "localized_helix",
     "deep_arch",
     "leaf",
+    "morphing_bilayer",
     "policy",
     "residual_network",
 )
@@ -138,6 +139,7 @@ def test_hair_that_touches(device):
     checked("strands", device, count=16, contact=True)
 
 
+@pytest.mark.slow
 def test_hair_that_touches_and_is_sag_free(device):
     checked("strands", device, count=16, contact=True, sag_free=True)
 
