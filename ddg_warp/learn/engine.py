@@ -27,6 +27,7 @@ from ddg_warp.solve.dynamics import Integrator
 from ddg_warp.solve.graphs import Graphs
 
 FOREVER = 2**62  # steps between readings of outcomes, which worlds flag
+LOAD = "load_steps", "start", "end"  # what is said of the way to an equilibrium, beside options of what solves for it
 
 
 class Engine:
@@ -51,6 +52,7 @@ class Engine:
         self.integrator.step_whole()
         self.adjoint = self.poses = self.by_poses = self.by_equilibrium = None
         self._equilibria = {}  # reverse of those that are given poses, and of others
+        self._solver = None  # of equilibria, and what it is for
         self.layout, self.tables = Layout(model), Tables(model)
         self.fields = self.layout.fields
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
@@ -249,7 +251,9 @@ class Engine:
         """
         start, way = self.model.empty_state(), []
         self.fill(tensors(start, self.fields), state)
-        found = statics.solve(self.model, start, controls=_on_host(controls), way=way, **options)
+        load = {name: options[name] for name in LOAD if name in options}
+        solver = self._static({name: value for name, value in options.items() if name not in LOAD})
+        found = solver.load(start, controls=_on_host(controls), way=way, **load)
         ones = [
             torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)
             for part in self.integrator._parts
@@ -260,6 +264,13 @@ class Engine:
             for at in way:
                 result += [*copies(tensors(at, self.fields)), view(at.sliding.velocity).clone()]
         return result
+
+    def _static(self, options: dict) -> statics.Equilibrium:
+        """What solves for equilibria: that of the last time where options are the same, as its graphs take as long as a small solve."""
+        asked = statics.StaticsOptions(**options), self.model.version
+        if self._solver is None or self._solver[0] != asked:
+            self._solver = asked, statics.Equilibrium(self.model, asked[0])
+        return self._solver[1]
 
     def way(self, end: float, found) -> list[tuple]:
         """Of the tensors that `balance` gave, of every equilibrium on the way: load parameter, tensors, velocities and increment.

@@ -8,7 +8,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import statics
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.learn.adjoint import EquilibriumAdjoint
 from tests.learn import differences
 from tests.learn.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
@@ -205,6 +205,27 @@ def test_gradients_go_through_all_load_steps(name):
     given |= {"poses": torch.tensor(poses), "forces": 1e-4 * force}
     sizes = {"contact_stiffness": 0.05, "contact_friction": 1e-3, "contact_radius": 1e-6 * RADIUS}
     check(loss, given, sizes | {"poses": 1e-5, "forces": 1e-6})
+
+
+@pytest.mark.parametrize("name", ["plane", "rolling"])
+def test_equilibria_are_those_of_a_new_solver(name):
+    """Bit for bit, whatever was solved for before: under other poses, by other numbers and options, and where that failed."""
+    torch = pytest.importorskip("torch")
+    from ddg_warp.torch import Simulator
+
+    model, poses = gripped(*GRIPPED[name])
+    own = Simulator(model, 0.01)
+
+    def positions(share: float, friction: float, **options):
+        numbers = {"contact.friction": friction * own.parameter("contact.friction", 2)}
+        return own.equilibrium(numbers, {"poses": share * torch.tensor(poses)}, batch=2, rtol=RTOL, **options).positions
+
+    first = positions(1.0, 1.0)
+    assert (positions(0.5, 2.0, load_steps=2) != first).any()
+    torch.testing.assert_close(positions(1.0, 1.0), first, rtol=0.0, atol=0.0)
+    with pytest.raises(SolverError):
+        positions(1.0, 1.0, max_iterations=1, max_cuts=1)
+    torch.testing.assert_close(positions(1.0, 1.0), first, rtol=0.0, atol=0.0)
 
 
 def test_a_rod_that_is_drawn():

@@ -60,10 +60,14 @@ class Resting:
         arrays.take_turns(self._join, products.most, inputs, [self._link], device)
         arrays.sweep(self._wake, len(self._link), [], [self._link, self._awake], device)
         self._bar()
-        arrays.take_turns(self._leave, products.most, [products.sets, newton.barred], [], device)
+        self.leave(products)
+
+    def leave(self, products) -> None:
+        """Have products leave out pairs between what rests, of those that there are by now."""
+        arrays.take_turns(self._leave, products.most, [products.sets, self.newton.barred], [], self.newton.device)
 
     def wake(self) -> None:
-        """Nothing rests."""
+        """Nothing rests; see `leave` for the pairs."""
         self._any.zero_()
         self._bar()
 

@@ -163,6 +163,8 @@ class StaticNewton(NetNewton):
             self.contact.lag(self._before)
         self.evaluate(state)
         self.balance()
+        if self.resting:
+            self.resting.leave(self.contact.terms.products)
         self.assemble()
         self.krylov.multiply_matrix(step)
         wp.launch(self._less, self.all, [self.krylov.product], [self.right], device=self.device)
