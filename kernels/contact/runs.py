@@ -45,11 +45,16 @@ def run_kernels(grouped: bool, real, serial: bool):
     half = wp.constant(real(0.5))
 
     @wp.func
+    def rounded(x: real, frame: real, reach: real):
+        """The reach, and what rounding may take from a coordinate seen from the frame."""
+        return reach + real(ROUNDING) * (wp.abs(x) + wp.abs(frame))
+
+    @wp.func
     def corner(x: X, frame: X, reach: real, sign: float):
         """Of a box around all that is within reach of x, seen from the frame."""
         found = wp.vec3()
         for d in range(3):
-            more = reach + real(ROUNDING) * (wp.abs(x[d]) + wp.abs(frame[d]))
+            more = rounded(x[d], frame[d], reach)
             found[d] = outward(x[d] - frame[d] + real(sign) * more, sign)
         return found
 
@@ -57,7 +62,7 @@ def run_kernels(grouped: bool, real, serial: bool):
     def inside(x: X, frame: X, reach: real, lower: wp.vec3, upper: wp.vec3):
         held = bool(True)  # not by what is no number
         for d in range(3):
-            more = reach + real(ROUNDING) * (wp.abs(x[d]) + wp.abs(frame[d]))
+            more = rounded(x[d], frame[d], reach)
             held = held and x[d] - frame[d] - more >= real(lower[d]) and x[d] - frame[d] + more <= real(upper[d])
         return held
 

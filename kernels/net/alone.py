@@ -49,6 +49,12 @@ def rod_kernels(kind: ChainKind, real):
     Frame, Strains = wp.types.vector(6, real), wp.types.vector(max(vertex_rows + edge_rows, 1), real)
 
     @wp.func
+    def owner(places: wp.array2d(dtype=int), c: int):
+        """World and rod of a column."""
+        w = c / places.shape[1]
+        return w, c - w * places.shape[1]
+
+    @wp.func
     def place(places: wp.array2d(dtype=int), what: int, r: int, k: int, shift: int):
         return wp.max(places[what, r] + k * places[what + 1, r] + shift, 0)
 
@@ -79,9 +85,8 @@ def rod_kernels(kind: ChainKind, real):
     ):
         """Starts the step of every rod: worlds that are not tried have nothing to do."""
         start, c = wp.tid()
-        rods = places.shape[1]
-        w = c / rods
-        r, n = c - w * rods, count[c]
+        w, r = owner(places, c)
+        n = count[c]
         tried = told[wp.static(TRIED), w] != 0
         if start == 0:
             flags[CAUTIOUS, c] = 0
@@ -144,9 +149,8 @@ def rod_kernels(kind: ChainKind, real):
         q_out: wp.array(dtype=V),
     ):
         start, c = wp.tid()
-        rods = places.shape[1]
-        w = c / rods
-        r, n = c - w * rods, count[c]
+        w, r = owner(places, c)
+        n = count[c]
         if told[wp.static(TRIED), w] == 0 or start >= n:
             return
         if start == 0:
@@ -185,9 +189,8 @@ def rod_kernels(kind: ChainKind, real):
         edge_last: wp.array2d(dtype=real),
     ):
         start, c = wp.tid()
-        rods = places.shape[1]
-        w = c / rods
-        r, n = c - w * rods, count[c]
+        w, r = owner(places, c)
+        n = count[c]
         if told[wp.static(TRIED), w] == 0 or start >= n:
             return
         for k in range(start, until(start, n)):
