@@ -256,6 +256,21 @@ def test_equilibria(name):
     check(loss, {"stiffness": values}, {"stiffness": 1e-2 * float(values.max())})
 
 
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in ("twisted", "sheet") else ()) for name in STIFFNESS]
+)
+def test_equilibria_are_those_of_a_new_simulator(name):
+    """Bit for bit, by each parameter that is not zero, after one by other values of it."""
+    own = resting(name)
+    for parameter in own.engine(1).tables.names():
+        values = own.parameter(parameter)
+        if not values.any():
+            continue
+        own.equilibrium({parameter: values})
+        found, wanted = (each.equilibrium({parameter: 1.3 * values}).positions for each in (own, resting(name)))
+        torch.testing.assert_close(found, wanted, rtol=0.0, atol=0.0)
+
+
 @pytest.mark.parametrize("end", [1.0, 0.7])
 @pytest.mark.parametrize("name", STIFFNESS)
 def test_equilibria_under_controls(name, end):
