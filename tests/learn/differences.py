@@ -143,6 +143,17 @@ class Difference:
 
         return self.by(change, step)
 
+    def by_length(self, dt: float, step: float, scheme: str = "implicit_euler") -> float:
+        """By the length of the one step from the state, dt long; each length is one integrator's."""
+        before = self.advance
+
+        def longer(x):
+            self.advance = lambda start: ddg.Integrator(self.model, scheme=scheme, **TIGHT).step(start, dt + x)
+
+        found = self.by(longer, step)
+        self.advance = before
+        return found
+
 
 def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
     """A state on the way, with random velocities: strains, rates and turns of frames everywhere."""
@@ -195,3 +206,10 @@ def check_state(model, gradient, difference) -> None:
         direction = along(values, meant)
         found = float((values * direction).sum())
         assert close(found, difference.by_entry(entry, direction, found)), entry
+
+
+def check_length(own, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
+    """What one part read of a step, dt long, against the derivative of the loss by its length."""
+    by_rate = sum(float(array.numpy().sum()) for array in (own.rate, *getattr(own, "elements_rate", ())))
+    per_step = 2.0 if scheme == "implicit_midpoint" else 1.0  # rate of the implicit Euler step that is solved, times dt
+    assert close(-per_step * by_rate / dt**2, difference.by_length(dt, step, scheme))
