@@ -22,13 +22,15 @@ class SolverError(RuntimeError):
         state: the last good state.
         outcome: name of the outcome, such as `line_search_failed`.
         rods: indices of the rods concerned.
+        gaining: whether a search for an equilibrium still gained energy when its iterations ended.
     """
 
-    def __init__(self, message: str, *, state=None, outcome: str = "", rods=()):
+    def __init__(self, message: str, *, state=None, outcome: str = "", rods=(), gaining: bool = False):
         super().__init__(message)
         self.state = state
         self.outcome = outcome
         self.rods = tuple(rods)
+        self.gaining = gaining
 
 
 def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:

@@ -9,6 +9,9 @@ from ddg_warp import arrays
 from ddg_warp.geometry import polyline
 from ddg_warp.threads import launches
 
+EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # what solvers tell of equilibria
+VELOCITIES = ("v", "omega", "a", "alpha")
+
 
 @dataclass
 class GroupState:
@@ -81,14 +84,19 @@ class State:
     Attributes:
         time: [s], which all worlds share.
         grips: poses of the grips of all worlds; None without, see `Grip`.
-        stable: of an equilibrium that a static solver found, whether it is stable, in all worlds; None where that was not asked, as
-            in dynamics. See `Equilibrium.solve`.
+        stable: of an equilibrium that a static solver found, whether it is stable; None where that was not asked, as in dynamics, or
+            rounding hides it. See `Equilibrium.solve`.
+        outcome: of an equilibrium, "converged" or "converged_to_rounding"; None of other states.
+        unbalanced: of an equilibrium, what of the loads supports and obstacles do not carry, over the loads; None of other states.
+            With several worlds these three are arrays (worlds,).
         sliding: of an equilibrium with friction, the `Sliding` by which that acts, though the state is at rest; None where it acts by
             the velocities of the state.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
-        self.stable: bool | None = None
+        self.stable: bool | np.ndarray | None = None
+        self.outcome: str | np.ndarray | None = None
+        self.unbalanced: float | np.ndarray | None = None
         self.sliding: Sliding | None = None
         self.model = model
         self.groups = groups
@@ -170,7 +178,8 @@ class State:
         """An independent copy."""
         other = self.model.empty_state()
         other.assign(self)
-        other.stable, other.sliding = self.stable, self.sliding
+        for name in EQUILIBRIUM:
+            setattr(other, name, getattr(self, name))
         return other
 
     def assign(self, other: "State") -> None:
@@ -178,7 +187,20 @@ class State:
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 arrays.copy(array, source)
-        self.time, self.stable, self.sliding = other.time, None, None
+        self.time = other.time
+        self.forget_equilibrium()
+
+    def forget_equilibrium(self) -> None:
+        """Take this for a state of which no solver has found that it is an equilibrium."""
+        for name in EQUILIBRIUM:
+            setattr(self, name, None)
+
+    def stop(self) -> None:
+        """Set all velocities to zero, and what the next step would go on from."""
+        for part in self.parts().values():
+            for name, array in part.arrays().items():
+                if name in VELOCITIES:
+                    array.zero_()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""

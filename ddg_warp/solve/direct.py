@@ -48,7 +48,12 @@ class Factorisation:
     @cached_property
     def negative(self) -> int:
         """Number of negative pivots; read when it is asked for, as SuperLU copies all of U for it."""
-        return int((self._lu.U.diagonal() < 0.0).sum())
+        return int(self.negative_rows.sum())
+
+    @cached_property
+    def negative_rows(self) -> np.ndarray:
+        """Whether the pivot of each row is negative (n,) bool."""
+        return (self._lu.U.diagonal() < 0.0)[self._lu.perm_c]
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """x with A x = b, for a vector or for columns."""

@@ -45,12 +45,14 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
             return None
         if iteration:
             scale = np.maximum(first, solver.residuals.load_scale(outer, gradient))
-            excess, solver.outcome = solver.residuals.excess(residual, gradient, hessian, q, scale)
-            if excess <= 0.0 and (solver.outcome == "converged" or polished):
-                stable = factor.reliable and not factor.negative
-                state.time, solver.stiffness = at, hessian
-                return state if stable or solver.options.mode == "follow" else None
-            polished = excess <= 0.0
+            excess, small = solver.residuals.by_island(residual, gradient, hessian, q, scale)
+            within = bool((excess <= 0.0).all())
+            if within and (small.all() or polished):
+                if not (factor.reliable and not factor.negative) and solver.options.mode == "minimise":
+                    return None
+                solver.stiffness = hessian
+                return solver.found(state, outer, residual, at, small)
+            polished = within
         else:
             residual = residual - hessian @ jump
         try:

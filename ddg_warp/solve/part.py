@@ -15,6 +15,8 @@ class Part:
     Attributes:
         host: its `Storage`.
         offset, size: of its dofs among all.
+        islands: number of islands, whose dofs follow one another and are as many in each; body_count: of bodies.
+        block: dofs of a node, positions first.
         given: outer forces of controls on the dofs of every world, in space, at full load (worlds, n) [N, N m].
 
     Args:
@@ -34,6 +36,16 @@ class Part:
     @cached_property
     def _usual_mass(self) -> np.ndarray:
         return self.part.dof_masses()
+
+    @property
+    def axis(self) -> np.ndarray:
+        """Axis of every dof that is a displacement (size,), 0 to 2; any of others."""
+        return np.minimum(np.arange(self.size) % self.block, 2)
+
+    @property
+    def component(self) -> np.ndarray:
+        """Index of the connected component of every dof (size,), from 0."""
+        return np.repeat(np.arange(self.islands), self.size // self.islands)
 
     def accelerations(self, gravity: np.ndarray) -> np.ndarray:
         """Those that gravity (3,) means on the dofs of a node, or of every block (1 or N, dofs of one) [m/s^2]."""

@@ -53,26 +53,59 @@ class Residuals:
 
         `scale` is of the bodies.
         """
+        excess, small = self.by_island(residual, gradient, hessian, q, scale)
+        return float(excess.max()), "converged" if small.all() else "converged_to_rounding"
+
+    def by_island(self, residual, gradient, hessian, q, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same of every island (islands,); and whether its residuals are below the tolerance, not only below rounding."""
         tangent, rtol = self.tangent, self.rtol
-        free, angle = tangent.free, tangent.angle
-        reach = np.abs(q[free & ~angle]).max(initial=1.0)
-        floor = self.rounding * (np.asarray(abs(hessian).sum(axis=1)).ravel() * reach + np.abs(gradient))
+        free, islands = tangent.free, tangent.island[tangent.free]
+        floor = self.rounding * (abs(hessian) @ self.magnitude(q) + np.abs(gradient))
         limit, size = rtol * self.allowed(scale), np.abs(residual)
         masked = np.where(free, residual, 0.0)
         sums = [
             part.sums(own, rtol, tangent.of(part, masked), tangent.of(part, floor))
             for part, own in self._by_part(scale)
         ]
-        small = (size <= limit)[free].all() and all(good for good, _ in sums)
-        worst = float((size - np.maximum(limit, floor))[free].max())
-        return max(worst, *(excess for _, excess in sums)), "converged" if small else "converged_to_rounding"
+        small, excess = (np.concatenate(values) for values in zip(*sums, strict=True))
+        small = small & (np.bincount(islands, (size > limit)[free], tangent.islands) == 0)
+        np.maximum.at(excess, islands, (size - np.maximum(limit, floor))[free])
+        return excess, small
+
+    def magnitude(self, q: np.ndarray) -> np.ndarray:
+        """Size of the numbers whose rounding moves dofs: of positions the largest coordinate of their island, of angles a radian."""
+        tangent = self.tangent
+        reach = np.zeros(tangent.islands)
+        np.maximum.at(reach, tangent.island[~tangent.angle], np.abs(q[~tangent.angle]))
+        return np.where(tangent.angle, np.maximum(1.0, np.abs(q)), reach[tangent.island])
+
+    def unbalanced(self, residual: np.ndarray, outer: np.ndarray) -> np.ndarray:
+        """What of the loads supports and obstacles do not carry, over the loads, at worst in each world (worlds,).
+
+        Residuals of free nodes add up to what is missing in the sum of all forces on a connected component. A component without loads
+        has nothing to carry.
+        """
+        tangent = self.tangent
+        worst = np.zeros(tangent.model.worlds)
+        for part in tangent.parts:
+            points = (tangent.free & ~tangent.angle)[part.offset : part.offset + part.size]
+            own, loads = (np.where(points, tangent.of(part, v), 0.0) for v in (residual, outer))
+            count, axes = part.component.max() + 1, part.axis
+            left = np.zeros((count, 3))
+            np.add.at(left, (part.component, axes), part.back(own))
+            total = np.bincount(part.component, np.abs(loads), count)
+            ratio = np.divide(np.abs(left).max(1), total, out=np.zeros(count), where=total > 0.0)
+            world = np.zeros(count, int)
+            world[part.component] = np.arange(part.size) // (part.size // part.worlds)
+            np.maximum.at(worst, world, ratio)
+        return worst
 
     def where(self, outcome: str, residual: np.ndarray, at: float, told: str = "") -> str:
-        """What to tell of a search that failed, with what is `told` of contact."""
+        """What to tell of a search that failed, with what is `told` of contact; see `ddg_warp.solve.remedies` for what would help."""
         masked = np.where(self.tangent.free, np.abs(self.scaled(residual)), -1.0)
         worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
-        longer = "a larger max_iterations, " if outcome == "max_iterations" else ""
+        told = told.rstrip("; ,")
         return (
             f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
-            f"{self.tangent.where(worst)}; {told}take {longer}more load steps, or hold what can still move freely"
+            f"{self.tangent.where(worst)}{told and '; ' + told}"
         )

@@ -17,6 +17,7 @@ from ddg_warp.solve.lowest import Lowest, LowestFactors, dense
 from ddg_warp.solve.rigid import rigid_modes
 from ddg_warp.solve.tangent import Tangent
 
+NEGATIVE = 64.0  # units of rounding, of a curvature over the sum of its terms' magnitudes, below which it may be zero
 DENSE = 600  # free dofs up to which a dense eigenvalue solver is the quicker and safer choice
 
 
@@ -143,20 +144,57 @@ def instabilities(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> int:
     return negative
 
 
-def stable(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> bool | None:
-    """Whether the tangent stiffness (size, size) is positive on free dofs but for rigid modes.
+@dataclass(frozen=True)
+class IslandStability:
+    """Stability of every island of an equilibrium.
 
-    None where one factorisation does not tell: under loads without a potential.
+    Attributes:
+        stable: whether the stiffness is positive but for rigid modes (islands,), True, False, or None where that is not known: under
+            loads without a potential, and where the lowest eigenvalue is negative by no more than rounding.
+        modes: the lowest modes of unstable islands (size,), each of any length; zero in others.
     """
-    matrix = stiffness[tangent.free][:, tangent.free]
+
+    stable: np.ndarray
+    modes: np.ndarray
+
+    def by_world(self, tangent: Tangent) -> tuple:
+        """Of all islands of each world: False if one is unstable, None if one is not known, else True."""
+        of_worlds = (self.stable[tangent.world == world] for world in range(tangent.model.worlds))
+        return tuple(False if False in own else None if None in own else True for own in map(list, of_worlds))
+
+
+def of_islands(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> IslandStability:
+    """Stability of every island by its tangent stiffness (size, size)."""
+    stable, modes = np.full(tangent.islands, None, object), np.zeros(tangent.size)
+    free = np.flatnonzero(tangent.free)
+    matrix, island = sparse.csc_matrix(stiffness[free][:, free]), tangent.island[free]
     if not is_symmetric(matrix):
-        return None
-    factor, _ = regular(sparse.csc_matrix(matrix), np.zeros(matrix.shape[0]))
-    if factor.reliable and not factor.negative:
-        return True
-    if not factor.reliable and matrix.shape[0] > DENSE:
-        return None
-    return instabilities(tangent, state, stiffness) == 0
+        return IslandStability(stable, modes)
+    factor, _ = regular(matrix, np.zeros(matrix.shape[0]))
+    if factor.reliable:
+        stable[np.bincount(island, factor.negative_rows, tangent.islands) == 0] = True
+    unknown = np.flatnonzero(stable != True)  # noqa: E712 (of an array of objects)
+    known = rigid_modes(tangent, state, stiffness)[free] if unknown.size else None
+    weights = np.where(tangent.angle, tangent.edge_length() ** 2, 1.0)[free]
+    for index in unknown:
+        rows = np.flatnonzero(island == index)
+        own, rigid = matrix[rows][:, rows], known[rows]
+        if not factor.reliable and len(rows) > DENSE:
+            continue
+        rigid = rigid[:, rigid.any(0)]
+        if negative_eigenvalues(pinned(own, rigid) if rigid.size else own) == 0:
+            stable[index] = True
+            continue
+        mode = _lowest_mode(own, weights[rows], rigid)
+        if mode @ (own @ mode) < -NEGATIVE * tangent.model.types.eps * (np.abs(mode) @ (abs(own) @ np.abs(mode))):
+            stable[index], modes[free[rows]] = False, mode
+    return IslandStability(stable, modes)
+
+
+def _lowest_mode(matrix: sparse.csc_matrix, weights: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Eigenvector of the lowest eigenvalue, rigid modes apart; its largest entry is positive, so that it is the same in every run."""
+    mode = (dense(matrix, weights, known) if len(weights) <= DENSE else Lowest(matrix, weights, known)(1))[1][:, 0]
+    return mode * np.sign(mode[np.argmax(np.abs(mode))])
 
 
 def is_symmetric(matrix) -> bool:

@@ -15,6 +15,7 @@ equilibrium is that of an increment of the load parameter, which the way there d
 nothing tells whether it is stable.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,11 +27,11 @@ from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
 from ddg_warp.scene import validate as scene_validate
-from ddg_warp.solve import mixed, stability
+from ddg_warp.solve import mixed, remedies, stability
 from ddg_warp.solve.choice import large_static, static_solver, why_not_pcg
 from ddg_warp.solve.descent import Descent
 from ddg_warp.solve.motion import jump_between, poses_between
-from ddg_warp.solve.net.statics import NetEquilibrium
+from ddg_warp.solve.net.statics import UNSETTLED, NetEquilibrium
 from ddg_warp.solve.residuals import Residuals
 from ddg_warp.solve.supports import require_supports
 from ddg_warp.solve.tangent import Tangent
@@ -38,10 +39,10 @@ from ddg_warp.threads import launches
 
 SOLVERS = ("auto", "direct", "pcg")
 DESCENTS = 8  # from saddles, in one solve
-UNFINISHED = (
-    "max_iterations",
-    "line_search_failed",
-)  # in contact by conjugate gradients; the latter where what is left is rounding
+# outcomes of conjugate gradients in contact from which factors go on; the second also where the residual is one of rounding, the
+# third where supports press everything together
+UNFINISHED = ("max_iterations", "line_search_failed", "no_room")
+LOST = 1e-3  # of the loads, which supports and obstacles may miss for rounding
 FIRST_TURN = 0.1  # rad, by which a search leaves a saddle
 
 
@@ -138,7 +139,6 @@ class Equilibrium:
         factors: whether the tangent at what it finds is factored, to tell whether that is stable.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
-        shift: of the last tangent, over its diagonal, that made it definite; 0 where it was.
         outcome: of the last solve, `converged` or `converged_to_rounding`.
         stiffness: the tangent at the last equilibrium (size, size), None without `factors`.
     """
@@ -157,7 +157,7 @@ class Equilibrium:
         self.factors = self._descends or (model.touch is not None and not self._rubs and not large_static(model))
         self.mixed = self.tangent.shells_alone and self.net is None
         self.descent = Descent(self)
-        self.iterations, self.shift = 0, 0.0
+        self.iterations = 0
         self.outcome, self.stiffness = "", None
 
     @property
@@ -214,16 +214,21 @@ class Equilibrium:
         self.check_apart(state)
         self.tangent.give(found)
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
+        state = state.copy()
+        state.stop()
         if start == end:
-            state = self.solve(state, start, end)
+            try:
+                state = self.solve(state, start, end)
+            except SolverError as error:
+                raise self._explained(error, state, end) from None
             self.count(state, 0.0)
             if way is not None:
                 way.append(state)
             return state
         at, whole, cuts = start, (end - start) / load_steps, 0
-        state = state.copy()
         if self._rubs:
             self.net.wary = True
+        balanced = self._rubs or self._balanced(state, start)
         while at != end:
             increment = whole * 0.5**cuts
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
@@ -234,20 +239,34 @@ class Equilibrium:
                     way.append(state)
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
-                cuts += 1
-                if error.outcome == arguments.PRESCRIBED:
+                if error.outcome in (arguments.PRESCRIBED, "lost_in_rounding"):
                     raise
+                if not balanced:  # as with another rest shape: no part of the increment is small enough
+                    balanced = True
+                    with suppress(SolverError):
+                        state = self.solve(state, start, start)
+                        continue
+                cuts += 1
                 if cuts > self.options.max_cuts and self._rubs and self.net.wary:
                     self.net.wary, cuts = False, 0  # it may have to slide
                 elif cuts > self.options.max_cuts:
                     advice = jump_between(self.model, at, target)
-                    raise SolverError(
-                        f"{advice and advice + '; '}{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
-                        state=state,
-                        outcome=error.outcome,
-                    ) from None
+                    told = f" (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)"
+                    raise self._explained(error, state, target, f"{told}{advice and '; ' + advice}") from None
         state.time = end
         return state
+
+    def _explained(self, error: SolverError, before: State, at: float, told: str = "") -> SolverError:
+        """The error of a search from the state `before`, which it carries, with what is `told` and what would help."""
+        helps = ("max_iterations", "line_search_failed", "non_finite", UNSETTLED)  # others say it themselves
+        remedy = remedies.of_search(self, error, before, at) if error.outcome in helps else ""
+        return SolverError(f"{error}{told}{remedy and '; ' + remedy}", state=before, outcome=error.outcome)
+
+    def _balanced(self, state: State, at: float) -> bool:
+        """Whether a state is about in equilibrium at load parameter `at`."""
+        gradient, outer = self.tangent.gradient(state), self.tangent.loads(at, self.tangent.dofs(state))
+        allowed = mixed.UNBALANCED * self.residuals.allowed(self.residuals.load_scale(outer, gradient))
+        return bool((np.abs(outer - gradient) <= allowed)[self.tangent.free].all())
 
     def check_apart(self, state: State) -> None:
         """Refuse to begin where surfaces overlap; by a penalty equilibria may."""
@@ -280,8 +299,9 @@ class Equilibrium:
         if not tangent.free.any():
             state = state.copy()
             tangent.move_supports(state, before, at)
-            state.time, state.stable, self.outcome = at, True, "converged"
-            return state
+            none = np.zeros(tangent.size)
+            state.stable = True if self.model.worlds == 1 else np.full(self.model.worlds, True, object)
+            return self.found(state, none, none, at, np.ones(tangent.islands, bool))
         if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
             state = found
         else:
@@ -290,12 +310,14 @@ class Equilibrium:
             if not self.factors:
                 return state
         for _ in range(DESCENTS):
-            state.stable = stability.stable(tangent, state, self.stiffness)
-            if state.stable is not False or self.options.mode == "follow":
+            found = stability.of_islands(tangent, state, self.stiffness)
+            self._tell_stable(state, found)
+            if self.options.mode == "follow" or not found.modes.any():
                 return state
-            beside = self._beside(state, at)
-            if beside is None:
-                state.stable = None
+            beside, left = self._beside(state, at, found.modes)
+            if not left.any():
+                found.stable[found.stable == False] = None  # noqa: E712 (of an array of objects)
+                self._tell_stable(state, found)
                 return state
             state = self._minimum(beside, at, state, abs(at - before))
         raise SolverError(
@@ -325,38 +347,70 @@ class Equilibrium:
         self.stiffness = self.tangent.stiffness(state, at) if self.factors else None
         return state
 
-    def _beside(self, state: State, at: float) -> State | None:
-        """A state of less energy beside a saddle, along its lowest mode; None if rounding leaves no such difference."""
+    def _tell_stable(self, state: State, found: stability.IslandStability) -> None:
+        stable = found.by_world(self.tangent)
+        state.stable = np.array(stable, object) if self.model.worlds > 1 else stable[0]
+
+    def _beside(self, state: State, at: float, modes: np.ndarray) -> tuple[State, np.ndarray]:
+        """A state of less energy beside a saddle, along the lowest `modes` (size,) of its unstable islands.
+
+        Returns:
+            The state; and islands (islands,) that have left, as rounding leaves no such difference in others.
+        """
         tangent = self.tangent
-        mode = stability.spectrum(self.model, state, 1, "unit", tangent, at).modes[:, 0]
-        q, energies = tangent.dofs(state), tangent.element_energies(state)
-        step = FIRST_TURN * np.sign(mode[np.argmax(np.abs(mode))]) / max(1e-300, tangent.rotation(q, mode)) * mode
-        for _ in range(20):
+        island, q, energies = tangent.island, tangent.dofs(state), tangent.element_energies(state)
+        turns = tangent.rotations(q, modes)
+        length = np.divide(FIRST_TURN, turns, out=np.zeros_like(turns), where=turns > 0.0)
+        noise = 64 * self.model.types.eps * tangent.island_energies(np.abs(energies))
+        wanted = length > 0.0
+
+        def moved_by(length):
             beside = state.copy()
-            tangent.assign(beside, tangent.retract(q, step))
+            moved = tangent.retract(q, length[island] * modes)
+            tangent.assign(beside, np.where(length[island] > 0.0, moved, q))
+            return beside
+
+        for _ in range(20):
+            beside = moved_by(length)
             moved = tangent.dofs(beside)
-            work = 0.5 * (tangent.loads(at, q) + tangent.loads(at, moved)) @ (moved - q)
-            noise = 64 * self.model.types.eps * np.abs(energies).sum()
-            if (tangent.element_energies(beside) - energies).sum() - work < -noise:
-                return beside
-            step = 0.5 * step
-        return None
+            work = 0.5 * (tangent.loads(at, q) + tangent.loads(at, moved)) * (moved - q)
+            change = tangent.island_energies(tangent.element_energies(beside) - energies)
+            left = wanted & (change - np.bincount(island, work, tangent.islands) < -noise)
+            if (left | ~wanted).all():
+                return beside, left
+            length = np.where(left, length, 0.5 * length)
+        return moved_by(np.where(left, length, 0.0)), left
 
-    def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
-        """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
-        points = self.tangent.free & ~self.tangent.angle
-        return self.outcome != "converged" and np.abs(residual[points]).sum() > 0.5 * np.abs(outer[points]).sum() > 0.0
+    def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float, small: np.ndarray) -> State:
+        """The state as the equilibrium at `at`.
 
-    def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
-        """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
-        if (self.shift > 0.0 or not self._descends) and self._hidden(outer, residual):
+        Args:
+            outer, residual: loads and out-of-balance forces (size,) [N, N m].
+            small: islands whose residuals are below the tolerance, not only below rounding (islands,).
+
+        Raises:
+            SolverError: `lost_in_rounding`, where rounding hides a part of the full loads, those at load parameter 1 or beyond, from
+                supports and obstacles. Of small load steps on the way to them it may hide more.
+        """
+        model, unbalanced = self.model, self.residuals.unbalanced(residual, outer)
+        rounded = np.bincount(self.tangent.world, ~small, model.worlds) > 0
+        full = self.tangent.loads(max(1.0, abs(at)), self.tangent.dofs(state))
+        lost = rounded & (self.residuals.unbalanced(residual, np.maximum(np.abs(outer), np.abs(full))) > LOST)
+        if lost.any():
+            world = int(np.argmax(np.where(lost, unbalanced, 0.0)))
             raise SolverError(
-                f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
-                "the loads are large; take better shaped elements, or float64",
+                f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces so uncertain that "
+                f"supports miss {unbalanced[world]:.1g} of the loads{f' of world {world}' if model.worlds > 1 else ''}; take "
+                "better shaped elements, longer ones where the stiffest are shortest, a smaller axial stiffness, or float64",
                 state=state,
                 outcome="lost_in_rounding",
             )
+        outcomes = np.where(rounded, "converged_to_rounding", "converged")
+        self.outcome = "converged_to_rounding" if rounded.any() else "converged"
         state.time = at
+        state.outcome, state.unbalanced = (
+            values if model.worlds > 1 else values[0].item() for values in (outcomes, unbalanced)
+        )
         return state
 
     def _with_supports_moved(self, state: State, before: float, at: float) -> State:

@@ -20,6 +20,8 @@ class Tangent:
         size: number of dofs, held and padding ones included.
         free: which dofs are free (size,) bool.
         angle: which dofs are angles (size,) bool.
+        islands: number of islands: rods of groups, and worlds of the coupled system, which no stiffness connects; island: of each dof
+            (size,); world: of each island (islands,).
         poses: of grips by load parameter, load -> (worlds, grips, 6); None where they are as the state has them.
     """
 
@@ -39,6 +41,16 @@ class Tangent:
             np.concatenate([getattr(part, name) for part in self.parts]) for name in ("free", "angle")
         )
 
+        first = np.cumsum([0, *(part.islands for part in self.parts)])
+        self.islands = int(first[-1])
+        self.island = np.concatenate(
+            [
+                at + np.repeat(np.arange(p.islands), p.size // p.islands)
+                for at, p in zip(first, self.parts, strict=False)
+            ]
+        )
+        self.world = np.concatenate([np.arange(part.islands) // (part.islands // model.worlds) for part in self.parts])
+
     @property
     def mass(self) -> np.ndarray:
         """Lumped mass and rotary inertia of every dof (size,) [kg, kg m^2]."""
@@ -54,7 +66,18 @@ class Tangent:
 
     def element_energies(self, state) -> np.ndarray:
         """Elastic energies of all elements [J], for differences free of cancellation."""
-        return np.concatenate([values.ravel() for part in self.parts for _, values in part.energies(state)])
+        values, islands, first = [], [], 0
+        for part in self.parts:
+            for _, own in part.energies(state):
+                values.append(own.ravel())
+                islands.append(first + np.repeat(np.arange(part.islands), own.size // part.islands))
+            first += part.islands
+        self._element_island = np.concatenate(islands)
+        return np.concatenate(values)
+
+    def island_energies(self, element_energies: np.ndarray) -> np.ndarray:
+        """Sums of values of elements, in the order of `element_energies`, over every island (islands,) [J]."""
+        return np.bincount(self._element_island, element_energies, self.islands)
 
     def elastic_energy(self, state) -> float:
         """That of all worlds without what touches [J]."""
@@ -66,16 +89,15 @@ class Tangent:
 
     @property
     def shells_alone(self) -> bool:
-        """Whether the model consists of shells alone, so that `linear_stress` serves it."""
+        """Whether the model consists of shells alone."""
         return not self.model.groups and not self.model.net.edges
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
-        """Exact second derivative of the elastic energy (size, size); of shells with other stresses where these are given."""
-        if stress is not None:
-            return self.parts[0].hessian(state, stress)
-        if len(self.parts) == 1:
-            return self.parts[0].hessian(state)
-        return sparse.block_diag([part.hessian(state) for part in self.parts], format="csc")
+        """Exact second derivative of the elastic energy (size, size); in the coupled system with other stresses where given."""
+        blocks = [part.hessian(state) for part in self.parts[:-1]]
+        last = self.parts[-1]
+        blocks.append(last.hessian(state) if stress is None else last.hessian(state, stress))
+        return blocks[0] if len(blocks) == 1 else sparse.block_diag(blocks, format="csc")
 
     def stiffness(self, state, load: float | None = None, stress: list | None = None) -> sparse.csc_matrix:
         """The tangent of the whole: `hessian`, less the derivative of the loads that follow at load parameter `load`.
@@ -87,8 +109,8 @@ class Tangent:
         return hessian if following is None else hessian + following
 
     def linear_stress(self, state, step: np.ndarray) -> list:
-        """Stresses (strains, elements) of every element set of the shells after a step, with strains e + J step."""
-        return self.parts[0].linear_stress(state, step)
+        """Stresses (strains, elements) of every element set of the coupled system after a step, with strains e + J step."""
+        return self.parts[-1].linear_stress(state, self.of(self.parts[-1], step))
 
     def give(self, found: dict[str, np.ndarray]) -> None:
         """From now on have the loads among what `Controls.checked` found, times the factor, beside those of the scene."""
@@ -120,7 +142,7 @@ class Tangent:
         for part in self.parts:
             part.assign(state, self.of(part, q))
         self.model.carry_frames(state)
-        state.stable = state.sliding = None
+        state.forget_equilibrium()
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs, and the magnetic field, where they are at load parameter `at`; the state belongs to `before`."""
@@ -177,14 +199,22 @@ class Tangent:
         return moved
 
     def rotation(self, q: np.ndarray, direction: np.ndarray) -> float:
-        """Largest turn of an edge, or change of an angle, that a step along `direction` would make [rad]."""
-        worst = np.abs(direction[self.angle]).max(initial=0.0)
+        """Largest rotation of an edge, or change of an angle, that a step along `direction` would make [rad]."""
+        return float(self.rotations(q, direction).max(initial=0.0))
+
+    def rotations(self, q: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Largest rotation of an edge, or change of an angle, of every island (islands,) [rad]; see `rotation`."""
+        worst = np.zeros(self.islands)
+        np.maximum.at(worst, self.island[self.angle], np.abs(direction[self.angle]))
+        first = 0
         for part in self.parts:
             edges, turns = (part.edges(self.of(part, v)) for v in (q, direction))
-            length = np.linalg.norm(edges, axis=1)
-            real = length > 0.0
-            worst = max(worst, (np.linalg.norm(turns[real], axis=1) / length[real]).max(initial=0.0))
-        return float(worst)
+            length, own = np.linalg.norm(edges, axis=1), np.linalg.norm(turns, axis=1)
+            turn = np.divide(own, length, out=np.zeros_like(own), where=length > 0.0)
+            islands = worst[first : first + part.islands]
+            np.maximum(islands, turn.reshape(part.islands, -1).max(1, initial=0.0), out=islands)
+            first += part.islands
+        return worst
 
     def turned_over(self, before: np.ndarray, after: np.ndarray) -> bool:
         """Whether an edge points backwards on dofs `after` as against `before`."""

@@ -113,7 +113,7 @@ def test_what_slides_off_has_no_equilibrium(device):
     model = on_slope(rod_on_floor, 0.3, friction=0.3).build(device, precision="float64")
     with pytest.raises(
         SolverError,
-        match=r"no equilibrium .* max_iterations.* may come to no rest: step the scene in time, take a larger max_iterations",
+        match=r"no equilibrium .* max_iterations.* may come to no rest.* a larger max_iterations, or step the scene in time",
     ):
         statics.solve(model, max_cuts=1, max_iterations=30)
 

@@ -27,7 +27,8 @@ class ChainTangent(Part):
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
         super().__init__(model, group, offset, group.columns * group.nodes * kind.block)
-        self.group, self.body_count = group, group.columns
+        self.group, self.block = group, kind.block
+        self.body_count = self.islands = group.columns
         self.rate = group.still  # over what strain-rate damping counts: at rest not
         self.incidence = _incidence(group)
         self.free = _free(group)
@@ -132,6 +133,15 @@ class ChainTangent(Part):
         """Edge vectors of the windows (E, dim), zero where there is none."""
         return (self.incidence @ q).reshape(-1, self.group.kind.window)[:, : self.group.kind.dim]
 
+    def edge_dofs(self) -> np.ndarray:
+        """Dofs of the positions of both ends of all edges (2, E, dim)."""
+        group, kind, ends = self.group, self.group.kind, []
+        for column in range(group.columns):
+            n = group.host.count[column % group.rods]
+            first = np.arange(n if kind.closed else n - 1)
+            ends.append(column * group.nodes + np.stack([first, (first + 1) % n]))
+        return kind.block * np.concatenate(ends, axis=1)[..., None] + np.arange(kind.dim)
+
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Sum of the outer forces on every rod, or its largest support force if that is more (columns,) [N]."""
         columns, nodes, force = self.group.columns, self.group.nodes, ~self.angle
@@ -144,13 +154,13 @@ class ChainTangent(Part):
         lengths = np.where(self.angle, np.repeat(np.tile(self.group.host.length, self.group.worlds), self._dofs), 1.0)
         return np.repeat(loads, self._dofs) * lengths
 
-    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray) -> tuple[bool, float]:
-        """Whether residuals add up to little along the rods from their first node, and the largest excess over rounding."""
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
+        """Whether residuals add up to little along each rod from its first node, and the largest excess over rounding (islands,)."""
         dim = self.group.kind.dim
         sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
         limit = (rtol * loads)[:, None, None]
         noise = np.sqrt(np.cumsum(self.blocks(floor)[..., :dim] ** 2, axis=1))
-        return bool((sums <= limit).all()), float((sums - np.maximum(limit, noise)).max())
+        return (sums <= limit).all((1, 2)), (sums - np.maximum(limit, noise)).max((1, 2))
 
     @property
     def _dofs(self) -> int:

@@ -374,13 +374,14 @@ class NetEquilibrium:
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
             told = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
             if rubs:
-                told += "what slides may come to no rest: step the scene in time, "
-            raise SolverError(owner.residuals.where(name, residual, at, told), state=state, outcome=name)
-        owner.outcome = name
+                told += "what slides may come to no rest"
+            message = owner.residuals.where(name, residual, at, told)
+            raise SolverError(message, state=state, outcome=name, gaining=name == "max_iterations")
         # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
         state.stable = False if indefinite else None
-        return owner.found(state, outer, residual, at), certain
+        small = (ends == outcome.CONVERGED) | (status == outcome.CONVERGED)
+        return owner.found(state, outer, residual, at, small), certain
 
     def _near(self, begun: np.ndarray, state: State) -> bool:
         """Whether nodes have moved from blocks (W N, 3) by so little that normal forces have hardly changed."""

@@ -27,7 +27,8 @@ class NetTangent(Part):
         kind[host.nodes :] = True
         self.free, self.angle = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind))
         super().__init__(model, model.net, offset, 3 * host.blocks * worlds)
-        self.net, self.body_count = model.net, host.bodies.count * worlds
+        self.net, self.block = model.net, 3
+        self.body_count, self.islands = host.bodies.count * worlds, worlds
         self.rate = model.net.still  # over what strain-rate damping counts: at rest not
         self.given_field = np.zeros((worlds, 3))  # of controls, over that of the scene [T]
         self.planes = HostPlanes(host, worlds) if host.frames else None
@@ -213,6 +214,19 @@ class NetTangent(Part):
         first, second = self.host.edges.T
         return (x[:, second] - x[:, first]).reshape(-1, 3)
 
+    def edge_dofs(self) -> np.ndarray:
+        """Dofs of the positions of both ends of all edges (2, E, 3)."""
+        blocks = self.host.edges.T[:, None] + self.host.blocks * np.arange(self.net.worlds)[:, None]
+        return 3 * blocks.reshape(2, -1)[..., None] + np.arange(3)
+
+    @cached_property
+    def component(self) -> np.ndarray:
+        """Index of the connected component of every dof (size,); what touches may connect all of a world."""
+        bodies = self.host.bodies
+        own = np.zeros(self.host.blocks, int) if self.model.touch else bodies.components[bodies.owner]
+        worlds = np.arange(self.worlds)[:, None] * (own.max() + 1)
+        return np.repeat((worlds + own).ravel(), 3)
+
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
         bodies, shape = self.host.bodies, (self.net.worlds, self.host.blocks, 3)
@@ -232,15 +246,15 @@ class NetTangent(Part):
         blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.net.worlds, -1)]
         return np.repeat(np.concatenate(blocks), 3)
 
-    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray) -> tuple[bool, float]:
-        """Whether residuals add up to little, and the largest excess over rounding; see `tolerance.largest_excess`."""
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
+        """Whether residuals add up to little, and the largest excess over rounding, world by world; see `tolerance.largest_excess`."""
         by_world = loads.reshape(self.net.worlds, -1), residual.reshape(self.net.worlds, -1, 3)
         floors = floor.reshape(self.net.worlds, -1, 3).max(2)
         found = [
             largest_excess(self.host.bodies.levels, own, rtol, r, f)
             for own, r, f in zip(*by_world, floors, strict=True)
         ]
-        return all(small for small, _ in found), max(excess for _, excess in found)
+        return tuple(np.array(values) for values in zip(*found, strict=True))
 
     def edge_length(self) -> float:
         """Mean rest length of edges [m]."""
