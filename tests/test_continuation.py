@@ -341,7 +341,7 @@ def test_failures_are_named(device):
     with pytest.raises(ddg.SolverError, match=r"no_start.*statics.solve") as caught:
         continuation.trace(start=0.3)
     assert caught.value.outcome == "no_start"
-    with pytest.raises(ddg.SolverError, match=r"after 1 points: step_too_small.*min_step smaller") as caught:
+    with pytest.raises(ddg.SolverError, match=r"after 1 points: step_too_small.*min_step below") as caught:
         truss(device, 3.0, max_iterations=1, step=0.05, min_step=0.02)[0].trace()
     assert caught.value.outcome == "step_too_small"
     assert len(caught.value.path) == 1

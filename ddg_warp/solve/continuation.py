@@ -11,6 +11,7 @@ Where contact sets in or ends a path turns within a small part of the range of c
 passed over as a corner. The load may be stationary there; which eigenvalues change sign at a corner is not looked for.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -26,6 +27,7 @@ from ddg_warp.solve.corrector import ContinuationOptions, Corrector, Failed
 from ddg_warp.threads import launches
 
 FORK = 1e-2  # work of the load along the path, over its largest along any, at which a stationary load is no limit point
+CONTROLLED = 0.2  # of a change under control: how far the shape may be from the mean of its rates at both ends
 LEAP = 4.0  # distance of two points over the length between them at which they are not on one path
 BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
 
@@ -160,8 +162,8 @@ class Continuation:
             max_cuts: how often an increment is halved.
 
         Raises:
-            SolverError: `no_start`, `singular_start`, or `displacement_turns_back`: the displacement cannot grow further along
-                the path.
+            SolverError: `no_start`, `singular_start`, or `displacement_turns_back`: the displacement cannot go on along the path
+                without a jump to another part of it; carries the path so far as its `path`.
         """
         if displacement not in self.watched:
             raise SceneError(
@@ -176,8 +178,9 @@ class Continuation:
             while reached != value:
                 target = value if abs(value - reached) <= abs(increment) * (1.0 + 1e-12) else reached + increment
                 try:
-                    here = self.corrector.to(here, row, target)
-                    reached = target
+                    there = self.corrector.to(here, row, target)
+                    self._require_smooth(here, there, row, target - reached)
+                    here, reached = there, target
                 except Failed:
                     cuts, increment = cuts + 1, 0.5 * increment
                     if cuts > max_cuts:
@@ -189,6 +192,22 @@ class Continuation:
             path.points.append(here)
         path.outcome = "values"
         return path
+
+    def _require_smooth(self, here: Point, there: Point, row: np.ndarray, change: float) -> None:
+        """Refuse a change of a controlled functional over which the shape does more than its rates at both ends tell.
+
+        A leap to another part of the path has a chord that is not the mean of these rates, or rates of opposite sense.
+        """
+        rates = [row @ point.direction for point in (here, there)]
+        if abs(change) <= 1e-12 * (np.abs(row[:-1]) @ np.abs(self.tangent.dofs(here.state))):
+            return
+        if rates[0] * rates[1] <= 0.0:
+            raise Failed("displacement_turns_back")
+        ends = [change / rate * point.direction for rate, point in zip(rates, (here, there), strict=True)]
+        chord = np.append(self.tangent.dofs(there.state) - self.tangent.dofs(here.state), 0.0)
+        gap, *ends = (np.append(way[:-1], 0.0) for way in (chord - 0.5 * (ends[0] + ends[1]), *ends))
+        if self.corrector.norm(gap) > CONTROLLED * max(map(self.corrector.norm, ends)):
+            raise Failed("leap")
 
     def _follow(self, path: Path, stop: Stop) -> Path:
         """Add points to a path until it stops."""
@@ -210,11 +229,32 @@ class Continuation:
             step *= np.clip(np.sqrt(options.iterations / max(1, there.iterations)), 0.5, 1.6)
             here = there
         path.outcome = "steps"
+        self._warn_of_rest(path, stop)
         return path
+
+    def _warn_of_rest(self, path: Path, stop: Stop) -> None:
+        """Warn of a path that has used up its steps before any bound, and of how far it has come."""
+        ways = [("load", path.load, stop.load)]
+        if stop.displacement is not None:
+            ways.append((repr(stop.displacement[0]), path.values(stop.displacement[0]), stop.displacement[1:]))
+        parts = [
+            (np.abs(values - values[0]).max() / abs(bound - values[0]), f"{name} = {bound:g}")
+            for name, values, bounds in ways
+            for bound in bounds
+            if np.isfinite(bound) and bound != values[0]
+        ]
+        if parts:
+            part, bound = max(parts)
+            warnings.warn(
+                f"the path ends after {stop.steps} steps, {100.0 * min(part, 1.0):.2g} % of the way to {bound}: give Stop more steps, "
+                "or Continuation a larger max_step or load_scale",
+                stacklevel=5,
+            )
 
     def _next(self, path: Path, step: float, stop: Stop) -> tuple[Point, list[Point], str, float]:
         """The point after the last of a path, events on the way, which bound of `stop` it lies on, if any, and the step to it."""
         here, options = path.points[-1], self.options
+        failed: object = f"rotation_cap, a step of {step:.2g} turns edges by all that it allows"
         while step >= options.min_step:
             try:
                 there = self.corrector.at(here, step)
@@ -226,7 +266,7 @@ class Continuation:
                 failed, step = failure, 0.5 * step
         there = self.corrector.past_corner(here)
         if there is None:
-            remedy = f"{failed}: the path may end or branch here; begin elsewhere, or take min_step smaller"
+            remedy = f"{failed}: the path may end or branch here; begin elsewhere, or take min_step below {options.min_step:g}"
             raise self._error("step_too_small", path, remedy)
         events = []
         if here.direction[-1] * there.direction[-1] < 0.0:

@@ -19,7 +19,7 @@ from ddg_warp.model.state import State
 from ddg_warp.scene.path import REGULAR, Displacement, Point
 from ddg_warp.solve import stability
 from ddg_warp.solve.bordered import Bordered
-from ddg_warp.solve.direct import SingularError
+from ddg_warp.solve.direct import Factorisation, SingularError
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
@@ -29,7 +29,8 @@ class ContinuationOptions:
 
     Attributes:
         step: first arc length; max_step, min_step: largest and smallest. See the metric above.
-        load_scale: change of the load parameter that counts as much as a displacement of the scene's size.
+        load_scale: change of the load parameter that counts as much as a displacement of the scene's size; by default 1, or if more
+            the lowest critical load parameter or that which moves the scene by its size, both linearised at rest, whichever is less.
         iterations: of the corrector that the step is adapted to; max_iterations: at which it is given up.
         rotation_cap: largest turn of an edge in a predictor [rad].
         tolerance: of limit points, relative to the step in which they are found.
@@ -39,7 +40,7 @@ class ContinuationOptions:
     step: float = 0.02
     max_step: float = 0.1
     min_step: float = 1e-7
-    load_scale: float = 1.0
+    load_scale: float | None = None
     iterations: int = 6
     max_iterations: int = 15
     rotation_cap: float = 0.3
@@ -48,13 +49,20 @@ class ContinuationOptions:
     floor_factor: float = 16.0
 
     def __post_init__(self):
-        positive = ("step", "max_step", "min_step", "load_scale", "rotation_cap", "tolerance", "rtol", "floor_factor")
-        check_options(self, positive, ("iterations", "max_iterations"))
+        positive = ("step", "max_step", "min_step", "rotation_cap", "tolerance", "rtol", "floor_factor")
+        scaled = () if self.load_scale is None else ("load_scale",)
+        check_options(self, positive + scaled, ("iterations", "max_iterations"))
+        for name in ("step", "max_step"):
+            if getattr(self, name) < self.min_step:
+                raise SceneError(
+                    f"{name} = {getattr(self, name):g} is below min_step = {self.min_step:g}; give a smaller min_step"
+                )
 
 
 CUTS, SHORTER = 16, 0.9  # of a move in contact: how often it is cut, and to what part of it at most
 CORNERS = (1e-3, 1e-4, 1e-5, 1e-6)  # arc lengths by which a path is followed past one, the first that does
 AROUND = 4.0  # of that length: how far from it an equilibrium beyond the corner may be
+SMALL = 1e-4  # rotation and displacement over the size, in which the tangent at rest is taken to change in proportion
 BEND = 0.2  # of a step: how far its chord may be from the mean of the tangents at its ends
 
 
@@ -85,8 +93,36 @@ class Corrector:
         position = tangent.point_dofs()
         size = np.linalg.norm(np.ptp(model.state().points(), axis=0))
         lengths = np.where(tangent.angle, tangent.edge_length(), 1.0) / size
-        weights = np.append(lengths**2 / len(position), self.options.load_scale**-2)
-        self.metric = np.where(np.append(tangent.free, True), weights, 0.0)
+        weights = np.where(tangent.free, lengths**2 / len(position), 0.0)
+        self.load_scale = options.load_scale or self._natural_load_scale(model.state(), weights)
+        self._unit, self.metric = np.where(tangent.angle, 1.0, size), np.append(weights, self.load_scale**-2)
+
+    def _natural_load_scale(self, state: State, weights: np.ndarray) -> float:
+        """See `ContinuationOptions.load_scale`; 1 where the tangent at rest does not tell, as it is singular or not definite."""
+        self.load_scale = 1.0
+        q = self.tangent.dofs(state)
+        _, stiffness, rate, support, *_ = self.system(state, q, 0.0)
+        matrix = sparse.csc_matrix(stiffness[self.free][:, self.free])
+        try:
+            factors = Factorisation(matrix)
+        except SingularError:
+            return 1.0
+        if not factors.reliable or factors.negative:
+            return 1.0
+        along = support.copy()
+        along[self.free] = factors.solve(rate[self.free])
+        size = float(np.sqrt(weights @ along**2))
+        turn = self.tangent.rotation(q, along)
+        if not (np.isfinite(size) and size > 0.0 and turn > 0.0):
+            return 1.0
+        part = SMALL / max(turn, size)
+        ahead = self.tangent.stiffness(self.tangent.advance(state, part * along, part), part)
+        softening = (matrix - sparse.csc_matrix(ahead[self.free][:, self.free])) / part
+        softening = 0.5 * (softening + softening.T)
+        scales = [1.0 / size]
+        for sense in (1.0, -1.0):
+            scales += list(stability.lowest_factors(matrix, sense * softening, factors, 1))
+        return max(1.0, float(min(scale for scale in scales if np.isfinite(scale) and scale > 0.0)))
 
     def at(self, here: Point, step: float, smooth: bool = True) -> Point:
         """The equilibrium at an arc length `step` along the tangent; `smooth` refuses a path that turns sharply on the way.
@@ -188,7 +224,8 @@ class Corrector:
             excess, solver.outcome = solver.residuals.excess(
                 residual, gradient, stiffness, q, scale if scale.any() else scale + np.abs(residual).max()
             )
-            done = excess <= 0.0 and abs(missing) <= 1e-12 * (1.0 + np.abs(row[:-1]) @ np.abs(q) + abs(row[-1] * load))
+            size = np.abs(row[:-1]) @ np.maximum(np.abs(q), self._unit) + abs(row[-1]) * max(abs(load), self.load_scale)
+            done = excess <= 0.0 and abs(missing) <= 1e-12 * size
             along, bordered = self._along(system, pivot)
             if done and (solver.outcome == "converged" or polished):
                 break
@@ -231,7 +268,7 @@ class Corrector:
     def system(self, state: State, q: np.ndarray, load: float):
         """Residual, tangent stiffness, and the rates of the residual and of supports with the load parameter."""
         tangent = self.tangent
-        delta = 1e-4 * self.options.load_scale
+        delta = 1e-4 * self.load_scale
         outer, gradient, stiffness = tangent.loads(load, q), tangent.gradient(state), tangent.stiffness(state, load)
         rate = (tangent.loads(load + delta, q) - tangent.loads(load - delta, q)) / (2.0 * delta)
         ahead, behind = (tangent.support_step(state, load, load + d) for d in (delta, -delta))
