@@ -1,0 +1,416 @@
+"""Searches for equilibria of hard cases: buckled, slack, hinged, crumpled, grown and stiff ones, at several lengths.
+
+    python tools/bench_equilibria.py [--only WORD ...] [--solver direct pcg] [--limit 60] [--out DIR]
+    python tools/bench_equilibria.py --read DIR/equilibria_cpu.csv
+
+Prints a table; writes equilibria_DEVICE.csv and .json. `newton` counts iterations of all load steps and halvings, `unbalanced` what of
+the loads supports miss; `error` compares `value` with a closed form or another independent reference, where there is one. A search that
+takes longer than `--limit` seconds is ended. Scenes with contact take the solver that serves it.
+"""
+
+import argparse
+import csv
+import itertools
+import multiprocessing
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.model import rest_shapes
+from ddg_warp.run.catalog import load_scene
+from ddg_warp.run.summary import machine, table, write_table
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+
+GRAVITY = 9.81
+ELASTICA = {2.6: 0.3921, 20.0: 0.4488}  # P L^2 / EI -> tip off the axis over L of a cantilever column without stretch
+
+
+@dataclass(frozen=True)
+class Case:
+    """A search.
+
+    Attributes:
+        name: in the table; build: makes the scene, or the scene and a function of the model that sets its rest shape.
+        steps: load steps; value: of model and state, what is compared; reference: its right value, None if there is none.
+    """
+
+    name: str
+    build: Callable
+    steps: int = 1
+    value: Callable = lambda model, state: np.nan
+    reference: float | None = None
+
+
+def column(
+    stretching: float, ratio: float = 1.0, load: float = 2.6, length: float = 1.0, dimension: int = 3
+) -> ddg.Scene:
+    """A straight cantilever column under a dead load P L^2 / EI at its tip; EA L^2 / EI = `stretching`, EI2 / EI1 = `ratio`."""
+    scene = ddg.Scene(gravity=(0, 0, 0), dimension=dimension)
+    bending = 1.0
+    section = ddg.Stiffness(
+        EA=stretching * bending / length**2, EI1=bending, EI2=ratio * bending, GJ=0.7 * bending, radius=0.01 * length
+    )
+    rod = scene.add_rod(np.linspace((0, 0, 0), (length, 0, 0), 26), section=section)
+    scene.clamp_end(rod, "first")
+    scene.add_force(rod, -1, (-load * bending / length**2, 0, 0))
+    return scene
+
+
+def off_axis(length: float, model, state) -> float:
+    """Distance of the tip from the x axis, over the length."""
+    return float(np.hypot(*state.points()[-1, 1:]) / length)
+
+
+def cantilever(length: float) -> ddg.Scene:
+    """A cantilever under F L^2 / EI = 2 across its tip, r / L = 0.01."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    section = ddg.Stiffness(EA=4.0 / (0.01 * length) ** 2, EI1=1.0, GJ=1.0)
+    rod = scene.add_rod(np.linspace((0, 0, 0), (length, 0, 0), 21), section=section)
+    scene.clamp_end(rod)
+    scene.add_force(rod, -1, (0, 0, 2.0 / length**2))
+    return scene
+
+
+@dataclass(frozen=True)
+class Cable:
+    """A slack cable between the origin and (span, 0, rise): axial and bending stiffness [N, N m^2], weight per length [N/m]."""
+
+    span: float
+    rise: float
+    length: float
+    axial: float
+    bending: float
+    weight: float
+    edges: int
+
+    def catenary(self) -> np.ndarray:
+        """Tension along the span and vertical force at the first end [N], of the elastic catenary (Irvine, Cable structures, 1981)."""
+        from scipy.optimize import fsolve
+
+        def missing(forces):
+            along, up = forces
+            total, below = self.weight * self.length, self.weight * self.length - up
+            span = along * self.length / self.axial
+            span += along / self.weight * (np.arcsinh(below / along) - np.arcsinh(-up / along))
+            rise = (0.5 * total * self.length - up * self.length) / self.axial
+            rise += along / self.weight * (np.hypot(1, below / along) - np.hypot(1, up / along))
+            return [span - self.span, rise - self.rise]
+
+        return fsolve(missing, [0.5 * self.weight * self.length] * 2, xtol=1e-13)
+
+    def scene(self, how: str, bend: bool = True) -> ddg.Scene:
+        """Drawn as a V that hangs, as one that stands ("hill"), or straight and then with its end "moved" to its place."""
+        at, end, motion = np.linspace(0.0, self.length, self.edges + 1), np.array([self.span, 0.0, self.rise]), None
+        if how == "moved":
+            points = at[:, None] * [1.0, 0.0, 0.0]
+            way = end - points[-1]
+            motion = ddg.Motion(translation=lambda t: tuple(way * min(t, 1.0)))
+        else:
+            half, chord = 0.5 * self.length, 0.5 * np.hypot(self.span, self.rise)
+            along = end / (2.0 * chord)
+            across = np.array([along[2], 0.0, -along[0]]) * (1.0 if how == "V" else -1.0)
+            low = along * chord + across * np.sqrt(half**2 - chord**2)
+            points = np.minimum(at, half)[:, None] / half * low
+            points = points + np.maximum(at - half, 0.0)[:, None] / half * (end - low)
+        scene = ddg.Scene(gravity=(0, 0, -GRAVITY))
+        section = ddg.Stiffness(
+            EA=self.axial, EI1=self.bending, GJ=self.bending, mass_per_length=self.weight / GRAVITY,
+            rotary_inertia=1e-6 * self.weight / GRAVITY,
+        )  # fmt: skip
+        rod = scene.add_rod(points, section=section, **(dict(natural="straight") if bend else dict(bend=False)))
+        scene.fix(rod, [0])
+        scene.fix(rod, [-1], motion=motion)
+        if bend:
+            scene.fix_twist(rod, [0])
+        return scene
+
+    def force_error(self, model, state) -> float:
+        """Largest relative error of the two forces."""
+        along, up = self.catenary()
+        first, last = model.reactions(state)[:2]
+        return float(max(abs(last.force[0] / along - 1.0), abs(first.force[2] / up - 1.0)))
+
+
+STRING = Cable(0.8, 0.1, 1.0, 200.0, 1e-7, 0.05, 100)
+UMBILICAL = Cable(60.0, 20.0, 100.0, 1e7, 1e2, 50.0, 100)
+LINE = Cable(400.0, 50.0, 410.0, 1e8, 1e4, 100.0, 100)
+
+
+def hinged_bars(load_across: float) -> ddg.Scene:
+    """Three hinged bars of 1 m, nearly rigid, between supports 2 m apart, drawn as a square arch and loaded down at its corners."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    section = ddg.Stiffness(EA=1e6, EI1=1e3, GJ=1e3)
+    corners = np.array([[0.0, 0, 0], [0.5, 0, np.sqrt(0.75)], [1.5, 0, np.sqrt(0.75)], [2.0, 0, 0]])
+    bars = [scene.add_rod(np.linspace(a, b, 5), section=section) for a, b in itertools.pairwise(corners)]
+    for a, b in itertools.pairwise(bars):
+        scene.join([(a, -1), (b, 0)], rigid=False)
+    scene.fix(bars[0], [0])
+    scene.fix(bars[-1], [-1])
+    for bar in bars:
+        scene.fix_twist(bar, [0])
+    for bar in bars[:2]:
+        scene.add_force(bar, -1, (load_across, 0.0, -1.0))
+    return scene
+
+
+def hanging(bend: bool) -> ddg.Scene:
+    """A limp chain, drawn level and fixed at one end, that comes to hang."""
+    scene = ddg.Scene(gravity=(0, 0, -GRAVITY))
+    section = ddg.Stiffness(EA=1e4, EI1=1e-6, GJ=1e-6, mass_per_length=0.01, rotary_inertia=1e-8)
+    rod = scene.add_rod(np.linspace((0, 0, 0), (1.0, 0, 0), 41), section=section, **({} if bend else dict(bend=False)))
+    scene.fix(rod, [0])
+    if bend:
+        scene.fix_twist(rod, [0])
+    return scene
+
+
+def crumpled(size: float, cells: int = 24, bending: str = "midedge_dof") -> ddg.Scene:
+    """A flat square whose vertices start anywhere within `size` cells of their places, clamped along one side, without loads."""
+    flat, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    start = flat + size / cells * np.random.default_rng(1).uniform(-1.0, 1.0, flat.shape)
+    fixed = flat[:, 0] < 1e-9
+    start[fixed] = flat[fixed]
+    sheet = scene.add_shell(
+        flat, triangles, thickness=1e-2, material=ddg.Material(1e6, 0.3, density=1.0), bending=bending
+    )
+    scene.hold(sheet, np.flatnonzero(flat[:, 0] < 1.5 / cells))
+    return scene, lambda model: model.state(points=start)
+
+
+def not_flat(model, state) -> float:
+    """Largest distance of a vertex from where it was drawn [m]."""
+    return float(np.abs(state.points() - model.state().points()).max())
+
+
+def bilayer(growth: float) -> ddg.Scene:
+    """A clamped strip of 0.1 m whose layers grow apart by `growth`, all at once."""
+    flat, triangles = meshes.rectangle(30, 4, (0.1, 0.01), "alternating")
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    strip = scene.add_shell(flat, triangles, thickness=5e-4, material=ddg.Material(1e6, 0.45, density=1000.0))
+    scene.clamp_boundary(strip, np.flatnonzero(flat[:, 0] < 1e-9))
+
+    def start(model):
+        curvature = rest_shapes.bilayer_curvature(growth, 2.5e-4, 2.5e-4)
+        model.set_rest(
+            strip,
+            curvature=rest_shapes.principal_form(flat, triangles, curvature, curvature),
+            metric=rest_shapes.grown_metric(flat, triangles, 1.0 + 0.5 * growth),
+        )
+        return model.state()
+
+    return scene, start
+
+
+def stepped(edges: int, ratio: float = 1e6) -> ddg.Scene:
+    """A cantilever whose outer half is `ratio` times as stiff, under 1e-5 N at its tip."""
+    bending = np.where(np.arange(edges) < edges // 2, 1.0, ratio)
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    rod = scene.add_rod(
+        np.linspace((0, 0, 0), (1.0, 0, 0), edges + 1),
+        section=ddg.Stiffness(EA=1e6, EI1=bending, EI2=bending, GJ=bending),
+    )
+    scene.clamp_end(rod)
+    scene.add_force(rod, -1, (0, 0, 1e-5))
+    return scene
+
+
+def carried(model, state) -> float:
+    """Reaction over load of a cantilever under a force of 1e-5 N across."""
+    return float(-model.reactions(state)[0].force[2] / 1e-5)
+
+
+def of_scene(name: str, **parameters) -> Case:
+    """A scene of the package, with its first check."""
+    module = load_scene(name)
+    scene = module.build(**parameters)
+    label = " ".join([name, *(f"{key} {value}" for key, value in parameters.items())])
+    return Case(f"scene {label}", partial(module.build, **parameters), scene.analysis.load_steps)
+
+
+def cases() -> list[Case]:
+    """All of them."""
+    tip = partial(off_axis, 1.0)
+    result = []
+    for stretching in (1e3, 1e5, 1e7, 1e9):
+        for ratio in (1.2, 1.0):
+            reference = ELASTICA[2.6] if stretching > 1e4 else 0.3836
+            result.append(
+                Case(
+                    f"column EA {stretching:.0e} EI2/EI1 {ratio}", partial(column, stretching, ratio), 6, tip, reference
+                )
+            )
+    result += [
+        Case("column EA 1e+07 one step", partial(column, 1e7), 1, tip, ELASTICA[2.6]),
+        Case("column EA 1e+07 load 20", partial(column, 1e7, 1.2, 20.0), 6, tip, ELASTICA[20.0]),
+        Case("column EA 1e+07 planar", partial(column, 1e7, dimension=2), 6, tip, ELASTICA[2.6]),
+    ]
+    for length in (1e-9, 1e-8, 1e4, 1e5):
+        result.append(
+            Case(
+                f"column EA 1e+07 length {length:.0e}",
+                partial(column, 1e7, 1.2, 2.6, length),
+                6,
+                partial(off_axis, length),
+                ELASTICA[2.6],
+            )
+        )
+    for length in (1.0, 1e-9, 1e-8, 1e4, 1e5):
+        result.append(
+            Case(f"cantilever length {length:.0e}", partial(cantilever, length), 2, partial(off_axis, length), 0.4937)
+        )
+    for name, cable in (("string", STRING), ("umbilical", UMBILICAL), ("line", LINE)):
+        result.append(Case(f"{name} drawn as V", partial(cable.scene, "V"), 1, cable.force_error, 0.0))
+    result += [
+        Case("string drawn as V, no bending", partial(STRING.scene, "V", False), 1, STRING.force_error, 0.0),
+        Case("string drawn as hill", partial(STRING.scene, "hill"), 1, STRING.force_error, 0.0),
+        Case("string moved in 20", partial(STRING.scene, "moved"), 20, STRING.force_error, 0.0),
+        Case("string moved in 1", partial(STRING.scene, "moved"), 1, STRING.force_error, 0.0),
+        Case("string moved in 4, no bending", partial(STRING.scene, "moved", False), 4, STRING.force_error, 0.0),
+        Case("umbilical moved in 20", partial(UMBILICAL.scene, "moved"), 20, UMBILICAL.force_error, 0.0),
+        Case("hinged bars, 1 step", partial(hinged_bars, 0.1), 1),
+        Case("hinged bars, 4 steps", partial(hinged_bars, 0.1), 4),
+        Case("hanging from level", partial(hanging, True), 1, lambda _, state: float(state.points()[-1, 2]), -1.0),
+        Case(
+            "hanging from level, no bending",
+            partial(hanging, False),
+            1,
+            lambda _, state: float(state.points()[-1, 2]),
+            -1.0,
+        ),
+        Case("crumpled sheet 0.1", partial(crumpled, 0.1), 1, not_flat, 0.0),
+        Case("crumpled sheet 0.5", partial(crumpled, 0.5), 1, not_flat, 0.0),
+        Case("bilayer grown 0.025 at once", partial(bilayer, 0.025)),
+        Case("bilayer grown 0.15 at once", partial(bilayer, 0.15)),
+        Case("stepped 40", partial(stepped, 40), 1, carried, 1.0),
+        Case("stepped 160", partial(stepped, 160), 1, carried, 1.0),
+        Case("stepped 320", partial(stepped, 320), 1, carried, 1.0),
+    ]
+    names = """
+        bend_45 bend_twist greenhill helical_spring hinged_roof magnetic_buckling magnetic_cantilever michell_ring post_buckling roll_up
+        tip_load ribbon_bistable ribbon_helix bilayer_strip plate_buckling morphing_bilayer localized_helix sphere_indentation
+        gridshell_dome leaf drawn_rod
+    """.split()
+    for name in names:
+        if hasattr(load_scene(name).build().analysis, "load_steps"):
+            result.append(of_scene(name))
+    return result
+
+
+def search(case: Case, solver: str, device: str) -> dict:
+    """A row of the table."""
+    row = {"case": case.name, "solver": solver, "steps": case.steps}
+    made = case.build()
+    scene, start = made if isinstance(made, tuple) else (made, lambda model: model.state())
+    equilibrium, began = None, time.perf_counter()
+    try:
+        model = scene.build(device, "float64")
+        state = start(model)
+        equilibrium = Equilibrium(model, StaticsOptions(solver="auto" if model.touch else solver))
+        began = time.perf_counter()
+        state = equilibrium.load(state, case.steps)
+        seconds = time.perf_counter() - began
+    except (ddg.SolverError, ddg.SceneError) as error:
+        outcome = getattr(error, "outcome", "") or "refused"
+        newton = equilibrium.iterations if equilibrium else 0
+        return row | {
+            "outcome": outcome,
+            "newton": newton,
+            "seconds": time.perf_counter() - began,
+            "message": str(error),
+        }
+    value = case.value(model, state)
+    return row | {
+        "outcome": getattr(state, "outcome", None) or equilibrium.outcome,
+        "stable": state.stable,
+        "newton": equilibrium.iterations,
+        "cg": equilibrium.pcg_iterations,
+        "seconds": seconds,
+        "unbalanced": getattr(state, "unbalanced", None),
+        "value": value,
+        "reference": case.reference,
+        "error": abs(value - case.reference) if case.reference is not None else None,
+    }
+
+
+def _serve(pipe, device: str) -> None:
+    """Send a row for every (case, solver) that a pipe brings."""
+    known = {case.name: case for case in cases()}
+    while True:
+        name, solver = pipe.recv()
+        pipe.send(search(known[name], solver, device))
+
+
+class Worker:
+    """A process that searches; one that takes too long is ended, and another one goes on."""
+
+    def __init__(self, device: str):
+        self.device, self.process = device, None
+
+    def row(self, case: Case, solver: str, limit: float) -> dict:
+        """`search` within so many seconds."""
+        if self.process is None:
+            self.pipe, other = multiprocessing.Pipe()
+            self.process = multiprocessing.get_context("spawn").Process(
+                target=_serve, args=(other, self.device), daemon=True
+            )
+            self.process.start()
+        self.pipe.send((case.name, solver))
+        if self.pipe.poll(limit):
+            return self.pipe.recv()
+        self.process.kill()
+        self.process.join()
+        self.process = None
+        return {"case": case.name, "solver": solver, "steps": case.steps, "outcome": "time"}
+
+
+COLUMNS = (
+    "case",
+    "solver",
+    "steps",
+    "outcome",
+    "stable",
+    "newton",
+    "cg",
+    "seconds",
+    "unbalanced",
+    "value",
+    "reference",
+    "error",
+    "message",
+)
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", default=[""])
+    parser.add_argument("--solver", nargs="*", default=["direct"])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--limit", type=float, default=60.0)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--read", type=Path)
+    chosen = parser.parse_args()
+    if chosen.read:
+        print(table(list(csv.DictReader(chosen.read.open()))))
+        return
+    rows, worker = [], Worker(chosen.device)
+    for case in cases():
+        if any(word in case.name for word in chosen.only):
+            for solver in chosen.solver:
+                row = worker.row(case, solver, chosen.limit)
+                rows.append({name: row.get(name) for name in COLUMNS})
+                print({k: v for k, v in rows[-1].items() if v is not None}, flush=True)
+    print(table([{k: v for k, v in row.items() if k != "message"} for row in rows]))
+    if chosen.out:
+        write_table(chosen.out / f"equilibria_{'cuda' if 'cuda' in chosen.device else 'cpu'}", rows, machine())
+
+
+if __name__ == "__main__":
+    main()
