@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 
 from ddg_warp.compile.ghosts import Ghosts, end_director, ghost_node
+from ddg_warp.compile.half_cells import HalfCells
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.chain import ChainKind
@@ -168,20 +169,18 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
     natural = _natural(batch, rows, part.ghosts, kind, edges, tangents, frames, twist, voronoi) if batch.bend else []
     damping = on_edges(section.viscosity)
 
-    def on_vertices(value):
-        value = on_edges(value)
-        return value if value.shape == (1, 1) else 0.5 * sum(polyline.ahead(value, batch.closed))
-
+    cells = HalfCells(lengths, batch.closed, on_edges(section.EI1))
     parameters = {}
     for term in kind.terms:
         stretch = term.measure.span == 1
         if stretch:
             stiffness, rest, weight, spread = [on_edges(section.EA)], [np.ones((1, 1))], lengths, damping
         else:
-            stiffness = [on_vertices(value) for value in _bending(section, kind)]
-            rest, weight, spread = natural, voronoi, on_vertices(section.viscosity)
+            stiffness = [cells.stiffness(on_edges(value)) for value in _bending(section, kind)]
+            rest, weight, spread = natural, voronoi, cells.viscosity(damping)
         given = {"measure": weight, "stiffness": stiffness, "rest": rest, "viscosity": spread}
-        values = _bound(batch, term, given, on_edges if stretch else on_vertices)
+
+        values = _bound(batch, term, given, on_edges, None if stretch else cells)
         parameters |= {f"{term.name}.{name}": compress(np.atleast_2d(v)) for name, v in values.items()}
     return Piece(
         batch,
@@ -201,8 +200,12 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
     )
 
 
-def _bound(batch: RodBatch, term: Term, given: dict, along) -> dict[str, np.ndarray]:
-    """Parameters of a term by name, from what the rod gives and what its law says; `along` puts values where the term has them."""
+def _bound(batch: RodBatch, term: Term, given: dict, on_edges, cells: HalfCells | None) -> dict[str, np.ndarray]:
+    """Parameters of a term by name, from what the rod gives and what its law says: on edges, or at the vertices of `cells`."""
+
+    def along(family, value):
+        return on_edges(value) if cells is None else cells.along(family, on_edges(value))
+
     where, families = f"rod {batch.first} ('{batch.name}'), {term.name}", {known.family for known in term.parameters}
     law = batch.laws.get(term.name)
     unstrained = 1.0 if term.measure.span == 1 else 0.0
@@ -212,7 +215,9 @@ def _bound(batch: RodBatch, term: Term, given: dict, along) -> dict[str, np.ndar
     given = {family: value for family, value in given.items() if family in families}
     for family, value in law.values.items() if law else ():
         try:
-            given[family] = [along(v) for v in value] if isinstance(value, list | tuple) else along(value)
+            given[family] = (
+                [along(family, v) for v in value] if isinstance(value, list | tuple) else along(family, value)
+            )
         except (TypeError, ValueError):
             raise SceneError(
                 f"{where}: {family} = {value!r}; give numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"

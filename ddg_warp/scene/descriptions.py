@@ -87,8 +87,9 @@ class Law:
     Attributes:
         density: a `ddg_warp.kernels.densities.Density`, of the package or one's own.
         values: of its parameters by family: a number, or an array that broadcasts to (rods, edges), or a list with one for each
-            strain; at vertices it is the mean of both edges. What is not given comes from the rod: stiffnesses of its section,
-            strains at rest, viscosity.
+            strain. At vertices stiffnesses are those of both half edges in series, and what else there is the mean over them (see
+            `ddg_warp.compile.half_cells`). What is not given comes from the rod: stiffnesses of its section, strains at rest,
+            viscosity.
     """
 
     density: object
