@@ -11,7 +11,8 @@ depend on v as in granular media, where forces depend on the direction of v, not
 
 Within a time step tangents and coefficients are constant, so that drag has a potential: a node with the resistance D, the sum of the
 halves of its edges, which the fluid alone would carry to a = x_n + s u in a solve of length s, adds (x - a) . D (x - a) / 2 s to the
-energy. It goes where inertia goes. Angles have the same mass-like quadratic: drag and rotary inertia make one, about a mean target.
+energy. A body at a node, such as a ball, adds c I to D. The energy goes where inertia goes. Angles have the same mass-like quadratic:
+drag and rotary inertia make one, about a mean target.
 """
 
 from functools import cache
@@ -24,9 +25,10 @@ from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
 from ddg_warp.kernels.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
-# rows of coefficients; SLOPE is tan(gamma), SPEED is zero where nothing is granular
-TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(8)
-ROWS = 8
+# rows of coefficients of an edge; SLOPE is tan(gamma), SPEED is zero where nothing is granular; FIRST and LAST are force over velocity
+# of bodies at its first and last node [N s/m]
+TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED, FIRST, LAST = range(10)
+ROWS = 10
 
 
 @cache
@@ -109,13 +111,14 @@ def chain_kernels(kind: ChainKind, real):
         rate = scalars[RATE, r]
         s = real(1.0) / rate
         u = flow[0]
+        one = wp.identity(n=wp.static(dim), dtype=real)
         for k in range(start, until(start, n)):
             D = M()
             b = behind(k, n)
             if wp.static(closed) or k < n - 1:
-                D += of_edge(tangents, v0, coefficients, u, k, n, r)
+                D += of_edge(tangents, v0, coefficients, u, k, n, r) + one * coefficients[wp.static(FIRST), k, r]
             if b >= 0:
-                D += of_edge(tangents, v0, coefficients, u, b, n, r)
+                D += of_edge(tangents, v0, coefficients, u, b, n, r) + one * coefficients[wp.static(LAST), b, r]
             node = Inertia()
             node.mass = mass[k, r]
             node.resistance = D * rate
@@ -238,7 +241,10 @@ def net_kernels(real):
                 p = P()
                 for c in range(wp.static(ROWS)):
                     p[c] = coefficients[c, edge + w * ends.shape[0]]
-                D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p)
+                body = p[wp.static(FIRST)]
+                if b == i:
+                    body = p[wp.static(LAST)]
+                D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p) + wp.identity(n=3, dtype=real) * body
             else:
                 D[0, 0] = coefficients[wp.static(ROTATIONAL), edge + w * ends.shape[0]] * wp.length(e)
         rate = scalars[RATE, w]

@@ -349,3 +349,96 @@ def test_joined_halves_are_one_rod(device, scheme):
             found.append(state.points()[-1])
         assert np.abs(found[0] - (1.0, 0.0, 0.0)).max() > 0.05
         np.testing.assert_allclose(found[0], found[1], atol=2e-3)  # a rigid joint's half cells are of second order
+
+
+# coefficients along rods, and bodies at nodes ---------------------------------------------------------------------------------------
+
+
+def varied(device, joined: bool, worlds: int = 1, **drag):
+    """Model of two rods of 7 nodes at random in a fluid, on their own or joined, and their points (2, 7, 3)."""
+    points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.3), 7) + np.array([[[0.0]], [[2.0]]]) * (0.0, 1.0, 0.0)
+    points = points + 0.03 * np.random.default_rng(1).normal(size=points.shape)
+    if joined:
+        points[1] += points[0, -1] - points[1, 0]
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rods = scene.add_rods(points, section=ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, radius=0.01))
+    if joined:
+        scene.join([(rods[0], -1), (rods[1], 0)])
+    scene.drag(rods, **drag)
+    return scene.build(device, "float64", worlds=worlds), points
+
+
+@pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
+def test_coefficients_of_every_edge(device, joined):
+    """Both rods move at one velocity, each edge is resisted by its own coefficients, and each node by that of the body there."""
+    random, u = np.random.default_rng(2), np.array([0.3, -0.2, 0.5])
+    tangential, normal, bodies = (random.uniform(0.5, 2.0, (2, n)) for n in (6, 6, 7))
+    model, points = varied(device, joined, 2, tangential=tangential, normal=normal, nodes=bodies)
+    edges = np.diff(points, axis=1)
+    length = np.linalg.norm(edges, axis=2, keepdims=True)
+    t = edges / length
+    along = t * (t @ u)[..., None]
+    halves = -0.5 * length * (tangential[..., None] * along + normal[..., None] * (u - along))
+    expected = -bodies[..., None] * u
+    expected[:, :-1] += halves
+    expected[:, 1:] += halves
+    if joined:  # rows that share a node have equal parts
+        expected[0, -1] = expected[1, 0] = 0.5 * (expected[0, -1] + expected[1, 0])
+    state = model.state(velocities=np.tile(u, (2, 14, 1)))
+    for found in model.drag(state).force:
+        np.testing.assert_allclose(found.reshape(2, 7, 3), expected, rtol=1e-12)
+
+
+def test_coefficients_at_nodes_are_linear_between(device):
+    """Those of open rods; of all that is given for a rod, one row serves both."""
+    values = np.array([1.0, 3.0, 2.0, 2.0, 5.0, 4.0, 0.0])
+    by_node, _ = varied(device, False, tangential=values, normal=2.0 * values, rotational=values)
+    middles = 0.5 * (values[1:] + values[:-1])
+    by_edge, _ = varied(device, False, tangential=middles, normal=2.0 * middles, rotational=middles)
+    np.testing.assert_array_equal(by_node.groups[0].host.drag, by_edge.groups[0].host.drag)
+
+
+def test_a_radius_of_every_edge(device):
+    """Viscous(radius=...) is the drag of a section with such radii, without a thicker rod."""
+    radius = np.array([0.01, 0.02, 0.01, 0.005, 0.03, 0.01])
+    found, _ = varied(device, False, law=ddg.Viscous(2.0, scale=1.0, radius=radius))
+    cox = np.log(2.0) - 0.5  # 4 pi mu / (ln(S / a) + ln 2 - 1/2)
+    expected = np.tile(4.0 * np.pi * 2.0 / (np.log(1.0 / radius) + cox), (2, 1))
+    np.testing.assert_allclose(found.groups[0].host.drag[1, :6].T, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
+def test_balls_on_a_thread_sink_at_stokes_speed(device, joined):
+    """A hanging thread of no weight and no drag, some nodes of which carry balls: W / (sum of 6 pi mu R), all as fast."""
+    resistance = 6.0 * np.pi * 10.0 * np.array([5e-3, 0.0, 25e-3, 0.0, 5e-3])
+    scene, points = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 5)
+    thread = ddg.Stiffness(EA=10.0, EI1=1e-4, GJ=1e-4, mass_per_length=1e-6)
+    rods = [scene.add_rod(part, section=thread) for part in ((points[:3], points[2:]) if joined else (points,))]
+    if joined:
+        scene.join([(rods[0], -1), (rods[1], 0)])
+        scene.drag(rods[0], nodes=resistance[:3])
+        scene.drag(rods[1], nodes=[0.0, *resistance[3:]])
+    else:
+        scene.drag(rods, nodes=resistance)
+    scene.add_force(rods[0], 0, (0.0, 0.0, -2e-3))
+    scene.add_force(rods[-1], -1, (0.0, 0.0, -5e-3))
+    model = scene.build(device, "float64")
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(20):
+        state = integrator.step(state, 1.0)
+    np.testing.assert_allclose(state.velocities()[:, 2], -7e-3 / resistance.sum(), rtol=1e-6)
+    assert model.drag(state).force[:, 2].sum() == pytest.approx(7e-3, rel=1e-6)
+
+
+def test_balls_hold_massless_nodes_and_nothing_else(device):
+    """A rod without mass needs drag at every free node: balls on all of them do, balls on some do not."""
+    for bodies in (np.ones(5), np.array([1.0, 1.0, 0.0, 1.0, 1.0])):
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+        rod = scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), section=ddg.Stiffness(1e2, 1.0, GJ=1.0))
+        scene.drag(rod, nodes=bodies)
+        model = scene.build(device, "float64")
+        if bodies.all():
+            ddg.Integrator(model)
+            continue
+        with pytest.raises(ddg.SceneError, match=r"node 2 of rod 0 is free and has no mass"):
+            ddg.Integrator(model)

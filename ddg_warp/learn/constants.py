@@ -7,6 +7,9 @@
                      of the edges of rods with such drag, per length; the last of those with twist
     "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
                      of the edges of rods in a granular medium
+    "drag.first", "drag.last" [N s/m]
+                     of bodies at the first and at the last node of the edges of rods with drag; `Scene.drag(nodes=...)` gives
+                     those of a node to the edge that starts there, and of the last node to the last edge
     "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
                      between objects of two names, or of one, that may touch; the last in scenes with friction, by direction the
                      smallest that is not zero, to which the others keep their ratios
@@ -36,7 +39,8 @@ GRANULAR = {
     "slope": drag.SLOPE,
     "speed": drag.SPEED,
 }
-COEFFICIENTS = {f"drag.{name}": row for name, row in (VISCOUS | GRANULAR).items()}
+BODIES = {"first": drag.FIRST, "last": drag.LAST}
+COEFFICIENTS = {f"drag.{name}": row for name, row in (VISCOUS | GRANULAR | BODIES).items()}
 NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *contact_places.NAMES)
 SIGNED, POSITIVE = (
     ("drag.leading",),
@@ -195,7 +199,7 @@ def _drag(model, name: str) -> Iterator[_Part]:
         if group.kind.drag and (group.kind.twist or row != drag.ROTATIONAL):
             k, column, rows = model.order.edge_places(group)
             places, usual = k * group.rods + column, group.host.drag[row]
-            chosen = (group.host.drag[drag.SPEED].ravel()[places] > 0.0) == granular
+            chosen = ((group.host.drag[drag.SPEED].ravel()[places] > 0.0) == granular) | (row in BODIES.values())
             places, rows = places[chosen], rows[chosen]
             yield _Part(
                 index,
@@ -218,7 +222,7 @@ def _drag(model, name: str) -> Iterator[_Part]:
                 rows.append(model.order.edge_starts[rod.rod] + own)
                 at += len(rod.piece.drag[rod.row])
         places, rows, shape = np.concatenate(places), np.concatenate(rows), (net.worlds, coefficients.shape[1], 1)
-        chosen = (coefficients[drag.SPEED, places] > 0.0) == granular
+        chosen = ((coefficients[drag.SPEED, places] > 0.0) == granular) | (row in BODIES.values())
         if row == drag.ROTATIONAL:
             chosen &= angles[places] >= 0
         places, rows = places[chosen], rows[chosen]

@@ -112,7 +112,7 @@ def _magnetised(magnetisation, field, dipoles: bool = False) -> Callable:
 
 
 def _drag(scene: Scene, rods) -> None:
-    scene.drag(rods, tangential=0.1, normal=0.2, rotational=1e-6)
+    scene.drag(rods, tangential=0.1, normal=0.2, rotational=1e-6, nodes=0.01)
 
 
 def _sand(scene: Scene, rods) -> None:

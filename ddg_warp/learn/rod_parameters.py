@@ -117,7 +117,8 @@ def _share(model, name: str) -> np.ndarray:
     rods = [model.order.edge(row)[1] for row in constants.elements(model, name)]
     found = [laws.given[laws.of_rods[rod]] for rod in rods]
     k = {"drag.tangential": 2.0 * pi, "drag.normal": 4.0 * pi}.get(name)
-    share = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in found if isinstance(law, Viscous)}
+    sized = (law for law in found if isinstance(law, Viscous) and law.radius is None)
+    share = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in sized}
     return np.array([share.get(law, 0.0) for law in found])
 
 

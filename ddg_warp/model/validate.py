@@ -57,8 +57,8 @@ def require_mass(model) -> None:
         own = (k >= host.first) & (k < host.first + host.own)
         bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
         if kind.drag:
-            held_back = drag.holds(host.drag)  # edges; the last node of an open rod starts none
-            bad &= ~(held_back | np.roll(held_back, 1, axis=0))
+            first, last = drag.holds(host.drag)  # of edges; the last node of an open rod starts none
+            bad &= ~(first | np.roll(last, 1, axis=0))
         if bad.any():
             k, column = np.argwhere(bad)[0]
             raise SceneError(

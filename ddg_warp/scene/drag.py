@@ -1,6 +1,7 @@
 """Laws of drag on rods, and the coefficients per length that they give: see `kernels.drag` for the theory. NumPy only."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from math import log, pi
 
 import numpy as np
@@ -16,29 +17,35 @@ THEORIES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Resistance:
-    """Drag in proportion to velocity, its coefficients given outright.
+    """Drag in proportion to velocity, its coefficients given outright: numbers, or arrays along rods as of `along_edges`.
 
     Attributes:
         tangential, normal: force per length over velocity along and across the rod [N s/m^2].
         rotational: moment per length over the spin about the tangent [N s].
     """
 
-    tangential: float
-    normal: float
-    rotational: float = 0.0
+    tangential: float | np.ndarray
+    normal: float | np.ndarray
+    rotational: float | np.ndarray = 0.0
 
     def __post_init__(self):
         for name in ("tangential", "normal", "rotational"):
-            _not_negative(f"drag: {name}", getattr(self, name), "N s" if name == "rotational" else "N s/m^2")
+            unit = "N s" if name == "rotational" else "N s/m^2"
+            object.__setattr__(self, name, _numbers(f"drag: {name}", getattr(self, name), unit))
+
+    def spread(self, along: Callable) -> "Resistance":
+        """Return this law with values on edges, which `along(name, values)` makes of those along rods."""
+        names = "tangential", "normal", "rotational"
+        return replace(self, **{name: along(name, getattr(self, name)) for name in names})
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
         """Rows of `kernels.drag`, of edges with these radii (R, edges) of rods of these lengths (R, 1)."""
         return [self.tangential, self.normal, self.rotational, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Viscous:
     """Drag of a viscous fluid on a slender rod, without inertia of the fluid, walls and neighbours.
 
@@ -54,19 +61,27 @@ class Viscous:
         viscosity: mu [Pa s].
         theory: "cox", "gray_hancock" or "lighthill".
         scale: S [m]; of "cox" the length of the rod by default.
+        radius: a [m], that of the section by default: a number, or an array along rods as of `along_edges`.
     """
 
     viscosity: float
     theory: str = "cox"
     scale: float | None = None
+    radius: float | np.ndarray | None = None
 
     def __post_init__(self):
         arguments.positive("Viscous: viscosity", self.viscosity, "Pa s")
+        if self.radius is not None:
+            object.__setattr__(self, "radius", _numbers("Viscous: radius", self.radius, "m", "positive", np.greater))
         arguments.choice("Viscous: theory", self.theory, tuple(THEORIES))
         if self.scale is not None:
             arguments.positive("Viscous: scale", self.scale, "m")
         elif self.theory != "cox":
             raise SceneError(f"Viscous: theory {self.theory!r} needs a scale [m], the length of a wave")
+
+    def spread(self, along: Callable) -> "Viscous":
+        """As of `Resistance`."""
+        return self if self.radius is None else replace(self, radius=along("radius", self.radius))
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
         """As of `Resistance`.
@@ -74,8 +89,11 @@ class Viscous:
         Raises:
             SceneError: the rod is too thick for the theory.
         """
+        radius = radius if self.radius is None else self.radius
         if np.min(radius) <= 0.0:
-            raise SceneError(f"{where}: its section has no radius; give it one, or drag(tangential=..., normal=...)")
+            raise SceneError(
+                f"{where}: its section has no radius; give Viscous(..., radius=...), or a section with one"
+            )
         along, across = (np.log((self.scale or length) / radius) + c for c in THEORIES[self.theory])
         if np.min(along) <= 0.0:
             raise SceneError(
@@ -109,6 +127,10 @@ class Granular:
     leading: float = 0.0
     angle: float = 0.2416  # 13.84 degrees
     speed: float = 1e-3
+
+    def spread(self, along: Callable) -> "Granular":
+        """As of `Resistance`."""
+        return self
 
     def __post_init__(self):
         _not_negative("Granular: lateral", self.lateral, "N/m")
@@ -150,6 +172,88 @@ def _not_negative(what: str, value, unit: str) -> float:
     return arguments.number(what, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
 
 
+def _numbers(what: str, values, unit: str, rule: str = "not negative", holds=np.greater_equal) -> float | np.ndarray:
+    """A number, or numbers along rods (n,) or (rods, n), for which a rule holds against zero; or a refusal that names `what`."""
+    found = arguments.floats(values) if not isinstance(values, bool) else np.array(np.nan)
+    if found.ndim > 2 or not found.size or not (np.isfinite(found).all() and holds(found, 0.0).all()):
+        raise SceneError(f"{what} is {values!r}; give a number, or numbers along the rod, finite and {rule} [{unit}]")
+    return found.copy() if found.ndim else float(found)
+
+
+def along_edges(what: str, values, rods: int, batch) -> np.ndarray:
+    """Return values on edges, each broadcastable to (rods, edges), of rods of a batch from what is given along them.
+
+    Args:
+        what: named by refusals.
+        values: a number; or (n,) or (rods, n) with n the number of edges, or of nodes of open rods, between which they are linear.
+        rods: how many rods they are given for.
+        batch: whose nodes and edges the rods have.
+
+    Raises:
+        SceneError: they do not fit.
+    """
+    values, ends = np.atleast_2d(values), not batch.closed and batch.nodes
+    if values.shape[0] in (1, rods) and values.shape[1] in (1, batch.edges, ends):
+        return 0.5 * (values[:, :-1] + values[:, 1:]) if values.shape[1] == ends else values
+    raise SceneError(
+        _misfit(what, values, rods, batch, f"{batch.edges} edges" + f" or {batch.nodes} nodes" * bool(ends))
+    )
+
+
+def at_nodes(values, rods: int, batch) -> np.ndarray:
+    """Return drag of bodies at nodes, broadcastable to (rods, nodes), of rods of a batch; see `along_edges`."""
+    values = np.atleast_2d(values)
+    if values.shape[0] in (1, rods) and values.shape[1] in (1, batch.nodes):
+        return values
+    raise SceneError(_misfit("nodes", values, rods, batch, f"{batch.nodes} nodes"))
+
+
+def _misfit(what: str, values: np.ndarray, rods: int, batch, there: str) -> str:
+    shape = values.shape[1:] if len(values) == 1 else values.shape
+    return (
+        f"drag: {what} has shape {shape}, and rods '{batch.name}' have {there}; give one number, one for each of these, or such a row "
+        f"for each of the {rods} rods"
+    )
+
+
+@dataclass(frozen=True)
+class RodDrag:
+    """Drag of some rods: their law, and force over velocity of bodies at their nodes [N s/m]."""
+
+    rods: np.ndarray
+    law: Resistance | Viscous | Granular
+    nodes: float | np.ndarray
+
+    def of(self, rows: np.ndarray, batch) -> "RodDrag":
+        """Return the drag of some of its rods, those at `rows`, which are of a batch: laws by edge, bodies by node."""
+
+        def chosen(values: np.ndarray) -> np.ndarray:
+            return values[rows] if len(values) > 1 else values
+
+        count = len(self.rods)
+        law = self.law.spread(lambda name, values: chosen(along_edges(name, values, count, batch)))
+        return RodDrag(self.rods[rows], law, chosen(at_nodes(self.nodes, count, batch)))
+
+
+def rod_drag(batches, rods: np.ndarray, law, tangential, normal, rotational, nodes) -> RodDrag:
+    """Return what `Scene.drag` is given for rods of a scene's batches, checked; arguments as there."""
+    bodies = 0.0 if nodes is None else _numbers("drag: nodes", nodes, "N s/m")
+    given = tangential is not None or normal is not None or np.any(rotational)
+    if law is None:
+        bare = nodes is not None and not given  # bodies alone
+        law = Resistance(0.0, 0.0) if bare else Resistance(tangential, normal, rotational)
+    elif not isinstance(law, Resistance | Viscous | Granular):
+        raise SceneError(f"drag: law is {law!r}; give Viscous(viscosity), Granular(...), or tangential and normal")
+    elif given:
+        raise SceneError("drag: a law and coefficients are given; give one of them")
+    result = RodDrag(rods, law, bodies)
+    for batch in batches:
+        rows = np.flatnonzero((rods >= batch.first) & (rods < batch.first + batch.rods))
+        if rows.size:
+            result.of(rows, batch)  # refuses what does not fit
+    return result
+
+
 class Laws:
     """Which law of drag every rod of a scene has.
 
@@ -161,35 +265,42 @@ class Laws:
     """
 
     def __init__(self, scene):
-        self.given, self.of_rods = [law for _, law in scene.drags], np.full(scene.rod_count, -1)
-        for place, (rods, _) in enumerate(scene.drags):
-            twice = rods[self.of_rods[rods] >= 0]
+        self._drags, self.of_rods = scene.drags, np.full(scene.rod_count, -1)
+        self.given, self._row = [given.law for given in scene.drags], np.zeros(scene.rod_count, int)
+        for place, given in enumerate(scene.drags):
+            twice = given.rods[self.of_rods[given.rods] >= 0]
             if twice.size:
                 raise SceneError(f"drag: rod {twice[0]} has drag already; give it one law")
-            self.of_rods[rods] = place
+            self.of_rods[given.rods] = place
+            self._row[given.rods] = np.arange(len(given.rods))
 
-    def coefficients(self, rods: np.ndarray, name: str, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Rows of `kernels.drag` (R, edges, rows) of rods (R,) with drag; none on edges without length, which are ghosts."""
-        from ddg_warp.kernels.drag import ROWS
+    def coefficients(self, rods: np.ndarray, batch, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        """Rows of `kernels.drag` (R, edges, rows) of rods (R,) of a batch with drag; none on edges without length, which are ghosts."""
+        from ddg_warp.kernels.drag import FIRST, LAST, ROWS
 
-        result, radius, laws = (
-            np.zeros((*lengths.shape, ROWS)),
-            np.broadcast_to(radius, lengths.shape),
-            self.of_rods[rods],
-        )
+        result, laws = np.zeros((*lengths.shape, ROWS)), self.of_rods[rods]
+        real = lengths[0] > 0.0
+        radius = np.broadcast_to(radius, lengths.shape)[:, real]
         for place in np.unique(laws):
             chosen = laws == place
-            own, length = radius[chosen], lengths[chosen].sum(1, keepdims=True)
-            rows = self.given[place].coefficients(f"drag: rods '{name}'", own, length)
-            result[chosen] = np.stack([np.broadcast_to(row, own.shape) for row in rows], -1)
-        result[lengths == 0.0] = 0.0
+            found = np.zeros((chosen.sum(), batch.edges, ROWS))
+            length = lengths[chosen].sum(1, keepdims=True)
+            given = self._drags[place].of(self._row[rods[chosen]], batch)
+            for i, values in enumerate(given.law.coefficients(f"drag: rods '{batch.name}'", radius[chosen], length)):
+                found[..., i] = values
+            bodies = np.broadcast_to(given.nodes, (len(found), batch.nodes))
+            found[..., FIRST] = bodies[:, : batch.edges]
+            if not batch.closed:
+                found[:, -1, LAST] = bodies[:, -1]
+            result[np.ix_(chosen, real)] = found
         return result
 
 
 def holds(coefficients: np.ndarray) -> np.ndarray:
-    """Which edges (...) are held back in all directions, by coefficients (rows, ...)."""
-    tangential, normal, _, lateral, friction, *_ = coefficients
-    return (tangential + friction > 0.0) & (normal + lateral > 0.0)
+    """Which first and last nodes of edges (2, ...) are held back in all directions, by coefficients (rows, ...)."""
+    tangential, normal, _, lateral, friction, _, _, _, first, last = coefficients
+    along = (tangential + friction > 0.0) & (normal + lateral > 0.0)
+    return np.stack([along | (first > 0.0), along | (last > 0.0)])
 
 
 def least(coefficients: np.ndarray) -> np.ndarray:

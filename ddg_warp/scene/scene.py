@@ -275,7 +275,7 @@ class Scene(Structures):
         mass = arguments.positive(f"add_mass: mass at node {node}", mass, "kg")
         self.masses.append((rods, node, mass))
 
-    def drag(self, rods=None, law=None, *, tangential=None, normal=None, rotational: float = 0.0) -> None:
+    def drag(self, rods=None, law=None, *, tangential=None, normal=None, rotational=0.0, nodes=None) -> None:
         """Let a fluid, or sand, resist the motion of rods by resistive force theory: anisotropic drag against `flow`.
 
         Drag needs motion: it does nothing in statics, continuation and spectra. In a time step it is implicit, with the tangents of the
@@ -284,12 +284,16 @@ class Scene(Structures):
 
         Args:
             rods: those in the fluid, all added so far by default.
-            law: `Viscous(viscosity)` or `Granular(...)`; or coefficients instead:
+            law: `Viscous(viscosity)` or `Granular(...)`; or coefficients instead, each a number or an array along the rod, one an edge
+                (edges,), or one a node of open rods (nodes,), linear between; (rods, edges) or (rods, nodes) where rods differ:
             tangential, normal: force per length over velocity along and across the rod [N s/m^2].
             rotational: moment per length over the spin about the tangent [N s].
+            nodes: force over velocity of bodies at nodes [N s/m], such as 6 pi mu R of a ball: a number, (nodes,) or (rods, nodes);
+                beside the rod's own drag, or alone.
 
         Raises:
-            SceneError: a coefficient is none, or, without `rods`, there are shells, which feel none; at `build`, a rod has two laws.
+            SceneError: a coefficient is none, or does not fit the rods, or, without `rods`, there are shells, which feel none; at
+                `build`, a rod has two laws.
         """
         if rods is None:
             for kind, shells in (("shell", self.shells), ("shell of revolution", self.axisymmetric_shells)):
@@ -297,13 +301,7 @@ class Scene(Structures):
                     raise SceneError(f"drag: {kind} 0 ('{shells[0].name}') can feel none; name the rods that do")
             rods = range(self.rod_count)
         rods = arguments.once("drag: rods", self._rods(rods))
-        if law is None:
-            law = drag.Resistance(tangential, normal, rotational)
-        elif not isinstance(law, drag.Resistance | drag.Viscous | drag.Granular):
-            raise SceneError(f"drag: law is {law!r}; give Viscous(viscosity), Granular(...), or tangential and normal")
-        elif tangential is not None or normal is not None or rotational != 0.0:
-            raise SceneError("drag: a law and coefficients are given; give one of them")
-        self.drags.append((rods, law))
+        self.drags.append(drag.rod_drag(self.batches, rods, law, tangential, normal, rotational, nodes))
 
     def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):
         """Freeze the scene, as it is now, into a `Model` on a device.

@@ -9,7 +9,7 @@ import warp as wp
 
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.chain import ChainKind, gather_functions
-from ddg_warp.kernels.drag import ROTATIONAL, ROWS, block_inertia, edge_function
+from ddg_warp.kernels.drag import FIRST, LAST, ROTATIONAL, ROWS, block_inertia, edge_function
 from ddg_warp.kernels.gather import row_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -25,7 +25,8 @@ def resisted_function(dim: int, real):
     @wp.func
     def resisted(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, turn: real):
         D = half(e, v, p)
-        return -wp.dot(wa, D * za) - wp.dot(wb, D * zb) - turn * p[wp.static(ROTATIONAL)] * wp.length(e)
+        bodies = p[wp.static(FIRST)] * wp.dot(wa, za) + p[wp.static(LAST)] * wp.dot(wb, zb)
+        return -wp.dot(wa, D * za) - wp.dot(wb, D * zb) - bodies - turn * p[wp.static(ROTATIONAL)] * wp.length(e)
 
     return resisted
 
@@ -129,15 +130,16 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
         if k >= n:
             return
         D = M()
+        one = wp.identity(n=wp.static(dim), dtype=real)
         by_tangent = V()
         by_velocity = V()
         b = behind(k, n)
         if wp.static(closed) or k < n - 1:
-            D += of_edge(tangents, v0, coefficients, flow[0], k, n, r)
+            D += of_edge(tangents, v0, coefficients, flow[0], k, n, r) + one * coefficients[wp.static(FIRST), k, r]
             by_tangent -= row(edge_in, k, r)
             by_velocity += row(velocity_in, k, r)
         if b >= 0:
-            D += of_edge(tangents, v0, coefficients, flow[0], b, n, r)
+            D += of_edge(tangents, v0, coefficients, flow[0], b, n, r) + one * coefficients[wp.static(LAST), b, r]
             by_tangent += row(edge_in, b, r)
             by_velocity += row(velocity_in, b, r)
         back = D * row(w, k, r)

@@ -302,7 +302,7 @@ def test_the_midpoint_rule_with_predictors_that_turn_edges(name, monkeypatch):
     check_state(model, gradient, difference)
 
 
-FLUID = {"tangential": 0.7, "normal": 1.9, "rotational": 3e-5}
+FLUID = {"tangential": 0.7, "normal": 1.9, "rotational": 3e-5, "nodes": 0.05}
 SAND = ddg.Granular(lateral=0.3, friction=0.2, leading=0.1, speed=0.05)
 
 

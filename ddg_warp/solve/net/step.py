@@ -45,7 +45,7 @@ class NetStep(PartStep):
         bare = ((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1)
         if host.drag:
             ends, _, coefficients = host.drag
-            bare[ends[:, drag.holds(coefficients)]] = False
+            bare[ends[drag.holds(coefficients)]] = False
         bare = np.flatnonzero(bare)
         if bare.size:
             raise SceneError(
