@@ -151,10 +151,17 @@ def chain_kernels(kind: ChainKind, real):
         scalars: wp.array2d(dtype=real),
         x_end: wp.array2d(dtype=V),
         theta_end: wp.array2d(dtype=real),
+        v0: wp.array2d(dtype=V),
+        omega0: wp.array2d(dtype=real),
         v_out: wp.array2d(dtype=V),
         omega_out: wp.array2d(dtype=real),
+        a_out: wp.array2d(dtype=V),
+        alpha_out: wp.array2d(dtype=real),
     ):
-        """Rates of what has no inertia are means over the step of the midpoint rule, which would keep them swinging about these."""
+        """Rates of what has no inertia are means over the step of the midpoint rule, which would keep them swinging about these.
+
+        Accelerations are the change of means over the step, zero where there was no motion before. The rule has made 2 mean - v0 of v.
+        """
         start, r = wp.tid()
         n = count[r]
         if (
@@ -165,10 +172,20 @@ def chain_kernels(kind: ChainKind, real):
             return
         for k in range(start, until(start, n)):
             if mass[k, r] <= real(0.0):
-                v_out[k, r] = (x_end[k, r] - x[k, r]) * scalars[RATE, r]
+                mean = (x_end[k, r] - x[k, r]) * scalars[RATE, r]
+                a = V()
+                if wp.length_sq(v0[k, r]) > real(0.0):
+                    a = (v_out[k, r] - mean) * (real(0.5) * scalars[RATE, r])
+                a_out[k, r] = a
+                v_out[k, r] = mean
             if wp.static(twist):
                 if rotary[k, r] <= real(0.0):
-                    omega_out[k, r] = (theta_end[k, r] - theta[k, r]) * scalars[RATE, r]
+                    spin = (theta_end[k, r] - theta[k, r]) * scalars[RATE, r]
+                    alpha = real(0.0)
+                    if omega0[k, r] != real(0.0):
+                        alpha = (omega_out[k, r] - spin) * real(0.5) * scalars[RATE, r]
+                    alpha_out[k, r] = alpha
+                    omega_out[k, r] = spin
 
     return resist, settle
 
@@ -265,7 +282,9 @@ def net_kernels(real):
         scalars: wp.array2d(dtype=real),
         blocks: int,
         q_end: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
+        a_out: wp.array(dtype=V),
     ):
         """As of chains, of dofs that feel drag."""
         i = wp.tid()
@@ -275,9 +294,15 @@ def net_kernels(real):
         block = inertia[w, i - w * blocks]
         v = v_out[i]
         mean = (q_end[i] - q[i]) * scalars[RATE, w]
+        change = (v - mean) * (real(0.5) * scalars[RATE, w])
+        moved = wp.length_sq(v0[i]) > real(0.0)
+        a = V()
         for d in range(3):
             if block.mass[d] <= real(0.0) and block.resistance[d, d] > real(0.0):
                 v[d] = mean[d]
+                if moved:
+                    a[d] = change[d]
         v_out[i] = v
+        a_out[i] = a
 
     return resist, settle

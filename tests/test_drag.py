@@ -165,6 +165,33 @@ def test_twist_relaxes_at_its_rate(device, scheme):
     assert state.angles()[-1] == pytest.approx(0.1 * np.sin(0.5 * np.pi * x[-1]) * np.exp(-rate * time), rel=1e-2)
 
 
+@pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
+@pytest.mark.parametrize(("scheme", "order"), [("implicit_euler", 1), ("implicit_midpoint", 2)])
+def test_orders_of_the_drag_at_a_state(device, scheme, order, joined):
+    """Of a rod without mass that its clamp turns in a flow that changes: forces, moments and power at the end of a step."""
+    s = np.linspace(0.0, 1.0, 13)
+    points = np.stack([s, 0.0 * s, 0.1 * np.sin(3.0 * s)], -1)
+
+    def run(steps: int) -> np.ndarray:
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=lambda t: (0.0, 0.2, np.sin(5.0 * t)))
+        section = ddg.Stiffness(EA=200.0, EI1=0.3, EI2=0.2, GJ=0.2)
+        rods = [scene.add_rod(part, section=section) for part in ((points[:7], points[6:]) if joined else (points,))]
+        if joined:
+            scene.join([(rods[0], -1), (rods[1], 0)])
+        scene.clamp_end(rods[0], motion=ddg.Motion(angle=lambda t: 2.0 * t * t, axis=(0.0, 1.0, 0.0)))
+        scene.drag(tangential=0.5, normal=1.5, rotational=0.05)
+        model = scene.build(device, "float64")
+        integrator, state = ddg.Integrator(model, scheme, rtol=1e-11), model.state()
+        for _ in range(steps):
+            state = integrator.step(state, 0.2 / steps)
+        found = model.drag(state)
+        return np.concatenate([found.force.ravel(), found.moment, [found.power]])
+
+    found = [run(steps) for steps in (10, 20, 40)]
+    first, second = np.abs(np.diff(found, axis=0)).max(1)
+    assert np.log2(first / second) == pytest.approx(order, abs=0.1)
+
+
 @pytest.mark.slow
 def test_orders_of_the_driven_filament():
     """The tip of the flagellum against linear hyperdiffusion: second order in space, and in time by the midpoint rule."""

@@ -101,14 +101,17 @@ class Drag:
 def drag(model, state) -> Drag:
     """Drag at a state, by its velocities and the flow at its time: zero at rest in a fluid at rest.
 
-    Rods without mass move as in the last step; a first state has the velocities that it is given.
+    Rods without mass move as in the last step: by implicit Euler at its end; by the midpoint rule, whose velocities are means over a
+    step, half a step after that, as in the last two steps. A first state has the velocities that it is given.
     """
     forces, moments, power, blocks, turns = [], [], np.zeros(model.worlds), None, None
     for group, data in zip(model.groups, state.groups, strict=True):
         v, omega = (arrays.download(array).astype(float) for array in (data.v, data.omega))
         force, moment = np.zeros_like(v), np.zeros_like(omega)
         if group.kind.drag:
-            inertia, u = ChainDrag(model, group).at(data, state.time)
+            resisted = ChainDrag(model, group)
+            v, omega = resisted.rates(data, state.lead)
+            inertia, u = resisted.at(data, state.time)
             force = np.einsum("krij,krj->kri", inertia["resistance"], u - v)
             moment = -inertia["spin"] * omega if group.kind.twist else moment
         work = (force * v).sum((0, 2)) + (moment * omega).sum(0)
@@ -116,10 +119,12 @@ def drag(model, state) -> Drag:
         forces.append(force)
         moments.append(moment)
     if model.net is not None:
-        v = state.net.v.numpy().astype(float).reshape(model.worlds, -1, 3)
-        force = np.zeros_like(v)
+        force = np.zeros((model.worlds, model.net.blocks, 3))
+        v = force
         if model.net.host.drag:
-            inertia, u = NetDrag(model).at(state.net, state.time)
+            resisted = NetDrag(model)
+            v = resisted.rates(state.net, state.lead)
+            inertia, u = resisted.at(state.net, state.time)
             force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
         power += (force * v).sum((1, 2))
         _, places = model.order.net_rows

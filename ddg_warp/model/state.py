@@ -23,7 +23,8 @@ class GroupState:
         frame: lagged reference frames (7, n, R): first director, tangent, reference twist; empty without twist.
         last: strains at this state (strains, n, R); empty without strain-rate damping.
         a, alpha: what the last solve added to its predictor, over the square of its step (n, R), [m/s^2] and [rad/s^2]; the next one
-            starts from where they lead. Zero where there was none; alpha is empty without twist.
+            starts from where they lead. Zero where there was none; alpha is empty without twist. By the midpoint rule accelerations of
+            what has drag and no mass, by its mean velocities in the last two steps.
     """
 
     x: wp.array
@@ -91,6 +92,8 @@ class State:
             With several worlds these three are arrays (worlds,).
         sliding: of an equilibrium with friction, the `Sliding` by which that acts, though the state is at rest; None where it acts by
             the velocities of the state.
+        lead: half the last step where that was one of the midpoint rule [s], else zero. By so much the state is later than velocities
+            of what has no mass, which are means over that step.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
@@ -103,6 +106,7 @@ class State:
         self.net = net
         self.grips = grips
         self.time = time
+        self.lead = 0.0
 
     def __repr__(self) -> str:
         model = self.model
@@ -187,7 +191,7 @@ class State:
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 arrays.copy(array, source)
-        self.time = other.time
+        self.time, self.lead = other.time, other.lead
         self.forget_equilibrium()
 
     def forget_equilibrium(self) -> None:
@@ -197,6 +201,7 @@ class State:
 
     def stop(self) -> None:
         """Set all velocities to zero, and what the next step would go on from."""
+        self.lead = 0.0
         for part in self.parts().values():
             for name, array in part.arrays().items():
                 if name in VELOCITIES:

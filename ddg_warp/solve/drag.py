@@ -72,17 +72,28 @@ class ChainDrag(Drag):
         self.resist(data, solve, self._over_a_second())
         return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
 
-    def settle(self, after, newton, islands) -> None:
-        """Rates of what has no inertia in the state `after`."""
+    def settle(self, before, after, newton, islands) -> None:
+        """Rates of what has no inertia in the state `after`, which may be `before` itself."""
         group = self.part
         if self.midpoint:
             self._launch(
                 self._settle,
                 group.node_threads,
                 [newton.x, newton.theta, group.mass, group.rotary, group.count, *islands.arrays]
-                + [after.x, after.theta],
-                [after.v, after.omega],
+                + [after.x, after.theta, before.v, before.omega],
+                [after.v, after.omega, after.a, after.alpha],
             )
+
+    def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rates of nodes and edges of a group's state (node, column), of what has no inertia `lead` [s] after those that it has."""
+        v, a, omega, alpha, mass, rotary = (
+            arrays.download(array).astype(float)
+            for array in (data.v, data.a, data.omega, data.alpha, self.part.mass, self.part.rotary)
+        )
+        if lead > 0.0:
+            v = v + lead * np.where(mass[..., None] <= 0.0, a, 0.0)
+            omega = omega + lead * np.where(rotary <= 0.0, alpha, 0.0) if self.part.kind.twist else omega
+        return v, omega
 
 
 class NetDrag(Drag):
@@ -121,9 +132,15 @@ class NetDrag(Drag):
         flow[: net.host.nodes] = self.flow.numpy()[0]
         return mass.numpy(), flow
 
-    def settle(self, after, solver, islands) -> None:
-        """Rates of what has no inertia in the state `after`."""
+    def rates(self, state, lead: float) -> np.ndarray:
+        """Rates of blocks (world, block) of a net's state, as of `ChainDrag`."""
+        net = self.part
+        v, a = (array.numpy().astype(float).reshape(net.worlds, -1, 3) for array in (state.v, state.a))
+        return v + lead * np.where(net.mass.numpy() <= 0.0, a, 0.0) if lead > 0.0 else v
+
+    def settle(self, before, after, solver, islands) -> None:
+        """As of `ChainDrag`."""
         net = self.part
         if self.midpoint:
-            inputs = [solver.q, solver.mass, *islands.arrays, net.blocks, after.q]
-            self._launch(self._settle, net.worlds * net.blocks, inputs, [after.v])
+            inputs = [solver.q, solver.mass, *islands.arrays, net.blocks, after.q, before.v]
+            self._launch(self._settle, net.worlds * net.blocks, inputs, [after.v, after.a])

@@ -145,6 +145,7 @@ class Integrator:
         self._control(found, source)
         self.advance(source, state.time, dt)
         target.time = state.time + dt
+        target.lead = 0.5 * dt if self.scheme == "implicit_midpoint" else 0.0
         self._steps_since_check += 1
         if self.failures == "raise" and self._steps_since_check >= self.check_every:
             self.check(target)

@@ -95,7 +95,7 @@ class ChainStep(PartStep):
             [after.x, after.v, after.theta, after.omega, after.a, after.alpha],
         )
         if self.drag:
-            self.drag.settle(after, newton, self.islands)
+            self.drag.settle(before, after, newton, self.islands)
 
     def complete(self, before, after) -> None:
         """Frames and strains that go with the positions."""

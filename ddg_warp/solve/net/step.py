@@ -233,7 +233,7 @@ class NetStep(PartStep):
         inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust]
         self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a])
         if self.drag:
-            self.drag.settle(after, solver, islands)
+            self.drag.settle(before, after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)
         if self.motion:
             self.motion.turn(islands, before, after)
