@@ -51,6 +51,7 @@ class Adjoint:
 
     def __init__(self, integrator):
         self.integrator, self.model = integrator, integrator.model
+        refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()
         self.chains = [ChainAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
         self.net = NetAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
@@ -62,7 +63,12 @@ class Adjoint:
         return [*self.chains, *([self.net] if self.net else [])]
 
     def step(self, state: State, dt: float) -> tuple[State, Tape]:
-        """The state after a step, and what its reverse needs, which stays valid for as long as it is held."""
+        """The state after a step, and what its reverse needs, which stays valid for as long as it is held.
+
+        Raises:
+            SceneError: the state was given spins, and the integrator lets them resist turns of their axes.
+        """
+        refuse_gyroscopic("Adjoint", self.integrator.resists(state))
         after = self.integrator.step(state, dt)
         return after, Tape(state, after, dt, self.keep(state))
 
@@ -133,6 +139,15 @@ class Adjoint:
             net, read = self.net.pull(parts[-1], after.net, given.net, s, (before, after), factors)
             inputs.append(read)
         return State(self.model, groups, net, before.time, self._grips), inputs
+
+
+def refuse_gyroscopic(what: str, wanted: bool | None) -> None:
+    """Refuse steps in which the spin of a rod resists turns of its axis, named by `what`."""
+    if wanted:
+        raise SceneError(
+            f"{what}: no gradient goes through the gyroscopic couples of spins that a state was given; gyroscopic=False, of the "
+            "Integrator or Simulator, leaves these out"
+        )
 
 
 @launches

@@ -50,6 +50,7 @@ class Engine:
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
         self.integrator.step_whole()
+        self.integrator._spin(bool(self.integrator.gyroscopic))
         self.adjoint = self.poses = self.by_poses = self.by_equilibrium = None
         self._equilibria = {}  # reverse of those that are given poses, and of others
         self._solver = None  # of equilibria, and what it is for

@@ -9,6 +9,7 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
+from ddg_warp.learn.adjoint import refuse_gyroscopic
 from ddg_warp.learn.engine import Engine
 from ddg_warp.learn.layout import copies, tensors
 from ddg_warp.learn.recipe import Recipe
@@ -145,9 +146,12 @@ class Simulator(torch.nn.Module):
         Unlike by `initial_state`, frames are those of the state, and dampers have its strains behind them, not those at rest.
 
         Raises:
-            SceneError: it is no state of this simulator's model, which has as many worlds; or surfaces overlap that touch.
+            SceneError: it is no state of this simulator's model, which has as many worlds; or surfaces overlap that touch; or it was
+                given spins, and `gyroscopic` does not say whether these resist turns of their axes.
         """
         validate.check_state("world_state", self.model, state)
+        if "gyroscopic" not in self.options:
+            refuse_gyroscopic("world_state", state.spun)
         engine = self.engine(self.model.worlds)
         values = copies(tensors(state, engine.fields))
         engine.check(values)

@@ -273,12 +273,13 @@ class Model:
                 these positions, and edges glued to a shell turn with it; ghost nodes of clamped ends stay.
             velocities: (P, 3) or (worlds, P, 3) [m/s].
             spins: rate of the edges' angles (edges,) or (worlds, edges) [rad/s]; without, zero, but as the shell turns where they
-                are glued.
+                are glued. Steps from here on let them resist turns of the rods' tangents, see `Integrator`, gyroscopic.
 
         Raises:
             ValueError: a shape does not fit, or a value is not finite.
         """
         state = self.empty_state()
+        state.spun = spins is not None and bool(np.any(spins))
         for group, data in zip(self.groups, state.groups, strict=True):
             x = np.concatenate([group.host.x] * self.worlds, axis=1)
             if points is not None:
@@ -336,7 +337,9 @@ class Model:
         if not isinstance(snapshot, dict):
             raise ValueError(f"restore: {type(snapshot).__name__} is no snapshot; give what state.snapshot() returns")
         state = self.empty_state()
-        names = {"time"} | {f"{part}/{name}" for part, data in state.parts().items() for name in data.arrays()}
+        names = {"time", *({"spun"} & set(snapshot))} | {
+            f"{part}/{name}" for part, data in state.parts().items() for name in data.arrays()
+        }
         if names ^ set(snapshot):
             raise ValueError(f"snapshot is of another model: it differs by {', '.join(sorted(names ^ set(snapshot)))}")
         for part, data in state.parts().items():
@@ -347,7 +350,7 @@ class Model:
                         f"snapshot is of another model: {name} has shape {values.shape}, not {array.shape}"
                     )
                 arrays.assign(array, values)
-        state.time = float(snapshot["time"])
+        state.time, state.spun = float(snapshot["time"]), "spun" in snapshot
         return state
 
     def group_state(self, group: Group) -> GroupState:

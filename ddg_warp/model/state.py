@@ -92,6 +92,7 @@ class State:
             With several worlds these three are arrays (worlds,).
         sliding: of an equilibrium with friction, the `Sliding` by which that acts, though the state is at rest; None where it acts by
             the velocities of the state.
+        spun: whether it was given spins, or comes from a state that was; see `Integrator`, gyroscopic.
         lead: half the last step where that was one of the midpoint rule [s], else zero. By so much the state is later than velocities
             of what has no mass, which are means over that step.
     """
@@ -106,6 +107,7 @@ class State:
         self.net = net
         self.grips = grips
         self.time = time
+        self.spun = False
         self.lead = 0.0
 
     def __repr__(self) -> str:
@@ -191,7 +193,7 @@ class State:
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 arrays.copy(array, source)
-        self.time, self.lead = other.time, other.lead
+        self.time, self.lead, self.spun = other.time, other.lead, other.spun
         self.forget_equilibrium()
 
     def forget_equilibrium(self) -> None:
@@ -201,7 +203,7 @@ class State:
 
     def stop(self) -> None:
         """Set all velocities to zero, and what the next step would go on from."""
-        self.lead = 0.0
+        self.lead, self.spun = 0.0, False
         for part in self.parts().values():
             for name, array in part.arrays().items():
                 if name in VELOCITIES:
@@ -209,4 +211,6 @@ class State:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""
-        return {"time": np.float64(self.time)} | {name: arrays.download(array) for name, array in self.arrays().items()}
+        spun = {"spun": np.bool_(True)} if self.spun else {}
+        own = {name: arrays.download(array) for name, array in self.arrays().items()}
+        return {"time": np.float64(self.time)} | spun | own

@@ -17,6 +17,7 @@ from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
 from ddg_warp.solve.changes import Changes
 from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
+from ddg_warp.solve.gyroscopic import Gyroscope
 from ddg_warp.solve.net.step import NetStep
 from ddg_warp.solve.worlds import Worlds, outcomes
 from ddg_warp.threads import launches
@@ -67,6 +68,10 @@ class Integrator:
         failures: what becomes of a step that is given up: "raise" stops the run, as described; by "flag" nothing is read or raised.
             The world it is in then rests as it was before that step, all of it, until `reset` starts it anew, or the integrator is
             given a state that it has not made itself; the others go on, and `outcomes` tells which are which.
+        gyroscopic: whether the spin of a rod about its tangent resists turns of the tangent; by default in steps from states that were
+            given spins (`Model.state`), and in those that follow. Ask for it where motors or moments spin up a rod that then tumbles.
+            Where rods spin no faster than they turn it is as small as their inertia against turns, (radius / length)^2, which rods
+            here do not have. See `kernels.gyroscopic`.
 
     Attributes:
         whole: whether rods that touch nothing are solved with their net all the same; see `step_whole`.
@@ -87,6 +92,7 @@ class Integrator:
         energy_bound: float | None = energy.BOUND,
         check_every: int | None = None,
         failures: str = "raise",
+        gyroscopic: bool | None = None,
         **options,
     ):
         validate.check_model("Integrator", model)
@@ -95,6 +101,7 @@ class Integrator:
         if model.net is None and linear in NET_ONLY:
             raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
         self.failures = arguments.choice("failures", failures, FAILURES)
+        self.gyroscopic = None if gyroscopic is None else arguments.flag("gyroscopic", gyroscopic)
         if check_every is not None:
             arguments.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
@@ -122,6 +129,8 @@ class Integrator:
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
         self._changes: Changes | None = None
+        self._gyroscope: Gyroscope | None = None  # made when a step first takes it
+        self._spinning = False  # whether the step at hand does
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -143,8 +152,10 @@ class Integrator:
         target = self._buffers[1 - source].state
         self._prepare(dt, state)
         self._control(found, source)
+        self._spin(self.resists(state))
         self.advance(source, state.time, dt)
         target.time = state.time + dt
+        target.spun = state.spun
         target.lead = 0.5 * dt if self.scheme == "implicit_midpoint" else 0.0
         self._steps_since_check += 1
         if self.failures == "raise" and self._steps_since_check >= self.check_every:
@@ -152,6 +163,17 @@ class Integrator:
         for callback in self.model.scene.callbacks:
             callback(target)
         return target
+
+    def resists(self, state: State) -> bool:
+        """Whether spins resist turns of their axes in a step from a state; see `gyroscopic`."""
+        return state.spun if self.gyroscopic is None else self.gyroscopic
+
+    def _spin(self, wanted: bool) -> None:
+        """Take gyroscopic couples into the steps from now on, or leave them out."""
+        self._spinning = wanted
+        if wanted and self._gyroscope is None:
+            self._gyroscope = Gyroscope(self.model, self._dt)
+            self._graphs.clear()
 
     def _prepare(self, dt: float, state: State) -> None:
         """Solve by what suits steps of dt from now on."""
@@ -176,7 +198,8 @@ class Integrator:
             self._launch(source)
 
         def replay():
-            self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
+            given = self.given is not None and self.given.any
+            self._graphs.replay((source, anew, given, self._spinning), launch)
 
         net = self._buffers[source].own.net
         # on its own: steps with and without it would be captured one by one
@@ -249,7 +272,7 @@ class Integrator:
             self._graphs.replay(("reset", source), launch)
         else:  # whose arrays may be gone by the next time
             launch()
-        then.state.time, then.state.stable = state.time, None
+        then.state.time, then.state.stable, then.state.spun = state.time, None, state.spun or to.spun
         if self._net is not None:
             self._net.arrive()
         return then.state
@@ -388,10 +411,13 @@ class Integrator:
                 part.motion.follow(before, after)
             if self.given is not None:
                 part.loads.give()
+        start = self._gyroscope.begin(before, self._chains, self._net) if self._spinning else before
         for chain in self._chains:
-            chain.step(before.groups[chain.index], after.groups[chain.index])
+            chain.step(start.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
-            self._net.step(before.net, after.net)
+            self._net.step(start.net, after.net)
+        if self._spinning:
+            self._gyroscope.finish(after, self._chains, self._net)
         if self.failures == "flag":
             self._worlds.settle(self._parts, before, after)
         if self._changes:
@@ -400,6 +426,8 @@ class Integrator:
     def _load_modules(self) -> None:
         for part in self._parts:
             part.load_modules()
+        if self._gyroscope:
+            arrays.load_kernels(self._gyroscope.kernels, self.model.wp_device)
         if self.failures == "flag":
             self._worlds.load_modules()
         if self._changes:
