@@ -61,17 +61,21 @@ SCALARS = (
     # the part of the time step that is done, and the part being tried
     "progress",
     "portion",
+    # the largest part that is tried at once, and the part that a row of the poses of motions is of; see `solve.net.arcs`
+    "substep",
+    "interval",
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
 (CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED, DRIVEN, CUT) = range(10, 22)
 ACTIVE, TURNING, WANTING = range(22, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE) = range(8)
-CARRIED, TURN, PROGRESS, PORTION = range(8, len(SCALARS))
-DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step that are larger than this
+CARRIED, TURN, PROGRESS, PORTION, SUBSTEP, INTERVAL = range(8, len(SCALARS))
+DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step, or of its substeps, that are larger than this
 
 
 class Islands:
-    """The entries of `count` islands, zero at first but for `turn` and `patience`; each row by its name, too, such as `islands.status`.
+    """The entries of `count` islands, zero at first but for `turn`, `patience` and parts of steps; each row by its name, too, such as
+    `islands.status`.
 
     Attributes:
         arrays: `flags` and `scalars`, for kernels.
@@ -87,6 +91,8 @@ class Islands:
             for row, name in enumerate(names):
                 setattr(self, name, array[row])
         self.turn.fill_(TURNED)
+        self.substep.fill_(1.0)
+        self.interval.fill_(1.0)
         self.patience.fill_(np.iinfo(np.int32).max)
         self.signals = self.arrays[0][ACTIVE:]
         self.active, self.turning, self.wanting = (self.signals[row, :1] for row in range(3))
@@ -110,7 +116,7 @@ def patience_function(real):
         detours = flags[DETOURS, i] + flags[CLAMPED, i]
         flags[DETOURS, i] = detours
         flags[CLAMPED, i] = 0
-        if detours <= flags[PATIENCE, i] or scalars[PORTION, i] <= real(LEAST):
+        if detours <= flags[PATIENCE, i] or scalars[PORTION, i] <= real(LEAST) * scalars[SUBSTEP, i]:
             return False
         flags[STATUS, i] = wp.static(outcome.INDEFINITE)
         return True

@@ -3,6 +3,8 @@
 A pose is a row of an array: the rotation vector of the step (3), the rotation at its start (9), the pivot (3), the translations
 at its start and end (3 each). s is the fraction of the step; the turn runs at a constant rate, so that no part of it is a chord.
 Where worlds are moved each for itself, by `Grip`, the rows of one world follow those of another, `stride` apart, which else is zero.
+Of a step that is taken in K = 2^k intervals (`solve.net.arcs`), K sets of `rows` follow those of all coarser intervals: the motion
+of an interval, extended to the whole step, so that s means the same.
 
 Supports are at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its
 ends, so that the extrapolated ones are exact, and angles and normals those in the middle.
@@ -12,12 +14,16 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames
+from ddg_warp.kernels import frames, outcome
 from ddg_warp.kernels.gather import column_of, point_functions
-from ddg_warp.kernels.islands import PORTION, PROGRESS
+from ddg_warp.kernels.islands import INTERVAL, PORTION, PROGRESS, REASON, STATUS, SUBSTEP
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 POSE = 21  # reals of a motion over a step
+MOST_PARTS = 1024  # substeps of a step, at most
+HALF = 1e-6  # half the angle by which what counts as half a turn is off [rad]
+COUNTED = 3.1415926535897932 + HALF  # length of a rotation vector, beyond which it counts turns [rad]
+SLACK = 1.0 - 1e-6  # of a turn that substeps are to resolve, for rounding
 
 
 @cache
@@ -63,6 +69,18 @@ def functions(real):
 
 
 @cache
+def row_function(real):
+    """row(scalars, i, rows): the first row of the interval that a solve of island i is in."""
+
+    @wp.func
+    def row(scalars: wp.array2d(dtype=real), i: int, rows: int):
+        parts = real(1.0) / scalars[INTERVAL, i]
+        return (int(parts) - 1 + int(wp.floor(scalars[PROGRESS, i] * parts))) * rows
+
+    return row
+
+
+@cache
 def reached_function(real, midpoint: bool):
     """reached(scalars, i): fraction of the step that a solve of island i is about."""
 
@@ -83,7 +101,7 @@ def support_kernels(dim: int, real, midpoint: bool):
     get, put = point_functions(dim, real)
     transport, *_ = frames.functions(real)
     _, placed, branch = functions(real)
-    reached = reached_function(real, midpoint)
+    reached, row = reached_function(real, midpoint), row_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def nodes(
@@ -91,6 +109,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         rest: wp.array(dtype=X),
         pose: wp.array2d(dtype=real),
         stride: int,
+        rows: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         columns: int,
@@ -104,10 +123,11 @@ def support_kernels(dim: int, real, midpoint: bool):
         if start >= real(1.0):
             return
         here = get(x, place, w, columns)
+        first = w * stride + row(scalars, r, rows)
         for d in range(3):
             m = where[i, 1 + d]
             if m >= 0:
-                m += w * stride
+                m += first
                 p = placed(pose, m, start + scalars[PORTION, r], rest[i])
                 if wp.static(midpoint):
                     p = real(0.5) * (p + placed(pose, m, start, rest[i]))
@@ -120,6 +140,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         rest: wp.array(dtype=X),
         pose: wp.array2d(dtype=real),
         stride: int,
+        rows: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         columns: int,
@@ -139,14 +160,16 @@ def support_kernels(dim: int, real, midpoint: bool):
             X(frame[0, e, r], frame[1, e, r], frame[2, e, r]), X(frame[3, e, r], frame[4, e, r], frame[5, e, r]), t
         )
         k = where[i, 0] / columns
-        theta[k, r] = branch(pose, where[i, 4] + w * stride, start, reached(scalars, r), rest[i], u, t, theta[k, r])
+        m = where[i, 4] + w * stride + row(scalars, r, rows)
+        theta[k, r] = branch(pose, m, start, reached(scalars, r), rest[i], u, t, theta[k, r])
 
     return nodes, angles
 
 
 @cache
-def grip_kernel(real):
-    """Poses of all motions over a step, world by world: those of grips between two states, of functions of time as they are given."""
+def grip_kernel(real, arcs: bool):
+    """Poses of all motions over a step, world by world: those of grips between two states, of functions of time as they are given; with
+    `arcs` also the substeps that resolve those of grips."""
     X, Q = wp.types.vector(3, real), wp.types.quaternion(real)
 
     @wp.func
@@ -164,15 +187,55 @@ def grip_kernel(real):
 
     @wp.func
     def turn_between(r0: X, r1: X):
-        """The rotation vector of the shortest turn from one orientation to another, exactly none where they are the same."""
+        """The rotation vector of the shortest turn from one orientation to another, exactly none where they are the same; of half a
+        turn that which rotation vectors differ by. What counts more than half a turn is no number: see `turns_between`."""
+        if wp.length(r1) > real(wp.static(COUNTED)) and wp.length(r1 - r0) > real(wp.static(COUNTED)):
+            return X(real(wp.nan), real(wp.nan), real(wp.nan))
         q = quaternion(r1) * wp.quat_inverse(quaternion(r0))
         v = X(q[0], q[1], q[2])
-        if q[3] < real(0.0):
+        back = q[3] < real(0.0)
+        if wp.abs(q[3]) < real(wp.static(HALF)):
+            back = wp.dot(v, r1 - r0) < real(0.0)
+        if back:
             v = -v
         size = wp.length(v)
         if size == real(0.0) or r0 == r1:
             return X()
         return v * (real(2.0) * wp.atan2(size, wp.abs(q[3])) / size)
+
+    @wp.func
+    def largest_turn(arms: wp.array2d(dtype=X), g: int, axis: X, allowed: real):
+        """Turn about an axis of the rest state [rad] whose chords are off the arcs of `arms` (grips, points) by what is allowed."""
+        far = real(0.0)
+        for p in range(arms.shape[1]):
+            far = wp.max(far, wp.length(wp.cross(axis, arms[g, p])))
+        if real(2.0) * far <= allowed:
+            return real(wp.inf)
+        return real(4.0) * wp.asin(wp.sqrt(real(0.5) * wp.min(real(1.0), allowed / far)))
+
+    @wp.func
+    def parts_of(
+        w: int,
+        count: int,
+        before: wp.array2d(dtype=real),
+        after: wp.array2d(dtype=real),
+        arms: wp.array2d(dtype=X),
+        allowed: wp.array2d(dtype=real),
+        most: wp.array2d(dtype=real),
+        parts: real,
+    ):
+        """Number of substeps that resolve the arcs of all grips of a world, a power of two and `parts` at least; more than
+        `MOST_PARTS` where so many do not."""
+        for g in range(count):
+            r0 = row(before, 3, g + w * count)
+            turn = turn_between(r0, row(after, 3, g + w * count))
+            angle = wp.length(turn)
+            if angle > real(0.0):
+                axis = wp.quat_rotate_inv(quaternion(r0), turn / angle)
+                largest = wp.min(most[w, g], largest_turn(arms, g, axis, allowed[w, g]))
+                while parts * largest < real(wp.static(SLACK)) * angle and parts <= real(wp.static(float(MOST_PARTS))):
+                    parts *= real(2.0)
+        return parts
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def grip(
@@ -181,13 +244,28 @@ def grip_kernel(real):
         shared: wp.array2d(dtype=real),
         before: wp.array2d(dtype=real),
         after: wp.array2d(dtype=real),
+        arms: wp.array2d(dtype=X),
+        allowed: wp.array2d(dtype=real),
+        most: wp.array2d(dtype=real),
         pose_out: wp.array2d(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        tally: wp.array(dtype=wp.int64),
     ):
-        """`grips` is the number of the grip of each row, among `count`, -1 where it is a function of time."""
-        m, w = wp.tid()
-        at = m + w * grips.shape[0]
+        """`grips` is the number of the grip of each row, among `count`, -1 where it is a function of time. Worlds whose arcs substeps
+        do not resolve are given up; see `kernels.step.advance_kernel` for `tally`."""
+        n, w = wp.tid()
+        if wp.static(arcs):
+            if n == 0:
+                parts = parts_of(w, count, before, after, arms, allowed, most, real(1.0) / scalars[INTERVAL, w])
+                if parts > real(wp.static(float(MOST_PARTS))) and flags[STATUS, w] != wp.static(outcome.GIVEN_UP):
+                    flags[STATUS, w] = wp.static(outcome.GIVEN_UP)
+                    flags[REASON, w] = wp.static(outcome.TURNED_TOO_FAR)
+                    wp.atomic_add(tally, wp.static(outcome.TURNED_TOO_FAR), wp.int64(1))
+                scalars[SUBSTEP, w] = real(1.0) / parts
+        m, at = n % grips.shape[0], n + w * shared.shape[0]
         for c in range(wp.static(POSE)):
-            pose_out[at, c] = shared[m, c]
+            pose_out[at, c] = shared[n, c]
         if grips[m] < 0:
             return
         i = grips[m] + w * count

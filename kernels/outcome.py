@@ -16,6 +16,7 @@ LOST_IN_ROUNDING = (
 ENERGY_DRIFT = 9  # the midpoint rule would have made or lost more energy than it may; see `kernels.energy`
 CROSSED = 10  # things would have passed through each other
 NO_ROOM = 11  # surfaces have come so near that a barrier, whose forces grow without bound, has lost its digits
+TURNED_TOO_FAR = 12  # supports or obstacles would turn farther in a step than substeps resolve
 
 NAMES = {
     CONVERGED: "converged",
@@ -29,4 +30,5 @@ NAMES = {
     ENERGY_DRIFT: "energy_drift",
     CROSSED: "crossed",
     NO_ROOM: "no_room",
+    TURNED_TOO_FAR: "turned_too_far",
 }

@@ -11,6 +11,7 @@ The search starts from the predictor, x_n + s v_n with edges turned, or beyond: 
 
 A rod whose solve fails first starts again from x_n instead of the predictor, then takes the step in halves (`portion`); rods
 are uncoupled, so each does so for itself. `progress` is the part of the step already taken; both are powers of two, exact.
+Where prescribed motions turn far, parts are at most `substep`, and each is retried as a step is (`solve.net.arcs`).
 """
 
 from functools import cache
@@ -34,6 +35,7 @@ from ddg_warp.kernels.islands import (
     REASON,
     RETRIES,
     STATUS,
+    SUBSTEP,
     TURN,
     attempt_functions,
 )
@@ -183,7 +185,7 @@ def start_function(real):
 
     @wp.func
     def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
-        scalars[PORTION, i] = real(1.0)
+        scalars[PORTION, i] = scalars[SUBSTEP, i]
         flags[CAUTIOUS, i] = 0
         flags[RETRIES, i] = 0
         scalars[PROGRESS, i] = wp.where(flags[STATUS, i] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
@@ -373,6 +375,7 @@ def advance_kernel(real):
             longer = real(2.0) * scalars[PORTION, r]
             if (
                 scalars[PROGRESS, r] < real(1.0)
+                and longer <= scalars[SUBSTEP, r]
                 and wp.floor(scalars[PROGRESS, r] / longer) * longer == scalars[PROGRESS, r]
             ):
                 scalars[PORTION, r] = longer
@@ -386,7 +389,7 @@ def advance_kernel(real):
             else:
                 flags[CAUTIOUS, r] = 0
                 scalars[PORTION, r] = real(0.5) * scalars[PORTION, r]
-            if flags[RETRIES, r] > retry_limit or scalars[PORTION, r] < smallest:
+            if flags[RETRIES, r] > retry_limit or scalars[PORTION, r] < smallest * scalars[SUBSTEP, r]:
                 flags[REASON, r] = result
                 flags[STATUS, r] = wp.static(outcome.GIVEN_UP)
                 scalars[PROGRESS, r] = real(1.0)

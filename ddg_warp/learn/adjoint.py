@@ -261,7 +261,7 @@ def _require_one_solve(own: ChainAdjoint | NetAdjoint, kept: Kept | NetKept, sta
     changed = (lagged.numpy() != now.numpy()).any(0)
     changed = changed.any(0) if changed.ndim == 2 else changed.reshape(len(part.islands), -1).any(1)
     for bad, what in (
-        (kept.whole.numpy() < 1.0, "took the step in parts, as a solve failed"),
+        (kept.whole.numpy() < 1.0, "took the step in parts, as a solve failed or what turns in contact sweeps arcs"),
         ((kept.retries.numpy() > 0) & (own.predictor is not None), "started the step once more, as a solve failed"),
         (
             changed,

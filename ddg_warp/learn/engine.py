@@ -62,6 +62,7 @@ class Engine:
         self._flagged, self._told, self._streams = {}, {}, {}
         self._solves = solved_kernel(model.types.real)
         self._graphs = self._by_start = None
+        self._numbered = False  # whether numbers of contact may be those of parameters
 
     # steps
 
@@ -72,12 +73,19 @@ class Engine:
         """
         integrator = self.integrator
         self.fill(self.source, state)
+        self._renumber(integrator._net)
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
         found = copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
         return found + (self.lagged() if graded else [])
+
+    def _renumber(self, owner) -> None:
+        """Have a step or an equilibrium of the net take anew the numbers of contact that parameters may have changed."""
+        if owner is not None and owner.arcs and (self.tables.given or self._numbered):
+            self._numbered = self.tables.given
+            owner.arcs.outdate()
 
     @property
     def solutions(self) -> list[wp.array]:

@@ -175,7 +175,8 @@ class Contacts:
         Args:
             shape: `Plane`, `Sphere`, `Capsule`, `Box` or `Mesh`, where it is at the start.
             motion: moves it as a whole, and friction goes with its surface, also of a ball or drum that spins about itself; of a mesh
-                it may give every vertex a displacement of its own. It stays still without.
+                it may give every vertex a displacement of its own. It stays still without. Steps in which it sweeps arcs are taken
+                in substeps that resolve these, see `ddg_warp.solve.net.arcs`.
             name: by which `contact_between` and output know it.
 
         Returns:

@@ -11,11 +11,12 @@ from ddg_warp import arguments
 class Grip:
     """A rigid motion of supports that every step is told: `integrator.step(state, dt, Controls(poses=...))`; see `Controls`.
 
-    It stands wherever a `Motion` does, and moves all supports that it is given to as one body. A pose is a translation (3,) [m] and a
-    rotation vector (3,) [rad], both relative to rest: a point X of the rest state is at pivot + R (X - pivot) + translation. Over a
-    step the translation runs straight and the rotation the shortest way from one orientation to the next, less than half a turn; turns
-    add up from step to step, as those of a `Motion` do. A grip that a step is told nothing of rests where it was. Its poses are part
-    of a `State` (`State.poses`): questions, and equilibria that are told nothing of it, find it where the state has it.
+    It stands wherever a `Motion` does, and moves all supports that it is given to as one body. A pose is a translation (3,) [m] and
+    a rotation vector (3,) [rad], both relative to rest: a point X of the rest state is at pivot + R (X - pivot) + translation. Over
+    a step the translation runs straight and the rotation the shorter way from one orientation to the next, half a turn at most:
+    rotation vectors that count more are refused. Turns add up from step to step, as those of a `Motion` do. A grip that a step is
+    told nothing of rests where it was. Its poses are part of a `State` (`State.poses`): questions, and equilibria that are told
+    nothing of it, find it where the state has it.
 
     Attributes:
         pivot: what it turns about at rest (3,) [m].
@@ -31,7 +32,7 @@ class Grip:
     def __post_init__(self):
         object.__setattr__(self, "pivot", arguments.vector("Grip: pivot", self.pivot))
 
-    def pose(self, t0: float, t1: float) -> np.ndarray:
+    def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
         """The row of `Motion.pose` (1, 21) of a grip at rest; what moves it is found on the device."""
         return np.concatenate([np.zeros(3), np.eye(3).ravel(), self.pivot, np.zeros(6)])[None]
 

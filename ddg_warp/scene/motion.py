@@ -42,7 +42,7 @@ class Motion:
     axis: tuple = (0.0, 0.0, 1.0)
     pivot: tuple = (0.0, 0.0, 0.0)
     count: int | None = field(init=False, default=None, repr=False, compare=False)  # of nodes, one displacement each
-    _unit: np.ndarray = field(init=False, repr=False, compare=False)
+    unit: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
         for name in ("translation", "angle"):
@@ -54,7 +54,7 @@ class Motion:
         length = np.linalg.norm(self.axis)
         if not length > 0.0:
             raise SceneError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
-        object.__setattr__(self, "_unit", np.asarray(self.axis, float) / length)
+        object.__setattr__(self, "unit", np.asarray(self.axis, float) / length)
         shift = arguments.value_at("Motion: translation", self.translation, 0.0, 3, error=SceneError)
         arguments.value_at("Motion: angle", self.angle, 0.0, error=SceneError)
         object.__setattr__(self, "count", len(shift) if shift.ndim == 2 else None)
@@ -91,14 +91,19 @@ class Motion:
         """
         return float(arguments.value_at("the motion's angle", self.angle, t))
 
-    def pose(self, t0: float, t1: float) -> np.ndarray:
-        """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3) in a row.
+    def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
+        """What the device needs of a step: turn (3), rotation at its start (9), pivot (3), translations (3, 3) in a row.
 
-        One row, or one for each node.
+        From t0 to t1 is a `part` of the step, from its fraction `start` on, and goes on alike over the whole. One row, or one for each
+        node.
         """
         a0, a1 = self.turned(t0), self.turned(t1)
         first, last = self.shift(t0), self.shift(t1)
-        same = np.concatenate([self._unit * (a1 - a0), self.rotation(a0).ravel(), self.pivot])
+        if part < 1.0:
+            a0, a1 = a0 - start * (a1 - a0) / part, a1 + (1.0 - start - part) * (a1 - a0) / part
+            rate = (last - first) / part
+            first, last = first - start * rate, last + (1.0 - start - part) * rate
+        same = np.concatenate([self.unit * (a1 - a0), self.rotation(a0).ravel(), self.pivot])
         return np.column_stack([np.tile(same, (len(first), 1)), first, last])
 
     def jump(self, t0: float, t1: float) -> float | None:
@@ -120,7 +125,7 @@ class Motion:
 
     def rotation(self, angle: float) -> np.ndarray:
         """Rotation matrix about the axis (Rodrigues)."""
-        k = self._unit
+        k = self.unit
         cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
         return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
 

@@ -18,6 +18,7 @@ from ddg_warp.solve.changes import Changes
 from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.gyroscopic import Gyroscope
+from ddg_warp.solve.motion import counts_turns, turns_between
 from ddg_warp.solve.net.step import NetStep
 from ddg_warp.solve.worlds import Worlds, outcomes
 from ddg_warp.threads import launches
@@ -141,7 +142,8 @@ class Integrator:
 
         Raises:
             SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
-                names rod and outcome.
+                names rod and outcome. Or supports or obstacles turn farther in contact than substeps resolve, or a grip by more than
+                half a turn (`turned_too_far`).
             SceneError: controls do not fit the model, or a shell has a curved membrane.
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
@@ -317,6 +319,9 @@ class Integrator:
         if self.model.grips:
             now, then = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
             if "poses" in found:
+                if counts_turns(found["poses"]):
+                    begin = self._buffers[source].own.poses().reshape(self.model.worlds, -1, 6)
+                    turns_between(begin, np.broadcast_to(found["poses"], begin.shape))
                 poses = np.broadcast_to(found["poses"], (self.model.worlds, *found["poses"].shape[1:]))
                 then.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
             else:

@@ -1,6 +1,7 @@
 """Motion of supports on a device."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -8,18 +9,19 @@ import warp as wp
 from ddg_warp import arguments
 from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels import motion
+from ddg_warp.kernels import motion, outcome
 from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.motion import COUNTED, HALF
 from ddg_warp.model.state import State
 
 
-def poses(model, t0: float, t1: float) -> np.ndarray:
-    """Poses of all motions of a model between t0 and t1 (rows, 21).
+def poses(model, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
+    """Poses of all motions of a model between t0 and t1 (rows, 21), of a whole step or of a `part` of it; see `Motion.pose`.
 
     Raises:
         SolverError: a motion has no finite value, or leaves the plane of a planar scene; names the function and the time.
     """
-    rows = np.concatenate([motion.pose(t0, t1) for motion in model.motions])
+    rows = np.concatenate([motion.pose(t0, t1, start, part) for motion in model.motions])
     if model.scene.dimension == 2 and rows[:, 19].any():
         raise SolverError(
             f"a motion's translation has a part along y at t = {t1:g}: {tuple(rows[np.argmax(np.abs(rows[:, 19])), 18:].tolist())}; "
@@ -41,14 +43,48 @@ def jump_between(model, t0: float, t1: float) -> str:
     return ""
 
 
+def counts_turns(poses: np.ndarray) -> bool:
+    """Whether a rotation vector of poses (..., 6) is longer than orientations take."""
+    return bool((np.square(poses[..., 3:]).sum(-1) > COUNTED**2).any())
+
+
+def turns_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Rotation vectors (..., 3) by which grips turn from poses (..., 6) to others, the shorter way; see `Grip`.
+
+    Raises:
+        SolverError: rotation vectors count more than half a turn, of which poses at both ends do not tell the way.
+    """
+    from scipy.spatial.transform import Rotation
+
+    first, last = (np.array(poses[..., 3:]).reshape(-1, 3) for poses in (begin, ends))
+    counted = np.linalg.norm(last - first, axis=-1)
+    long = np.flatnonzero((np.linalg.norm(last, axis=-1) > COUNTED) & (counted > COUNTED))
+    if long.size:
+        grips, turns = begin.shape[-2], counted[long[0]] / (2.0 * np.pi)
+        world = f" of world {long[0] // grips}" if len(first) > grips else ""
+        raise SolverError(
+            f"turned_too_far: poses of grip {long[0] % grips}{world} differ by {turns:.3g} turns, from the rotation vector "
+            f"{np.round(first[long[0]], 6).tolist()} to {np.round(last[long[0]], 6).tolist()}, and a grip takes the shorter way, half "
+            f"a turn at most; go in {int(np.ceil(2.0 * turns))} steps or more, or give the rotation vector of the shorter way",
+            outcome=outcome.NAMES[outcome.TURNED_TOO_FAR],
+        )
+    turn = (Rotation.from_rotvec(last) * Rotation.from_rotvec(first).inv()).as_rotvec()
+    half = np.linalg.norm(turn, axis=-1) > np.pi - 2.0 * HALF
+    turn[half & (((last - first) * turn).sum(-1) < 0.0)] *= -1.0
+    return turn.reshape(begin.shape[:-1] + (3,))
+
+
 def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> Callable:
-    """Poses of grips (worlds, grips, 6) by load parameter, from those of a state at `start` to `ends` at `end`: see `Grip`."""
+    """Poses of grips (worlds, grips, 6) by load parameter, from those of a state at `start` to `ends` at `end`: see `Grip`.
+
+    Raises:
+        SolverError: as `turns_between`.
+    """
     from scipy.spatial.transform import Rotation
 
     begin = state.poses().reshape(state.model.worlds, -1, 6)
     ends = np.array(np.broadcast_to(ends, begin.shape))
-    first, last = (Rotation.from_rotvec(poses[..., 3:].reshape(-1, 3)) for poses in (begin, ends))
-    turn = (last * first.inv()).as_rotvec()
+    first, turn = Rotation.from_rotvec(begin[..., 3:].reshape(-1, 3)), turns_between(begin, ends).reshape(-1, 3)
 
     def poses(at: float) -> np.ndarray:
         if at == end:
@@ -70,24 +106,25 @@ class Motion:
         part: `Group` or `DeviceNet`.
 
     Attributes:
-        pose: see `kernels.motion`; with grips, of every world, `stride` rows apart.
+        pose: see `kernels.motion`; with grips, of every world, `stride` rows apart; rows: how many there are of an interval.
+        levels: of every world, log2 of the number of intervals (worlds,).
     """
 
     def __init__(self, model, part, midpoint: bool = False):
         host, real = part.host, model.types.real
         self.model, self.part = model, part
         starts = pose_starts(model.motions)
-        self._shared = wp.zeros((starts[-1], motion.POSE), dtype=real, device=model.wp_device)
-        self._host = wp.zeros_like(self._shared, device="cpu")
-        self._rows = self._host.numpy()
-        self.pose, self.stride, self._grip = self._shared, 0, None
+        self.rows, self.levels, self._grip, self._of_arcs = int(starts[-1]), np.zeros(model.worlds, int), None, []
         if model.grips:
-            grips = np.full(starts[-1], -1)
+            grips = np.full(self.rows, -1)
             places = [i for i, moved in enumerate(model.motions) if moved in model.grips]
             grips[starts[places]] = np.arange(len(places))
-            self.stride, self._grips = len(grips), self._list(grips).flatten()
-            self.pose = wp.zeros((model.worlds * len(grips), motion.POSE), dtype=real, device=model.wp_device)
-            self._grip = motion.grip_kernel(real)
+            self._grips = self._list(grips).flatten()
+            self._grip = motion.grip_kernel(real, False)
+            makes = [(wp.types.vector(3, real), 2), *[(real, 2)] * 2, (int, 2), (real, 2), (wp.int64, 1)]
+            self._of_arcs = [wp.zeros((1,) * ndim, dtype=dtype, device=model.wp_device) for dtype, ndim in makes]
+        self._make_room(0)
+        if model.grips:
             self._hand(0.0, 0.0)
         self._timed = len(model.grips) < len(model.motions)
         self._nodes, self._angles = motion.support_kernels(part.dim, real, midpoint)
@@ -97,6 +134,17 @@ class Motion:
         edges = angles - host.nodes
         self.angles = self._list(host.index(angles), edges, host.edge_ends(angles), host.turning[:, 1])
         self.directors = self._vectors(host.frame[:3].reshape(3, -1)[:, edges].T)
+
+    def _make_room(self, level: int) -> None:
+        """Have room for the poses of 2^level intervals, and of all coarser ones."""
+        real, device, count = self.model.types.real, self.model.wp_device, (2 ** (level + 1) - 1) * self.rows
+        self._shared = wp.zeros((count, motion.POSE), dtype=real, device=device)
+        self._host = wp.zeros_like(self._shared, device="cpu")
+        self._rows = self._host.numpy()
+        self.pose, self.stride = self._shared, 0
+        if self._grip:
+            self.pose = wp.zeros((self.model.worlds * count, motion.POSE), dtype=real, device=device)
+            self.stride = count
 
     def _list(self, *columns: np.ndarray) -> wp.array:
         return wp.array(np.column_stack(columns).astype(np.int32), dtype=int, device=self.model.wp_device)
@@ -114,22 +162,51 @@ class Motion:
         """Have the poses that another part of the same model is handed."""
         self.pose, self.stride, self._timed, self._grip = other.pose, other.stride, False, None
 
+    def resolve_grips(self, of_arcs: list) -> None:
+        """Have the kernel of grips find substeps, by arrays of `Arcs`, for islands whose arrays and tally these end with."""
+        if self._grip:
+            self._grip, self._of_arcs = motion.grip_kernel(self.model.types.real, True), of_arcs
+
     def upload(self, t0: float, t1: float) -> None:
         """Poses between t0 and t1 of motions that are functions of time."""
         if self._timed:
             self._hand(t0, t1)
 
+    def divide(self, levels: np.ndarray, t0: float, t1: float) -> bool:
+        """Poses of each of 2^level intervals of a step, in every world (worlds,), after `upload`; whether arrays have grown."""
+        self.levels, most = levels, int(levels.max())
+        grown = self._shared.shape[0] < (2 ** (most + 1) - 1) * self.rows
+        if grown:
+            self._make_room(most)
+        for level in np.unique(levels[levels > 0]).tolist():
+            count = 2**level
+            times = t0 + (t1 - t0) * np.arange(count + 1) / count
+            times[-1] = t1
+            for k, (start, end) in enumerate(pairwise(times.tolist())):
+                first = (count - 1 + k) * self.rows
+                self._rows[first : first + self.rows] = poses(self.model, start, end, k / count, 1.0 / count)
+        if most:
+            self._hand(t0, t1)
+        return grown
+
     def _hand(self, t0: float, t1: float) -> None:
-        self._rows[:] = poses(self.model, t0, t1)
-        wp.copy(
-            self._shared, self._host
-        )  # from memory that is not pinned, so that the next rows may take its place at once
+        self._rows[: self.rows] = poses(self.model, t0, t1)
+        # from memory that is not pinned, so that the next rows may take its place at once
+        wp.copy(self._shared, self._host)
 
     def follow(self, before: State, after: State) -> None:
         """Poses of every world over the step from one state to another, where there are grips; launches alone."""
         if self._grip:
-            inputs = [self._grips, len(self.model.grips), self._shared, before.grips.pose, after.grips.pose]
-            self._launch(self._grip, self._grips, inputs, [self.pose])
+            of_arcs = self._of_arcs
+            inputs = [
+                self._grips,
+                len(self.model.grips),
+                self._shared,
+                before.grips.pose,
+                after.grips.pose,
+                *of_arcs[:3],
+            ]
+            self._launch(self._grip, self._shared, inputs, [self.pose, *of_arcs[3:]])
 
     def apply(self, islands, x: wp.array, *directed: wp.array) -> None:
         """Put what is held where the part of the step that an island tries has it: see `place` and `direct`."""
@@ -138,13 +215,13 @@ class Motion:
 
     def place(self, islands, x: wp.array) -> None:
         """Put nodes x."""
-        inputs = [self.nodes, self.rest, self.pose, self.stride, *islands.arrays, self.part.world_columns]
+        inputs = [self.nodes, self.rest, self.pose, self.stride, self.rows, *islands.arrays, self.part.world_columns]
         self._launch(self._nodes, self.nodes, inputs, [x])
 
     def direct(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
         """Put angles theta, from lagged frames to the tangents that edges have in x."""
         if len(self.angles):
-            inputs = [self.angles, self.directors, self.pose, self.stride]
+            inputs = [self.angles, self.directors, self.pose, self.stride, self.rows]
             inputs += [*islands.arrays, self.part.world_columns, x, frame]
             self._launch(self._angles, self.angles, inputs, [theta])
 

@@ -242,6 +242,11 @@ def world_kernels(real):
     restart = start_function(real)
 
     @wp.func
+    def whole(scalars: wp.array2d(dtype=real), w: int):
+        """Whether a step is tried at once: what is met on arcs is not near the straight ways of all of it."""
+        return scalars[PROGRESS, w] < real(1.0) and scalars[PORTION, w] == real(1.0)
+
+    @wp.func
     def enter(told: wp.array2d(dtype=int), w: int, tried: bool):
         told[wp.static(TRIED), w] = wp.where(tried, 1, 0)
         told[wp.static(WORST), w] = 0
@@ -264,7 +269,7 @@ def world_kernels(real):
         restart(flags, scalars, w)
         for row in range(wp.static(STEPS), wp.static(TICK + 1)):
             known[row, w] = known[row, w] + 1
-        enter(told, w, scalars[PROGRESS, w] < real(1.0) and known[DOUBT, w] == 0)
+        enter(told, w, whole(scalars, w) and known[DOUBT, w] == 0)
         told[wp.static(LEFT), w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -279,7 +284,7 @@ def world_kernels(real):
     ):
         """`any_tried` and `remaining` are zero before."""
         w = wp.tid()
-        tried = scalars[PROGRESS, w] < real(1.0) and gap[w] >= reach and overflow[0] == 0
+        tried = whole(scalars, w) and gap[w] >= reach and overflow[0] == 0
         enter(told, w, tried)
         if tried:
             any_tried[0] = 1

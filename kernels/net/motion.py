@@ -14,7 +14,7 @@ def normal_kernels(real, midpoint: bool):
     """normals(...) for the solve, and turn(...) at the end of the step."""
     V = wp.types.vector(3, real)
     turned, *_ = motion.functions(real)
-    reached = motion.reached_function(real, midpoint)
+    reached, row = motion.reached_function(real, midpoint), motion.row_function(real)
 
     @wp.func
     def write(where: wp.array2d(dtype=int), i: int, shift: int, n: V, data: wp.array2d(dtype=real)):
@@ -27,6 +27,7 @@ def normal_kernels(real, midpoint: bool):
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
         stride: int,
+        rows: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         elements: int,
@@ -35,7 +36,8 @@ def normal_kernels(real, midpoint: bool):
         """`where` is (element, first row of its data, motion), `rest` the normal at rest."""
         i, w = wp.tid()
         if scalars[PROGRESS, w] < real(1.0):
-            n = turned(pose, where[i, 2] + w * stride, reached(scalars, w), rest[i])
+            m = where[i, 2] + w * stride + row(scalars, w, rows)
+            n = turned(pose, m, reached(scalars, w), rest[i])
             write(where, i, w * elements, n, data_out)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -44,6 +46,7 @@ def normal_kernels(real, midpoint: bool):
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
         stride: int,
+        rows: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         elements: int,
@@ -57,7 +60,8 @@ def normal_kernels(real, midpoint: bool):
         for d in range(3):
             n[d] = before[where[i, 1] + d, column]
         if flags[MOVED, w] != 0:
-            n = turned(pose, where[i, 2] + w * stride, scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
+            m = where[i, 2] + w * stride + row(scalars, w, rows)
+            n = turned(pose, m, scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
         write(where, i, w * elements, n, data_out)
 
     return normals, turn

@@ -79,7 +79,7 @@ class NetContact:
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
-        self.bodies = _number_bodies(host)
+        self.bodies = number_bodies(host)
         unit, self._units = _number_units(*self.bodies, host, model.motions)
         self._unit = wp.array(unit, dtype=int, device=device)
         places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
@@ -367,7 +367,7 @@ class NetContact:
         wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)
 
 
-def _number_bodies(host) -> tuple[np.ndarray, int]:
+def number_bodies(host) -> tuple[np.ndarray, int]:
     """Rod or shell that every block belongs to, one for all that are joined, -1 for none; and how many there may be."""
     unit = np.full(host.blocks, -1, np.int32)
     count = 0

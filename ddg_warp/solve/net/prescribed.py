@@ -38,13 +38,13 @@ class NetMotion(Motion):
         net = self.part
         super().direct(islands, net.points(q), net.frames(frame), net.angles(q))
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, self.stride, *islands.arrays, net.sets[index].elements]
+            inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, net.sets[index].elements]
             self._launch(self._normals, where, inputs, [self.data[index]])
 
     def turn(self, islands, before: NetState, after: NetState) -> None:
         """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, self.stride, *islands.arrays, self.part.sets[index].elements]
+            inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, self.part.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
 
 

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
@@ -17,6 +18,7 @@ from ddg_warp.solve.drag import NetDrag
 from ddg_warp.solve.energy import NetEnergy
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.alone import Alone, rods_of, suits, uncoupled
+from ddg_warp.solve.net.arcs import Arcs
 from ddg_warp.solve.net.foresight import Foresight
 from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
 from ddg_warp.solve.net.prescribed import NetField, NetMotion
@@ -86,11 +88,22 @@ class NetStep(PartStep):
             self.loads = ControlledLoads(model, self.net, self.midpoint, given, scale)
         elif host.timed or host.followers:
             self.loads = Loads(model, self.net, self.midpoint)
+        self.arcs = self._resolve_arcs()
         self.field = NetField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
         self.alone, self._groups = None, counts_of and counts_of._groups
         # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
         self._since_renewal, self._sought = 0, (0, 0)
+
+    def _resolve_arcs(self) -> Arcs | None:
+        """What finds the substeps in which contact sees prescribed motions; None where these move no surface."""
+        arcs = Arcs(self.model) if self.newton.contact and self.motion else None
+        if not (arcs and arcs.moved):
+            return None
+        for parts in (self.islands.substep, self.islands.interval):
+            parts.fill_(1.0)
+        self.motion.resolve_grips([*arcs.of_grips, *self.islands.arrays, self.tally])
+        return arcs
 
     def arrive(self) -> None:
         """The next step begins from a state that comes from elsewhere."""
@@ -152,6 +165,20 @@ class NetStep(PartStep):
         super().prescribe(t0, t1)
         for chain in self._rods:
             chain.prescribe(t0, t1)
+        if self.arcs:
+            self._cut(self.arcs.levels(t0, t1), t0, t1)
+
+    def _cut(self, levels: np.ndarray, t0: float, t1: float) -> None:
+        """Take the step in 2^levels substeps (worlds,); those of grips may be shorter."""
+        if not (levels.any() or self.motion.levels.any()):
+            return
+        if self.motion.divide(levels, t0, t1):
+            for chain in self._rods:
+                if chain.motion:
+                    chain.motion.go_by(self.motion)
+            self.integrator._graphs.clear()
+        self.islands.interval.assign(0.5**levels)
+        self.islands.substep.assign(0.5**levels)
 
     def load_modules(self) -> None:
         """As of `PartStep`."""
@@ -307,6 +334,12 @@ class NetStep(PartStep):
     def rods_of(self, worlds: np.ndarray) -> list[int]:
         """None: what failed is not one rod's."""
         return []
+
+    def failure(self, state, island: int) -> tuple[str, str]:
+        """As of `PartStep`."""
+        if int(self.islands.reason.numpy()[island]) == outcome.TURNED_TOO_FAR:
+            return outcome.NAMES[outcome.TURNED_TOO_FAR], self.arcs.failure(island)
+        return super().failure(state, island)
 
     def where(self, state, world: int) -> str:
         """Where the largest residual was, and what to do."""

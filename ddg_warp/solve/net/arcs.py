@@ -1,0 +1,208 @@
+"""Substeps that resolve the arcs of prescribed motions in contact.
+
+CCD moves every node straight. A node that turns by an angle a about an axis at the distance R moves along an arc, which is off its
+chord by the sagitta R (1 - cos(a / 2)); chords pass everything in between. So a step, or an increment of a static load, is cut into
+substeps, 2^k of one length, until the surfaces that a motion moves are off their chords by less than `PART` of the range of contact and
+of the thickness of what they may meet.
+
+Motions that are functions of time are sampled at uneven times until they are resolved. Grips turn at a constant rate; their substeps
+are found on the device, world by world (`kernels.motion.grip_kernel`). Distances from an axis are those of nodes at rest: a surface
+that only turns about its axis of symmetry, as of balls, capsules and drums, needs no substeps.
+"""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.motion import MOST_PARTS, SLACK
+from ddg_warp.scene.grip import Grip
+from ddg_warp.solve.motion import turns_between
+from ddg_warp.solve.net.swept import Swept, swept_surfaces
+
+PART = 0.25  # of the range and the thickness, by which an arc may be off its chord
+TIMES = np.array([0.0, 0.13, 0.31, 0.52, 0.68, 0.87, 1.0])  # of an interval, at which motions are sampled
+
+
+class Arcs:
+    """Substeps of the steps, and of the static increments, of a model with contact.
+
+    Attributes:
+        moved: `Swept` of every motion that moves surfaces.
+        of_grips: on the device, of every grip nodes beside its pivot (grips, P), how far these may be off their chords, and its largest
+            turn in a substep (worlds, grips).
+    """
+
+    def __init__(self, model):
+        self.model, self._version, self._allowed = model, None, []
+        self.moved = swept_surfaces(model)
+        motions = [swept.motion for swept in self.moved]
+        self._of_grip = [motions.index(grip) if grip in motions else -1 for grip in model.grips]
+        real, device, grips = model.types.real, model.wp_device, len(model.grips)
+        arms = np.zeros((grips, max([1, *(len(swept.points) for swept in self.moved)]), 3))
+        for own, i in zip(arms, self._of_grip, strict=True):
+            if i >= 0:
+                own[: len(self.moved[i].points)] = self.moved[i].arms
+        numbers = (wp.zeros((model.worlds, grips), dtype=real, device=device) for _ in range(2))
+        self.of_grips = [wp.array(arms, dtype=wp.types.vector(3, real), device=device), *numbers]
+        self._renew()
+
+    def outdate(self) -> None:
+        """Have the numbers of contact read from the device before the next step."""
+        self._version = None
+
+    def _renew(self) -> None:
+        """Take the numbers of contact anew once a parameter has changed."""
+        if self._version == self.model.version:
+            return
+        self._version = self.model.version
+        self._allowed = [self._room(swept) for swept in self.moved]
+        if self._of_grip:
+            allowed, most = np.full((2, self.model.worlds, len(self._of_grip)), np.inf)
+            for g, i in enumerate(self._of_grip):
+                if i >= 0:
+                    allowed[:, g], most[:, g] = self._allowed[i], self.moved[i].most
+            for array, values in zip(self.of_grips[1:], (allowed, most), strict=True):
+                array.assign(values)
+
+    def _room(self, swept: Swept) -> np.ndarray:
+        """Return how far surfaces may be off their chords in every world (worlds,) [m], infinite where they meet nothing."""
+        net, given, worlds = self.model.net, self.model.net.host.touching, self.model.worlds
+        count = len(given.names)
+        within = net.touching["range"].numpy().reshape(worlds, count, count)
+        radii = net.touching["radius"].numpy().reshape(worlds, -1)
+        least = np.stack([radii[:, given.group == g].min(1) for g in range(count)], 1)
+        first, second = given.meeting
+        meets = np.isin(first, swept.groups) | np.isin(second, swept.groups)
+        first, second = first[meets], second[meets]
+        thickness = least[:, first] + least[:, second]
+        return PART * np.minimum(within[:, first, second], thickness).min(1, initial=np.inf)
+
+    def levels(self, t0: float, t1: float, load_steps: int = 0) -> np.ndarray:
+        """Return log2 of the number of substeps in which functions of time are resolved from t0 to t1, of every world (worlds,).
+
+        Args:
+            t0, t1: time at both ends of a step; load_steps: of a static load, of which that is one.
+
+        Raises:
+            SolverError: more than `MOST_PARTS` would be needed; names the object, its turn, and a step that is short enough.
+        """
+        self._renew()
+        result = np.zeros(self.model.worlds, int)
+        for swept, allowed in zip(self.moved, self._allowed, strict=True):
+            if not isinstance(swept.motion, Grip) and np.isfinite(allowed).any():
+                result = np.maximum(result, _levels_of(swept, allowed, t0, t1, load_steps))
+        return result
+
+    def increments(self, state, ends: np.ndarray | None, start: float, end: float, load_steps: int) -> int:
+        """Return the number of increments of a static load that resolves `load_steps` from `start` to `end`.
+
+        Args:
+            state: at the start; ends: poses of grips at the end (worlds, grips, 6), None where they stay.
+
+        Raises:
+            SolverError: as of `levels`.
+        """
+        if start == end or not self.moved:
+            return load_steps
+        at = np.linspace(start, end, load_steps + 1).tolist()
+        parts = 2 ** max(int(self.levels(*each, load_steps).max()) for each in pairwise(at))
+        if ends is None:
+            return load_steps * parts
+        begin = state.poses().reshape(self.model.worlds, -1, 6)
+        turns = turns_between(begin, np.broadcast_to(ends, begin.shape))
+        for w, g in np.argwhere(turns.any(-1)):
+            if (i := self._of_grip[g]) < 0:
+                continue
+            angle = float(np.linalg.norm(turns[w, g]))
+            axis = Rotation.from_rotvec(begin[w, g, 3:]).inv().apply(turns[w, g] / angle)
+            needed = SLACK * angle / load_steps / largest_turn(self.moved[i], self._allowed[i][w], axis)
+            if needed > MOST_PARTS:
+                raise _refusal(
+                    self.moved[i], angle, f"load_steps = {math.ceil(load_steps * needed / MOST_PARTS)} or more"
+                )
+            parts = max(parts, 2 ** max(0, math.ceil(math.log2(needed))))
+        return load_steps * parts
+
+    def failure(self, world: int) -> str:
+        """Return the remedy for a world that was given up, as a grip of it turned too far."""
+        self._renew()
+        turns = [(largest_turn(self.moved[i], self._allowed[i][world]), i) for i in self._of_grip if i >= 0]
+        turn, i = min(turns)
+        return (
+            f"{self.moved[i].label} turns farther in a step than {MOST_PARTS} substeps resolve; turn its grip by at most "
+            f"{_rounded_down(MOST_PARTS * turn):g} rad in a step, or give contact a larger range"
+        )
+
+
+def largest_turn(swept: Swept, allowed: float, axis: np.ndarray | None = None) -> float:
+    """Return the largest turn of a substep about an axis at rest, by default any, with nodes off their chords by `allowed` [m]."""
+    far = np.linalg.norm(swept.arms if axis is None else np.cross(axis, swept.arms), axis=-1).max()
+    if 2.0 * far <= allowed:
+        return swept.most
+    return min(swept.most, 4.0 * math.asin(math.sqrt(0.5 * min(1.0, allowed / far))))
+
+
+def _levels_of(swept: Swept, allowed: np.ndarray, t0: float, t1: float, load_steps: int) -> np.ndarray:
+    """Return log2 of the number of substeps (worlds,) that resolve a function of time."""
+    largest = np.array([largest_turn(swept, each, swept.motion.unit) for each in allowed])
+    result, coarse, level = np.zeros(len(allowed), int), np.ones(len(allowed), bool), 0
+    while True:
+        off, turn = _chords(swept, t0, t1, level)
+        coarse &= (off > allowed) | (SLACK * turn > largest)
+        if not coarse.any():
+            return result
+        if 2**level == MOST_PARTS:
+            excess = float(np.maximum(turn / largest, np.sqrt(off / allowed)).max())
+            remedy = f"dt = {_rounded_down(abs(t1 - t0) / excess):g} s or less"
+            if load_steps:
+                remedy = f"load_steps = {math.ceil(load_steps * excess)} or more"
+            raise _refusal(swept, _chords(swept, t0, t1, 0)[1], remedy)
+        level += 1
+        result[coarse] = level
+
+
+def _refusal(swept: Swept, turn: float, remedy: str) -> SolverError:
+    what = f"turns by {turn / (2.0 * math.pi):.3g} turns" if turn else "moves along arcs"
+    return SolverError(
+        f"turned_too_far: {swept.label} {what} in a step, farther than {MOST_PARTS} substeps resolve; take {remedy}, or give contact a "
+        "larger range",
+        outcome=outcome.NAMES[outcome.TURNED_TOO_FAR],
+    )
+
+
+def _rounded_down(value: float) -> float:
+    """Return a positive number with two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.floor(value / unit) * unit
+
+
+def _chords(swept: Swept, t0: float, t1: float, level: int) -> tuple[float, float]:
+    """Return the largest distance of nodes from their chords [m], and the largest turn [rad], in 2^level intervals from t0 to t1."""
+    motion, count = swept.motion, 2**level
+    times = (t0 + (t1 - t0) * (np.arange(count)[:, None] + TIMES) / count).ravel().tolist()
+    angles = np.array([motion.angle(t) for t in times] if motion.turns else np.zeros(len(times)), float)
+    shifts = np.array([motion.translation(t) for t in times], float).reshape(len(times), -1, 3)
+    if motion.count is not None:
+        shifts = shifts[:, swept.rows]
+    # angles alone tell how often a node goes round from one sample to the next
+    places = (_turned(motion.unit, angles, swept.arms) + shifts).reshape(count, len(TIMES), len(swept.points), 3)
+    way = places - places[:, :1]
+    chord = way[:, -1:]
+    along, square = (way * chord).sum(-1, keepdims=True), (chord * chord).sum(-1, keepdims=True)
+    if motion.count is None:  # a rigid body goes along its chords as one
+        along, square = along.sum(-2, keepdims=True), square.sum(-2, keepdims=True)
+    share = np.clip(along / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
+    off = np.sqrt(np.square(way - share * chord).sum(-1).max())
+    return float(off), float(np.ptp(angles.reshape(count, -1), axis=-1).max())
+
+
+def _turned(axis: np.ndarray, angles: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """Return arms (P, 3) turned about an axis by angles (n,), (n, P, 3)."""
+    along = np.outer(arms @ axis, axis)
+    cos, sin = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]
+    return along + cos * (arms - along) + sin * np.cross(axis, arms)

@@ -1,0 +1,300 @@
+"""What turns far in a step pushes what its arcs meet; chords would pass it."""
+
+import numpy as np
+import pytest
+from turn_cases import (
+    BALL,
+    DT,
+    FIRST,
+    HALF,
+    KINDS,
+    LAST,
+    OBSTACLES,
+    RADIUS,
+    RANGE,
+    STIFF,
+    THICKNESS,
+    ahead,
+    needed,
+    place,
+    posed,
+    scene,
+)
+
+import ddg_warp as ddg
+from ddg_warp.kernels.motion import MOST_PARTS
+from ddg_warp.solve.net.arcs import PART
+
+WIDE = "mesh", "box", "hold", "half-space"  # push a whole rod, which does not turn out of their way
+TURNS = 0.02, 0.05, 1 / 6, 0.3, 0.5, 0.75, 0.95, 1.0, 1.3, 2.5
+RADII = 0.07, 0.1, 0.15, 0.19, 0.198, 0.1995
+QUICK = [(1 / 6, 0.198), (0.75, 0.19), (2.5, 0.1)]
+
+
+def turning(turns: float) -> ddg.Motion:
+    return ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t / DT)
+
+
+def step(made: ddg.Scene, device, controls=None, dt: float = DT, **options):
+    model = made.build(device=device)
+    integrator = ddg.Integrator(model, **options)
+    return integrator, integrator.step(model.state(), dt, controls)
+
+
+def substeps(integrator) -> list[int]:
+    """Number of substeps of the last step, world by world."""
+    return np.round(1.0 / integrator._net.islands.substep.numpy()).astype(int).tolist()
+
+
+def radii(kind: str) -> list[float]:
+    """Where rods are met: by a ball in the middle of its way, and on either side."""
+    if kind == "ball":
+        return [LAST - BALL + part * BALL for part in (-0.9, 0.0, 0.9)]
+    return [*RADII, LAST + 0.7 * (RADIUS if kind == "box" else THICKNESS)]
+
+
+def swept(kind: str, turns: float, radius: float) -> bool:
+    """Whether rods are met at half of the way that are not so before."""
+    start = np.arcsin(min(1.0, (BALL + THICKNESS) / radius)) if kind == "ball" else 2.0 * THICKNESS / radius
+    return 2.0 * start < np.pi * turns and (kind != "half-space" or turns < 1.0)
+
+
+def check_pushed(kind: str, turns: float, radius: float, held: str, device) -> None:
+    """A rod half-way along the turn is pushed, and a rod at an angle that nothing sweeps stays where it is, to the bit.
+
+    Wide blades have it ahead of them at the end: dragged by what surrounds it, it goes no farther than it is pushed.
+    """
+    motion = turning(turns) if held == "motion" else ddg.Grip()
+    beyond = place(LAST + BALL + 0.05, -0.5)
+    away = place(radius, 1.5 * np.pi) if turns < 0.7 and kind != "half-space" else beyond
+    made = scene(
+        kind, motion, [place(radius, np.pi * turns), away] if kind != "half-space" else [place(radius, np.pi * turns)]
+    )
+    integrator, state = step(made, device, posed(turns) if held == "grip" else None)
+    points = (
+        state.points()[:, :2].reshape(-1, 11, 2) if kind in OBSTACLES else state.points()[:22, :2].reshape(-1, 11, 2)
+    )
+    moved = np.linalg.norm(points[0, 5] - place(radius, np.pi * turns))
+    statistics = integrator.statistics()["contact"]
+    assert moved > 0.1 * THICKNESS
+    assert statistics["smallest_gap"] > 0.0
+    if kind in WIDE and radius < LAST:
+        lead = np.sin(ahead(points[0], 2.0 * np.pi * turns)) * np.linalg.norm(points[0], axis=-1)
+        side = THICKNESS if kind != "half-space" else RADIUS
+        assert (lead > side).all()
+        assert (lead < side + 2.0 * RANGE).all()
+    if len(points) > 1:
+        assert (points[1] == away).all()
+
+
+@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_arcs_push_what_chords_would_pass(device, kind, held):
+    for turns, radius in QUICK:
+        radius = radius if kind != "ball" else LAST - BALL
+        if swept(kind, turns, radius) and (held == "motion" or turns <= 0.5):
+            check_pushed(kind, turns, radius, held, device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_arcs_push_what_chords_would_pass_at_any_radius(device, kind, held):
+    for turns in TURNS:
+        for radius in radii(kind):
+            if swept(kind, turns, radius) and (held == "motion" or turns <= 0.5):
+                check_pushed(kind, turns, radius, held, device)
+
+
+def test_substeps_are_as_many_as_the_sagitta_asks_for(device):
+    """Just below the turn whose sagitta is allowed none are cut, and motions and grips are cut alike, about any axis."""
+    limit = 2.0 * np.arccos(1.0 - PART * min(RANGE, THICKNESS) / LAST) / (2.0 * np.pi)
+    for turns in (0.99 * limit, 1.01 * limit, 3.9 * limit, 0.4):
+        wanted = needed(2.0 * np.pi * turns, LAST)
+        for motion, controls in ((turning(turns), None), (ddg.Grip(), posed(turns))):
+            integrator, state = step(scene("capsule", motion, place(0.1, -1.5)), device, controls)
+            assert substeps(integrator) == [wanted]
+            assert integrator.statistics()["newton_iterations"]["max"] < 20
+            np.testing.assert_array_equal(state.points()[5, :2], place(0.1, -1.5))
+
+
+AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
+SYMMETRIC = {
+    "ball": ddg.Sphere((0.1, 0.0, 0.0), 0.05),
+    "capsule": ddg.Capsule(tuple(np.array([0.1, 0, 0]) - 0.1 * AXIS), tuple(np.array([0.1, 0, 0]) + 0.2 * AXIS), 0.02),
+    "half-space": ddg.Plane((0.3, -0.1, -0.1), tuple(AXIS)),
+}
+
+
+@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("shape", SYMMETRIC)
+def test_what_turns_about_its_axis_of_symmetry_needs_no_substeps(device, shape, held):
+    """However far it turns; a half-space as few as its tilts would."""
+    turn, pivot = 0.49 * 2.0 * np.pi, (0.1, 0.0, 0.0)
+    made = ddg.Scene(gravity=(0, 0, 0))
+    made.add_rod(
+        np.linspace((-0.3, -0.3, -0.3), (-0.3, -0.3, -0.2), 5) + 2.0 * AXIS, section=ddg.Circle(RADIUS), material=STIFF
+    )
+    motion = ddg.Motion(angle=lambda t: turn * t / DT, axis=tuple(AXIS), pivot=pivot)
+    made.add_obstacle(SYMMETRIC[shape], motion=motion if held == "motion" else ddg.Grip(pivot=pivot))
+    made.contact()
+    controls = ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, *(turn * AXIS)]])) if held == "grip" else None
+    integrator, _ = step(made, device, controls)
+    assert substeps(integrator) == [16 if shape == "half-space" else 1]
+
+
+def test_a_drum_that_spins_by_half_a_turn_a_step_rubs_as_one_that_spins_slowly(device):
+    """A rod that lies on top slides: m dv / dt = mu N, by whatever angle the drum turns in a step."""
+    mu, dt, settled, steps, radius = 0.3, 2e-3, 40, 6, 0.05
+    for turn in (0.2, np.pi, 5.0):
+        made = ddg.Scene(mass_damping=5.0)
+        line = np.linspace((-0.05, 0.0, 1.3 * RADIUS), (0.05, 0.0, 1.3 * RADIUS), 11)
+        made.add_rod(line, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e8, density=1000.0, viscosity=1e-3))
+        made.contact(friction=mu)
+
+        def angle(t, turn=turn):
+            return turn * max(0.0, t / dt - settled)
+
+        motion = ddg.Motion(angle=angle, axis=(0.0, 1.0, 0.0), pivot=(0.0, 0.0, -radius))
+        made.add_obstacle(ddg.Capsule((0.0, -0.1, -radius), (0.0, 0.1, -radius), radius), motion=motion)
+        model = made.build(device=device)
+        integrator, state, pushes = ddg.Integrator(model), model.state(), 0.0
+        for k in range(settled + steps):
+            state = integrator.step(state, dt)
+            pushes += np.linalg.norm(model.contacts(state).force.sum(0)) if k >= settled else 0.0
+        mass = model.scene.batches[0].section.mass_per_length * 0.1
+        speed = state.velocities()[:, 0].mean()
+        np.testing.assert_allclose(speed, mu * pushes * dt / mass, rtol=0.1)
+        assert speed > 0.5 * mu * 9.81 * steps * dt
+
+
+ORBIT = LAST - BALL
+
+
+@pytest.mark.parametrize("turns", [1.0, 2.0, 7.0])
+@pytest.mark.parametrize("way", ["orbit", "swing", "vertices"])
+def test_functions_of_time_are_sampled_until_their_arcs_are_resolved(device, way, turns):
+    """A ball that goes round by its translation, a blade that swings to and fro, vertices that go round: all are back at the end."""
+    if way == "orbit":
+
+        def shift(t):
+            return (*(place(ORBIT, 2.0 * np.pi * turns * t / DT) - [ORBIT, 0.0]), 0.0)
+
+        made = scene("ball", ddg.Motion(translation=shift), place(ORBIT, 2.1))
+    elif way == "swing":
+        motion = ddg.Motion(angle=lambda t: 1.5 * np.sin(np.pi * turns * t / DT) ** 2)
+        made = scene("capsule", motion, place(0.19, 0.7))
+    else:
+        points = OBSTACLES["mesh"].points
+
+        def shifts(t):
+            c, s = np.cos(2.0 * np.pi * turns * t / DT), np.sin(2.0 * np.pi * turns * t / DT)
+            return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) - points
+
+        made = scene("mesh", ddg.Motion(translation=shifts), place(0.19, 2.1))
+    integrator, state = step(made, device)
+    model = integrator.model
+    moved = np.linalg.norm(state.points()[:11] - model.state().points()[:11], axis=1)
+    assert moved[5] > THICKNESS
+    assert substeps(integrator)[0] > 16
+
+
+def test_a_straight_motion_is_one_step_however_it_is_paced(device):
+    made = scene("capsule", ddg.Motion(translation=lambda t: (0.0, 0.02 * t**3, 0.01 * t**3)), place(0.1, 1.0))
+    integrator, _ = step(made, device)
+    assert substeps(integrator) == [1]
+
+
+def test_what_substeps_do_not_resolve_is_refused_with_a_step_that_does(device):
+    made = scene("capsule", turning(40.0), place(0.1, -1.5), reach=2e-5)
+    with pytest.raises(ddg.SolverError, match=r"turned_too_far: obstacle 0 \('blade'\) turns by 40 turns") as error:
+        step(made, device)
+    assert error.value.outcome == "turned_too_far"
+    dt = float(str(error.value).split("dt = ")[1].split()[0])
+    assert 0.1 < dt / (DT * MOST_PARTS / (40.0 * 2.0 * np.pi / (2.0 * np.arccos(1.0 - PART * 2e-5 / LAST)))) <= 1.0
+    integrator, _ = step(made, device, dt=dt)
+    assert substeps(integrator) == [MOST_PARTS]
+
+
+def test_a_grip_goes_the_shorter_way_and_no_farther_than_half_a_turn(device):
+    model = scene("capsule", ddg.Grip(), place(0.19, 3.0)).build(device=device)
+    with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.6 turns") as error:
+        ddg.Integrator(model).step(model.state(), DT, posed(0.6))
+    assert error.value.outcome == "turned_too_far"
+    # counted turns go on, and orientations may begin again
+    integrator, state = ddg.Integrator(model), model.state()
+    for turns in (0.45, 0.9, 0.2):
+        state = integrator.step(state, DT, posed(turns))
+    angle = ahead(state.points()[5:6], 0.0)
+    assert 0.45 * 2.0 * np.pi - 2.0 * np.pi < angle[0] < 0.2 * 2.0 * np.pi
+
+
+def test_a_grip_that_substeps_do_not_resolve_gives_up_its_world_alone(device):
+    turns = np.zeros((2, 1, 6))
+    turns[1, 0, 5] = np.pi
+    model = scene("capsule", ddg.Grip(), place(0.1, -1.5), reach=2e-7).build(device=device, worlds=2)
+    integrator = ddg.Integrator(model, failures="flag")
+    state = integrator.step(model.state(), DT, ddg.Controls(poses=turns))
+    assert integrator.outcomes().tolist() == ["converged", "turned_too_far"]
+    text = integrator.failure(state, 1)
+    most = float(text.split("at most ")[1].split()[0])
+    turns[1, 0, 5] = most
+    integrator = ddg.Integrator(model)
+    integrator.step(model.state(), DT, ddg.Controls(poses=turns))
+    assert substeps(integrator) == [1, MOST_PARTS]
+    turns[1, 0, 5] = np.pi
+    with pytest.raises(ddg.SolverError, match="turns farther in a step than 1024 substeps resolve"):
+        ddg.Integrator(model).step(model.state(), DT, ddg.Controls(poses=turns))
+
+
+def test_every_world_is_cut_for_itself(device):
+    """To the bit as it is alone."""
+    turns, found = (1 / 6, 0.0, 0.4), {}
+    for some in (turns, *((each,) for each in turns)):
+        model = scene("capsule", ddg.Grip(), place(0.19, np.pi / 6)).build(device=device, worlds=len(some))
+        integrator, state = ddg.Integrator(model), model.state()
+        for k in range(2):
+            poses = np.zeros((len(some), 1, 6))
+            poses[:, 0, 5] = 2.0 * np.pi * (k + 1) * np.array(some)
+            state = integrator.step(state, DT, ddg.Controls(poses=poses))
+        found[some] = state.points().reshape(len(some), -1, 3)
+        assert substeps(integrator) == [needed(2.0 * np.pi * t, LAST) if t else 1 for t in some]
+    for w, each in enumerate(turns):
+        np.testing.assert_array_equal(found[turns][w], found[(each,)][0])
+
+
+def test_grips_and_functions_of_time_are_cut_together(device):
+    """A ball that orbits and an arm that a grip turns, each with a rod in its way; worlds where the arm rests go by the ball."""
+
+    def shift(t):
+        return (*(place(ORBIT, 0.3 * np.pi * t / DT) - [ORBIT, 0.0]), 0.0)
+
+    made = scene("ball", ddg.Motion(translation=shift), [place(ORBIT, 0.2 * np.pi), place(0.1, 0.3)])
+    made.add_obstacle(ddg.Capsule((FIRST, 0, 0), (0.12, 0, 0), HALF), motion=ddg.Grip(), name="arm")
+    model = made.build(device=device, worlds=2)
+    integrator, poses = ddg.Integrator(model), np.zeros((2, 1, 6))
+    poses[1, 0, 5] = 0.9 * np.pi
+    state = integrator.step(model.state(), DT, ddg.Controls(poses=poses))
+    moved = np.linalg.norm(state.points() - model.state().points(), axis=-1).reshape(2, -1)[:, [5, 16]]
+    assert (moved[:, 0] > THICKNESS).all()
+    assert moved[0, 1] == 0.0 and moved[1, 1] > THICKNESS
+    ends = state.net.q.numpy().reshape(2, -1, 3)[:, model.net.host.obstacles[0]]
+    np.testing.assert_allclose(ends[:, 0, :2], [place(ORBIT, 0.3 * np.pi)] * 2, atol=1e-12)
+    one, other = substeps(integrator)
+    assert one < other == needed(0.9 * np.pi, 0.12)
+
+
+@pytest.mark.parametrize(("law", "precision"), [("penalty", "float64"), ("barrier", "mixed")])
+def test_substeps_serve_both_laws_and_precisions(device, law, precision):
+    made = scene("mesh", turning(0.3), place(0.198, 0.3 * np.pi), law=law)
+    model = made.build(device=device, precision=precision)
+    state = ddg.Integrator(model, rtol=1e-4).step(model.state(), DT)
+    lead = ahead(state.points()[:11], 0.6 * np.pi)
+    assert (lead > 0.0).all() and (lead < 0.02).all()
+
+
+def test_step_control_cuts_its_steps(device):
+    model = scene("mesh", turning(0.5), place(0.198, 0.5 * np.pi)).build(device=device)
+    steps = ddg.StepControl(ddg.Integrator(model), error=1.0, halvings=2)
+    state = steps.advance(model.state(), DT)
+    assert 0.0 < ahead(state.points()[5:6], np.pi)[0] < 0.02

@@ -1,0 +1,70 @@
+"""Blades that turn about z, by every kind of support and obstacle, and a rod across the plane of their turn."""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.solve.net.arcs import PART
+
+FIRST, LAST, HALF = 0.05, 0.2, 1e-3  # m, of a blade along x: nearest and farthest from the axis, half its thickness
+RADIUS = 1e-3  # m, of the rod
+BALL = 0.02  # m, radius of a ball
+DT = 1.0
+RANGE, THICKNESS = 0.5 * RADIUS, RADIUS + HALF
+LINE = np.linspace((FIRST, 0.0, 0.0), (LAST, 0.0, 0.0), 7)
+PLATE = np.array([[FIRST, 0, -0.1], [LAST, 0, -0.1], [LAST, 0, 0.1], [FIRST, 0, 0.1]])
+CELLS = np.array([[0, 1, 2], [0, 2, 3]])
+STIFF, RIGID = ddg.Material(young=1e10, density=1000.0), ddg.Material(young=1e13, density=1000.0)
+
+OBSTACLES = {
+    "mesh": ddg.Mesh(PLATE, CELLS, HALF),
+    "box": ddg.Box((0.5 * (FIRST + LAST), 0.0, 0.0), (0.5 * (LAST - FIRST), HALF, 0.1)),
+    "capsule": ddg.Capsule(tuple(LINE[0]), tuple(LINE[-1]), HALF),
+    "half-space": ddg.Plane((FIRST, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    "ball": ddg.Sphere((LAST - BALL, 0.0, 0.0), BALL),
+}
+SUPPORTS = ("clamp", "fix", "hold")
+KINDS = (*OBSTACLES, *SUPPORTS)
+
+
+def scene(kind: str, motion, places, reach: float | None = None, **contact) -> ddg.Scene:
+    """A blade of a kind with its motion, and short rods along z through places (n, 2) of the plane.
+
+    The rods are dragged by all that surrounds them, and so go no farther than they are pushed.
+    """
+    made = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=1e3)
+    line = np.linspace((0.0, 0.0, -0.05), (0.0, 0.0, 0.05), 11)
+    for x, y in np.atleast_2d(places):
+        made.add_rod(line + [x, y, 0.0], section=ddg.Circle(RADIUS), material=STIFF, name="rod")
+    section = {"section": ddg.Circle(HALF), "material": RIGID}
+    if kind in OBSTACLES:
+        made.add_obstacle(OBSTACLES[kind], motion=motion, name="blade")
+    elif kind == "hold":
+        shell = made.add_shell(PLATE, CELLS, thickness=2.0 * HALF, material=STIFF, name="blade")
+        made.hold(shell, np.arange(len(PLATE)), motion=motion)
+    else:
+        blade = made.add_rod(LINE, **section, name="blade")
+        if kind == "fix":
+            made.fix(blade, np.arange(len(LINE)), motion=motion)
+        else:
+            made.clamp_end(blade, "first", motion=motion)
+    made.contact(stiffness=1e4, range=reach, **contact)
+    return made
+
+
+def place(radius: float, angle: float) -> np.ndarray:
+    return radius * np.array([np.cos(angle), np.sin(angle)])
+
+
+def ahead(points: np.ndarray, angle: float) -> np.ndarray:
+    """Angles by which points are ahead of a blade, between -pi and pi."""
+    return (np.arctan2(points[:, 1], points[:, 0]) - angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def posed(turns: float) -> ddg.Controls:
+    return ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2.0 * np.pi * turns]]))
+
+
+def needed(turn: float, radius: float, thickness: float = THICKNESS) -> int:
+    """2^k >= turn / a, where the sagitta R (1 - cos(a / 2)) is `PART` of the range and the thickness."""
+    a = 2.0 * np.arccos(1.0 - PART * min(RANGE, thickness) / radius)
+    return 2 ** int(np.ceil(np.log2(turn / a)))
