@@ -262,6 +262,7 @@ class Engine:
         self.fill(tensors(start, self.fields), state)
         load = {name: options[name] for name in LOAD if name in options}
         solver = self._static({name: value for name, value in options.items() if name not in LOAD})
+        self._renumber(solver.net)
         found = solver.load(start, controls=_on_host(controls), way=way, **load)
         ones = [
             torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)

@@ -104,7 +104,8 @@ def solve(
         controls: forces, moments, gravity and magnetic field, world by world, which the load parameter scales as it does those of the
             scene; and poses of grips at `end`, which move there straight from where the state has them.
         load_steps: increments; one that fails is halved. In contact supports and obstacles may go any way in one: they stop where
-            something is in their way, and go on once it has yielded; in mode "follow" the increment is halved until nothing is.
+            something is in their way, and go on once it has yielded; in mode "follow" the increment is halved until nothing is. Where
+            they turn far, there are as many increments as resolve their arcs.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         way: a list, to which the equilibria of all increments are added, the last one too.
         options: see `StaticsOptions`.
@@ -216,6 +217,8 @@ class Equilibrium:
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         state = state.copy()
         state.stop()
+        if self.net and self.net.arcs:
+            load_steps = self.net.arcs.increments(state, found.get("poses"), start, end, load_steps)
         if start == end:
             try:
                 state = self.solve(state, start, end)

@@ -31,6 +31,7 @@ from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import large_static, net_preconditioner
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.loads import StaticLoads
+from ddg_warp.solve.net.arcs import Arcs
 from ddg_warp.solve.net.newton import NetNewton
 from ddg_warp.solve.net.polish import Polish
 
@@ -218,6 +219,7 @@ class NetEquilibrium:
                 psd="progressive" if touching else "gauss_newton",
             ),
         )
+        self.arcs = Arcs(model) if touching and model.motions else None
         self._rest = self.tangent.dofs(model.state())
         self._size = float(np.ptp(model.net.host.rest[: model.net.host.nodes], axis=0).max())
         self._start = model.net.empty()  # lagged data of a solve
