@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ddg_warp.geometry import polygons
 from ddg_warp.io import MeshError, existing
 
 USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
@@ -20,7 +21,8 @@ USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
 def read_mesh(path, prim: str | None = None, weld: float | None = None) -> tuple[np.ndarray, np.ndarray, str]:
     """The mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
 
-    Polygons are cut into fans from their first corner, which suits convex ones. `Surface` checks what comes back.
+    Polygons that are not convex are cut by ears in their plane, others into fans from their first corner. `Surface` checks
+    what comes back.
 
     Args:
         path: A .obj, .usd, .usda, .usdc or .usdz file.
@@ -53,10 +55,10 @@ def _read(path: Path, prim: str | None) -> tuple[np.ndarray, np.ndarray, str]:
 def triangulated(
     points: np.ndarray, counts: np.ndarray, indices: np.ndarray, where: str, lines: list[int] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(triangles (T, 3), face of each triangle (T,)): every face as a fan from its first corner.
+    """(triangles (T, 3), face of each triangle (T,)): convex faces as fans from their first corner, others by ears in their plane.
 
     Args:
-        points: (P, 3), only to be checked.
+        points: (P, 3).
         counts: Corners of each face, shape (F,).
         indices: Points of the corners, face after face.
         where: What messages begin with.
@@ -84,7 +86,27 @@ def triangulated(
     face = np.repeat(np.arange(len(counts)), counts - 2)
     step = np.arange(len(face)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
     first = (np.cumsum(counts) - counts)[face]
-    return indices[np.stack([first, first + step + 1, first + step + 2], axis=1)], face
+    triangles = indices[np.stack([first, first + step + 1, first + step + 2], axis=1)]
+    for count in np.unique(counts[counts > 3]):
+        same = np.flatnonzero(counts == count)
+        corners = indices[(np.cumsum(counts) - counts)[same][:, None] + np.arange(count)]
+        for number in np.flatnonzero(~fans_suit(points[corners])):
+            found, fault = polygons.triangulate(points[corners[number]])
+            if fault:
+                line = "" if lines is None else f":{lines[same[number]]}"
+                raise MeshError(
+                    f"{where}{line}: face {same[number]} with {count} corners {fault}; cut it into triangles, or correct it"
+                )
+            triangles[face == same[number]] = corners[number][found]
+    return triangles, face
+
+
+def fans_suit(corners: np.ndarray) -> np.ndarray:
+    """Whether fans from the first corners of faces (F, n, 3) are good triangles of them (F,)."""
+    steps = np.diff(corners, axis=1)[:, 1:], (corners[:, 1:] - corners[:, :1])[:, :-1]
+    vectors, normals = np.cross(steps[1], steps[0]), polygons.area_vectors(corners)[:, None]
+    sizes = np.linalg.norm(vectors, axis=-1) * np.linalg.norm(normals, axis=-1)
+    return polygons.convex(corners) & ((vectors * normals).sum(-1) >= polygons.STEEP * sizes).all(1)
 
 
 def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, str]:

@@ -46,7 +46,7 @@ def read_curves(path, prim: str | None = None) -> list[CurveSet]:
 def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, str]:
     """The mesh of a USD file, in metres with z up: (points (P, 3), triangles (T, 3), name of the prim).
 
-    Polygons are cut into fans; holes are left out. A subdivision surface is taken as its control mesh. Triangles run
+    Polygons are cut as `triangulated` does; holes are left out. A subdivision surface is taken as its control mesh. Triangles run
     counter-clockwise as seen from outside, also where the file says leftHanded or a transform mirrors.
 
     Args:
