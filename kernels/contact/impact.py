@@ -19,12 +19,13 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 REST, NEAR = 0.1, 0.2  # of the gap: what is left of wide ones; of narrow ones, and of the reach
 PARTS = 1000  # in which a motion is followed; where that does not do, the time reached so far is safe, too
 PATIENCE = 100_000  # the same for what is to be told apart from passing
+BESIDE = 0.1  # of the reach, by which two that pass beside each other have to do so for certain
 TOUCHING = 1e-9  # distance of two that pass, over the size of the pair
 
 
 @cache
 def impact_functions(kind: Kind, real):
-    """impact(x, p, thickness, reach) -> time; meet(x, p) -> whether two without thickness do.
+    """impact(x, p, thickness, reach) -> time; meet(x, p, thickness) -> whether two come as near as their thickness.
 
     x, p: positions and displacements of the nodes.
     """
@@ -63,16 +64,16 @@ def impact_functions(kind: Kind, real):
         return t
 
     @wp.func
-    def meet(x: Y, p: Y):
+    def meet(x: Y, p: Y, thickness: real):
         """Whether two come together on their way, or can not be told to stay apart."""
         q, speed = relative(x, p)
         size = speed + wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
-        least, t = real(touching) * size, real(0.0)
+        least, t = thickness + real(touching) * size, real(0.0)
         for _ in range(wp.static(PATIENCE)):
             apart = distance(x, q, t)
             if apart <= least:
                 return True
-            t += apart / speed
+            t += (apart - thickness) / speed
             if t > real(1.0):
                 return False
         return True
@@ -124,7 +125,7 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
                     nodes = slots(sides, k, l, w)
                     y, p = corners(x, nodes), corners(move, nodes)
                     if wp.static(passing):
-                        if meet(y, p):
+                        if meet(y, p, real(0.0)):
                             wp.atomic_add(number, w, 1)
                             i, j = k + w * sides.counts[0], l + w * sides.counts[1]
                             key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
@@ -139,9 +140,9 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
 
 @cache
 def passing_kernel(kind: Kind, real):
-    """How many of the pairs of a list pass through each other."""
+    """How many of the pairs of a list pass through each other, or as near as `keep` of their thickness and of a part of the reach."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    slots, *_ = pair_functions(kind, real)
+    slots, _, thickness, _ = pair_functions(kind, real)
     _, meet = impact_functions(kind, real)
     corners, things = corners_function(real), things_function(real)
 
@@ -153,12 +154,17 @@ def passing_kernel(kind: Kind, real):
         sides: Sides,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
+        keep: real,
+        reach: real,
         number: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
             w, i, j = things(sides, pairs[p])
             nodes = slots(sides, i, j, w)
-            if meet(corners(x, nodes), corners(move, nodes)):
+            near = real(0.0)
+            if keep > real(0.0):
+                near = keep * (thickness(sides, i, j, w) + real(wp.static(BESIDE)) * reach)
+            if meet(corners(x, nodes), corners(move, nodes), near):
                 wp.atomic_add(number, w, 1)
 
     return passing

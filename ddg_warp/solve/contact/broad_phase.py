@@ -291,11 +291,14 @@ class BroadPhase:
         self._watch(base, q, self._beyond)
         wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
 
-    def passing(self, base: wp.array) -> None:
-        """The same of candidates alone, which are all that may, in the motion from `base` that was told of last."""
+    def passing(self, base: wp.array, keep: float = 0.0) -> None:
+        """Count candidates alone, which are all that may, in the motion from `base` that was told of last.
+
+        With `keep` those that come as near as that part of their thickness, or a little farther.
+        """
         self.crossed.zero_()
         for pairs in self.lists:
-            pairs.cross(base, self._move, self.crossed)
+            pairs.cross(base, self._move, self.crossed, keep, self.reach)
 
     def first_crossing(self) -> str:
         """The first of the pairs that passed through each other, by name, or nothing. Reads from the device."""

@@ -172,7 +172,7 @@ class PairList:
         inputs = [self.pairs, self.count, self.sides, x, enough]
         arrays.take_turns(self._gaps, self.capacity, inputs, [gap], self.device)
 
-    def cross(self, x, move, crossed) -> None:
-        """Count those that pass through each other in the motion from x, by world."""
-        inputs = [self.pairs, self.count, self.sides, x, move]
+    def cross(self, x, move, crossed, keep: float = 0.0, reach: float = 0.0) -> None:
+        """Count those that pass through each other in the motion from x, by world, or come as near as `keep` of their thickness."""
+        inputs = [self.pairs, self.count, self.sides, x, move, keep, reach]
         arrays.take_turns(self._passing, self.capacity, inputs, [crossed], self.device)
