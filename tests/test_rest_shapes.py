@@ -230,3 +230,69 @@ def test_direction_across_the_surface_is_refused():
     points, triangles = meshes.rectangle(2, 2)
     with pytest.raises(ValueError, match="triangle 0: direction"):
         principal_form(points, triangles, 1.0, 0.0, (0.0, 0.0, 1.0))
+
+
+def test_growth_by_load_steps(device):
+    """A strip whose rest shape is that of a bilayer, put on by load steps: curvature kappa all along, as when it is set step by step."""
+    points, triangles = meshes.rectangle(16, 2, (0.1, 0.0125), "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    strip = scene.add_shell(points, triangles, thickness=5e-4, material=ddg.Material(1e6, 0.0), name="strip")
+    scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
+    curvature = 15.0  # a quarter of a turn
+    form = principal_form(points, triangles, curvature, 0.0)
+    model = scene.build(device, "float64")
+    way = []
+    state = solve(model, rest={"strip": dict(curvature=form)}, load_steps=4, way=way)
+    end = state.points()[np.argmax(points[:, 0])]  # of an arc with that curvature
+    assert np.hypot(*end[[0, 2]]) == pytest.approx(2.0 * np.sin(0.5 * curvature * 0.1) / curvature, rel=2e-2)
+    half = scene.build(device, "float64")
+    half.set_rest(strip, curvature=0.5 * form)
+    np.testing.assert_allclose(way[1].points(), solve(half, half.state(points=way[1].points())).points(), atol=1e-9)
+    whole = scene.build(device, "float64")
+    whole.set_rest(strip, curvature=form)
+    np.testing.assert_allclose(solve(whole, whole.state(points=state.points())).points(), state.points(), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["planar", "alone", "joined"])
+def test_natural_curvature_by_load_steps(device, kind):
+    """A cantilever that gets natural curvature pi / L along itself ends as half a circle, in one load step or five.
+
+    The rigid joint in the middle of two rods keeps its own rest shape, so that these turn by 39 of 40 vertices' angles.
+    """
+    for steps in (1, 5):
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2 if kind == "planar" else 3)
+        points = np.linspace((0, 0, 0), (1.0, 0, 0), 41)
+        parts = (points[:21], points[20:]) if kind == "joined" else (points,)
+        rods = [scene.add_rod(part, section=ddg.Circle(0.01), material=ddg.Material(1e6)) for part in parts]
+        if kind == "joined":
+            scene.join([(rods[0], -1), (rods[1], 0)])
+        scene.clamp_end(rods[0])
+        model = scene.build(device, "float64")
+        bent = np.pi if kind == "planar" else (np.pi, 0.0)
+        state = solve(model, rest={rod: dict(curvature=bent) for rod in rods}, load_steps=steps)
+        x = state.points()
+        turn = np.pi * (39.0 / 40.0 if kind == "joined" else 1.0)
+        assert np.linalg.norm(x[-1] - x[0]) == pytest.approx(2.0 / turn * np.sin(0.5 * turn), rel=2e-2)
+        energy = sum(float(np.sum(own)) for own in model.energies(state).values())
+        assert energy < 1e-10 or kind == "joined"
+
+
+def test_rest_shapes_that_do_not_fit_are_refused(device):
+    points, triangles = meshes.rectangle(2, 2)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.hold(
+        scene.add_shell(points, triangles, thickness=1e-2, material=ddg.Material(1e6, 0.3), name="sheet"), [0, 1, 2]
+    )
+    scene.clamp_end(
+        scene.add_rod(np.linspace((0, 0, 1), (1, 0, 1), 5), section=ddg.Circle(0.01), material=ddg.Material(1e6))
+    )
+    model = scene.build(device, "float64")
+    for rest, words in (
+        ({"none": dict(curvature=1.0)}, r"rest\['none'\] is no shell or rod"),
+        ({0: dict(metrics=1.0)}, r"rest\[0\] has \['metrics'\]; there are"),
+        ({"sheet": dict(metric=np.zeros((3, 3)))}, r"rest\['sheet'\].*shape"),
+        ({0: dict(twist=(1.0, 2.0))}, r"rest\[0\]\['twist'\]"),
+        (3, "give a dictionary"),
+    ):
+        with pytest.raises(ddg.SceneError, match=words):
+            solve(model, rest=rest)

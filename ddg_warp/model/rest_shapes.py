@@ -90,20 +90,19 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
 
-def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
-    """See `Model.set_rest`."""
+def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
+    """See `Model.set_rest`; `plate` are values of its `Plate` by name, as they are stored."""
     if model.net is None or not 0 <= arguments.index("set_rest: shell", shell) < len(model.net.host.shells):
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
     held, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
     membrane = model.scene.shells[shell].membrane
-    surface, plate = held.surface, held.plate
+    surface, changes = held.surface, dict(plate or {})
     count = len(surface.triangles)
-    if all(values is None for values in (points, metric, curvature, angle)):
+    if not changes and all(values is None for values in (points, metric, curvature, angle)):
         raise ValueError("set_rest: give points, metric, curvature or angle")
     if bending == "isometric":
         raise ValueError("bending 'isometric' keeps its flat rest shape; use 'midedge_dof' or 'hinge'")
-    changes = {}
     if points is not None:
         points = _shaped("points", points, surface.points.shape)
         _refuse_without_area("points", shell_forms.metric(surface, points))
@@ -122,7 +121,7 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
             raise ValueError(f"bending {bending!r} has no rest angles; give a curvature, or the points of a rest shape")
         angle = _shaped("angle", angle, (len(surface.edges),))
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
-    plate = replace(plate, **changes)
+    plate = replace(held.plate, **changes)
     sets = {part.term.name: part for part in model.net.sets}
     elements_of = shell_terms.shell_elements(surface, plate, held.kinds, bending, membrane)
     places = [(sets[e.term.name], held.first[e.term.name], e.parameters) for e in elements_of if len(e)]

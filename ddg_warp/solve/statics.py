@@ -15,6 +15,7 @@ equilibrium is that of an increment of the load parameter, which the way there d
 nothing tells whether it is stable.
 """
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -33,6 +34,7 @@ from ddg_warp.solve.descent import Descent
 from ddg_warp.solve.motion import jump_between, poses_between
 from ddg_warp.solve.net.statics import UNSETTLED, NetEquilibrium
 from ddg_warp.solve.residuals import Residuals
+from ddg_warp.solve.rest_path import RestPath
 from ddg_warp.solve.supports import require_supports
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
@@ -94,6 +96,7 @@ def solve(
     start: float = 0.0,
     end: float = 1.0,
     way: list[State] | None = None,
+    rest: Mapping | None = None,
     **options,
 ) -> State:
     """The equilibrium at load parameter `end`, reached from `start` in `load_steps` increments or more.
@@ -108,6 +111,9 @@ def solve(
             they turn far, there are as many increments as resolve their arcs.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         way: a list, to which the equilibria of all increments are added, the last one too.
+        rest: rest shapes at `end`, to which those of the model change in proportion to the load parameter from `start` on, so that
+            load steps and halving act on growth: by shell or rod, index or name, such as {0: dict(metric=..., curvature=...)}; see
+            `ddg_warp.solve.rest_path.RestPath`. The model keeps the rest shapes of the last equilibrium.
         options: see `StaticsOptions`.
 
     Returns:
@@ -127,7 +133,7 @@ def solve(
     if state is not None:
         validate.check_state("statics", model, state)
     equilibrium = Equilibrium(model, StaticsOptions(**options))
-    return equilibrium.load(state or model.state(), load_steps, start, end, controls, way)
+    return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)
 
 
 @launches
@@ -201,6 +207,7 @@ class Equilibrium:
         end: float = 1.0,
         controls: Controls | None = None,
         way: list[State] | None = None,
+        rest: Mapping | None = None,
     ) -> State:
         """Load stepping; see `solve`."""
         for name, value in (("start", start), ("end", end)):
@@ -217,9 +224,11 @@ class Equilibrium:
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         state = state.copy()
         state.stop()
+        shapes = RestPath(self.model, rest if rest is not None else {})
         if self.net and self.net.arcs:
             load_steps = self.net.arcs.increments(state, found.get("poses"), start, end, load_steps)
         if start == end:
+            shapes.to(1.0)
             try:
                 state = self.solve(state, start, end)
             except SolverError as error:
@@ -235,6 +244,7 @@ class Equilibrium:
         while at != end:
             increment = whole * 0.5**cuts
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
+            shapes.to((target - start) / (end - start))
             try:
                 state = self.solve(state, at, target)
                 self.count(state, abs(target - at))
@@ -242,6 +252,7 @@ class Equilibrium:
                     way.append(state)
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
+                shapes.to((at - start) / (end - start))
                 if error.outcome in (arguments.PRESCRIBED, "lost_in_rounding"):
                     raise
                 if not balanced:  # as with another rest shape: no part of the increment is small enough
