@@ -15,6 +15,7 @@ import warp as wp
 from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
 from ddg_warp.kernels.islands import (
     COEFFICIENT,
+    DOUBTFUL,
     DROWNED,
     ITERATION,
     LOAD_SCALE,
@@ -24,6 +25,7 @@ from ddg_warp.kernels.islands import (
     STEP_LENGTH,
     UNBALANCED,
 )
+from ddg_warp.kernels.judge import ROUNDED, SETTLED
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
@@ -162,8 +164,10 @@ def check_kernel(kind: ChainKind, real, linear):
         accepted = flags[SLOT, r]
         taken = scalars[STEP_LENGTH, r]
         limit = rtol * scalars[LOAD_SCALE, r]
+        doubtful = real(wp.static(ROUNDED)) * scalars[LOAD_SCALE, r]
         if flags[ITERATION, r] == 0 or taken < real(1.0):
             limit /= real(n)
+        settled = real(wp.static(SETTLED)) * length[r]
         moved = flags[PLACED, r] != 0
         for k in range(start, until(start, n)):
             f, moment, size, elastic = balance(
@@ -192,6 +196,9 @@ def check_kernel(kind: ChainKind, real, linear):
                     flags[DROWNED, r] = 1
                     if not wp.abs(f[d]) <= least:
                         flags[UNBALANCED, r] = 1
+                    if wp.static(real is wp.float32):
+                        if wp.abs(f[d]) > doubtful and not wp.abs(real(direction[d, k, r])) < settled:
+                            flags[DOUBTFUL, r] = 1
             if wp.static(twist):
                 held = ((mask >> wp.static(dim)) & 1) == 1
                 right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
@@ -205,6 +212,10 @@ def check_kernel(kind: ChainKind, real, linear):
                     )
                     if not wp.abs(moment) <= least:
                         flags[UNBALANCED, r] = 1
+                    if wp.static(real is wp.float32):
+                        turn = wp.abs(real(direction[wp.static(nb - 1), k, r]))
+                        if wp.abs(moment) > doubtful * length[r] and not turn < real(wp.static(SETTLED)):
+                            flags[DOUBTFUL, r] = 1
             if flags[ITERATION, r] == 0:
                 continue
             change = real(0.0)

@@ -40,6 +40,11 @@ FLAGS = (
     "moved",  # whether this part of it succeeded
     "driven",  # whether supports that contact holds up moved in the last step of the solve; see `kernels.net.touch`
     "cut",  # whether contact has cut the last motion, of the predictor or of a step
+    # in float32, see `judge`: whether rounding excuses more than `ROUNDED` of the loads, the iteration from which on it excuses all,
+    # and whether a solve has ended so
+    "doubtful",
+    "polished",
+    "doubted",
     # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames; of
     # nets, whether one wants a direction
     "active",
@@ -67,7 +72,8 @@ SCALARS = (
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
 (CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED, DRIVEN, CUT) = range(10, 22)
-ACTIVE, TURNING, WANTING = range(22, len(FLAGS))
+DOUBTFUL, POLISHED, DOUBTED = range(22, 25)
+ACTIVE, TURNING, WANTING = range(25, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE) = range(8)
 CARRIED, TURN, PROGRESS, PORTION, SUBSTEP, INTERVAL = range(8, len(SCALARS))
 DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step, or of its substeps, that are larger than this
@@ -155,6 +161,8 @@ def attempt_functions(real, midpoint: bool):
         flags[DETOURS, i] = 0
         flags[UNBALANCED, i] = 0
         flags[DROWNED, i] = 0
+        flags[DOUBTFUL, i] = 0
+        flags[POLISHED, i] = 0
         flags[ACTIVE, 0] = 1
 
     return length, restart

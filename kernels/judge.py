@@ -2,6 +2,11 @@
 
 A rod stops where it balances; else its iterate is accepted, or the step to it is shortened: Armijo's rule (c = 1e-4) on the
 energy, or, where the expected decrease drowns in rounding, a residual that has not grown much.
+
+In float32 the bound of what rounding leaves of a residual may be much of the load itself, and far more than rounding does leave. A
+residual above `ROUNDED` of the load scale that is within that bound ends a solve where the last Newton step has moved its node by less
+than `SETTLED` of the length of the rod, or turned its edge by less than `SETTLED`; else after `POLISHES` more iterations, and such
+solves are told, see `Integrator`.
 """
 
 from functools import cache
@@ -13,12 +18,15 @@ from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import (
     ACTIVE,
     DECREMENT,
+    DOUBTED,
+    DOUBTFUL,
     DRIVEN,
     DROWNED,
     HALVINGS,
     ITERATION,
     LOAD_SCALE,
     MERIT,
+    POLISHED,
     RESIDUAL,
     SLOT,
     STALE,
@@ -31,6 +39,30 @@ from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_func
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
+ROUNDED, SETTLED, POLISHES = 1e-4, 1e-5, 10
+
+
+@cache
+def rests_function(real):
+    """rests(flags, i): whether residuals of island i are small, or rounding excuses them, by the flags of its iterate."""
+
+    @wp.func
+    def rests(flags: wp.array2d(dtype=int), i: int):
+        if flags[UNBALANCED, i] != 0:
+            return False
+        if flags[DROWNED, i] == 0:
+            return True
+        # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
+        if flags[ITERATION, i] == 0:
+            return False
+        if wp.static(real is wp.float32):
+            return flags[DOUBTFUL, i] == 0 or (
+                flags[POLISHED, i] != 0 and flags[ITERATION, i] >= flags[POLISHED, i] + wp.static(POLISHES)
+            )
+        else:
+            return True
+
+    return rests
 
 
 @cache
@@ -39,21 +71,29 @@ def judge_functions(twist: bool, real, driven: bool = False):
 
     `driven`: whether supports may have moved in the last step, whose work the search does not know.
     """
-    shorter = shorter_function(real)
+    shorter, rests = shorter_function(real), rests_function(real)
 
     @wp.func
     def balanced(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), r: int):
         """Whether the rod has stopped, by its last iterate or before; lowers its flags where it has not."""
         if flags[STATUS, r] != 0:
             return True
-        # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
-        if flags[UNBALANCED, r] == 0 and (flags[DROWNED, r] == 0 or flags[ITERATION, r] > 0):
+        if rests(flags, r):
             flags[STATUS, r] = wp.where(
                 flags[DROWNED, r] == 0,
                 int(wp.static(outcome.CONVERGED)),
                 int(wp.static(outcome.CONVERGED_TO_ROUNDING)),
             )
+            if wp.static(real is wp.float32):
+                if flags[DROWNED, r] != 0 and flags[DOUBTFUL, r] != 0 and flags[POLISHED, r] > 0:
+                    flags[DOUBTED, r] = 1
             return True
+        if wp.static(real is wp.float32):
+            if flags[UNBALANCED, r] == 0 and flags[POLISHED, r] == 0:
+                flags[POLISHED, r] = flags[ITERATION, r]
+                if flags[ITERATION, r] == 0 and scalars[LOAD_SCALE, r] == real(0.0):  # all that moves it is rounding
+                    flags[POLISHED, r] = -wp.static(POLISHES)
+            flags[DOUBTFUL, r] = 0
         flags[UNBALANCED, r] = 0
         flags[DROWNED, r] = 0
         return False

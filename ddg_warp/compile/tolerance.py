@@ -42,6 +42,7 @@ class Bodies:
         count: number of bodies: rods, shells, meridians.
         owner: body of each block (N,), the first where they are joined; arm: what moments are divided by, 1 at nodes [m].
         levels: parts, from small to large.
+        shortest: length of the shortest rod, or root of the area of the smallest shell [m].
     """
 
     def __init__(self, host):
@@ -73,6 +74,9 @@ class Bodies:
             np.concatenate([np.zeros(0, type_), *values])
             for values, type_ in ((blocks, int), (body, int), (share, float), (arm, float), (family, int))
         )
+        sizes = [length for *_, length in lines] + [np.sqrt(_areas(shell.surface).sum()) for shell in host.shells]
+        sizes += [np.ptp(meridian.points, axis=0).max() for meridian in host.meridians]
+        self.shortest = float(min(sizes))
         is_shell = (body >= len(lines)) & (body < len(lines) + len(host.shells))
         self._blocks, self._body = blocks, body
         self._line = np.concatenate([np.zeros(0, int), *(nodes for nodes, *_ in lines)])

@@ -39,7 +39,8 @@ class Integrator:
 
     In mixed precision, groups whose float32 factors would be poor at the step taken (stiff, finely divided rods and long steps) take
     tensions of edges for unknowns of their own, or, where that does not do or is not to be had (closed rods, and rods joined to what
-    moves), are solved in float64; `statistics()["linear"]` says which.
+    moves), are solved in float64; `statistics()["linear"]` says which. In float32 rounding may leave more than 1e-4 of the loads out of
+    balance at a node; where iterations do not better that, the step counts as `converged_to_rounding`, and a warning says so, once.
 
     A step is one captured graph: nothing in it allocates or waits for the host. On CUDA, outcomes are read every
     `check_every` steps; a rod that failed rests at its last good state meanwhile, and the others go on.
@@ -132,6 +133,7 @@ class Integrator:
         self._changes: Changes | None = None
         self._gyroscope: Gyroscope | None = None  # made when a step first takes it
         self._spinning = False  # whether the step at hand does
+        self._doubted = False  # whether it was told that rounding leaves more than a part of the loads
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -221,6 +223,8 @@ class Integrator:
         self._steps_since_check = 0
         for part in self._parts if self.failures == "raise" else ():
             part.raise_failures(state)
+            if self.model.precision == "float32" and not self._doubted:
+                self._doubted = part.warn_of_doubt()
 
     def outcomes(self) -> np.ndarray:
         """What became of every world (worlds,): "converged", or the name of the outcome for which something in it was given up."""

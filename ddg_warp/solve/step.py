@@ -1,5 +1,6 @@
 """A time step of what one solver advances, a group of rods or the net: attempts, retries, and what became of them."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.islands import DETOURS_ALLOWED, LEAST
+from ddg_warp.kernels.judge import ROUNDED
 from ddg_warp.solve.motion import jump_between
 
 KEPT = 16  # lengths of steps whose limits are remembered
@@ -174,6 +176,17 @@ class PartStep:
             outcome=name,
             rods=self.rods_of(failed),
         )
+
+    def warn_of_doubt(self) -> bool:
+        """Warn where rounding has ended a solve with residuals above `ROUNDED` of the loads; whether it has. Reads from the device."""
+        doubted = np.flatnonzero(self.islands.doubted.numpy())
+        if doubted.size:
+            warnings.warn(
+                f"{self.who(int(doubted[0]))}: in precision 'float32' rounding has ended steps (converged_to_rounding) with residuals "
+                f"above {ROUNDED:g} of the loads and nodes that iterations still move; take 'mixed' or 'float64'",
+                stacklevel=5,
+            )
+        return bool(doubted.size)
 
     def _counted(self) -> np.ndarray:
         """`tally` after the last step."""

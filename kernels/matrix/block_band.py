@@ -11,7 +11,8 @@ import warp as wp
 
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
-from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, DROWNED, ITERATION, STATUS, UNBALANCED
+from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, STATUS
+from ddg_warp.kernels.judge import rests_function
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -69,6 +70,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     stored = stored or linear
     _, behind, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
+    rests = rests_function(real)
     curved, begin = exact_from is not None, exact_from or 0
     first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric.block_functions(kind, linear)
 
@@ -138,7 +140,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         n = count[r]
         if flags[STATUS, r] != 0 or k >= n:
             return
-        if flags[UNBALANCED, r] == 0 and (flags[DROWNED, r] == 0 or flags[ITERATION, r] > 0):
+        if rests(flags, r):
             return
         if reuse != 0 and flags[ITERATION, r] > 0:
             return

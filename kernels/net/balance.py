@@ -8,7 +8,8 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.islands import COEFFICIENT, DROWNED, LOAD_SCALE, SLOT, STATUS, UNBALANCED
+from ddg_warp.kernels.islands import COEFFICIENT, DOUBTFUL, DROWNED, LOAD_SCALE, SLOT, STATUS, UNBALANCED
+from ddg_warp.kernels.judge import ROUNDED, SETTLED
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
@@ -41,6 +42,7 @@ def given_type(real, drag: bool):
 
     In contact blocks have forces `push`, and bounds `pressed` on the stiffness of what pushes them. `allowed` is what the residual
     of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`. Moments are compared over the length `arm`.
+    Nodes that the last step moved by more than `settled` [m] are none that only rounding moves; see `kernels.judge`.
     What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
     """
     V, Mass = wp.types.vector(3, real), mass_type(real, drag)
@@ -59,6 +61,7 @@ def given_type(real, drag: bool):
         nodes: int
         arm: real
         longest: real
+        settled: real
         rtol: real
         floor: real
         push: wp.array(dtype=V)
@@ -192,6 +195,12 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
         r = H()
         total = real(0.0)
         worst = real(0.0)
+        moved = True
+        if wp.static(real is wp.float32):
+            settled = real(wp.static(SETTLED))  # rad
+            if k < given.nodes:
+                settled = given.settled
+            moved = not wp.length(given.q[i] - given.base[i]) < settled
         for d in range(wp.static(dofs)):
             if ((mask >> d) & 1) == 0:
                 a = wp.abs(force[d])
@@ -202,6 +211,9 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
                     flags[DROWNED, w] = 1
                     if not a <= least:
                         flags[UNBALANCED, w] = 1
+                    if wp.static(real is wp.float32):
+                        if a > real(wp.static(ROUNDED)) * load_scale * allowed and moved:
+                            flags[DOUBTFUL, w] = 1
         found.right[i] = r
         found.ratio[w, k] = worst / allowed
         found.square[w, k] = total / (length * length)

@@ -12,6 +12,7 @@ from ddg_warp.kernels.islands import (
     CAUTIOUS,
     CUT,
     DECREMENT,
+    DOUBTFUL,
     DRIVEN,
     DROWNED,
     ITERATION,
@@ -96,6 +97,9 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         )
         if polish and flags[ITERATION, w] > 0:
             flags[UNBALANCED, w] = 1
+        if wp.static(real is wp.float32):
+            if scalars[STEP_LENGTH, w] < real(1.0):  # which tells little of how far nodes are to go
+                flags[DOUBTFUL, w] = 1
         if wp.static(contact):
             if flags[DRIVEN, w] == wp.static(ON_THE_WAY):
                 flags[UNBALANCED, w] = 1

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels.judge import SETTLED
 from ddg_warp.kernels.net import balance
 
 
@@ -21,6 +22,7 @@ class Balance:
         given.q = newton.here
         for name in ("base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
             setattr(given, name, getattr(newton, name))
+        given.settled = SETTLED * net.host.bodies.shortest
         given.allowed, given.blocks, given.nodes = newton.allowed.blocks, net.blocks, net.host.nodes
         given.rtol, given.floor = newton.options.rtol, newton.options.floor_factor * newton.eps
         for name in ("right", "square", "change", "noise"):
