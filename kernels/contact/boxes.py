@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.contact.surfaces import surface_struct
@@ -9,7 +10,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 ROUNDING = 3e-7  # more than two roundings of float32, relative: that of a sum and that of the conversion
 FAR = 1e15  # beyond anything [m], squared still a number
-LEAST = 1e-30  # so that zero is rounded outwards, too [m]
+LEAST = float(np.finfo(np.float32).tiny)  # so that zero is rounded outwards, too
 
 
 @wp.struct

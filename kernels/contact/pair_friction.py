@@ -44,6 +44,7 @@ from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, factor_struct, lay_fu
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, sides_struct
 from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.measures.slip import basis
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -133,12 +134,17 @@ def rolling_functions(kind: Kind, real):
 @cache
 def directed_basis(real):
     """directed(n, d, way) -> tangents at right angles to n, of slips forwards along d, across, and backwards, as long as `way` says."""
-    V, tangents, tiny = wp.types.vector(3, real), basis(real), wp.constant(real(1.0e-12))
+    V, tangents, tiny, nonzero = (
+        wp.types.vector(3, real),
+        basis(real),
+        wp.constant(real(1.0e-12)),
+        nonzero_function(real),
+    )
 
     @wp.func
     def root(square: real):
         """Whose reverse is a number at zero, too."""
-        return wp.where(square > real(0.0), wp.sqrt(wp.max(square, real(1.0e-30))), real(0.0))
+        return wp.where(square > real(0.0), wp.sqrt(nonzero(square)), real(0.0))
 
     @wp.func
     def directed(n: V, d: V, way: V):
@@ -262,13 +268,13 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
     E, M, A = wp.types.vector(2, real), wp.types.matrix((2, 2), real), wp.types.vector(ANGLES, linear)
     P = wp.types.vector(density.parameter_size(2), real)
     energy_of, slope_of, curvature_of = density.laws(real, 2)
-    one, half, tiny = wp.constant(real(1.0)), wp.constant(real(0.5)), wp.constant(real(1.0e-30))
+    one, half, nonzero = wp.constant(real(1.0)), wp.constant(real(0.5)), nonzero_function(real)
 
     @wp.func
     def secant(u: E, bound: real, p: P):
         """mu N / phi, beta and u / |u|."""
         size = wp.length(u)
-        n = u / wp.max(size, tiny)
+        n = u / nonzero(size)
         f = slope_of(u, p)
         c = curvature_of(u, p)
         along = wp.dot(n, c * n)
@@ -291,7 +297,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
     def root_of(m: M):
         """Of a positive semi-definite matrix."""
         s = wp.sqrt(wp.max(wp.determinant(m), real(0.0)))
-        return (m + wp.diag(E(s, s))) / wp.sqrt(wp.max(wp.trace(m) + real(2.0) * s, tiny))
+        return (m + wp.diag(E(s, s))) / wp.sqrt(nonzero(wp.trace(m) + real(2.0) * s))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(

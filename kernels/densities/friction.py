@@ -17,6 +17,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
+from ddg_warp.kernels.division import nonzero_function
 
 STEEPNESS = 7.5
 
@@ -79,7 +80,7 @@ def _functions(profile, real):
     """(energy, slope, curvature, root) of a profile G."""
     potential, force, slope_of = profile(real)
     E, P = wp.types.vector(2, real), wp.types.vector(6, real)
-    tiny = wp.constant(real(1.0e-30))
+    nonzero = nonzero_function(real)
 
     @wp.func
     def slid(e: E, p: P):
@@ -101,7 +102,7 @@ def _functions(profile, real):
     @wp.func
     def between(u: E, across: real, along: real):
         """The matrix that is `along` in the direction of the slip, `across` at right angles to it."""
-        unit = u / wp.max(wp.length(u), tiny)
+        unit = u / nonzero(wp.length(u))
         return wp.diag(E(across, across)) + wp.outer(unit, unit) * (along - across)
 
     @wp.func

@@ -23,6 +23,8 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.division import nonzero_function
+
 # Square of the sine of the angle below which lines count as parallel, of which any point is as close as any other.
 PARALLEL = {wp.float64: 1.0e-20, wp.float32: 1.0e-10}
 
@@ -135,7 +137,7 @@ def distance_functions(closest_of, size: int, real):
     edges = size // 3
     Q, K, V = wp.types.vector(size, real), wp.types.vector(edges, real), wp.types.vector(3, real)
     closest = closest_of(real)
-    tiny = wp.constant(real(1.0e-30))
+    nonzero = nonzero_function(real)
 
     @wp.func
     def between(q: Q, rho: K):
@@ -157,20 +159,20 @@ def distance_functions(closest_of, size: int, real):
         rho, _m, _o = closest(q)
         r = between(q, rho)
         d = wp.length(r)
-        return d, spread(rho, r / wp.max(d, tiny))
+        return d, spread(rho, r / nonzero(d))
 
     @wp.func
     def yielding(rho: K, r: V, m: K, rm: V):
         """B / |r_m|."""
-        return (spread(rho, rm) + spread(m, r)) / wp.max(wp.length(rm), tiny)
+        return (spread(rho, rm) + spread(m, r)) / nonzero(wp.length(rm))
 
     @wp.func
     def bend(q: Q):
         rho, m, o = closest(q)
         r = between(q, rho)
         rm = between(q, m)
-        across = o - m * (wp.dot(between(q, o), rm) / wp.max(wp.dot(rm, rm), tiny))
-        inverse = real(1.0) / wp.max(wp.length(r), tiny)
+        across = o - m * (wp.dot(between(q, o), rm) / nonzero(wp.dot(rm, rm)))
+        inverse = real(1.0) / nonzero(wp.length(r))
         return (
             spread(rho, r * inverse),
             yielding(rho, r, m, rm),

@@ -15,6 +15,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.hinge_angle import dihedral
 
@@ -34,21 +35,21 @@ def mirror(real):
 @cache
 def tilt(real):
     """Device function (e, a, N) -> (alpha, dalpha/de, dalpha/da) of a triangle at a clamp with the prescribed normal N."""
-    V = wp.types.vector(3, real)
+    V, nonzero = wp.types.vector(3, real), nonzero_function(real)
 
     @wp.func
     def tilted(e: V, a: V, N: V):
-        # y = (n x N) . t and x = n . N with t = e / |e|; n x N . e = (a . e) (N . e) - (N . a) |e|^2
+        # y = (n x N) . t / |e| and x = n . N / |e| with t = e / |e|; n x N . e = (a . e) (N . e) - (N . a) |e|^2
         length = wp.length(e)
         t = e / length
         Nt = wp.dot(N, t)
         at = wp.dot(a, t)
         Na = wp.dot(N, a)
-        y = at * Nt * length - Na * length
-        x = wp.dot(wp.cross(e, a), N)
+        y = at * Nt - Na
+        x = wp.dot(wp.cross(t, a), N)
         y_e = N * at + a * Nt - t * (at * Nt + Na)
         y_a = (t * Nt - N) * length
-        scale = real(1.0) / wp.max(x * x + y * y, real(1.0e-30))
+        scale = real(1.0) / (length * nonzero(x * x + y * y))
         return (
             wp.atan2(y, x),
             (y_e * x - wp.cross(a, N) * y) * scale,

@@ -19,6 +19,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.measures import Measure
 
 
@@ -29,7 +30,7 @@ def dihedral(real):
     Returns:
         angle(e, a, b) -> theta; derivative(e, a, b) -> (theta, dtheta/de, dtheta/da, dtheta/db).
     """
-    V = wp.types.vector(3, real)
+    V, nonzero = wp.types.vector(3, real), nonzero_function(real)
 
     @wp.func
     def angle(e: V, a: V, b: V):
@@ -40,7 +41,8 @@ def dihedral(real):
     @wp.func
     def by_height(n: V, length: real):
         """Unit normal over the height of its triangle on an edge of that length; zero where the triangle has no area."""
-        return n * (length / wp.max(wp.dot(n, n), real(1.0e-30)))
+        h = n / length
+        return h / nonzero(wp.dot(h, h))
 
     @wp.func
     def derivative(e: V, a: V, b: V):

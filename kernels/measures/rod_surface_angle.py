@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels import frames
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.measures import Measure
 
 
@@ -36,6 +37,7 @@ def _functions(real):
     Q, S, E, M = rod_surface_angle.types(real)
     V = wp.types.vector(3, real)
     transport, angle_between, _ = frames.functions(real)
+    nonzero = nonzero_function(real)
 
     @wp.func
     def angle(q: Q, s: S):
@@ -48,8 +50,8 @@ def _functions(real):
     @wp.func
     def by_height(e: V, a: V):
         """n / h of a triangle with the sides e and a."""
-        n = wp.cross(e, a)
-        return n * (wp.length(e) / wp.max(wp.dot(n, n), real(1.0e-30)))
+        h = wp.cross(wp.normalize(e), a)
+        return h / nonzero(wp.dot(h, h))
 
     @wp.func
     def strains(q: Q, s: S, w: real):

@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.solve.krylov import inverse_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -43,7 +44,7 @@ def joint_kernels(linear):
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
     multiply, block = coupling_functions(linear)
-    invert = inverse_function(linear)
+    invert, nonzero = inverse_function(linear), nonzero_function(linear)
 
     @wp.func
     def inverse_or(m: M, instead: M, f: H):
@@ -53,7 +54,7 @@ def joint_kernels(linear):
             inverse, good = invert(wp.cw_mul(instead, wp.outer(f, f)), f)
             if not good:
                 for d in range(3):
-                    inverse[d, d] = f[d] / wp.max(wp.abs(instead[d, d]), linear(1.0e-30))
+                    inverse[d, d] = f[d] / nonzero(wp.abs(instead[d, d]))
         return inverse, definite
 
     @wp.func

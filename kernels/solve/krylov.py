@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.matrix.sliced import BARRED, product_functions, settle_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -63,7 +64,7 @@ def serial_sum_kernel(real, largest: bool = False):
 @cache
 def inverse_function(linear):
     """inverse_of(m, f) -> (inverse on the free dofs f of a matrix masked by them, whether it is definite); zero if it is not."""
-    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    H, M, nonzero = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), nonzero_function(linear)
 
     @wp.func
     def inverse_of(masked: M, f: H):
@@ -71,7 +72,7 @@ def inverse_function(linear):
         # scaled to a unit diagonal: a block of a rod's end holds stretching and bending stiffness
         s = H()
         for d in range(3):
-            s[d] = linear(1.0) / wp.sqrt(wp.max(wp.abs(m[d, d]), linear(1.0e-30)))
+            s[d] = linear(1.0) / wp.sqrt(nonzero(wp.abs(m[d, d])))
         scale = wp.outer(s, s)
         m = wp.cw_mul(m, scale)
         inverse = wp.cw_mul(wp.cw_mul(wp.inverse(m), scale), wp.outer(f, f))
@@ -95,7 +96,7 @@ def solver_kernels(linear, indefinite: bool = False):
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
     settle = settle_function(linear)
-    inverse_of = inverse_function(linear)
+    inverse_of, nonzero = inverse_function(linear), nonzero_function(linear)
     eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
 
     @wp.func
@@ -139,7 +140,7 @@ def solver_kernels(linear, indefinite: bool = False):
         inverse, definite = inverse_of(wp.cw_mul(m, wp.outer(f, f)), f)
         if not definite:
             for d in range(3):
-                inverse[d, d] = f[d] / wp.max(wp.abs(m[d, d]), linear(1.0e-30))
+                inverse[d, d] = f[d] / nonzero(wp.abs(m[d, d]))
         inverse_out[i] = inverse
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -14,6 +14,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -26,6 +27,7 @@ def level_kernels(linear):
     """collect(...) and gather(...) of the diagonal blocks; restrict(...), correct(...) and finish(...) of an application."""
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
+    nonzero = nonzero_function(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
@@ -83,7 +85,7 @@ def level_kernels(linear):
         sum_out[i] = m
         s = H()
         for d in range(3):
-            s[d] = wp.where(m[d, d] > linear(0.0), linear(1.0) / wp.sqrt(wp.max(m[d, d], linear(1.0e-30))), linear(0.0))
+            s[d] = wp.where(m[d, d] > linear(0.0), linear(1.0) / wp.sqrt(nonzero(m[d, d])), linear(0.0))
         scale = wp.outer(s, s)
         scaled = wp.cw_mul(m, scale)
         for d in range(3):
