@@ -233,7 +233,7 @@ def test_direction_across_the_surface_is_refused():
 
 
 def test_growth_by_load_steps(device):
-    """A strip whose rest shape is that of a bilayer, put on by load steps: curvature kappa all along, as when it is set step by step."""
+    """A strip that gets the rest curvature of a bilayer by load steps is an arc, as when it is set step by step."""
     points, triangles = meshes.rectangle(16, 2, (0.1, 0.0125), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     strip = scene.add_shell(points, triangles, thickness=5e-4, material=ddg.Material(1e6, 0.0), name="strip")

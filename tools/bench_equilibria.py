@@ -175,12 +175,12 @@ def crumpled(size: float, cells: int = 24, bending: str = "midedge_dof") -> ddg.
     flat, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0, 0, 0))
     start = flat + size / cells * np.random.default_rng(1).uniform(-1.0, 1.0, flat.shape)
-    fixed = flat[:, 0] < 1e-9
+    fixed = flat[:, 0] < 1.5 / cells
     start[fixed] = flat[fixed]
     sheet = scene.add_shell(
         flat, triangles, thickness=1e-2, material=ddg.Material(1e6, 0.3, density=1.0), bending=bending
     )
-    scene.hold(sheet, np.flatnonzero(flat[:, 0] < 1.5 / cells))
+    scene.hold(sheet, np.flatnonzero(fixed))
     return scene, lambda model: model.state(points=start)
 
 

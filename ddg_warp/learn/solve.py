@@ -23,6 +23,7 @@ CLOSE = 1e-5  # relative error of w up to which gradients take what float32 solu
 PASSES = 2  # ... so that no more than these serve: with 3, an error of 1e-2 each, gradients erred by 1e-3
 LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner
 MISSED = 1e-6  # what they may have left in truth, for rounding
+NEUTRAL = 16.0  # units of rounding, of a curvature over the sum of its terms' magnitudes, that are none
 SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
 
 
@@ -78,10 +79,18 @@ class HostSolve:
         missed = np.abs(own.T @ found - given)
         if not missed.max(initial=0.0) <= SINGULAR * np.abs(given).max(initial=0.0):
             raise self._singular(free[int(np.argmax(missed))])
+        if coefficient == 0.0 and self._neutral(own, found):
+            raise self._singular(free[int(np.argmax(np.abs(found)))])
         w = np.zeros(tangent.size)
         w[free] = found
         self.held = None if following is None else np.where(tangent.free, 0.0, -(following.T @ w))
         return w
+
+    @staticmethod
+    def _neutral(matrix: sparse.csc_matrix, w: np.ndarray) -> bool:
+        """Whether a solution goes along what has no stiffness but for rounding, where any solution is one of rounding."""
+        eps = np.finfo(float).eps
+        return abs(w @ (matrix @ w)) <= NEUTRAL * eps * (np.abs(w) @ (abs(matrix) @ np.abs(w)))
 
     def _spun(self, state, factor: float, rubs: bool) -> sparse.csc_matrix | None:
         """What frames that an equilibrium carries along do, where the tangent holds them still; None where nothing twists an edge.

@@ -90,7 +90,7 @@ class Descent:
             SolverError: `max_iterations`, `line_search_failed`, `non_finite` or `lost_in_rounding`; carries the last state.
         """
         search = Search(self, state, at)
-        rises = Rises(search) if self.tangent.model.net and not self.follows and not self.owner.net else None
+        rises = Rises(search) if self.tangent.model.net and not self.follows and not self.tangent.model.touch else None
         for _ in range(self.options.max_iterations):
             exact = self._stiffness(search.here, at)
             if search.converged(exact):
@@ -286,7 +286,7 @@ class Search:
     def _move(self, step: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Dofs after a step, which is cut where something is in its way, and what that leaves of the fractions `taken`."""
         moved = self.tangent.retract(self.here.q, step)
-        if not self.owner.net:
+        if not self.tangent.model.touch:
             return moved, taken
         share = self.owner.net.share(self.here.q, moved)
         return self.here.q + share * (moved - self.here.q), share * taken

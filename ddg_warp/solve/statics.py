@@ -1,18 +1,19 @@
-"""Equilibria: load stepping with Newton on the exact tangent.
+"""Equilibria: load stepping with Newton's method on the exact tangent.
 
-Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
-tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
-mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Where symmetry makes a search in
-mode "minimise" end at a saddle, it goes on from beside it, along the direction of lowest stiffness. Every state says whether it is
-stable (`State.stable`). Shells try Newton with stresses
-of its own first (`ddg_warp.solve.mixed`), which takes fewer iterations, and fall back on this search. Large nets are solved on
-the device by conjugate gradients instead (`ddg_warp.solve.net.statics`).
+Every load step places supports where their motion has them at the load parameter t, scales loads by t, and moves rest shapes on. Mode
+"minimise" searches for minima within a trust region of rotations (`ddg_warp.solve.descent`), and mode "follow" takes the tangent as it
+is, with the residual as merit, to follow equilibria that are not stable. A search in mode "minimise" that ends at a saddle goes on from
+beside it, along the direction of lowest stiffness, island by island. Shells try Newton with independent stresses first
+(`ddg_warp.solve.mixed`). Large coupled systems are solved on the device by conjugate gradients (`ddg_warp.solve.net.statics`), and by
+this search where these do not converge.
 
-So is what touches, at any size: its search cuts every iterate before anything passes through anything. Where nets are small its
-equilibria are judged by the factored tangent, saddles are left, and what conjugate gradients are slow to finish, without second
-derivatives of shells' bending, is finished by this search, its steps cut alike, as are those of mode "follow". With friction an
-equilibrium is that of an increment of the load parameter, which the way there decides; it is found on the device at any size, and
-nothing tells whether it is stable.
+Contact is solved by conjugate gradients at any size: every iterate is limited before anything passes through anything. Where the
+coupled system is small its equilibria are judged by the factored tangent, saddles are left, and what conjugate gradients do not finish
+is finished by this search, its steps cut alike, as are those of mode "follow". With friction an equilibrium depends on the increments
+of the load parameter; it is found on the device at any size, and nothing tells whether it is stable.
+
+Every equilibrium says how it was found (`State.outcome`), how far supports and obstacles are from carrying its loads
+(`State.unbalanced`), and whether it is stable (`State.stable`).
 """
 
 from collections.abc import Mapping
@@ -355,7 +356,8 @@ class Equilibrium:
         try:
             state = self.net.solve(state, at, before, increment)
         except SolverError as error:
-            if not (self.factors and error.outcome in UNFINISHED and self.net.arrived):
+            goes_on = not self._rubs and (self.factors or self.model.touch is None)
+            if not (goes_on and error.outcome in UNFINISHED and self.net.arrived):
                 raise
             return self.descent.solve(error.state, at)  # with second derivatives that conjugate gradients leave out
         self.stiffness = self.tangent.stiffness(state, at) if self.factors else None
