@@ -19,7 +19,7 @@ def contacts(model, state) -> Contacts:
     touch = model.touch
     if touch is None:
         raise SceneError("contacts: this scene has no contact; add scene.contact()")
-    touch.at(state.net.q)
+    touch.at(state.net.q, state.net.rate)
     found = touch.pairs(state.net.q, state.rubbing)
     owners = {size: touch.shapes.things(size)[2] for size in touch.shapes.sizes}
     objects = np.zeros((len(found["gap"]), 2), int)

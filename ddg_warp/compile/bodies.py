@@ -35,6 +35,8 @@ class Touching:
         law: what the scene says; bodies: what may touch, obstacles at last.
         names: of the groups that numbers are of, one a name; group (bodies,): number of that of each.
         friction, stiffness [N/m], range [m]: of two groups (groups, groups).
+        inertia: masses [kg] of two groups (groups, groups); times the square of a rate the least stiffness of a step that had no room;
+            zero where the stiffness is given.
         ways: what friction is multiplied by where a rod slides forwards, backwards and across (groups, groups, 3).
         ignored: pairs of groups that pass through each other.
     """
@@ -47,6 +49,7 @@ class Touching:
     ways: np.ndarray
     stiffness: np.ndarray
     range: np.ndarray
+    inertia: np.ndarray
     ignored: list[tuple[int, int]] = field(default_factory=list)
 
     @property

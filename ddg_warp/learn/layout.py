@@ -27,7 +27,7 @@ def fields(model) -> list[Field]:
     return [
         Field(name, array.ndim - 1, name.partition("/")[2].rstrip("_0123456789") in GRADIENTS)
         for name, array in model.empty_state().arrays().items()
-        if array.size > 1 and name != nothing
+        if (array.size > 1 or name == "net/rate") and name != nothing
     ]
 
 

@@ -218,7 +218,8 @@ class NetAdjoint:
         for at, q in ways:  # friction lagged there, and the solution
             damped = replace(solved, q=q, last=before.last)
             if self.contact:
-                self.contact.system.find(at, before.q, q, self._rubbing)
+                rates = after.rate, before.rate if at is before.q else None
+                self.contact.system.find(at, before.q, q, self._rubbing, rates)
             self.solve(damped, rate, kept.time, by_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._pull):

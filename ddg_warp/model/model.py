@@ -112,8 +112,10 @@ class Model:
         host = self.net.host.touching if self.net is not None else None
         if host is None:
             return None
-        force = float(np.median(host.stiffness * host.range))
-        return Touching([body.label for body in host.bodies], host.size, force)
+        forces = (host.stiffness * host.range)[host.meeting]
+        return Touching(
+            [body.label for body in host.bodies], host.size, float(np.median(forces)) if forces.size else 1.0
+        )
 
     @cached_property
     def touch(self):

@@ -22,6 +22,8 @@ class NetState:
         frame: director and tangent of rod edges (6, W edges).
         lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
         data: data (rows, W E) of those sets, by index, that have normals among them that supports turn, or the magnetic field.
+        rate: 1/h of the step that has led there (W,) [1/s], where that had inertia in the stiffness of contact, else zero; empty in
+            scenes whose contact never has.
     """
 
     q: wp.array
@@ -31,12 +33,15 @@ class NetState:
     lag: list[wp.array] = field(default_factory=list)
     last: list[wp.array] = field(default_factory=list)
     data: dict[int, wp.array] = field(default_factory=dict)
+    rate: wp.array | None = None
 
     def arrays(self) -> dict[str, wp.array]:
         """All arrays by name."""
         named = {"q": self.q, "v": self.v, "a": self.a, "frame": self.frame}
         for i, (lag, last) in enumerate(zip(self.lag, self.last, strict=True)):
             named |= {f"lag_{i}": lag, f"last_{i}": last}
+        if self.rate is not None and len(self.rate):
+            named["rate"] = self.rate
         return named | {f"data_{i}": data for i, data in self.data.items()}
 
 
@@ -148,6 +153,8 @@ class DeviceNet:
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
             state.last.append(self._zeros(strains, count if strains else 1))
         state.data = self.turning_data() | self.field_data()
+        heavy = self.host.touching and self.host.touching.inertia.any()
+        state.rate = wp.zeros(self.worlds if heavy else 0, dtype=self.real, device=self.device)
         return state
 
     @property

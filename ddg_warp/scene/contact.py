@@ -81,8 +81,10 @@ class Contacts:
             law: "barrier" or "penalty".
             range: gap below which surfaces push each other [m]; by default half of the smallest radius of a rod or half thickness of
                 a shell.
-            stiffness: of the law [N/m]; by default of every object what lets a node's weight, or bending as tight as ten radii, close
-                the gap by some part of the range, and between two the geometric mean.
+            stiffness: of the law [N/m]; by default of every object what lets ten weights of a node, bending as tight as ten radii, or
+                half a percent of strain in a shell's membrane close the gap by some part of the range, and between two the geometric
+                mean. A step that has no room by that, in halves either, is tried again with at least ten times the mass of a node over
+                the square of its length, so that shorter steps stop what longer ones do. A stiffness that is given stays as it is.
             friction: Coulomb's coefficient; `contact_between` takes one for each direction, too.
             friction_law: "logistic" or "polynomial": how friction grows with the speed.
             velocity: the speed nu from which on all of the friction acts, nearly [m/s]: what sticks creeps by less.

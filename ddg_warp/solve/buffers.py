@@ -26,7 +26,8 @@ class Buffer:
     def _allocate(self) -> None:
         self.own = self._model.empty_state()
         *groups, net, grips = (
-            part and _mapped(part, lambda array: array[:]) for part in (*self.own.groups, self.own.net, self.own.grips)
+            part and _mapped(part, lambda array: array[:] if array.size else array)
+            for part in (*self.own.groups, self.own.net, self.own.grips)
         )
         self.state = State(self._model, groups, net, grips=grips)
         self._watch()

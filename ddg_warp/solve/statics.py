@@ -228,6 +228,8 @@ class Equilibrium:
         shapes = RestPath(self.model, rest if rest is not None else {})
         if self.net and self.net.arcs:
             load_steps = self.net.arcs.increments(state, found.get("poses"), start, end, load_steps)
+        if state.net is not None:
+            state.net.rate.zero_()  # contact has no inertia in equilibria
         if start == end:
             shapes.to(1.0)
             try:

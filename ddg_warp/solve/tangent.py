@@ -157,7 +157,7 @@ class Tangent:
         result, touch = np.zeros(self.size), self.model.touch
         if touch and touch.terms.frictions:
             net = self.parts[-1]
-            self.of(net, result)[:] = net.into(touch.friction(state.net.q, state.rubbing).ravel())
+            self.of(net, result)[:] = net.into(touch.friction(state.net.q, state.rubbing, state.net.rate).ravel())
         return result
 
     @property

@@ -22,7 +22,7 @@ import warp as wp
 from ddg_warp.kernels.contact.gather import ANGLES, SLOTS
 from ddg_warp.kernels.contact.pair_energy import pair_energy_functions, shape_types
 from ddg_warp.kernels.contact.pair_friction import directed_basis, rolling_functions, spun_function
-from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct, read_functions
+from ddg_warp.kernels.contact.pair_terms import by_rate_function, groups_function, law_struct, read_functions
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.measures.slip import basis
@@ -42,6 +42,7 @@ def pull_kernel(kind: Kind, density: Density, real):
     V = wp.types.vector(3, real)
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
+    by_rate_of = by_rate_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
@@ -66,6 +67,10 @@ def pull_kernel(kind: Kind, density: Density, real):
                 numbers[i, pair] = real(0.0)
             for i in range(3):
                 numbers[i, pair] = dp[i]
+            by_rate = by_rate_of(law, sides, pairs[pair])
+            if by_rate > real(0.0):
+                numbers[wp.static(STIFFNESS), pair] = real(0.0)
+                numbers[wp.static(RATE), pair] = dp[0] * by_rate
 
     return pull
 

@@ -23,6 +23,9 @@ def law_struct(real):
     """Parameters of pairs by the groups of both objects (worlds, groups, groups): stiffness [N/m], range and thickness [m], the latter
     below zero for the sum of radii, and the coefficient of friction.
 
+    The stiffness of a pair is that or inertia (groups, groups) [kg] times the square of the rate (worlds,) [1/s], 1/h of a step,
+    whichever is larger.
+
     group (objects,); square (edges,): squared lengths of edges at rest [m^2]; inner (edges,): of both nodes, see `pair_energy`.
     """
     U = wp.types.vector(2, real)
@@ -34,6 +37,8 @@ def law_struct(real):
         range: wp.array3d(dtype=real)
         thickness: wp.array3d(dtype=real)
         friction: wp.array3d(dtype=real)
+        inertia: wp.array2d(dtype=real)
+        rate: wp.array(dtype=real)
         square: wp.array(dtype=real)
         inner: wp.array(dtype=U)
 
@@ -51,6 +56,20 @@ def groups_function(real):
         return w, i, j, law.group[sides.first.object[i]], law.group[sides.second.object[j]]
 
     return groups
+
+
+@cache
+def by_rate_function(real):
+    """by_rate(law, sides, pair) -> the derivative of the stiffness of a pair by the rate [N s/m], zero where inertia is none of it."""
+    Law, Sides, groups = law_struct(real), sides_struct(real), groups_function(real)
+
+    @wp.func
+    def by_rate(law: Law, sides: Sides, pair: wp.vec2i):
+        w, _i, _j, a, b = groups(law, sides, pair)
+        slope = law.inertia[a, b] * law.rate[w]
+        return wp.where(slope * law.rate[w] > law.stiffness[w, a, b], real(2.0) * slope, real(0.0))
+
+    return by_rate
 
 
 @cache
@@ -74,7 +93,8 @@ def read_functions(kind: Kind, real):
             threshold = real(wp.static(SHARE)) * law.square[i] * law.square[j]
             one, other = law.inner[i], law.inner[j]
             inner = W(one[0], one[1], other[0], other[1])
-        return P(law.stiffness[w, a, b], law.range[w, a, b], both), threshold, inner
+        stiffness = wp.max(law.stiffness[w, a, b], law.inertia[a, b] * law.rate[w] * law.rate[w])
+        return P(stiffness, law.range[w, a, b], both), threshold, inner
 
     @wp.func
     def corners(x: wp.array(dtype=V), nodes: wp.vec4i):

@@ -331,18 +331,23 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
         a0: wp.array(dtype=V),
         predicted: wp.array(dtype=V),
         trust: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         blocks: int,
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
         a_out: wp.array(dtype=V),
+        rate_out: wp.array(dtype=real),
     ):
-        """Blocks, their velocities and accelerations at the end of the step, of the worlds that converged."""
+        """Blocks, their velocities and accelerations at the end of the step, of the worlds that converged; and the rates of inertia in
+        contact, where there is room for them."""
         w, first = share(wp.tid(), blocks)
         ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if first == 0:
             flags[MOVED, w] = wp.where(ahead, 1, 0)
+            if ahead and rate_out.shape[0] > 0:
+                rate_out[w] = rate[w]
         told = told_of(flags, scalars, w) * trust[w]
         for k in range(first, until(first, blocks)):
             i = k + w * blocks

@@ -15,7 +15,9 @@ from ddg_warp.kernels.islands import (
     HALVINGS,
     ITERATION,
     MOVED,
+    PORTION,
     PROGRESS,
+    RETRIES,
     SLOT,
     STATUS,
     STEP_LENGTH,
@@ -28,6 +30,7 @@ from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
+UNBRACED = 2  # retries, until the step was halved, after which inertia counts in contact that still has no room
 UNTRIED = 2  # iterates that are not tried with the exact matrix after one in which it was indefinite
 
 
@@ -35,7 +38,7 @@ UNTRIED = 2  # iterates that are not tried with the exact matrix after one in wh
 def world_kernels(real):
     """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
     expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices; again(...) with another friction;
-    short(...) of predictors that were cut; less(...) of motions that were long."""
+    short(...) of predictors that were cut; less(...) of motions that were long; brace(...) what has no room."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -177,7 +180,26 @@ def world_kernels(real):
         if modes[w] == wp.static(WHOLE) and longest[w] > most:
             time[w] = time[w] * (most / longest[w])
 
-    return account, modes, predicted, depart, expect, refuse, curve, again, short, less
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def brace(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        dt: wp.array(dtype=real),
+        braced: wp.array(dtype=int),
+        rate: wp.array(dtype=real),
+    ):
+        """Before a part of a step is tried: the rate by which inertia counts in the stiffness of contact, zero until there was no
+        room."""
+        w = wp.tid()
+        if scalars[PROGRESS, w] >= real(1.0):
+            return
+        if scalars[PROGRESS, w] == real(0.0) and flags[RETRIES, w] == 0:
+            braced[w] = 0
+        elif flags[RETRIES, w] >= wp.static(UNBRACED) and flags[STATUS, w] == wp.static(outcome.NO_ROOM):
+            braced[w] = 1
+        rate[w] = wp.where(braced[w] != 0, real(1.0) / (dt[w] * scalars[PORTION, w]), real(0.0))
+
+    return account, modes, predicted, depart, expect, refuse, curve, again, short, less, brace
 
 
 @cache

@@ -9,9 +9,10 @@ from ddg_warp.scene.contact import Contact, touching_names
 from ddg_warp.scene.obstacles import MESH
 
 HALF = 0.5  # of the smallest radius, the range of contact by default
-GRAVITY = 9.81  # by which nodes are taken to weigh at least [m/s^2]
-WEIGHTS = 10.0  # of a node that close the gap by some part of the range
-BENDING = 0.01  # of EI / r^2 that does: bending to ten radii
+# Of forces that close the gap by some part of the range, by default: weights of a node; the share of EI / r^2, bending to ten radii;
+# the strain of what a node carries of a membrane; and that of a rod, which counts where its bending stiffness is next to none.
+WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
+INERTIA = 10.0  # of the mass of a node over the square of the step, by which the default stiffness grows
 
 
 def touching(scene, net: Net) -> Touching | None:
@@ -35,22 +36,26 @@ def touching(scene, net: Net) -> Touching | None:
                 Body(rod.nodes, ROD, radius, batch.name, f"rod {rod.rod}", closed=batch.closed, angles=angles)
             )
             bending = max(float(np.max(_of_rod(batch, name, row))) for name in ("EI1", "EI2"))
-            forces.append((net.mass[rod.nodes, 0].max(), bending / radius**2))
+            elastic = max(BENDING * bending / radius**2, LIMP * float(np.max(_of_rod(batch, "EA", row))))
+            forces.append((net.mass[rod.nodes, 0].max(), elastic))
     for index, shell in enumerate(net.shells):
         if (name := shell.surface.name) in names:
             plate = shell.plate
             half = law.radius.get(name, 0.5 * float(plate.thickness.max()))
             cells = shell.nodes[shell.surface.triangles]
             bodies.append(Body(shell.nodes, MESH, half, name, f"shell {index}", cells, shell=index))
-            bending = float((plate.young * plate.thickness**3 / 12.0 / (1.0 - plate.poisson**2)).max())
-            forces.append((net.mass[shell.nodes, 0].max(), bending / half))
-    weight = max(GRAVITY, float(np.linalg.norm(scene.gravity)))
-    scale = [max(WEIGHTS * mass * weight, BENDING * bending) for mass, bending in forces]
+            membrane = float((plate.membrane_stiffness * np.sqrt(2.0 * plate.area)).max())
+            elastic = max(BENDING * float(plate.bending_stiffness.max()) / half, STRAIN * membrane)
+            forces.append((net.mass[shell.nodes, 0].max(), elastic))
+    gravity, obstacles = float(np.linalg.norm(scene.gravity)), len(scene.obstacles)
+    scale = [max(WEIGHTS * mass * gravity, elastic) for mass, elastic in forces]
+    own = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
+    own = np.column_stack([own, np.full((2, obstacles), np.nan)])
     for index, (obstacle, nodes, markers) in enumerate(zip(scene.obstacles, net.obstacles, net.markers, strict=True)):
         shape, name = obstacle.shape, obstacle.name
         given = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
         bodies.append(Body(*given, still=True, markers=markers))
-    found = _numbers(scene, law, bodies, np.array([*scale, *np.full(len(scene.obstacles), np.nan)]))
+    found = _numbers(scene, law, bodies, *own)
     if law.rolling and not (found.rubs and any(body.angles.size for body in bodies)):
         lacking = "no rod touches anything" if found.rubs else "there is no friction"
         raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
@@ -63,18 +68,18 @@ def _of_rod(batch, name: str, row: int) -> np.ndarray:
     return values[row] if values.ndim == 2 and len(values) > 1 else values
 
 
-def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray) -> Touching:
-    """Numbers by pairs of groups; `scale` is the force [N] of every body that closes the gap by some part of the range."""
+def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: np.ndarray) -> Touching:
+    """Numbers by pairs of groups.
+
+    Args:
+        scale: of every body the force [N] that closes the gap by some part of the range; mass: of its heaviest node [kg].
+    """
     names, group = np.unique([body.name for body in bodies], return_inverse=True)
     count, moving = len(names), np.array([not body.still for body in bodies])
     radius = min(body.radius for body in bodies if not body.still)
     within = np.full((count, count), HALF * radius if law.range is None else law.range)
     rough = np.full((count, count, 3), law.friction)
-    own = np.full(count, np.nan)  # of obstacles that of what they touch counts
-    for g in np.unique(group[moving]):
-        own[g] = scale[moving & (group == g)].max()
-    own = np.where(np.isnan(own)[:, None], own[None], own[:, None])
-    force = np.sqrt(np.where(np.isnan(own), 1.0, own) * np.where(np.isnan(own.T), 1.0, own.T))
+    force, inertia = (_of_both(own, group, moving) for own in (scale, INERTIA * mass))
     stiffness = np.full((count, count), np.nan if law.stiffness is None else law.stiffness)
     ignored, place = [], {name: i for i, name in enumerate(names.tolist())}
     for between in scene.betweens:
@@ -84,8 +89,21 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray) -> Touc
                 table[g, h] = table[h, g] = value
         if between.ignore:
             ignored.append((g, h))
+    inertia = np.where(np.isnan(stiffness), inertia, 0.0)
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
-    return Touching(law, bodies, names.tolist(), group, *_by_way(rough), stiffness, within, ignored)
+    return Touching(law, bodies, names.tolist(), group, *_by_way(rough), stiffness, within, inertia, ignored)
+
+
+def _of_both(values: np.ndarray, group: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Geometric means (groups, groups) of the largest values of what moves in two groups, of obstacles that of what they touch.
+
+    Two obstacles, which never touch, have zero.
+    """
+    own = np.full(int(group.max()) + 1, np.nan)
+    for g in np.unique(group[moving]):
+        own[g] = values[moving & (group == g)].max()
+    own = np.where(np.isnan(own)[:, None], own[None], own[:, None])
+    return np.nan_to_num(np.sqrt(own * own.T))
 
 
 def _by_way(friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ def law_tables(search, given: dict, groups, shared: dict[str, wp.array]) -> tupl
     """The `law_struct` of a `BroadPhase`, alike in all worlds, and whether there is friction.
 
     Args:
-        given: "stiffness", "range", "thickness" and "friction", as `PairTerms` has them.
+        given: "stiffness", "range", "thickness", "friction" and "inertia", as `PairTerms` has them.
         groups: of each object, None for one.
         shared: arrays (worlds, groups, groups) to be taken in place of new ones.
 
@@ -41,10 +41,23 @@ def law_tables(search, given: dict, groups, shared: dict[str, wp.array]) -> tupl
         if own is None:
             own = wp.array(np.tile(values, (search.worlds, 1, 1)), dtype=real, device=device)
         setattr(law, name, own)
+    inertia = table("inertia", 0.0 if given["inertia"] is None else given["inertia"], number, False)
+    law.inertia = wp.array(inertia, dtype=real, device=device)
+    law.rate = wp.zeros(search.worlds, dtype=real, device=device)
     square, inner = _edges(shapes)
     law.square = wp.array(square, dtype=real, device=device)
     law.inner = wp.array(inner, dtype=wp.types.vector(2, real), device=device)
     return law, bool(tables["friction"].any())
+
+
+def at_own_rate(law, real):
+    """The same `law_struct` with rates of its own, zero at first."""
+    struct = law_struct(real)
+    other = struct()
+    for name in struct.vars:
+        setattr(other, name, getattr(law, name))
+    other.rate = wp.zeros_like(law.rate)
+    return other
 
 
 def _within_reach(search, within: np.ndarray, thickness: np.ndarray, groups: np.ndarray) -> None:

@@ -16,7 +16,7 @@ from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_fr
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.friction_elements import FrictionElements
-from ddg_warp.solve.contact.law_tables import law_tables, table
+from ddg_warp.solve.contact.law_tables import at_own_rate, law_tables, table
 from ddg_warp.solve.contact.pair_product import PairProduct
 from ddg_warp.solve.contact.spins import Spins
 from ddg_warp.solve.contact.totals import Totals
@@ -47,6 +47,8 @@ class PairTerms:
         velocity: nu [m/s], positive: what sticks creeps with a share of it.
         linear: type of factors and of vectors of products, by default that of positions.
         silent: nodes of a world that forces and products need not be told of, which may be in thousands of pairs.
+        inertia: masses [kg], not negative, a number or symmetric (groups, groups): the stiffness is at least that times the square of
+            the rates of `law`; None or 0: it is as given.
         shared: by name of what is by groups, arrays (worlds, groups, groups) that the law has in place of its own.
         exact: whether products with what turns are exact for edges that are all but parallel, too, however many these are.
 
@@ -61,7 +63,8 @@ class PairTerms:
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         start: positions and angles that slip starts from (worlds times nodes,), if not from others; more: what friction counts beside
             normal forces (worlds,) [N], none but where what meets is to stick.
-        law: `law_struct`, on the device; products: the `PairProduct` of all lists.
+        law: `law_struct`, on the device, with rates of inertia (worlds,) [1/s], zero at first; lag_law: the one by
+            which friction was lagged last; products: the `PairProduct` of all lists.
         spins: how far objects that spin have turned since slips started.
 
     Raises:
@@ -83,13 +86,22 @@ class PairTerms:
         velocity: float = 1e-3,
         linear=None,
         silent: np.ndarray | None = None,
+        inertia=None,
         shared: dict[str, wp.array] | None = None,
         exact: bool = False,
     ):
         self.search, self.device, self.real = search, search.device, search.real
         self.linear = linear or self.real
-        given = {"stiffness": stiffness, "range": range, "thickness": thickness, "friction": friction}
+        given = {
+            "stiffness": stiffness,
+            "range": range,
+            "thickness": thickness,
+            "friction": friction,
+            "inertia": inertia,
+        }
         self.law, rubs = law_tables(search, given, groups, shared or {})
+        self.heavy = inertia is not None and bool(np.any(inertia))
+        self.lag_law, self._law_before = self.law, at_own_rate(self.law, self.real) if self.heavy and rubs else None
         nodes = len(search.shapes.points) * search.worlds
         self.gap = wp.zeros(search.worlds, dtype=self.real, device=self.device)
         self._no_rate = wp.zeros_like(self.gap)
@@ -156,10 +168,22 @@ class PairTerms:
         self._version = self.search.version
         return True
 
-    def lag(self, x: wp.array, again: bool = False) -> None:
+    def brace(self, rate: wp.array | None) -> None:
+        """Set the rates of `law` (worlds,) [1/s], by which inertia counts in the stiffness; to zero without."""
+        if self.heavy and rate is not None:
+            wp.copy(self.law.rate, rate)
+        elif self.heavy:
+            self.law.rate.zero_()
+
+    def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None) -> None:
         """Take pairs, normal forces and tangents of friction from contact at x, and x as where slip starts.
 
         Slip still starts from where it did if friction is lagged `again`. Does nothing where there is no friction.
+
+        Args:
+            x: positions (worlds times nodes,).
+            again: whether a search goes on.
+            rate: by which inertia counts in the stiffness at x (worlds,) [1/s]; by default that of `law`.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`.
@@ -167,10 +191,15 @@ class PairTerms:
         if not self.frictions:
             return
         self._start_anew()
+        self.lag_law = self.law
+        if self._law_before and rate is not None:
+            wp.copy(self._law_before.rate, rate)
+            self.lag_law = self._law_before
+        law = self.lag_law
 
         def lag(part: ContactElements, friction: FrictionElements) -> None:
-            part.write(x, self.law, self.gap)
-            friction.lag(self.law, x, again, self.more)
+            part.write(x, law, self.gap)
+            friction.lag(law, x, again, self.more)
 
         arrays.side_by_side([partial(lag, *both) for both in zip(self.lists, self.frictions, strict=True)], self.device)
         if not again:

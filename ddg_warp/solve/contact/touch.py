@@ -50,6 +50,7 @@ class Touch:
             range=given.range,
             groups=given.group,
             friction=given.friction,
+            inertia=given.inertia,
             ways=given.ways,
             friction_law=self.law.friction_law,
             velocity=self.law.velocity,
@@ -59,14 +60,19 @@ class Touch:
             exact=exact,
         )
 
-    def at(self, x: wp.array) -> None:
+    def at(self, x: wp.array, rate: wp.array | None = None) -> None:
         """Energies and forces at blocks x, with room for all pairs. Not in a capture.
+
+        Args:
+            x: blocks (W N,).
+            rate: by which inertia counts in the stiffness (worlds,) [1/s], that of the state; none by default.
 
         Raises:
             SolverError: names a node whose position is not finite.
         """
         self.find(x)
         self.terms.fit()
+        self.terms.brace(rate)
         self.terms.evaluate(x)
 
     def rub(self, x: wp.array, v: wp.array) -> None:
@@ -75,12 +81,12 @@ class Touch:
         self.terms.lag(x)
         self.terms.evaluate(x, wp.full(self.net.worlds, 1.0, dtype=self.net.real, device=x.device), start)
 
-    def friction(self, x: wp.array, v: wp.array) -> np.ndarray:
+    def friction(self, x: wp.array, v: wp.array, rate: wp.array | None = None) -> np.ndarray:
         """Forces of friction on blocks (W N, 3) [N] that are at x and move by v, on markers those that turn what spins.
 
         Not in a capture; raises as `at`.
         """
-        self.at(x)
+        self.at(x, rate)
         pushed = self.terms.forces.numpy().astype(float)
         self.rub(x, v)
         return self.terms.forces.numpy() - pushed + self.terms.spins.forces(x, self.terms.frictions)

@@ -25,6 +25,7 @@ from ddg_warp.solve.net.system import Sums
 FAR = 16.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
 # Where pairs would be too many all the same ways are cut to so many margins, and to a part of what they were until they are not.
 LONGEST, SHORTER = 4096.0, 0.25
+STIFFER = 100.0  # times as stiff contact has room where it had none: of five cases of cloth all five, by 10 times four
 LEAST = 1e-3  # of the range, the gap from which on a barrier has no room
 ROUNDING = 16.0  # units in the last place within which supports have arrived
 
@@ -76,6 +77,7 @@ class NetContact:
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
         self._going = make(1, int)
         self._longest, self.farthest = make(worlds, real), math.inf
+        self._braced = make(worlds, int)
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
@@ -97,6 +99,7 @@ class NetContact:
             self._again,
             self._find_short,
             self._less,
+            self._brace,
         ) = made
         self._kernels = list(made)
         made = kernels.block_kernels(real, linear, arrays.serial(device))
@@ -118,6 +121,7 @@ class NetContact:
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._bands = None
         self._least = LEAST * float(host.touching.range.min()) if self.touch.keep else -math.inf
+        self._stiffest = float(host.touching.stiffness.max())
 
     @property
     def touching_bodies(self) -> int:
@@ -143,10 +147,13 @@ class NetContact:
         """Have candidates at positions x, where no motion brings them."""
         self.search.update(x)
 
-    def lag(self, x: wp.array, again: bool = False) -> None:
-        """What friction takes from positions x, which are on the way that was cut last; slips, unless it does so `again`."""
+    def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None) -> None:
+        """What friction takes from positions x, which are on the way that was cut last; slips, unless it does so `again`.
+
+        Where a step begins, `rate` is that of the step before; see `PairTerms.lag`.
+        """
         if self.rubs:
-            self.terms.lag(x, again)
+            self.terms.lag(x, again, rate)
 
     def rest(self) -> None:
         """Nothing is on its way: what is proposed is where it is."""
@@ -160,6 +167,12 @@ class NetContact:
         self._sweep(self._keep_solution, [newton.q, newton.islands.moved, self.net.blocks], [solution])
         self.lag(newton.q, again=True)
         self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
+
+    def brace(self, dt: wp.array) -> None:
+        """Have inertia in the stiffness of what a step of dt (worlds,) [s] found no room for, from its next trial to its end."""
+        if self.terms.heavy:
+            outputs = [self._braced, self.terms.law.rate]
+            self._launch(self._brace, self.net.worlds, [*self.newton.islands.arrays, dt], outputs)
 
     def place(self) -> None:
         """Cut the predictor, once supports are placed, where they have to be."""
@@ -334,8 +347,20 @@ class NetContact:
         gap, pair = self.touch.closest(x)
         if gap >= self.search.reach:
             return ""
-        remedy = "give their contact a larger stiffness or range, " if reason == outcome.NO_ROOM else ""
-        return f"the smallest gap, {gap:.3g} m, is between {pair}; {remedy}"
+        return (
+            f"the smallest gap, {gap:.3g} m, is between {pair}; {self._widen(gap) if reason == outcome.NO_ROOM else ''}"
+        )
+
+    def _widen(self, gap: float) -> str:
+        """What helps where there is no room, that which helps most first; `gap` [m] is the smallest before."""
+        if gap < self._least:
+            return "move them apart, as model.pushed_apart(state) does, "
+        if self.terms.heavy:
+            return f"give their contact a larger stiffness, such as {STIFFER * self._stiffest:.3g} N/m, or a larger range, "
+        return (
+            f"give their contact a larger stiffness, {STIFFER:g} times as much or none, by which it is as large as steps need, or a "
+            "larger range, "
+        )
 
     def _shorten(self, longest: float) -> bool:
         """Go shorter ways than `longest` [m] from now on, if that is long."""

@@ -34,13 +34,20 @@ class ExactContact:
         """Kernels to load before a capture."""
         return [*self.search.kernels, *self.terms.kernels, *(self._bands.kernels if self._bands else [])]
 
-    def find(self, lagged: wp.array, before: wp.array, q: wp.array, rate: wp.array) -> None:
-        """Of a solution q with friction lagged at blocks `lagged`, in a step from `before` at rates 1/h (worlds,). Launches alone."""
+    def find(
+        self, lagged: wp.array, before: wp.array, q: wp.array, rate: wp.array, rates: tuple = (None, None)
+    ) -> None:
+        """Of a solution q with friction lagged at blocks `lagged`, in a step from `before` at rates 1/h (worlds,). Launches alone.
+
+        `rates` are those by which inertia counts in the stiffness at q, none by default, and where friction was lagged.
+        """
         search, terms = self.search, self.terms
+        here, there = rates
+        terms.brace(here)
         search.rebuild(lagged)
         if terms.frictions:
             search.search(lagged)
-            terms.lag(lagged)
+            terms.lag(lagged, rate=there)
         search.search(q)
         terms.evaluate(q, rate if terms.frictions else None, before)
         terms.meet()

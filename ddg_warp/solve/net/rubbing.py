@@ -59,7 +59,7 @@ class Rubbing:
         """
         terms = self.system.terms
         rub = terms.frictions[index]
-        inputs = [rub.pairs, rub.count, rub.found.sides, terms.law, *of, rub.factor.used]
+        inputs = [rub.pairs, rub.count, rub.found.sides, terms.lag_law, *of, rub.factor.used]
         inputs += [*at, w, self._velocity, rate, *rub.directions, terms.spins.places, terms.spins.turned.flatten()]
         written = [rub.gradient, self._start_parts, self._lagged_parts]
         more = [numbers, self.by_direction, self.spun, self.radii]

@@ -136,6 +136,8 @@ class NetStep(PartStep):
         """Launch a whole step from one state to another."""
         if self.alone is None or self.net.worlds > 1:
             self._keep()
+        if len(before.rate):
+            wp.copy(after.rate, before.rate)
         if self.alone is None:
             super().step(before, after)
             return
@@ -226,6 +228,8 @@ class NetStep(PartStep):
         """One solve of every world that has not finished the step, from state `before` to `after`."""
         net, solver, islands = self.net, self.newton, self.islands
         blocks = net.blocks
+        if solver.contact:
+            solver.contact.brace(self.integrator._dt)
         self._sweep(
             self._begin,
             [before.q, before.v, solver.held, net.moves]
@@ -247,7 +251,7 @@ class NetStep(PartStep):
             self._foresight.start(before)
         if solver.contact:
             solver.contact.place()
-            solver.contact.lag(before.q)
+            solver.contact.lag(before.q, rate=before.rate)
         solver.solve(start)
         if solver.contact:
             for solution in solver.contact.solutions:
@@ -257,8 +261,9 @@ class NetStep(PartStep):
         if self.energy:
             self.energy.judge(before, start)
         self._foresight.weigh(before)
-        inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust]
-        self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a])
+        rate = solver.contact.terms.law.rate if solver.contact else after.rate
+        inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
+        self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a, after.rate])
         if self.drag:
             self.drag.settle(before, after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)
@@ -352,10 +357,15 @@ class NetStep(PartStep):
         """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
         x = state.net.q.numpy().reshape(self.model.worlds, -1, 3)[world]
         found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
-        return next(filter(None, found), "") or self._tightest(state, world) + self.advice(state)
+        return next(filter(None, found), "") or self._tightest(state, world)
 
     def _tightest(self, state, world: int) -> str:
-        """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart."""
+        """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart; and advice.
+
+        Where there is no room, a smaller dt or a looser rtol makes none.
+        """
         if not self.newton.contact:
-            return ""
-        return self.newton.contact.tightest(state.net.q, int(self.islands.reason.numpy()[world]))
+            return self.advice(state)
+        reason = int(self.islands.reason.numpy()[world])
+        told = self.newton.contact.tightest(state.net.q, reason)
+        return told + ("or check its loads and supports" if told and reason == outcome.NO_ROOM else self.advice(state))

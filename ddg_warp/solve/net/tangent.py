@@ -61,14 +61,14 @@ class NetTangent(Part):
             values = out.numpy().astype(np.float64)
             yield part.term.name, values.reshape(self.net.worlds, -1)
         if self.model.touch:
-            self.model.touch.at(state.net.q)
+            self.model.touch.at(state.net.q, state.net.rate)
             yield "contact", self.model.touch.terms.energy.numpy().astype(np.float64)[:, None]
 
     def gradient(self, state) -> np.ndarray:
         elastic = self.elastic_gradient(state)
         if not self.model.touch:
             return elastic
-        self.model.touch.at(state.net.q)
+        self.model.touch.at(state.net.q, state.net.rate)
         return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
 
     def elastic_gradient(self, state) -> np.ndarray:
@@ -121,7 +121,7 @@ class NetTangent(Part):
             total += np.bincount(places, spread.ravel(), len(total))
         elastic = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
         if self.model.touch:
-            self.model.touch.at(state.net.q)
+            self.model.touch.at(state.net.q, state.net.rate)
             elastic = elastic + assembled.hessian(self.model.touch.terms, state.net.q)
         return self.matrix(elastic)
 
