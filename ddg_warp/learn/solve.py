@@ -18,12 +18,12 @@ from ddg_warp.solve.chains.tangent import ChainTangent
 from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
 from ddg_warp.solve.reduction import CyclicReduction, Elimination
+from ddg_warp.solve.rigid import rigid_modes
 
 CLOSE = 1e-5  # relative error of w up to which gradients take what float32 solutions, refined, leave; roll-outs amplify it ...
 PASSES = 2  # ... so that no more than these serve: with 3, an error of 1e-2 each, gradients erred by 1e-3
 LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner
 MISSED = 1e-6  # what they may have left in truth, for rounding
-NEUTRAL = 16.0  # units of rounding, of a curvature over the sum of its terms' magnitudes, that are none
 SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
 
 
@@ -62,6 +62,8 @@ class HostSolve:
         hessian = (
             tangent.hessian(state) if rubbing is None else tangent.potential_hessian(state) + tangent.matrix(rubbing)
         )
+        if coefficient == 0.0 and tangent.model.touch is None:
+            self._require_stiff(state, hessian)
         matrix = hessian + sparse.diags(coefficient * tangent.mass)
         if more is not None:
             matrix = matrix + tangent.matrix(more)
@@ -79,18 +81,28 @@ class HostSolve:
         missed = np.abs(own.T @ found - given)
         if not missed.max(initial=0.0) <= SINGULAR * np.abs(given).max(initial=0.0):
             raise self._singular(free[int(np.argmax(missed))])
-        if coefficient == 0.0 and self._neutral(own, found):
-            raise self._singular(free[int(np.argmax(np.abs(found)))])
         w = np.zeros(tangent.size)
         w[free] = found
         self.held = None if following is None else np.where(tangent.free, 0.0, -(following.T @ w))
         return w
 
-    @staticmethod
-    def _neutral(matrix: sparse.csc_matrix, w: np.ndarray) -> bool:
-        """Whether a solution goes along what has no stiffness but for rounding, where any solution is one of rounding."""
-        eps = np.finfo(float).eps
-        return abs(w @ (matrix @ w)) <= NEUTRAL * eps * (np.abs(w) @ (abs(matrix) @ np.abs(w)))
+    def _require_stiff(self, state, hessian: sparse.csc_matrix) -> None:
+        """Refuse an equilibrium that leaves a rigid motion neutral, as the spin of a rod that nothing holds.
+
+        Where parameters push along such a motion the equilibrium jumps, however little they change; nothing of the loss tells.
+        """
+        tangent = self.tangent
+        neutral = rigid_modes(tangent, state, hessian)
+        if neutral.shape[1]:
+            mode = neutral[:, 0]
+            spins = np.abs(mode[~tangent.angle]).max(initial=0.0) <= 1e-6 * np.abs(mode).max() / tangent.edge_length()
+            what = "the spin of" if spins else "a motion of"
+            place = tangent.where(int(np.argmax(np.abs(mode))))
+            raise SolverError(
+                f"no gradient goes through the equilibrium: {what} {place} is neutral, as nothing holds it, so that it would jump with "
+                f"parameters; {'hold it by scene.fix_twist(...)' if spins else 'hold it'}",
+                outcome="neutral",
+            )
 
     def _spun(self, state, factor: float, rubs: bool) -> sparse.csc_matrix | None:
         """What frames that an equilibrium carries along do, where the tangent holds them still; None where nothing twists an edge.

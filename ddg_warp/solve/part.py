@@ -38,6 +38,11 @@ class Part:
         return self.part.dof_masses()
 
     @property
+    def parts(self) -> list:
+        """Itself alone, so that a part at offset 0 serves where a `Tangent` does."""
+        return [self]
+
+    @property
     def axis(self) -> np.ndarray:
         """Axis of every dof that is a displacement (size,), 0 to 2; any of others."""
         return np.minimum(np.arange(self.size) % self.block, 2)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import ddg_warp as ddg
 from ddg_warp import arrays, statics
 from ddg_warp.errors import SolverError
 from ddg_warp.learn.adjoint import EquilibriumAdjoint
@@ -106,3 +107,31 @@ def test_velocities_of_an_equilibrium_have_no_effect():
     again = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
     np.testing.assert_array_equal(inputs[-1].load.numpy(), again[-1].load.numpy())
     assert product(state, weights) == pytest.approx(difference.loss())
+
+
+def test_neutral_equilibria_are_refused(device):
+    """A straight rod between two points, of a round section, may spin about itself: natural curvature would turn it at once.
+
+    Held at one edge it has a gradient.
+    """
+    for held in (False, True):
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+        rod = scene.add_rod(
+            np.linspace((0, 0, 0), (1, 0, 0), 11),
+            section=ddg.Circle(0.01),
+            material=ddg.Material(1e8),
+            natural="straight",
+        )
+        scene.fix(rod, [0, -1])
+        scene.add_force(rod, 5, (0.0, 0.0, -0.1))
+        if held:
+            scene.fix_twist(rod, [0])
+        model = scene.build(device, "float64")
+        state = statics.solve(model)
+        given = cotangent(model, position_weights(model, state))
+        if held:
+            EquilibriumAdjoint(model).pull(state, given)
+            continue
+        with pytest.raises(SolverError, match=r"spin of .* of rod 0 is neutral.*fix_twist") as caught:
+            EquilibriumAdjoint(model).pull(state, given)
+        assert caught.value.outcome == "neutral"
