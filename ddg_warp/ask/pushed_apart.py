@@ -84,7 +84,8 @@ def _part(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray,
     gap = length - thickness
     near = np.flatnonzero(gap < least)
     if len(near):
-        n, weights, nodes = _directions(way[near], length[near], x.numpy()[nodes[near]]), weights[near], nodes[near]
+        weights, nodes = weights[near], nodes[near]
+        n = _directions(way[near], length[near], x.numpy()[nodes], pairs.kind.endless)
         may = free[nodes] * n[:, None]  # (pairs, nodes, 3), what of the direction each node is free to go
         give = (weights**2 * (may * n[:, None]).sum(2)).sum(1)
         size = np.where(give > 0.0, (BEYOND * least - gap[near]) / np.where(give > 0.0, give, 1.0), 0.0)
@@ -93,8 +94,11 @@ def _part(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray,
     return float(gap.min())
 
 
-def _directions(way: np.ndarray, length: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) along ways; across both sides where closest points are the same."""
+def _directions(way: np.ndarray, length: np.ndarray, corners: np.ndarray, endless: bool) -> np.ndarray:
+    """Unit vectors (n, 3) along ways; across both sides where closest points are the same. Of `endless` half-spaces their normals."""
+    if endless:
+        way = np.cross(corners[:, 2] - corners[:, 1], corners[:, 3] - corners[:, 1])
+        return way / np.linalg.norm(way, axis=1)[:, None]
     sides = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 2]
     size = np.maximum(np.linalg.norm(sides[0], axis=1), np.linalg.norm(sides[1], axis=1))
     across = np.cross(*sides)

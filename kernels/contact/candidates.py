@@ -40,7 +40,6 @@ import warp as wp
 from ddg_warp.kernels.contact.boxes import Trees, overlap
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
-from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.reading import read_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -180,7 +179,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
     ranges_of, reaches, asked = asked_functions(kind, real, single)
     corners, relative = corners_function(real), relative_function(kind, real)
     link_of = read_function(wp.vec2i)
-    half, two, nonzero = wp.constant(real(0.5)), wp.constant(real(2.0)), nonzero_function(real)
+    half, two = wp.constant(real(0.5)), wp.constant(real(2.0))
 
     @wp.func
     def apart(x: Y, p: Y, around: real):
@@ -193,7 +192,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
             turn = half * wp.max(wp.length(p[2] - p[1]), wp.length(p[3] - p[1])) + two * around
             beside = half * (wp.length(p[0]) + wp.length(p[1])) + two * around
             return wp.length(r) - near - two * turn * (beside + turn)
-        n = r / nonzero(wp.length(r))
+        n = wp.normalize(r)
         first, second = real(wp.inf), real(-wp.inf)
         for k in range(4):
             at, off = wp.dot(n, y[k] - y[0]), half * wp.abs(wp.dot(n, p[k]))

@@ -67,7 +67,11 @@ def impact_functions(kind: Kind, real):
     def meet(x: Y, p: Y, thickness: real):
         """Whether two come together on their way, or can not be told to stay apart."""
         q, speed = relative(x, p)
-        size = speed + wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
+        size = speed
+        if wp.static(kind.endless):  # whose nodes are 1 m apart, whatever size the others have
+            size += distance(x, q, real(0.0))
+        else:
+            size += wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
         least, t = thickness + real(touching) * size, real(0.0)
         for _ in range(wp.static(PATIENCE)):
             apart = distance(x, q, t)

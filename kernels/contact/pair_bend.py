@@ -14,21 +14,16 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
-from ddg_warp.kernels.division import nonzero_function
+from ddg_warp.kernels.measures.closest_points import PARALLEL
 
 KINDS = EDGES, EDGE_POINT, POINT_TRIANGLE, POINT_PLANE
 TRIANGLES = KINDS.index(POINT_TRIANGLE)
-
-
-# 1 - cos^2 of the angle between two edges, below which it is rounding
-OPEN = {wp.float64: 1e-14, wp.float32: 1e-6}
 
 
 @cache
 def bend_function(linear):
     """bend(kind, x, w, v) -> D D'' v of nodes x (4, 3) with weights w, times a movement v (4, 3); `kind` is a place in `KINDS`."""
     Y, W = wp.types.matrix((4, 3), linear), wp.types.vector(4, linear)
-    nonzero, least = nonzero_function(linear), wp.constant(linear(OPEN[linear]))
 
     @wp.func
     def free(kind: int, w: W):
@@ -67,10 +62,12 @@ def bend_function(linear):
             a00 = linear(1.0)
         if a11 == linear(0.0):
             a11 = linear(1.0)
-        along0, along1 = a01 / a00, a01 / a11
-        open = wp.max(linear(1.0) - along0 * along1, least)
-        g0, g1 = (b0 - along1 * b1) / (a00 * open), (b1 - along0 * b0) / (a11 * open)
-        across = s - r * (wp.dot(r, s) / nonzero(wp.dot(r, r))) - e0 * g0 - e1 * g1
+        # over squared lengths, so that at no scale products of them are lost: 1 less the square of the cosine
+        k0, k1, u0, u1 = a01 / a00, a01 / a11, b0 / a00, b1 / a11
+        sine = wp.max(linear(1.0) - k0 * k1, linear(wp.static(PARALLEL[linear])))
+        g0, g1 = (u0 - k0 * u1) / sine, (u1 - k1 * u0) / sine
+        n = wp.normalize(r)
+        across = s - n * wp.dot(n, s) - e0 * g0 - e1 * g1
         return wp.outer(w, across) - wp.outer(c0 * g0 + c1 * g1, r)
 
     return bend

@@ -26,7 +26,6 @@ import warp as wp
 from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, Kind
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.contact import mollifier_function
-from ddg_warp.kernels.division import nonzero_function
 from ddg_warp.kernels.measures import closest_points
 
 ENDS = 4  # ends of two edges
@@ -54,7 +53,6 @@ def distance_function(kind: Kind, real):
     Q = wp.types.vector(9, real)
     closest_of = closest_points.edge_edge if kind == EDGES else closest_points.point_triangle
     closest = closest_of(real)
-    nonzero = nonzero_function(real)
 
     @wp.func
     def near(x: X):
@@ -64,7 +62,7 @@ def distance_function(kind: Kind, real):
         rho, _m, _o = closest(Q(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
         r = a * rho[0] + b * rho[1] + c * rho[2]
         d = wp.length(r)
-        return W(-rho[0], rho[0] - rho[1], rho[1] - rho[2], rho[2]), d, r / nonzero(d)
+        return W(-rho[0], rho[0] - rho[1], rho[1] - rho[2], rho[2]), d, r / wp.where(d > real(0.0), d, real(1.0))
 
     return near
 
@@ -94,7 +92,6 @@ def point_edge_function(real):
     _, _, V = shape_types(real)
     Q = wp.types.vector(6, real)
     closest = closest_points.point_edge(real)
-    nonzero = nonzero_function(real)
 
     @wp.func
     def apart(p: V, a: V, b: V):
@@ -103,7 +100,7 @@ def point_edge_function(real):
         rho, _m, _o = closest(Q(u[0], u[1], u[2], e[0], e[1], e[2]))
         r = u + e * rho[1]
         d = wp.length(r)
-        return rho[1], d, r / nonzero(d)
+        return rho[1], d, r / wp.where(d > real(0.0), d, real(1.0))
 
     return apart
 
@@ -153,7 +150,6 @@ def end_functions(density: Density, real):
     end = end_function(real)
     energy_of, slope_of, curvature_of = density.laws(real, 1)
     others, half = I(2, 2, 0, 0), real(0.5)
-    nonzero = nonzero_function(real)
 
     @wp.func
     def to_node(x: X, k: int, j: int):
@@ -163,7 +159,7 @@ def end_functions(density: Density, real):
             w[i] = wp.where(i == j, real(1.0), real(0.0)) - wp.where(i == k, real(1.0), real(0.0))
         r = x[j] - x[k]
         d = wp.length(r)
-        return w, d, r / nonzero(d)
+        return w, d, r / wp.where(d > real(0.0), d, real(1.0))
 
     @wp.func
     def of_end(x: X, p: V, inner: W, k: int):

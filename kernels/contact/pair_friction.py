@@ -268,13 +268,12 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
     E, M, A = wp.types.vector(2, real), wp.types.matrix((2, 2), real), wp.types.vector(ANGLES, linear)
     P = wp.types.vector(density.parameter_size(2), real)
     energy_of, slope_of, curvature_of = density.laws(real, 2)
-    one, half, nonzero = wp.constant(real(1.0)), wp.constant(real(0.5)), nonzero_function(real)
+    one, half = wp.constant(real(1.0)), wp.constant(real(0.5))
 
     @wp.func
     def secant(u: E, bound: real, p: P):
         """mu N / phi, beta and u / |u|."""
-        size = wp.length(u)
-        n = u / nonzero(size)
+        n = wp.normalize(u)
         f = slope_of(u, p)
         c = curvature_of(u, p)
         along = wp.dot(n, c * n)
@@ -297,7 +296,8 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
     def root_of(m: M):
         """Of a positive semi-definite matrix."""
         s = wp.sqrt(wp.max(wp.determinant(m), real(0.0)))
-        return (m + wp.diag(E(s, s))) / wp.sqrt(nonzero(wp.trace(m) + real(2.0) * s))
+        trace = wp.trace(m) + real(2.0) * s
+        return (m + wp.diag(E(s, s))) / wp.sqrt(wp.where(trace > real(0.0), trace, one))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(

@@ -17,7 +17,6 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
-from ddg_warp.kernels.division import nonzero_function
 
 STEEPNESS = 7.5
 
@@ -80,7 +79,6 @@ def _functions(profile, real):
     """(energy, slope, curvature, root) of a profile G."""
     potential, force, slope_of = profile(real)
     E, P = wp.types.vector(2, real), wp.types.vector(6, real)
-    nonzero = nonzero_function(real)
 
     @wp.func
     def slid(e: E, p: P):
@@ -102,7 +100,7 @@ def _functions(profile, real):
     @wp.func
     def between(u: E, across: real, along: real):
         """The matrix that is `along` in the direction of the slip, `across` at right angles to it."""
-        unit = u / nonzero(wp.length(u))
+        unit = wp.normalize(u)
         return wp.diag(E(across, across)) + wp.outer(unit, unit) * (along - across)
 
     @wp.func
