@@ -7,6 +7,7 @@ import numpy as np
 from ddg_warp.compile.bodies import ROD
 from ddg_warp.kernels.solve import cyclic_reduction
 from ddg_warp.kernels.terms import ALL
+from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.chains.step import DIRECT
@@ -50,6 +51,9 @@ def report(model) -> str:
         if touching := model.net.host.touching:
             lines += contact_lines(touching)
             present |= contact_terms(touching)
+    bare = dict.fromkeys(batch.name for batch in model.scene.batches if batch.section.radius is None)
+    if bare:
+        lines.append(f"drawn {2.0 * DRAWN:g} m thick, as their section has no radius: {', '.join(bare)}")
     absent = sorted({term.name for term in ALL.values()} - present)
     lines.append("not in this scene: " + ", ".join(absent))
     if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):

@@ -196,7 +196,9 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
         own.sum(1),
         parameters,
         [on_edges(value) for value in (section.EI1, section.EI2, section.GJ)],
-        laws.coefficients(rods, batch, on_edges(section.radius), own) if kind.drag else None,
+        laws.coefficients(rods, batch, on_edges(np.nan if section.radius is None else section.radius), own)
+        if kind.drag
+        else None,
     )
 
 

@@ -9,6 +9,7 @@ from ddg_warp.compile import axisymmetric
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.model.group import Group
+from ddg_warp.scene.material import DRAWN
 
 
 class Order:
@@ -222,7 +223,7 @@ def _numbers(what: str, values) -> np.ndarray:
 
 
 def _node_radius(batch) -> np.ndarray:
-    radius = np.asarray(batch.section.radius, float)
+    radius = np.asarray(DRAWN if batch.section.radius is None else batch.section.radius, float)
     if radius.ndim == 0 or radius.shape[-1] == 1:
         return radius
     return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))

@@ -90,9 +90,10 @@ class Viscous:
             SceneError: the rod is too thick for the theory.
         """
         radius = radius if self.radius is None else self.radius
-        if np.min(radius) <= 0.0:
+        if not np.min(radius) > 0.0:
             raise SceneError(
-                f"{where}: its section has no radius; give Viscous(..., radius=...), or a section with one"
+                f"{where}: its section has no radius, which Viscous drag goes by; give Stiffness(radius=...), Viscous(..., radius=...), "
+                "or drag(tangential=..., normal=...)"
             )
         along, across = (np.log((self.scale or length) / radius) + c for c in THEORIES[self.theory])
         if np.min(along) <= 0.0:

@@ -8,6 +8,8 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
+DRAWN = 1e-3  # radius of rods that are drawn and have none [m]
+
 
 @dataclass(frozen=True)
 class Material:
@@ -47,7 +49,8 @@ class Stiffness:
         GJ: twisting stiffness [N m^2].
         mass_per_length: rho A [kg/m].
         rotary_inertia: rho (I1 + I2) [kg m], inertia about the tangent per length.
-        radius: of the drawn tube, and of the rod in contact [m].
+        radius: of the rod in contact, in `Viscous` drag, and of the drawn tube [m]; None where it is not known. Contact and such drag
+            ask for it, and tubes are drawn with that of `DRAWN`, 1 mm, which `report` says.
         viscosity: strain-rate damping [s], as in `Material`.
         area: of the section [m^2], which a magnetisation needs; 0 where it is not known.
     """
@@ -58,7 +61,7 @@ class Stiffness:
     GJ: float = 0.0
     mass_per_length: float = 0.0
     rotary_inertia: float = 0.0
-    radius: float = 1e-3
+    radius: float | None = None
     viscosity: float = 0.0
     area: float = 0.0
 

@@ -138,6 +138,8 @@ def check_batch(batch, dimension: int) -> None:
         _check_shape(batch, rows, dimension)
     section = batch.section
     for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity", "area"):
+        if what == "radius" and section.radius is None:
+            continue
         try:
             value = np.asarray(getattr(section, what), float)
             np.broadcast_to(value, (batch.rods, batch.edges))

@@ -15,7 +15,7 @@ from ddg_warp.geometry import meshes
 
 DEVICE = "cpu"  # refusals come from the host
 NAN, INF = float("nan"), float("inf")
-STIFFNESS = ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=0.01)
+STIFFNESS = ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=0.01, radius=1e-3)
 RUBBER = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
 RING = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 DOME = np.column_stack([np.sin(np.linspace(0.0, 1.0, 6)), np.cos(np.linspace(0.0, 1.0, 6))])

@@ -25,7 +25,9 @@ def touching(scene, net: Net) -> Touching | None:
         batch = rod.piece.batch
         if batch.name in names:
             row = rod.rod - batch.first
-            radius = law.radius.get(batch.name, float(np.max(_of_rod(batch, "radius", row))))
+            radius = law.radius.get(batch.name)
+            if radius is None:
+                radius = _radius(batch, row, rod.rod)
             if law.rolling and not rod.edges.size:
                 raise SceneError(
                     f"contact: rolling, and rod {rod.rod} ('{batch.name}') has no twist, by which it would roll; leave rolling out, or "
@@ -60,6 +62,20 @@ def touching(scene, net: Net) -> Touching | None:
         lacking = "no rod touches anything" if found.rubs else "there is no friction"
         raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
     return found
+
+
+def _radius(batch, row: int, rod: int) -> float:
+    """Largest radius of one rod of a batch [m], by which it touches.
+
+    Raises:
+        SceneError: its section has none.
+    """
+    if batch.section.radius is None:
+        raise SceneError(
+            f"contact: rod {rod} ('{batch.name}') touches by a radius, and its section has none; give Stiffness(radius=...), or "
+            f"contact(radius={{{batch.name!r}: ...}})"
+        )
+    return float(np.max(_of_rod(batch, "radius", row)))
 
 
 def _of_rod(batch, name: str, row: int) -> np.ndarray:
