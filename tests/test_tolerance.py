@@ -4,6 +4,7 @@ And nothing that is out of balance at the start has converged there: a smooth re
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+import bench_rods
 import bench_tolerance as bench
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
@@ -36,6 +38,24 @@ def test_rods_alone_and_in_a_net(device, rtol):
     assert max(found) <= FACTOR * min(found)
     fall = 0.5 * 9.81 * (steps * bench.DT) ** 2
     assert 1e-12 < max(found) < 10.0 * rtol * fall
+
+
+@pytest.mark.parametrize("nodes", [121, pytest.param(961, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("island", [False, True], ids=["alone", "island"])
+def test_long_rods_of_many_nodes(device, island, nodes):
+    """Rods of 1 cm edges that have fallen for 64 steps are off by less than rtol of their length, and by less the less it is."""
+    case = bench_rods.Case(
+        "", 3, nodes, length=0.01 * (nodes - 1), precision="mixed", island=island, blocks=1, block=54
+    )
+    on, found = wp.get_device(device), {}
+    for rtol in (8e-7, 1e-8):
+        found[rtol] = bench_rods.run(replace(case, rtol=rtol), on)[1]
+    alone = replace(case, rods=1, island=False, solver="sweep", precision="float64", rtol=bench_rods.EXACT_RTOL)
+    exact = bench_rods.run(alone, on)[1]
+    fall = np.ptp(exact[..., 2])
+    assert fall > 0.2
+    for rtol, points in found.items():
+        assert np.linalg.norm(points - exact, axis=2).max() < rtol * case.length
 
 
 @pytest.mark.parametrize(
