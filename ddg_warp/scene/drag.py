@@ -92,8 +92,8 @@ class Viscous:
         radius = radius if self.radius is None else self.radius
         if not np.min(radius) > 0.0:
             raise SceneError(
-                f"{where}: its section has no radius, which Viscous drag goes by; give Stiffness(radius=...), Viscous(..., radius=...), "
-                "or drag(tangential=..., normal=...)"
+                f"{where}: its section has no radius, which Viscous drag goes by; give Stiffness(radius=...), "
+                "Viscous(..., radius=...), or drag(tangential=..., normal=...)"
             )
         along, across = (np.log((self.scale or length) / radius) + c for c in THEORIES[self.theory])
         if np.min(along) <= 0.0:

@@ -93,11 +93,11 @@ def check_load(host, place: int, found: np.ndarray, difference: Difference) -> N
 
 
 def test_a_mechanism_has_no_gradient():
-    """A joined rod that is not held can spin about its hinge: angles of its edges have no gradient, positions do."""
+    """A joined rod that is not held can spin about its hinge."""
     model = built(SCENES["hinged"]())
     state = statics.solve(model)
     weights = directions(model, state, 5)
-    with pytest.raises(SolverError, match=r"no gradient goes through the solution: edge \d of rod \d can move without"):
+    with pytest.raises(SolverError, match=r"no gradient .* the spin of edge \d of rod \d is neutral.*fix_twist"):
         EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
 
 
