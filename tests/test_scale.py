@@ -1,37 +1,126 @@
-"""Everything scales: with lengths times c, time times c and gravity over c, at the same material, shapes over c are the same."""
+"""The same relative answer at every length: objects from a nanometre to a hundred kilometres, in equilibria, steps, paths and spectra.
+
+A scene of size L with the moduli of one of 1 m, forces by L^2, moments by L^3, gravity by 1 / L, drag coefficients by L and time by L has
+the same shape over L, and frequencies by 1 / L.
+"""
+
+from functools import cache
 
 import numpy as np
 import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.solve.continuation import Continuation
+from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.statics import solve
 
-MATERIAL = ddg.Material(young=1e6, density=1000.0, poisson=0.3)
-SIZES = {"float64": (1e-9, 1e-6, 1e5), "mixed": (1e-6, 1e5)}
-
-
-def stiffened(device, precision: str, size: float, bending: str) -> np.ndarray:
-    """Points over the size of a clamped sheet with a rod glued along it, which has bent down under its weight for 10 steps."""
-    points, triangles = meshes.rectangle(6, 4)
-    scene = ddg.Scene(gravity=(0.0, 0.0, -50.0 / size))
-    shell = scene.add_shell(size * points, triangles, thickness=0.01 * size, material=MATERIAL, bending=bending)
-    scene.clamp_boundary(shell, np.flatnonzero(points[:, 0] == points[:, 0].min()))
-    line = np.flatnonzero(np.abs(points[:, 1] - np.unique(points[:, 1].round(9))[1]) < 1e-6)
-    line = line[np.argsort(points[line, 0])]
-    rod = scene.add_rod(size * points[line], section=ddg.Circle(0.01 * size), material=MATERIAL)
-    scene.attach(rod, range(len(line)), shell, line)
-    model = scene.build(device, precision)
-    integrator, state = ddg.Integrator(model, rtol=1e-9), model.state()
-    for _ in range(10):
-        state = integrator.step(state, 0.02 * size)
-    return state.points() / size
+MATERIAL = ddg.Material(1e6, 0.3, density=1000.0)
+LENGTHS = [1e-9, pytest.param(1e-3, marks=pytest.mark.slow), 1e5]
+TOLERANCE = {"float64": 1e-7, "mixed": 1e-6}
 
 
-@pytest.mark.parametrize("precision", SIZES)
-@pytest.mark.parametrize("bending", ["hinge", pytest.param("midedge_dof", marks=pytest.mark.slow)])
-def test_sheets_with_rods_on_them(device, bending, precision):
-    """Dihedral angles, tilts at a clamp and angles between a rod and a sheet divide by areas, of which none is too small."""
-    expected = stiffened(device, precision, 1.0, bending)
-    assert np.ptp(expected[:, 2]) > 0.5
-    for size in SIZES[precision]:
-        np.testing.assert_allclose(stiffened(device, precision, size, bending), expected, atol=1e-7)
+def line(length: float, edges: int = 12) -> np.ndarray:
+    return np.linspace((0, 0, 0), (length, 0, 0), edges + 1)
+
+
+def scene_of(length: float, dimension: int = 3, weight: float = 1e-3) -> ddg.Scene:
+    """A scene whose gravity is that of 1 m, as a part of g, over its length."""
+    return ddg.Scene(gravity=(0, 0, -weight * 9.81 / length), dimension=dimension)
+
+
+def rod(length, **options):
+    scene = scene_of(length, options.pop("dimension", 3))
+    section = options.pop("section", ddg.Circle(0.02 * length))
+    own = scene.add_rod(line(length), section=section, material=MATERIAL, **options)
+    scene.clamp_end(own)
+    scene.add_force(own, -1, (0, 0, 0.1 * length**2))
+    return scene
+
+
+def ribbon(length):
+    return rod(length, section=ddg.Ribbon(0.1 * length, 0.01 * length), director=(0, 1, 0))
+
+
+def joined(length):
+    scene = scene_of(length)
+    points = line(length)
+    kind = dict(section=ddg.Circle(0.02 * length), material=MATERIAL)
+    first, last = scene.add_rod(points[:7], **kind), scene.add_rod(points[6:], **kind)
+    brace = scene.add_rod(np.linspace(points[6], points[6] + [0, 0.4 * length, 0], 5), **kind)
+    scene.join([(first, -1), (last, 0)])
+    scene.join([(first, -1), (brace, 0)], rigid=False)
+    scene.clamp_end(first)
+    scene.fix(brace, [-1])
+    scene.fix_twist(brace, [0])
+    scene.add_force(last, -1, (0, 0, 0.1 * length**2))
+    return scene
+
+
+def shell(length, bending, stiffened=False):
+    scene = scene_of(length)
+    points, triangles = meshes.rectangle(4, 3, (length, 0.6 * length), "alternating")
+    sheet = scene.add_shell(points, triangles, thickness=0.02 * length, material=MATERIAL, bending=bending)
+    scene.clamp_boundary(sheet, np.flatnonzero(points[:, 0] < 1e-6 * length))
+    scene.add_vertex_force(sheet, [int(np.argmax(points @ [1.0, 1e-3, 0.0]))], (0, 0, 0.05 * length**2))
+    if stiffened:
+        row = np.flatnonzero(np.abs(points[:, 1] - points[:, 1].min()) < 1e-6 * length)
+        row = row[np.argsort(points[row, 0])]
+        stiffener = scene.add_rod(points[row], section=ddg.Circle(0.01 * length), material=MATERIAL)
+        scene.attach(stiffener, range(len(row)), sheet, row)
+    return scene
+
+
+def magnet(length):
+    scene = rod(length)
+    scene.magnetize(0, (1e4, 0.0, 0.0))
+    scene.magnetic_field((0.0, 0.0, 1e-2))
+    return scene
+
+
+def dragged(length):
+    scene = rod(length)
+    scene.drag(0, tangential=1e-2 * length, normal=2e-2 * length)
+    return scene
+
+
+OBJECTS = {
+    "rod": rod,
+    "planar": lambda length: rod(length, dimension=2),
+    "no_twist": lambda length: rod(length, twist=False),
+    "ribbon": ribbon,
+    "joined": joined,
+    "magnet": magnet,
+    "drag": dragged,
+    "midedge_dof": lambda length: shell(length, "midedge_dof"),
+    "midedge": lambda length: shell(length, "midedge"),
+    "hinge": lambda length: shell(length, "hinge"),
+    "stiffened": lambda length: shell(length, "midedge_dof", stiffened=True),
+}
+
+
+@cache
+def answers(name: str, length: float, precision: str, device: str) -> dict:
+    """Shapes over the length, and frequencies times it, of one object."""
+    model = OBJECTS[name](length).build(device, precision)
+    state = solve(model, load_steps=2)
+    result = {"equilibrium": state.points() / length}
+    if precision == "float64":
+        result["frequencies"] = spectrum(model, state, 3).frequencies * length
+        path = Continuation(model).trace(stop=ddg.Stop(steps=3))
+        result["path"] = path.points[-1].state.points() / length
+    integrator, state = ddg.Integrator(model, rtol=1e-9 if precision == "float64" else 1e-7), model.state()
+    for _ in range(4):
+        state = integrator.step(state, 0.1 * length)
+    return result | {"steps": state.points() / length}
+
+
+@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("length", LENGTHS)
+@pytest.mark.parametrize("name", OBJECTS)
+def test_scale(device, name, length, precision):
+    found, expected = (answers(name, each, precision, str(device)) for each in (length, 1.0))
+    assert np.abs(expected["equilibrium"] - OBJECTS[name](1.0).build("cpu").state().points()).max() > 1e-3
+    for what, values in expected.items():
+        scale = np.abs(values).max()
+        np.testing.assert_allclose(found[what], values, rtol=0.0, atol=TOLERANCE[precision] * scale, err_msg=what)

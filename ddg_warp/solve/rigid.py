@@ -57,7 +57,9 @@ def rigid_modes(tangent, state, stiffness: sparse.csc_matrix) -> np.ndarray:
     places = np.concatenate([body.nodes.max(axis=1) for body in bodies])
     inside = np.concatenate([np.where(body.nodes >= 0, q[body.nodes], 0.0) for body in bodies])[places >= 0]
     centre, size = inside.mean(axis=0), max(1e-300, np.linalg.norm(np.ptp(inside, axis=0)))
-    motions = [body.motions(q, centre, size) for body in bodies]
+    # angles times the size, as displacements are, so that neither outweighs the other whatever the size
+    lever = np.where(tangent.angle, size, 1.0)
+    motions = [(dofs, lever[dofs][:, None] * columns) for dofs, columns in (body.motions(q, centre, size) for body in bodies)]
     belongs = sparse.csr_matrix(
         (
             np.ones(sum(len(dofs) for dofs, _ in motions)),
@@ -73,7 +75,7 @@ def rigid_modes(tangent, state, stiffness: sparse.csc_matrix) -> np.ndarray:
     for members in np.split(order, np.searchsorted(piece[order], np.arange(1, count))):
         dofs, columns = _of_piece([motions[i] for i in members], tangent.free)
         if columns.shape[1]:
-            result += _unresisted(dofs, columns, stiffness, tolerance)
+            result += _unresisted(dofs, columns / lever[dofs][:, None], stiffness, tolerance)
     modes = np.zeros((tangent.size, len(result)))
     for mode, (dofs, values) in zip(modes.T, result, strict=True):
         mode[dofs] = values
