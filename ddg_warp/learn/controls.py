@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.learn.layout import view
 from ddg_warp.solve.controls import LOADS
+from ddg_warp.solve.motion import counts_turns, turns_between
 
 
 class StepControls:
@@ -37,9 +38,23 @@ class StepControls:
         if model.grips:
             place = view(engine.after.grips.pose)
             if "poses" in controls:
+                self._refuse_far_turns(controls["poses"])
                 place.copy_(controls["poses"].reshape(-1, 6).T)
             else:
                 place.copy_(view(engine.before.grips.pose))
+
+    def _refuse_far_turns(self, poses: torch.Tensor) -> None:
+        """Refuse rotation vectors that count more than half a turn; where reading them would wait, steps end as not finite by them.
+
+        Raises:
+            SolverError: as `turns_between`.
+        """
+        if self.model.wp_device.is_cuda and self.model.touch is None:
+            return
+        ends = poses.detach().cpu().numpy()
+        if counts_turns(ends):
+            begin = view(self.engine.before.grips.pose).T.reshape(ends.shape)
+            turns_between(begin.detach().cpu().numpy(), ends)
 
     def give_field(self, controls: dict) -> None:
         """Hand the integrator the magnetic field of a step."""

@@ -65,6 +65,11 @@ class Motion:
         return self.angle is not _unturned
 
     @property
+    def shifts(self) -> bool:
+        """Return True if it was given a translation."""
+        return self.translation is not _still
+
+    @property
     def planar(self) -> bool:
         """Whether what lies in the plane of x and z turns within it."""
         return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from turn_cases import (
     BALL,
+    DAMPING,
     DT,
     FIRST,
     HALF,
@@ -59,6 +60,12 @@ def swept(kind: str, turns: float, radius: float) -> bool:
     return 2.0 * start < np.pi * turns and (kind != "half-space" or turns < 1.0)
 
 
+def outward(turns: float, radius: float) -> float:
+    """How far a rod goes out along a blade at most, by d + r omega / alpha for each radian, d ahead of it and dragged by alpha m v."""
+    turn = 2.0 * np.pi * turns
+    return (turn - 0.5 * turn % (2.0 * np.pi)) * (THICKNESS + RANGE + radius * turn / DT / DAMPING)
+
+
 def check_pushed(kind: str, turns: float, radius: float, held: str, device) -> None:
     """A rod half-way along the turn is pushed, and a rod at an angle that nothing sweeps stays where it is, to the bit.
 
@@ -78,7 +85,7 @@ def check_pushed(kind: str, turns: float, radius: float, held: str, device) -> N
     statistics = integrator.statistics()["contact"]
     assert moved > 0.1 * THICKNESS
     assert statistics["smallest_gap"] > 0.0
-    if kind in WIDE and radius < LAST:
+    if kind in WIDE and radius + outward(turns, radius) < LAST:
         lead = np.sin(ahead(points[0], 2.0 * np.pi * turns)) * np.linalg.norm(points[0], axis=-1)
         side = THICKNESS if kind != "half-space" else RADIUS
         assert (lead > side).all()
@@ -94,6 +101,29 @@ def test_arcs_push_what_chords_would_pass(device, kind, held):
         radius = radius if kind != "ball" else LAST - BALL
         if swept(kind, turns, radius) and (held == "motion" or turns <= 0.5):
             check_pushed(kind, turns, radius, held, device)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "capsule", "fix"])
+def test_a_rod_is_pushed_along_the_arc_at_and_near_the_axis(device, kind):
+    """A blade through the axis pushes a rod that is dragged, so that it goes along the normal of the blade, and out along it.
+
+    At a distance d ahead of the blade and r along it a substep that turns by a has r cos(a) + d sin(a).
+    """
+    turns = 1.0
+    for radius in (0.0035, 0.01, 0.05):
+        made = scene(kind, turning(turns), place(radius, 0.5 * np.pi), first=-LAST)
+        integrator, state = step(made, device)
+        angle, x = 2.0 * np.pi * turns, state.points()[5, :2]
+        along, off = x @ place(1.0, angle), x @ place(1.0, angle + 0.5 * np.pi)
+        assert THICKNESS < off < THICKNESS + RANGE
+        count = needed(angle, LAST)
+        assert substeps(integrator) == [count]
+        wanted = place(radius, 0.5 * np.pi)
+        for k in range(1, count + 1):
+            normal = place(1.0, angle * k / count + 0.5 * np.pi)
+            wanted = wanted + max(0.0, off - wanted @ normal) * normal
+        # what is dragged by alpha m v keeps a part of 1 / (1 + alpha s) of its velocity in a substep s
+        assert along == pytest.approx(wanted @ place(1.0, angle), rel=0.05)
 
 
 @pytest.mark.slow
@@ -146,7 +176,7 @@ def test_what_turns_about_its_axis_of_symmetry_needs_no_substeps(device, shape, 
 def test_a_drum_that_spins_by_half_a_turn_a_step_rubs_as_one_that_spins_slowly(device):
     """A rod that lies on top slides: m dv / dt = mu N, by whatever angle the drum turns in a step."""
     mu, dt, settled, steps, radius = 0.3, 2e-3, 40, 6, 0.05
-    for turn in (0.2, np.pi, 5.0):
+    for turn in (0.2, np.pi):
         made = ddg.Scene(mass_damping=5.0)
         line = np.linspace((-0.05, 0.0, 1.3 * RADIUS), (0.05, 0.0, 1.3 * RADIUS), 11)
         made.add_rod(line, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e8, density=1000.0, viscosity=1e-3))
@@ -214,10 +244,13 @@ def test_what_substeps_do_not_resolve_is_refused_with_a_step_that_does(device):
     assert 0.1 < dt / (DT * MOST_PARTS / (40.0 * 2.0 * np.pi / (2.0 * np.arccos(1.0 - PART * 2e-5 / LAST)))) <= 1.0
     integrator, _ = step(made, device, dt=dt)
     assert substeps(integrator) == [MOST_PARTS]
+    jumping = ddg.Motion(angle=lambda t: 3.0 * (t > 0.4))
+    with pytest.raises(ddg.SolverError, match=r"a motion that does not jump, as this one at t = 0\.4, such as a ramp"):
+        step(scene("capsule", jumping, place(0.1, -1.5)), device)
 
 
 def test_a_grip_goes_the_shorter_way_and_no_farther_than_half_a_turn(device):
-    model = scene("capsule", ddg.Grip(), place(0.19, 3.0)).build(device=device)
+    model = scene("mesh", ddg.Grip(), place(0.19, 3.0)).build(device=device)
     with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.6 turns") as error:
         ddg.Integrator(model).step(model.state(), DT, posed(0.6))
     assert error.value.outcome == "turned_too_far"
@@ -225,8 +258,8 @@ def test_a_grip_goes_the_shorter_way_and_no_farther_than_half_a_turn(device):
     integrator, state = ddg.Integrator(model), model.state()
     for turns in (0.45, 0.9, 0.2):
         state = integrator.step(state, DT, posed(turns))
-    angle = ahead(state.points()[5:6], 0.0)
-    assert 0.45 * 2.0 * np.pi - 2.0 * np.pi < angle[0] < 0.2 * 2.0 * np.pi
+        lead = ahead(state.points()[5:6], 2.0 * np.pi * turns)[0]
+        assert 0.0 < lead < 0.02 if turns != 0.45 else lead == pytest.approx(3.0 - 0.9 * np.pi)
 
 
 def test_a_grip_that_substeps_do_not_resolve_gives_up_its_world_alone(device):

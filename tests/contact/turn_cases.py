@@ -8,43 +8,54 @@ from ddg_warp.solve.net.arcs import PART
 FIRST, LAST, HALF = 0.05, 0.2, 1e-3  # m, of a blade along x: nearest and farthest from the axis, half its thickness
 RADIUS = 1e-3  # m, of the rod
 BALL = 0.02  # m, radius of a ball
-DT = 1.0
+DT, DAMPING = 1.0, 1e3  # s, 1/s
 RANGE, THICKNESS = 0.5 * RADIUS, RADIUS + HALF
-LINE = np.linspace((FIRST, 0.0, 0.0), (LAST, 0.0, 0.0), 7)
-PLATE = np.array([[FIRST, 0, -0.1], [LAST, 0, -0.1], [LAST, 0, 0.1], [FIRST, 0, 0.1]])
 CELLS = np.array([[0, 1, 2], [0, 2, 3]])
 STIFF, RIGID = ddg.Material(young=1e10, density=1000.0), ddg.Material(young=1e13, density=1000.0)
 
-OBSTACLES = {
-    "mesh": ddg.Mesh(PLATE, CELLS, HALF),
-    "box": ddg.Box((0.5 * (FIRST + LAST), 0.0, 0.0), (0.5 * (LAST - FIRST), HALF, 0.1)),
-    "capsule": ddg.Capsule(tuple(LINE[0]), tuple(LINE[-1]), HALF),
-    "half-space": ddg.Plane((FIRST, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    "ball": ddg.Sphere((LAST - BALL, 0.0, 0.0), BALL),
-}
+
+def line(first: float = FIRST) -> np.ndarray:
+    return np.linspace((first, 0.0, 0.0), (LAST, 0.0, 0.0), 7)
+
+
+def plate(first: float = FIRST) -> np.ndarray:
+    return np.array([[first, 0, -0.1], [LAST, 0, -0.1], [LAST, 0, 0.1], [first, 0, 0.1]])
+
+
+def obstacles(first: float = FIRST) -> dict:
+    return {
+        "mesh": ddg.Mesh(plate(first), CELLS, HALF),
+        "box": ddg.Box((0.5 * (first + LAST), 0.0, 0.0), (0.5 * (LAST - first), HALF, 0.1)),
+        "capsule": ddg.Capsule(tuple(line(first)[0]), tuple(line(first)[-1]), HALF),
+        "half-space": ddg.Plane((first, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        "ball": ddg.Sphere((LAST - BALL, 0.0, 0.0), BALL),
+    }
+
+
+OBSTACLES = obstacles()
 SUPPORTS = ("clamp", "fix", "hold")
 KINDS = (*OBSTACLES, *SUPPORTS)
 
 
-def scene(kind: str, motion, places, reach: float | None = None, **contact) -> ddg.Scene:
-    """A blade of a kind with its motion, and short rods along z through places (n, 2) of the plane.
+def scene(kind: str, motion, places, reach: float | None = None, first: float = FIRST, **contact) -> ddg.Scene:
+    """A blade of a kind from `first` on, with its motion, and short rods along z through places (n, 2) of the plane.
 
     The rods are dragged by all that surrounds them, and so go no farther than they are pushed.
     """
-    made = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=1e3)
-    line = np.linspace((0.0, 0.0, -0.05), (0.0, 0.0, 0.05), 11)
+    made = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=DAMPING)
+    across = np.linspace((0.0, 0.0, -0.05), (0.0, 0.0, 0.05), 11)
     for x, y in np.atleast_2d(places):
-        made.add_rod(line + [x, y, 0.0], section=ddg.Circle(RADIUS), material=STIFF, name="rod")
+        made.add_rod(across + [x, y, 0.0], section=ddg.Circle(RADIUS), material=STIFF, name="rod")
     section = {"section": ddg.Circle(HALF), "material": RIGID}
     if kind in OBSTACLES:
-        made.add_obstacle(OBSTACLES[kind], motion=motion, name="blade")
+        made.add_obstacle(obstacles(first)[kind], motion=motion, name="blade")
     elif kind == "hold":
-        shell = made.add_shell(PLATE, CELLS, thickness=2.0 * HALF, material=STIFF, name="blade")
-        made.hold(shell, np.arange(len(PLATE)), motion=motion)
+        shell = made.add_shell(plate(first), CELLS, thickness=2.0 * HALF, material=STIFF, name="blade")
+        made.hold(shell, np.arange(4), motion=motion)
     else:
-        blade = made.add_rod(LINE, **section, name="blade")
+        blade = made.add_rod(line(first), **section, name="blade")
         if kind == "fix":
-            made.fix(blade, np.arange(len(LINE)), motion=motion)
+            made.fix(blade, np.arange(7), motion=motion)
         else:
             made.clamp_end(blade, "first", motion=motion)
     made.contact(stiffness=1e4, range=reach, **contact)

@@ -6,7 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
 from tests.learn import differences
-from tests.learn.contact_cases import DT, RADIUS, RANGE, bar, scene_of, touching
+from tests.learn.contact_cases import DT, RADIUS, RANGE, SOFT, bar, scene_of, touching
 from tests.learn.differences import TIGHT
 
 torch = pytest.importorskip("torch")
@@ -235,3 +235,20 @@ def test_radii_that_are_given_stay():
         change += np.log(1.1)
     found = factors()["contact.radius"] / RADIUS
     torch.testing.assert_close(found, torch.tensor([[1.1, 1.2]], dtype=torch.float64), rtol=1e-12, atol=0.0)
+
+
+def test_what_turns_far_has_no_gradient_and_counts_no_more_than_half_a_turn():
+    """A step in substeps that resolve arcs is no single solve; poses say nothing of more than half a turn."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_rod(np.linspace((0.1, 0.02, -0.05), (0.1, 0.02, 0.05), 7), section=ddg.Circle(RADIUS), material=SOFT)
+    scene.add_obstacle(ddg.Capsule((0.05, 0.0, 0.0), (0.2, 0.0, 0.0), RADIUS), motion=ddg.Grip())
+    scene.contact(stiffness=1e4)
+    own = Simulator(scene.build(device=differences.DEVICE, precision="float64"), 0.1)
+    for turn, finite in ((0.01, True), (0.5, False)):
+        poses = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, turn]], dtype=torch.float64, requires_grad=True)
+        end = own.step(own.initial_state(), controls={"poses": poses})
+        assert torch.isfinite(end.positions).all() and own.outcomes().tolist() == ["converged"]
+        end.positions.sum().backward()
+        assert bool(torch.isfinite(poses.grad).all()) == finite
+    with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.7 turns"):
+        own.step(own.initial_state(), controls={"poses": torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 1.4 * np.pi]])})

@@ -24,7 +24,7 @@ from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.motion import turns_between
 from ddg_warp.solve.net.swept import Swept, swept_surfaces
 
-PART = 0.25  # of the range and the thickness, by which an arc may be off its chord
+PART = 0.125  # of the range and the thickness, by which an arc may be off its chord
 TIMES = np.array([0.0, 0.13, 0.31, 0.52, 0.68, 0.87, 1.0])  # of an interval, at which motions are sampled
 
 
@@ -38,7 +38,7 @@ class Arcs:
     """
 
     def __init__(self, model):
-        self.model, self._version, self._allowed = model, None, []
+        self.model, self._version, self._allowed, self._largest = model, None, [], []
         self.moved = swept_surfaces(model)
         motions = [swept.motion for swept in self.moved]
         self._of_grip = [motions.index(grip) if grip in motions else -1 for grip in model.grips]
@@ -61,6 +61,7 @@ class Arcs:
             return
         self._version = self.model.version
         self._allowed = [self._room(swept) for swept in self.moved]
+        self._largest = [_largest_turns(*each) for each in zip(self.moved, self._allowed, strict=True)]
         if self._of_grip:
             allowed, most = np.full((2, self.model.worlds, len(self._of_grip)), np.inf)
             for g, i in enumerate(self._of_grip):
@@ -93,9 +94,9 @@ class Arcs:
         """
         self._renew()
         result = np.zeros(self.model.worlds, int)
-        for swept, allowed in zip(self.moved, self._allowed, strict=True):
-            if not isinstance(swept.motion, Grip) and np.isfinite(allowed).any():
-                result = np.maximum(result, _levels_of(swept, allowed, t0, t1, load_steps))
+        for swept, allowed, largest in zip(self.moved, self._allowed, self._largest, strict=True):
+            if largest is not None:
+                result = np.maximum(result, _levels_of(swept, allowed, largest, t0, t1, load_steps))
         return result
 
     def increments(self, state, ends: np.ndarray | None, start: float, end: float, load_steps: int) -> int:
@@ -147,9 +148,17 @@ def largest_turn(swept: Swept, allowed: float, axis: np.ndarray | None = None) -
     return min(swept.most, 4.0 * math.asin(math.sqrt(0.5 * min(1.0, allowed / far))))
 
 
-def _levels_of(swept: Swept, allowed: np.ndarray, t0: float, t1: float, load_steps: int) -> np.ndarray:
+def _largest_turns(swept: Swept, allowed: np.ndarray) -> np.ndarray | None:
+    """Return the largest turn of a substep (worlds,) of a function of time, None where it meets nothing, and of grips."""
+    if isinstance(swept.motion, Grip) or not np.isfinite(allowed).any():
+        return None
+    return np.array([largest_turn(swept, each, swept.motion.unit) for each in allowed])
+
+
+def _levels_of(
+    swept: Swept, allowed: np.ndarray, largest: np.ndarray, t0: float, t1: float, load_steps: int
+) -> np.ndarray:
     """Return log2 of the number of substeps (worlds,) that resolve a function of time."""
-    largest = np.array([largest_turn(swept, each, swept.motion.unit) for each in allowed])
     result, coarse, level = np.zeros(len(allowed), int), np.ones(len(allowed), bool), 0
     while True:
         off, turn = _chords(swept, t0, t1, level)
@@ -161,6 +170,9 @@ def _levels_of(swept: Swept, allowed: np.ndarray, t0: float, t1: float, load_ste
             remedy = f"dt = {_rounded_down(abs(t1 - t0) / excess):g} s or less"
             if load_steps:
                 remedy = f"load_steps = {math.ceil(load_steps * excess)} or more"
+            at = swept.motion.jump(t0, t1)
+            if at is not None:
+                remedy = f"a motion that does not jump, as this one at t = {at:g}, such as a ramp over the step"
             raise _refusal(swept, _chords(swept, t0, t1, 0)[1], remedy)
         level += 1
         result[coarse] = level
@@ -182,23 +194,29 @@ def _rounded_down(value: float) -> float:
 
 
 def _chords(swept: Swept, t0: float, t1: float, level: int) -> tuple[float, float]:
-    """Return the largest distance of nodes from their chords [m], and the largest turn [rad], in 2^level intervals from t0 to t1."""
+    """Return the largest distance of nodes from their chords [m], and the largest turn [rad], in 2^level intervals from t0 to t1.
+
+    Of a motion that turns alone the turn says all.
+    """
     motion, count = swept.motion, 2**level
     times = (t0 + (t1 - t0) * (np.arange(count)[:, None] + TIMES) / count).ravel().tolist()
-    angles = np.array([motion.angle(t) for t in times] if motion.turns else np.zeros(len(times)), float)
+    angles = np.array([motion.angle(t) for t in times] if motion.turns else [0.0] * len(times), float)
+    # it alone tells how often a node goes round from one sample to the next
+    turn = float(np.ptp(angles.reshape(count, -1), axis=-1).max())
+    if not motion.shifts:
+        return 0.0, turn
     shifts = np.array([motion.translation(t) for t in times], float).reshape(len(times), -1, 3)
     if motion.count is not None:
         shifts = shifts[:, swept.rows]
-    # angles alone tell how often a node goes round from one sample to the next
-    places = (_turned(motion.unit, angles, swept.arms) + shifts).reshape(count, len(TIMES), len(swept.points), 3)
-    way = places - places[:, :1]
+    places = shifts + _turned(motion.unit, angles, swept.arms) if turn else shifts
+    way = places.reshape(count, len(TIMES), -1, 3)
+    way = way - way[:, :1]
     chord = way[:, -1:]
     along, square = (way * chord).sum(-1, keepdims=True), (chord * chord).sum(-1, keepdims=True)
     if motion.count is None:  # a rigid body goes along its chords as one
         along, square = along.sum(-2, keepdims=True), square.sum(-2, keepdims=True)
     share = np.clip(along / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
-    off = np.sqrt(np.square(way - share * chord).sum(-1).max())
-    return float(off), float(np.ptp(angles.reshape(count, -1), axis=-1).max())
+    return float(np.sqrt(np.square(way - share * chord).sum(-1).max())), turn
 
 
 def _turned(axis: np.ndarray, angles: np.ndarray, arms: np.ndarray) -> np.ndarray:
