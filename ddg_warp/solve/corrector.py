@@ -255,8 +255,13 @@ class Corrector:
         return float(self.tangent.energy(state)["contact"].sum())
 
     def _moved(self, state: State, load: float, move: np.ndarray) -> tuple[State, np.ndarray]:
-        """The state after a move (size + 1,) from it and from `load`, and what of the move was taken before something is in the way."""
-        taken = 1.0
+        """The state after a move (size + 1,) from it and from `load`, and what of the move was taken before something is in the way.
+
+        In contact no more is taken than resolves the arcs of supports and obstacles that turn.
+        """
+        taken, arcs = 1.0, self.equilibrium.net.arcs if self.equilibrium.net else None
+        if arcs:
+            taken = 0.5 ** int(arcs.levels(*sorted((load, load + move[-1]))).max())
         for _ in range(CUTS):
             there = self.tangent.advance(state, taken * move[:-1], load + taken * move[-1])
             share = self.equilibrium.share(state, there)
