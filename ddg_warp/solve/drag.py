@@ -85,14 +85,15 @@ class ChainDrag(Drag):
             )
 
     def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rates of nodes and edges of a group's state (node, column), of what has no inertia `lead` [s] after those that it has."""
+        """Return rates of nodes and edges of a group's state (node, column); of what has no inertia `lead` [s] after its own."""
         v, a, omega, alpha, mass, rotary = (
             arrays.download(array).astype(float)
             for array in (data.v, data.a, data.omega, data.alpha, self.part.mass, self.part.rotary)
         )
         if lead > 0.0:
-            v = v + lead * np.where(mass[..., None] <= 0.0, a, 0.0)
-            omega = omega + lead * np.where(rotary <= 0.0, alpha, 0.0) if self.part.kind.twist else omega
+            v = v + lead * np.where((mass[..., None] <= 0.0) & (v != 0.0), a, 0.0)
+            if self.part.kind.twist:
+                omega = omega + lead * np.where((rotary <= 0.0) & (omega != 0.0), alpha, 0.0)
         return v, omega
 
 
@@ -136,7 +137,7 @@ class NetDrag(Drag):
         """Rates of blocks (world, block) of a net's state, as of `ChainDrag`."""
         net = self.part
         v, a = (array.numpy().astype(float).reshape(net.worlds, -1, 3) for array in (state.v, state.a))
-        return v + lead * np.where(net.mass.numpy() <= 0.0, a, 0.0) if lead > 0.0 else v
+        return v + lead * np.where((net.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
 
     def settle(self, before, after, solver, islands) -> None:
         """As of `ChainDrag`."""

@@ -278,7 +278,8 @@ class Integrator:
             self._graphs.replay(("reset", source), launch)
         else:  # whose arrays may be gone by the next time
             launch()
-        then.state.time, then.state.stable, then.state.spun = state.time, None, state.spun or to.spun
+        then.state.time, then.state.lead, then.state.stable = state.time, state.lead, None
+        then.state.spun = state.spun or to.spun
         if self._net is not None:
             self._net.arrive()
         return then.state
