@@ -5,6 +5,7 @@ import numpy as np
 from ddg_warp.compile.loads import Couple
 from ddg_warp.compile.storage import FREE, Held, Storage
 from ddg_warp.errors import SceneError
+from ddg_warp.scene.grip import Grip
 
 STILL = FREE - 1  # instead of a pose, of a dof that is held still
 
@@ -60,12 +61,18 @@ def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
 
 
 class Claims:
-    """Which pose moves each held dof of a storage; a dof that two poses, or one and a still support, claim is refused."""
+    """Which pose moves each held dof of a storage; a dof that two poses, or one and a still support, claim is refused.
+
+    A motion that leaves one of the components where it is that its support names claims it as a still support does: one about y is no
+    conflict with a plane of symmetry "y". One that moves none of them is taken at its word.
+    """
 
     def __init__(self, scene, storage: Storage):
         self.storage, self.motions = storage, scene_motions(scene)
+        self._duration = getattr(scene.analysis, "duration", None) or 1.0
         starts = pose_starts(self.motions)
         self._start = {id(motion): int(start) for motion, start in zip(self.motions, starts, strict=False)}
+        self._moved = {}  # motion, and components that it is to move, by number of the support
         self._claims = []  # places, components, poses, number of the support and owners, of each support
 
     def take(self, support, nodes: np.ndarray, nth: np.ndarray, owners: np.ndarray, angles: np.ndarray = _NONE) -> None:
@@ -83,6 +90,7 @@ class Claims:
             poses = np.full(len(places), STILL if motion is None else self._start[id(motion)])
             if motion is not None and motion.count is not None:
                 poses += np.tile(nth, len(along))  # such a motion turns no edge
+            self._moved[len(storage.held)] = motion, along
             known = np.isin(components, storage.axes)
             owners = np.concatenate([np.tile(owners, len(along)), angles])
             claims = places, components, poses, np.full(len(places), len(storage.held)), owners
@@ -99,7 +107,12 @@ class Claims:
         claims = [np.concatenate(values) for values in zip(*self._claims, strict=True)]
         order = np.argsort(3 * claims[0] + claims[1], kind="stable")  # claims of one dof stay in order
         places, components, poses, supports, owners = (values[order] for values in claims)
-        again = np.diff(3 * places + components) == 0
+        dofs = 3 * places + components
+        again = np.diff(dofs) == 0
+        differ = np.isin(dofs, dofs[1:][again & (np.diff(poses) != 0)]) & (places < self.storage.nodes) & (poses > FREE)
+        for support in np.unique(supports[differ]):
+            here = differ & (supports == support)
+            poses[here] = np.where(self._kept(support)[components[here]], STILL, poses[here])
         shared = (np.diff(supports) == 0) & (np.diff(owners) != 0)
         clash = np.flatnonzero(again & (np.diff(poses) != 0) & ~shared)
         if clash.size:
@@ -112,6 +125,14 @@ class Claims:
         moving = np.full((len(nodes), 4), FREE)
         moving[:, 0], moving[row, 1 + components[node]] = nodes, poses[node]
         self.storage.moving, self.storage.turning = moving, np.column_stack([places[~node], poses[~node]])
+
+    def _kept(self, support: int) -> np.ndarray:
+        """Which components (3,) of nodes the motion of a support leaves where they are."""
+        motion, along = self._moved[support]
+        if isinstance(motion, Grip) or motion.count is not None:
+            return np.zeros(3, bool)
+        moves = motion.moves(self._duration)
+        return ~moves & moves[along].any()
 
     def _refuse(self, place: int, component: int, still: bool) -> None:
         where, axis = self.storage.name(place), f" along {'xyz'[component]}" if place < self.storage.nodes else ""

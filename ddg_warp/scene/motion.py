@@ -8,6 +8,7 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SolverError
 
+LOOKS = 64  # times at which a translation is asked for what it moves
 JUMP = 0.25  # part of its change over a step that a motion makes at one instant, from which it is a jump
 
 
@@ -73,6 +74,12 @@ class Motion:
     def planar(self) -> bool:
         """Whether what lies in the plane of x and z turns within it."""
         return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)
+
+    def moves(self, duration: float) -> np.ndarray:
+        """Which components of a point it moves (3,), as far as its translation tells at some times until `duration`."""
+        about = np.abs(self._unit) < 1.0 if self.turns else np.zeros(3, bool)
+        times = duration * (np.arange(LOOKS) + 1.0) / LOOKS
+        return about | np.any([(self.shift(t) != 0.0).any(0) for t in times], axis=0)
 
     def shift(self, t: float) -> np.ndarray:
         """Translations at t, (1, 3) or (n, 3) [m].
