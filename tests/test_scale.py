@@ -1,6 +1,6 @@
 """The same relative answer at every length: objects from a nanometre to a hundred kilometres, in equilibria, steps, paths and spectra.
 
-A scene of size L with the moduli of one of 1 m, forces by L^2, moments by L^3, gravity by 1 / L, drag coefficients by L and time by L has
+A scene of size L with the moduli of one of 1 m, forces by L^2, gravity by 1 / L, drag coefficients and time by L has
 the same shape over L, and frequencies by 1 / L.
 """
 

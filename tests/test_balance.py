@@ -1,0 +1,40 @@
+"""Supports and obstacles carry the loads in the equilibria of every scene: reactions and loads add up to nothing."""
+
+import numpy as np
+import pytest
+
+from ddg_warp.run.catalog import load_scene, scene_files
+from ddg_warp.scene.descriptions import Statics
+from ddg_warp.solve.statics import Equilibrium
+
+FAST = {"greenhill", "helical_spring", "tip_load", "bend_twist", "plate_buckling", "gridshell_dome", "cantilever_plate_shear"}
+
+
+def scenes() -> list:
+    """Scenes that are equilibria, those that are not quick marked as slow."""
+    result = []
+    for name in scene_files():
+        if name == "identify_from_statics":
+            continue
+        if isinstance(load_scene(name).build().analysis, Statics):
+            result.append(pytest.param(name, marks=() if name in FAST else pytest.mark.slow))
+    return result
+
+
+@pytest.mark.parametrize("name", scenes())
+def test_reactions_carry_the_loads(device, name):
+    """Sum of reactions = - sum of loads, to what `State.unbalanced` says; nothing of a rod, shell or obstacle is left out."""
+    scene = load_scene(name).build()
+    model = scene.build(device, "float64")
+    solver = Equilibrium(model)
+    state = solver.load(model.state(), scene.analysis.load_steps)
+    tangent = solver.tangent
+    loads = tangent.at_points(np.where(tangent.angle, 0.0, tangent.loads(1.0, tangent.dofs(state)))).reshape(-1, 3)
+    size = np.abs(loads).sum()
+    assert state.outcome in ("converged", "converged_to_rounding")
+    assert state.unbalanced <= (1e-8 if state.outcome == "converged" else 1e-3)
+    if size == 0.0:
+        assert state.unbalanced == 0.0
+        return
+    forces = np.sum([reaction.force for reaction in model.reactions(state)], axis=0)
+    np.testing.assert_allclose(forces + loads.sum(0), 0.0, rtol=0.0, atol=(1e-7 + 3.0 * state.unbalanced) * size)
