@@ -90,7 +90,9 @@ class Contacts:
             velocity: the speed nu from which on all of the friction acts, nearly [m/s]: what sticks creeps by less.
             lags: how often in a step friction takes the normal forces and directions anew.
             rolling: whether friction acts on the surfaces of rods, of the capsules that they are here, and turns them about their axes,
-                so that they roll. Else it acts between their middle lines.
+                so that they roll. Else it acts between their middle lines, and takes the angular momentum of what rubs: all that two
+                free parallel rods have that meet and slide across each other, which keep 0.95 of it if they roll. Friction along rods
+                turns none about its axis, and takes it either way. Piles of 12 and 40 rods take 35 and 50 % longer so.
             apart: edges of a rod with less than this between them along it are no pair [m]; by default pi times its radius.
             radius: by name of objects, instead of those of their sections, or half thicknesses [m].
             objects: names of the rods and shells that touch; by default all. Obstacles always do.
