@@ -96,6 +96,7 @@ OBJECTS = {
     "midedge": lambda length: shell(length, "midedge"),
     "hinge": lambda length: shell(length, "hinge"),
     "stiffened": lambda length: shell(length, "midedge_dof", stiffened=True),
+    "stiffened_hinge": lambda length: shell(length, "hinge", stiffened=True),
 }
 
 

@@ -59,7 +59,9 @@ def rigid_modes(tangent, state, stiffness: sparse.csc_matrix) -> np.ndarray:
     centre, size = inside.mean(axis=0), max(1e-300, np.linalg.norm(np.ptp(inside, axis=0)))
     # angles times the size, as displacements are, so that neither outweighs the other whatever the size
     lever = np.where(tangent.angle, size, 1.0)
-    motions = [(dofs, lever[dofs][:, None] * columns) for dofs, columns in (body.motions(q, centre, size) for body in bodies)]
+    motions = [
+        (dofs, lever[dofs][:, None] * columns) for dofs, columns in (body.motions(q, centre, size) for body in bodies)
+    ]
     belongs = sparse.csr_matrix(
         (
             np.ones(sum(len(dofs) for dofs, _ in motions)),
