@@ -25,11 +25,13 @@ CLOSE = 1.15  # radii, half the distance of the strands at first
 BEND = 8.0 * RADIUS  # m, radius at which the ends turn into the strands at first
 WOUND = 1.5  # turns of the strands at first
 LOOP = (6.0 * RADIUS, 14.0 * RADIUS)  # m, about half of the width and the height of the loop at first
+LOOPED = 0.4  # rad, the angle at which it has that size
 STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
 MASS_PER_LENGTH = (
     1000.0  # kg/m; in steps so long inertia is some thousandths of the tension, yet slows what is drawn too freely
 )
 TWISTED = 1.1  # torque at first over that of the plectoneme
+FINE = 0.16  # times the radius and the curvature of strands sin^2(a) / r, the longest edges that find all to 5 %
 SETTLED = 0.6  # part of the run after which tension, torque and angle are compared
 SOURCE = "Clauvelin, Audoly and Neukirch, 2008"
 
@@ -47,10 +49,17 @@ def build(
         steps: time steps
         seed: of a jitter of the nodes at first, a tenth of the range of contact; none below 0
     """
-    if not 0.1 <= angle <= 0.7:
-        raise ValueError(f"angle = {angle}; strands lie at 0.1 to 0.7 to the axis, below pi / 4")
-    if not 0.0 < edge <= 2.0:
-        raise ValueError(f"edge = {edge}; edges are 2 radii of the rod at most")
+    if not 0.3 <= angle <= 0.5:
+        raise ValueError(
+            f"angle = {angle}; strands are found at 0.3 to 0.5 to the axis: a weaker tension does not hold the loop until they touch, "
+            "a stronger one opens it"
+        )
+    longest = min(2.0, FINE / np.sin(angle) ** 2)
+    if not 0.0 < edge <= longest:
+        raise ValueError(
+            f"edge = {edge}; edges are {longest:.3g} radii of the rod at most where strands lie at {angle:g} to the axis, whose "
+            "curvature they follow"
+        )
     points = looped(angle, tail * RADIUS, edge * RADIUS)
     duration = steps * STEP_TIME
     free = np.pad(np.ones(len(points) - 2), 1)[:, None]
@@ -94,9 +103,11 @@ def looped(angle: float, tail: float, edge: float) -> np.ndarray:
     turn, end = 0.5 * np.pi * u, np.linspace(tail, 0.0, 4001)
     # distance from y, angle about it, and height, from the end to the top of the loop
     distance = [r + BEND + end, r + BEND * (1.0 - np.sin(turn)), r + 0.0 * u]
-    distance.append(np.cos(turn) * (r + LOOP[0] * np.sin(turn) ** 2))
+    # a weaker tension holds a larger loop, as sqrt(B / T)
+    wide, tall = np.array(LOOP) * np.sqrt(law(LOOPED)[1] / law(angle)[1])
+    distance.append(np.cos(turn) * (r + wide * np.sin(turn) ** 2))
     about = [0.0 * u, 0.0 * u, np.pi * 2.0 * WOUND * u, 2.0 * np.pi * WOUND + 0.0 * u]
-    height = [0.0 * u, BEND * (1.0 - np.cos(turn)), BEND + high * u, BEND + high + LOOP[1] * np.sin(turn)]
+    height = [0.0 * u, BEND * (1.0 - np.cos(turn)), BEND + high * u, BEND + high + tall * np.sin(turn)]
     d, a, y = (np.concatenate([part[:-1] for part in parts]) for parts in (distance, about, height))
     one = np.stack([-d * np.cos(a), y, d * np.sin(a)], axis=1)
     curve = np.concatenate([one, (one * [-1.0, 1.0, -1.0])[::-1]])
