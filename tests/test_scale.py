@@ -116,7 +116,7 @@ def answers(name: str, length: float, precision: str, device: str) -> dict:
     return result | {"steps": state.points() / length}
 
 
-@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
 @pytest.mark.parametrize("length", LENGTHS)
 @pytest.mark.parametrize("name", OBJECTS)
 def test_scale(device, name, length, precision):

@@ -151,6 +151,7 @@ def solver_kernels(linear, indefinite: bool = False):
         barred: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
+        scale: linear,
         residual_out: wp.array(dtype=H),
         solution_out: wp.array(dtype=H),
         p_out: wp.array(dtype=H),
@@ -163,7 +164,7 @@ def solver_kernels(linear, indefinite: bool = False):
         k = i - w * blocks
         r, z = H(), H()
         if barred[i] != BARRED:
-            r = right[i]
+            r = scale * right[i]
             if diagonal[k] >= 0:
                 z = inverse[i] * r
         residual_out[i] = r
@@ -226,6 +227,7 @@ def solver_kernels(linear, indefinite: bool = False):
         iterations: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
+        unit: linear,
         solution: wp.array(dtype=H),
         residual: wp.array(dtype=H),
         z_out: wp.array(dtype=H),
@@ -242,10 +244,10 @@ def solver_kernels(linear, indefinite: bool = False):
         k = i - w * blocks
         if ends(curvature[w], rho[w]):
             if iterations[w] == 0:
-                solution[i] = p[i]
+                solution[i] = unit * p[i]
             return
         alpha = rho[w] / curvature[w]
-        solution[i] = solution[i] + alpha * p[i]
+        solution[i] = solution[i] + (unit * alpha) * p[i]
         r = residual[i] - alpha * product[i]
         residual[i] = r
         if diagonal[k] >= 0:  # chains see to the others
@@ -317,12 +319,16 @@ def confirm_kernels(real, linear):
         allowed: wp.array(dtype=real),
         wanted: wp.array(dtype=int),
         blocks: int,
+        unit: linear,
+        residual_out: wp.array(dtype=H),
         ratio_out: wp.array2d(dtype=real),
     ):
         i = wp.tid()
         w = i / blocks
         if wanted[w] == 2:
-            ratio_out[w, i - w * blocks] = real(wp.max(wp.abs(residual[i]))) / allowed[i]
+            r = unit * residual[i]
+            residual_out[i] = r
+            ratio_out[w, i - w * blocks] = real(wp.max(wp.abs(r))) / allowed[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def confirm(

@@ -3,6 +3,7 @@
 import math
 from functools import partial
 
+import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
@@ -14,20 +15,38 @@ from ddg_warp.solve.net.system import Sums
 SPARE = 0.5  # of the tolerance, and of those that may be out of it, what the last linear solve of a step may leave
 
 
+def natural_scale(net) -> float:
+    """Power of two by which forces and displacements are multiplied so that their products are of the size of one.
+
+    Stretching an element of the coupled system by its length takes w k, measure times stiffness [J]. At lengths of 1e-9 m that is
+    1e-25 J, and products of residuals and directions at a tolerance of 1e-8 lie beyond float32.
+    """
+    energies = [
+        float(np.median(part.parameters["measure"])) * float(np.median(part.parameters["stiffness"]))
+        for part in net.sets
+        if part.term.name.endswith("_stretch") and {"measure", "stiffness"} <= set(part.parameters.values)
+    ]
+    largest = max(energies, default=1.0)
+    return 2.0 ** round(-0.5 * math.log2(largest)) if largest > 0.0 else 1.0
+
+
 class ConjugateGradients:
     """H d = r in the worlds that want it, to a residual as small as `forcing` says, in the norm of the preconditioner.
 
     Args:
         newton: a `NetNewton`, or what has its names, whose matrix, residual, direction and chains these are.
         multilevel: whether levels precondition what chains leave, or all; see `kernels.solve.levels`.
+        scale: residuals and directions are multiplied by it on the way, a power of two, so that products of them neither underflow nor
+            overflow in the precision of H; see `natural_scale`.
         indefinite: whether H may be.
 
     Attributes:
-        rest: the residual; z: preconditioned; p: the search direction; product: H p; inverse: of the diagonal blocks.
+        rest: the residual, scaled; z: preconditioned; p: the search direction; product: H p; inverse: of the diagonal blocks.
         rho_first, total: squares of the norm of the first and of the last residual; sum: of values of blocks, world by world.
     """
 
-    def __init__(self, newton, multilevel: bool, indefinite: bool = False):
+    def __init__(self, newton, multilevel: bool, indefinite: bool = False, scale: float = 1.0):
+        self._scale, self._unit = newton.linear(scale), newton.linear(1.0 / scale)
         self.newton, net, linear, device = newton, newton.net, newton.linear, newton.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.rest, self.z, self.p, self.product = (wp.zeros(newton.all, dtype=H, device=device) for _ in range(4))
@@ -60,7 +79,7 @@ class ConjugateGradients:
         )
         self._launch(
             self._start,
-            [newton.right, self.inverse, table.diagonal, newton.barred, wanted, blocks],
+            [newton.right, self.inverse, table.diagonal, newton.barred, wanted, blocks, self._scale],
             [self.rest, newton.direction, self.p, newton.krylov_dots],
         )
         if newton.chains:
@@ -102,7 +121,7 @@ class ConjugateGradients:
         self._launch(
             advance,
             [self.p, self.product, self.inverse, newton.system.diagonal, newton.barred, self.rho, self.curvature]
-            + [newton.iterations, wanted, blocks],
+            + [newton.iterations, wanted, blocks, self._unit],
             [newton.direction, self.rest, self.z, dots, self.busy],
         )
         self.precondition(self.z)
@@ -151,7 +170,7 @@ class Directions(ConjugateGradients):
     """Those of a `NetNewton`, as exactly as its `forcing` and `goal` say."""
 
     def __init__(self, newton, multilevel: bool):
-        super().__init__(newton, multilevel)
+        super().__init__(newton, multilevel, scale=natural_scale(newton.net))
         real = newton.real
         self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], real, newton.device, largest=True)
         self._compare, self._confirm = krylov.confirm_kernels(real, newton.linear)
@@ -185,9 +204,9 @@ class Directions(ConjugateGradients):
     def compare(self) -> None:
         """Ratios of `NetNewton.allowed` by what a solve has left, of worlds that are done."""
         newton, allowed = self.newton, self.newton.allowed
-        inputs = [self.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks]
-        self._launch(self._compare, inputs, [allowed.ratio])
-        allowed.sum_up(self.rest, newton.options.rtol, newton.islands, *self._unread)
+        inputs = [self.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks, self._unit]
+        self._launch(self._compare, inputs, [self.z, allowed.ratio])  # z is written anew by worlds that go on
+        allowed.sum_up(self.z, newton.options.rtol, newton.islands, *self._unread)
 
     def cycle(self) -> None:
         """One iteration."""
