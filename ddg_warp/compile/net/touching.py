@@ -12,7 +12,7 @@ HALF = 0.5  # of the smallest radius, the range of contact by default
 # Of forces that close the gap by some part of the range, by default: weights of a node; the share of EI / r^2, bending to ten radii;
 # the strain of what a node carries of a membrane; and that of a rod, which counts where its bending stiffness is next to none.
 WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
-INERTIA = 10.0  # of the mass of a node over the square of the step, by which the default stiffness grows
+INERTIA = 10.0  # of the mass of a node over the square of the step, the least stiffness of a step that had no room
 
 
 def touching(scene, net: Net) -> Touching | None:

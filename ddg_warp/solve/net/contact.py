@@ -12,7 +12,6 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import touch as kernels
@@ -21,6 +20,7 @@ from ddg_warp.solve.contact.tally import Tally
 from ddg_warp.solve.contact.touch import Touch
 from ddg_warp.solve.net.contact_bands import ContactBands
 from ddg_warp.solve.net.system import Sums
+from ddg_warp.solve.net.units import number_bodies, number_units
 
 FAR = 16.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
 # Where pairs would be too many all the same ways are cut to so many margins, and to a part of what they were until they are not.
@@ -82,7 +82,7 @@ class NetContact:
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
         self.bodies = number_bodies(host)
-        unit, self._units = _number_units(*self.bodies, host, model.motions)
+        unit, self._units = number_units(*self.bodies, host, model.motions)
         self._unit = wp.array(unit, dtype=int, device=device)
         places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
@@ -390,46 +390,3 @@ class NetContact:
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)
-
-
-def number_bodies(host) -> tuple[np.ndarray, int]:
-    """Rod or shell that every block belongs to, one for all that are joined, -1 for none; and how many there may be."""
-    unit = np.full(host.blocks, -1, np.int32)
-    count = 0
-    for rod in host.rods:
-        unit[rod.all_nodes], unit[rod.all_edges] = count, count
-        count += 1
-    for shell in host.shells:
-        unit[shell.nodes], unit[shell.edges[shell.edges >= 0]] = count, count
-        count += 1
-    return _joined(unit, host), count
-
-
-def _number_units(body: np.ndarray, count: int, host, motions: list) -> tuple[np.ndarray, int]:
-    """Unit of every block: what is cut together, a body or all that one motion moves; and how many there are."""
-    unit, starts = body.copy(), pose_starts(motions)
-    for places, poses in ((host.moving[:, 0], host.moving[:, 1:].max(1)), host.turning.T):
-        unit[places] = count + np.searchsorted(starts, poses, side="right") - 1
-    return unit, count + len(motions)
-
-
-def _joined(unit: np.ndarray, host) -> np.ndarray:
-    """The same with one unit for what shares nodes, so that joints stay whole."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = [(unit[rod.all_nodes], np.full(len(rod.all_nodes), i)) for i, rod in enumerate(host.rods)]
-    first = len(host.rods)
-    pairs += [(unit[shell.nodes], np.full(len(shell.nodes), first + i)) for i, shell in enumerate(host.shells)]
-    if not pairs:
-        return unit
-    one, other = (np.concatenate(values) for values in zip(*pairs, strict=True))
-    size = int(unit.max()) + 1
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(size, size))
-    number = connected_components(graph, directed=False)[1]
-    joined = np.where(unit >= 0, number[unit], -1).astype(np.int32)
-    for part in host.sets:  # rotations of joints move with what they join
-        rows = np.flatnonzero((unit[part.slots] < 0).any(0))
-        own = part.slots[:, rows]
-        joined[np.where(unit[own] < 0, own, own[:1])] = joined[own[:1]]
-    return joined
