@@ -8,7 +8,7 @@ from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.obstacles import PLANE
-from ddg_warp.solve.net.contact import number_bodies
+from ddg_warp.solve.net.units import number_bodies
 
 TILT = 0.25  # turn of a half-space in a substep at most [rad]: it may push at any distance
 SPIN = 1.0  # turn of a surface that spins with friction [rad], whose slip goes by the sine of a turn
