@@ -107,7 +107,7 @@ class Claims:
         claims = [np.concatenate(values) for values in zip(*self._claims, strict=True)]
         order = np.argsort(3 * claims[0] + claims[1], kind="stable")  # claims of one dof stay in order
         places, components, poses, supports, owners = (values[order] for values in claims)
-        dofs = 3 * places + components
+        dofs, given = 3 * places + components, poses.copy()
         again = np.diff(dofs) == 0
         differ = np.isin(dofs, dofs[1:][again & (np.diff(poses) != 0)]) & (places < self.storage.nodes) & (poses > FREE)
         for support in np.unique(supports[differ]):
@@ -117,7 +117,7 @@ class Claims:
         clash = np.flatnonzero(again & (np.diff(poses) != 0) & ~shared)
         if clash.size:
             first = clash[np.argmin(order[clash + 1])]
-            self._refuse(places[first], components[first], min(poses[first], poses[first + 1]) == STILL)
+            self._refuse(places[first], components[first], min(given[first], given[first + 1]) == STILL)
         moves = np.append(~again, True) & (poses > FREE)
         places, components, poses = (values[moves] for values in (places, components, poses))
         node = places < self.storage.nodes

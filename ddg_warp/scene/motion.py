@@ -77,7 +77,7 @@ class Motion:
 
     def moves(self, duration: float) -> np.ndarray:
         """Which components of a point it moves (3,), as far as its translation tells at some times until `duration`."""
-        about = np.abs(self._unit) < 1.0 if self.turns else np.zeros(3, bool)
+        about = np.abs(self.unit) < 1.0 if self.turns else np.zeros(3, bool)
         times = duration * (np.arange(LOOKS) + 1.0) / LOOKS
         return about | np.any([(self.shift(t) != 0.0).any(0) for t in times], axis=0)
 

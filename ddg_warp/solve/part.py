@@ -48,6 +48,11 @@ class Part:
         return np.minimum(np.arange(self.size) % self.block, 2)
 
     @property
+    def balances(self) -> np.ndarray:
+        """Which dofs have forces that add up to nothing over a free piece in equilibrium (size,) bool."""
+        return ~self.angle
+
+    @property
     def component(self) -> np.ndarray:
         """Index of the connected component of every dof (size,), from 0."""
         return np.repeat(np.arange(self.islands), self.size // self.islands)

@@ -88,7 +88,7 @@ class Residuals:
         tangent = self.tangent
         worst = np.zeros(tangent.model.worlds)
         for part in tangent.parts:
-            points = (tangent.free & ~tangent.angle)[part.offset : part.offset + part.size]
+            points = tangent.of(part, tangent.free) & part.balances
             own, loads = (np.where(points, tangent.of(part, v), 0.0) for v in (residual, outer))
             count, axes = part.component.max() + 1, part.axis
             left = np.zeros((count, 3))

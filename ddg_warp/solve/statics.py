@@ -412,8 +412,10 @@ class Equilibrium:
         """
         model, unbalanced = self.model, self.residuals.unbalanced(residual, outer)
         rounded = np.bincount(self.tangent.world, ~small, model.worlds) > 0
-        full = self.tangent.loads(max(1.0, abs(at)), self.tangent.dofs(state))
-        lost = rounded & (self.residuals.unbalanced(residual, np.maximum(np.abs(outer), np.abs(full))) > LOST)
+        lost = rounded & (unbalanced > LOST)
+        if lost.any() and abs(at) < 1.0:
+            full = np.abs(self.tangent.loads(1.0, self.tangent.dofs(state)))
+            lost &= self.residuals.unbalanced(residual, np.maximum(np.abs(outer), full)) > LOST
         if lost.any():
             world = int(np.argmax(np.where(lost, unbalanced, 0.0)))
             raise SolverError(

@@ -100,8 +100,11 @@ def test_edge_of_a_cylinder(device):
 
 
 def test_point_loads_on_a_sphere(device):
-    """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946) under opposite forces on both poles; edges finer towards these."""
-    R, h, load = 1.0, 1e-5, 1e-4
+    """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946) under opposite forces on both poles; edges finer towards these.
+
+    With h = 1e-5 R rounding of membrane forces is 3 % of the load: the supports miss it, and the state is refused.
+    """
+    R, h, load = 1.0, 1e-4, 1e-4
     stiffness = 4.0 * E * h**2 / (R * np.sqrt(3.0 * (1.0 - NU**2)))
     edges, errors = (40, 80, 160), []
     for n in edges:

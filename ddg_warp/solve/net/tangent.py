@@ -220,6 +220,14 @@ class NetTangent(Part):
         return 3 * blocks.reshape(2, -1)[..., None] + np.arange(3)
 
     @cached_property
+    def balances(self) -> np.ndarray:
+        """Which dofs have forces that add up to nothing over a free piece (size,) bool: radial ones of revolution do not."""
+        result = np.repeat(np.arange(self.host.blocks)[:, None] < self.host.nodes, 3, axis=1)
+        for shell in self.host.meridians:
+            result[shell.nodes, :2] = False
+        return np.tile(result.ravel(), self.worlds)
+
+    @cached_property
     def component(self) -> np.ndarray:
         """Index of the connected component of every dof (size,); what touches may connect all of a world."""
         bodies = self.host.bodies
