@@ -33,6 +33,7 @@ SMALL = {
     "hair_combed": {"gaps": 2, "rows": 2, "n": 24},
     "hanging_chain": {"n": 25},
     "hanging_sheet": {},
+    "heavy_top": {"steps": 200},
     "helical_flagellum": {"n": 24},
     "helical_spring": {"n": 200},
     "hinged_roof": {"n": 6, "steps": 16},

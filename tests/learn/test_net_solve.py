@@ -171,8 +171,8 @@ def hasty(monkeypatch):
     """Conjugate gradients that end with their first iteration."""
     once = ConjugateGradients.__init__
 
-    def cut(self, newton, multilevel, indefinite=False):
-        once(self, newton, multilevel, indefinite)
+    def cut(self, newton, multilevel, indefinite=False, **options):
+        once(self, newton, multilevel, indefinite, **options)
         self._limit = 1 if indefinite else self._limit
 
     monkeypatch.setattr(ConjugateGradients, "__init__", cut)
