@@ -44,6 +44,7 @@ LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken,
 # falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
 LAGGED = 5
 NEAR = 0.01  # of the range of contact: ways on which normal forces hardly change
+TRIED = 4  # solves after which Newton's method with consistent normal forces is tried wherever the iterate is
 STUCK = 30  # iterations in which what meets for the first time sticks, at most
 SETTLED = 1e-4  # residuals over all loads, of what has
 UNSETTLED = "unsettled"  # outcome where forces do not balance with the friction that the state has
@@ -351,7 +352,7 @@ class NetEquilibrium:
             status = int(np.where(settled, np.minimum(ends, outcome.CONVERGED_TO_ROUNDING), ends).max())
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
-            if near and solves >= later and self.polish and not settled.all():
+            if (near or solves >= TRIED) and solves >= later and self.polish and not settled.all():
                 if found := self.polish(state, at, partial(self._slides, first, increment)):
                     status = next(k for k, name in outcome.NAMES.items() if name == found)
                     break
