@@ -125,12 +125,12 @@ def test_slack_cable(device, how, bend):
     assert solver.iterations <= 150
 
 
-@pytest.mark.parametrize("steps", [1, 4])
-def test_hinged_bars_collapse(device, steps):
+@pytest.mark.parametrize(("steps", "solver"), [(1, "direct"), (4, "direct"), (1, "pcg")])
+def test_hinged_bars_collapse(device, steps, solver):
     """An arch of three nearly rigid hinged bars falls over and hangs: moments about both hinges vanish.
 
     Bars turn by up to 150 degrees with EA = 1e6 times their loads, in a closed loop. Loads (0.1, 0, -1) act on both inner hinges: each
-    outer bar takes along itself the load of its hinge and the pull of the middle bar.
+    outer bar takes along itself the load of its hinge and the pull of the middle bar. Conjugate gradients alone do not get there.
     """
     scene = ddg.Scene(gravity=(0, 0, 0))
     section, load = ddg.Stiffness(EA=1e6, EI1=1e3, GJ=1e3), np.array([0.1, 0.0, -1.0])
@@ -143,7 +143,7 @@ def test_hinged_bars_collapse(device, steps):
     scene.fix(bars[-1], [-1])
     for bar in bars:
         scene.fix_twist(bar, [0])
-    state, solver = searched(scene, device, steps)
+    state, found = searched(scene, device, steps, solver=solver)
     a, b = state.points()[[4, 9]]
     for hinge, other, support in ((a, b, corners[0]), (b, a, corners[3])):
         outer, middle = hinge - support, other - hinge
@@ -151,8 +151,9 @@ def test_hinged_bars_collapse(device, steps):
         assert pull > 0.0
         assert np.linalg.norm(np.cross(outer, load + pull * middle)) < 1e-6
     assert max(a[2], b[2]) < -0.8
-    assert solver.iterations <= 30 * steps
-    assert state.stable is True
+    if solver == "direct":
+        assert found.iterations <= 30 * steps
+        assert state.stable is True
 
 
 def test_an_equilibrium_is_at_rest(device):
