@@ -10,7 +10,7 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from ddg_warp.solve.direct import Factorisation, pinned, regular
+from ddg_warp.solve.direct import Factorisation, SingularError, pinned, regular
 
 STEPS = 40  # of the first estimate of a critical factor
 ROUGH = 0.02  # its relative error
@@ -112,7 +112,10 @@ class Lowest(Shifted):
         return np.where(np.abs(values) <= ROUNDED * abs(self.shift), 0.0, values), vectors
 
     def inertia(self, at: float) -> int | None:
-        factor = Factorisation(self.matrix - at * sparse.diags(self.mass, format="csc"))
+        try:
+            factor = Factorisation(self.matrix - at * sparse.diags(self.mass, format="csc"))
+        except SingularError:  # one that is exactly zero tells nothing of its neighbours
+            return None
         return factor.negative - (self.known.shape[1] if at > 0.0 else 0) if factor.reliable else None
 
     def _inverse(self, y: np.ndarray) -> np.ndarray:
