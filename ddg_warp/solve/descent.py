@@ -55,13 +55,14 @@ class Iterate:
 
 @dataclass
 class Step:
-    """A step of every group of a search.
+    """A step of every island of a search.
 
     Attributes:
         end: where it leads; direction: whole step (size,).
-        taken: fraction of it (groups,), 0 where nothing was to be done; failed: groups in which no fraction is accepted.
-        turn: largest rotation of the whole step (groups,) [rad].
-        gain, model: of the potential, what the step gains and what its quadratic model predicts (groups,) [J].
+        taken: fraction of it (islands,), 0 where nothing was to be done; failed: islands in which no fraction is accepted.
+        turn: largest rotation of the whole step (islands,) [rad].
+        gain, model: of the potential, what the step gains and what its quadratic model predicts (islands,) [J].
+        noise: rounding of the potential where the step begins (islands,) [J].
     """
 
     end: Iterate
@@ -71,6 +72,7 @@ class Step:
     turn: np.ndarray
     gain: np.ndarray
     model: np.ndarray
+    noise: np.ndarray
 
 
 class Descent:
@@ -218,7 +220,7 @@ class Search:
         size = self.tangent.island_energies(np.abs(iterate.energies)) + of_forces
         return 64 * self.owner.model.types.eps * size
 
-    def step(self, exact: sparse.csc_matrix) -> Step:
+    def step(self, exact: sparse.csc_matrix) -> None:
         """Move every island that has not converged to a state of less energy, or in mode "follow" of a smaller residual.
 
         Raises:
@@ -226,7 +228,6 @@ class Search:
         """
         step = self.propose(exact, ~self.done)
         self.end(step, step.failed)
-        return step
 
     def end(self, step: Step, failed: np.ndarray) -> None:
         """Make the end of a step the iterate, but for islands that have `failed` (islands,): these stay, and have converged."""
@@ -242,9 +243,8 @@ class Search:
     def accept(self, step: Step) -> None:
         """Adapt the radius to a step."""
         taken = np.where(step.failed, 0.0, step.taken)
-        noise = self.noise(self.here)
-        self.region.resize(taken, step.turn, step.gain, step.model, noise)
-        self._lost = np.where(self.done, self._lost, step.model <= 10.0 * noise)
+        self.region.resize(taken, step.turn, step.gain, step.model, step.noise)
+        self._lost = np.where(self.done, self._lost, step.model <= 10.0 * step.noise)
 
     def propose(self, hessian: sparse.csc_matrix, active: np.ndarray, free: np.ndarray | None = None) -> Step:
         """A step from the iterate by `hessian`, and the largest fraction of it that a line search accepts, island by island.
@@ -281,7 +281,7 @@ class Search:
             if not refused.any():
                 break
             taken = np.where(refused, 0.5 * taken, taken)
-        return Step(there, direction, taken, wanted, turn, -change, slope - 0.5 * curvature)
+        return Step(there, direction, taken, wanted, turn, -change, slope - 0.5 * curvature, noise)
 
     def _move(self, step: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Dofs after a step, which is cut where something is in its way, and what that leaves of the fractions `taken`."""
