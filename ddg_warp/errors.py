@@ -11,6 +11,10 @@ class SceneWarning(UserWarning):
     """A scene that can be built, but is likely not what was meant."""
 
 
+class GradientWarning(UserWarning):
+    """Worlds have no gradient; see `ddg_warp.torch.Simulator`."""
+
+
 class DataError(ValueError):
     """Data cannot be written or read as asked; the message names the file or folder, what is wrong and the remedy."""
 

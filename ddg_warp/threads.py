@@ -2,10 +2,11 @@
 
 While Warp captures on the CPU device, it records the launches and copies of every thread of the process (Warp 1.19). So a capture,
 and whatever compiles or loads kernels, waits until no other thread is inside of this package, and keeps them out meanwhile; all else
-runs side by side. On CUDA all threads share the current stream of a device, which Warp replaces while it reads an array: two that
-read at once can leave it replaced for good ("unknown stream"), and memory or a graph that a thread frees ends the capture of
-another. So where there is CUDA every call is alone, and so is every collection of garbage; what is launched runs on. Launches that a
-user makes in threads of his own are his to keep apart.
+runs side by side, but for calls of one object that works in memory of its own, such as an `Integrator`. On CUDA all threads share the
+current stream of a device, which Warp replaces while it reads an array: two that read at once can leave it replaced for good
+("unknown stream"), and memory or a graph that a thread frees ends the capture of another. So where there is CUDA every call is alone,
+and so is every collection of garbage; what is launched runs on. Launches that a user makes in threads of his own are his to keep
+apart.
 """
 
 import gc
@@ -13,6 +14,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
+
+from ddg_warp.errors import SceneError
 
 
 class _Turns:
@@ -68,6 +71,17 @@ class _Turns:
                 self._inside += depth > 0
                 self._own.depth = depth
 
+    def await_lock(self, lock) -> None:
+        """Acquire a lock that another thread holds, which may wait for this one to leave its turn meanwhile."""
+        depth = getattr(self._own, "depth", 0)
+        with self._changing():
+            self._inside -= depth > 0
+        lock.acquire()
+        with self._changing():
+            if depth:
+                self._changed.wait_for(lambda: not self._capturing and not (self.shared and self._inside))
+                self._inside += 1
+
     @contextmanager
     def _changing(self) -> Iterator[None]:
         self._own.changing = True
@@ -111,6 +125,52 @@ def launches(what):
                 setattr(what, name, _within(launching, member))
     what.__del__ = _release
     return what
+
+
+def lock_of(owner) -> threading.RLock:
+    """Return the lock of an object whose memory one call at a time may use."""
+    return vars(owner).get("_lock") or vars(owner).setdefault("_lock", threading.RLock())
+
+
+@contextmanager
+def alone(owner) -> Iterator[None]:
+    """Keep other threads out of an object's memory."""
+    lock = lock_of(owner)
+    if not lock.acquire(blocking=False):
+        _turns.await_lock(lock)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def one_at_a_time(method):
+    """Decorate a method that works in memory of its object, so that threads which share the object call it one after the other."""
+
+    @wraps(method)
+    def entered(self, *args, **kwargs):
+        with alone(self):
+            return method(self, *args, **kwargs)
+
+    return entered
+
+
+def stays_here(cls):
+    """Decorate a class whose objects hold captured launches and scratch memory of a device: threads that share an object call its
+    public methods one after the other, and no copy can take it over.
+    """
+    for name, member in list(vars(cls).items()):
+        if not name.startswith("_") and callable(member) and not isinstance(member, type | staticmethod | classmethod):
+            setattr(cls, name, one_at_a_time(member))
+
+    def refuse(self, *_):
+        raise SceneError(
+            f"{cls.__name__}: its captured launches and device memory can be neither copied nor saved; copy or save the model and "
+            f"the states (pickle, torch.save, copy.deepcopy), and make another {cls.__name__} of the model"
+        )
+
+    cls.__reduce_ex__ = refuse
+    return cls
 
 
 def _release(self) -> None:

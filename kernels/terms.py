@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -61,22 +62,22 @@ class Term:
         """Name in the registries, which hold each term with and without strain-rate damping."""
         return term_key(self.name, self.measure.by_angle) + ("_damped" if self.density.undamped else "")
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """All parameters, the rest measure first."""
         return (MEASURE, *self.density.parameters(len(self.measure.strains)))
 
-    @property
+    @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """Their names."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    @property
+    @cached_property
     def stiffness(self) -> tuple[str, ...]:
         """Names of its stiffnesses."""
         return tuple(parameter.name for parameter in self.parameters if parameter.family == "stiffness")
 
-    @property
+    @cached_property
     def rest(self) -> tuple[str, ...]:
         """Names of its rest strains."""
         return tuple(parameter.name for parameter in self.parameters if parameter.family == "rest")

@@ -42,8 +42,33 @@ def select_kernel(dtype, serial: bool):
 
 
 @cache
+def blank_kernels(dtype):
+    """blank(...): make entries of an array not numbers in worlds of a mask; bar(...): enter the outcome of worlds that rest in a step,
+    as a parameter of theirs is invalid or their first entry of an array is not a number.
+    """
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def blank(mask: wp.array(dtype=int), share: int, out: wp.array3d(dtype=dtype)):
+        i, j, k = wp.tid()
+        if mask[k / share] != 0:
+            out[i, j, k] = dtype(scalar(wp.nan))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def bar(invalid: wp.array(dtype=int), values: wp.array3d(dtype=dtype), share: int, resting: wp.array(dtype=int)):
+        w = wp.tid()
+        code = invalid[w]
+        if code == 0 and wp.isnan(values[0, 0, w * share]):
+            code = wp.static(outcome.GIVEN_UP)
+        resting[w] = code
+
+    return blank, bar
+
+
+@cache
 def island_kernels():
-    """note(...), seal(...), enter(...) of worlds in which an island was given up in this step; clear(...) of worlds that start anew."""
+    """note(...), seal(...), enter(...) of worlds in which an island was given up in this step; clear(...) of worlds that start anew;
+    find(...): whether any world is in a mask."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def note(
@@ -53,7 +78,7 @@ def island_kernels():
         failed: wp.array(dtype=int),
         any_failed: wp.array(dtype=int),
     ):
-        """Enter the largest outcome of islands that were given up in worlds which did not rest before."""
+        """Enter the largest outcome of islands that were given up, in worlds which did not rest before."""
         i = wp.tid()
         w = i / share
         if flags[STATUS, i] == wp.static(outcome.GIVEN_UP) and resting[w] == 0:
@@ -81,7 +106,12 @@ def island_kernels():
             flags[STATUS, i] = wp.static(outcome.CONVERGED)
             flags[REASON, i] = 0
 
-    return note, seal, enter, clear
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def find(mask: wp.array(dtype=int), any_found: wp.array(dtype=int)):
+        if mask[wp.tid()] != 0:
+            any_found[0] = 1
+
+    return note, seal, enter, clear, find
 
 
 @cache

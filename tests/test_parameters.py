@@ -52,7 +52,8 @@ def set_parameters(model, change):
     """Replace every row of the parameter table by change(row, nodes, rods)."""
     for group in model.groups:
         values = group.parameters.values
-        group.parameters.set(**{name: change(v, group.nodes, group.columns) for name, v in values.items()})
+        values |= {name: change(v, group.nodes, group.columns) for name, v in values.items()}
+        group.parameters.upload()  # which keeps their forms, where `set` would spread them over those before
     return model
 
 

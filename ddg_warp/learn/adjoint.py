@@ -21,7 +21,7 @@ from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.net import NetState
 from ddg_warp.model.state import State
-from ddg_warp.threads import launches
+from ddg_warp.threads import launches, stays_here
 
 
 @dataclass
@@ -34,6 +34,7 @@ class Tape:
     parts: list
 
 
+@stays_here
 @launches
 class Adjoint:
     """Reverse of the steps of an integrator.
@@ -150,6 +151,7 @@ def refuse_gyroscopic(what: str, wanted: bool | None) -> None:
         )
 
 
+@stays_here
 @launches
 class EquilibriumAdjoint:
     """Gradients of equilibria, stable or not, by what their balance reads; points of a path at their load parameter.

@@ -3,28 +3,32 @@
 Memory of integrator and adjoint stays where it is, so that each is one captured graph: tensors are copied in and out.
 """
 
-from contextlib import nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.adjoint.step import smooth_kernel, solved_kernel
+from ddg_warp.kernels.adjoint.step import asked_kernel, flag_kernels, smooth_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.controls import StepControls
-from ddg_warp.learn.layout import Layout, copies, tensors, view
+from ddg_warp.learn.layout import GRADIENTS, Layout, copies, tensors, view
 from ddg_warp.learn.net import NetKept
 from ddg_warp.learn.net_predictor import NetPredictor
+from ddg_warp.learn.notice import Notice
 from ddg_warp.learn.poses import Poses
 from ddg_warp.learn.predictor import ChainPredictor
 from ddg_warp.learn.tables import Tables
 from ddg_warp.model.controls import Controls
+from ddg_warp.model.recipe import Recipe
 from ddg_warp.model.state import Sliding
 from ddg_warp.solve import statics
 from ddg_warp.solve.dynamics import Integrator
 from ddg_warp.solve.graphs import Graphs
+from ddg_warp.solve.worlds import cubed
+from ddg_warp.threads import alone
 
 FOREVER = 2**62  # steps between readings of outcomes, which worlds flag
 LOAD = "load_steps", "start", "end"  # what is said of the way to an equilibrium, beside options of what solves for it
@@ -34,9 +38,13 @@ class Engine:
     """Steps and gradients of a model with its worlds.
 
     Args:
-        model, scheme, options: as of `Integrator`.
+        source: the user's model; the engine steps a copy of it, so that tensors never get into what others step.
+        worlds: how many the copy has.
+        scheme, options: as of `Integrator`.
 
     Attributes:
+        codes: outcomes of the last step of every world (worlds,), see `kernels.outcome`: 0 where it converged and, where gradients were
+            asked for, has one.
         layout, fields: what the tensors of a state are.
         tables, controls: what else steps read.
         before, after: the states at the ends of a step.
@@ -45,8 +53,11 @@ class Engine:
         by_equilibrium: tensors of the derivatives by the equilibrium before that; None without friction.
     """
 
-    def __init__(self, model, scheme: str, options: dict):
-        self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
+    def __init__(self, source, worlds: int, scheme: str, options: dict):
+        recipe = Recipe(source, worlds)
+        self.model = model = recipe.build()
+        self._version = recipe.version
+        self.device = str(wp.device_to_torch(model.wp_device))
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
         self.integrator.step_whole()
@@ -59,33 +70,57 @@ class Engine:
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
         self.controls = StepControls(self)
-        self._flagged, self._told, self._streams = {}, {}, {}
-        self._solves = solved_kernel(model.types.real)
+        self._flagged, self._streams = {}, {}
+        self._solves, self._excuse, self._fails = flag_kernels(model.types.real)
         self._graphs = self._by_start = None
         self._numbered = False  # whether numbers of contact may be those of parameters
+        self.integrator._worlds.watch()
+        self._invalid = view(self.integrator._worlds.invalid)
+        self._codes = wp.zeros(worlds, dtype=int, device=model.wp_device)
+        self.codes, self._resting = view(self._codes), self.integrator._worlds.resting
+        self._told_of = Notice(model.wp_device)
+
+    def follow(self, source) -> None:
+        """Take over the parameters and rest shapes of the user's model where they have changed."""
+        if self._version != source.version:
+            with self.turn():
+                self.tables.restore()
+                recipe = Recipe(source, self.model.worlds)
+                recipe.put(self.model)
+                self._version = recipe.version
+
+    @property
+    def lost(self) -> bool:
+        """Whether a step or a reverse had no gradient in a world, as far as the device has told by now."""
+        return self._told_of.given
 
     # steps
 
     def forward(self, start: float, dt: float, state, controls: dict, graded: bool) -> list[torch.Tensor]:
-        """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,), if that is asked.
-
-        Then follow the `lagged`, of 24 bytes a block in float64.
-        """
+        """Return tensors: the state after a step; flags (islands,) of every part, not numbers where it has no gradient, if that is
+        asked; `codes` (worlds,); and the `lagged`, of 24 bytes a block in float64."""
         integrator = self.integrator
+        self._invalid.copy_(self.tables.invalid)
         self.fill(self.source, state)
         self._renumber(integrator._net)
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
+        wp.copy(self._codes, self._resting)
         found = copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
-        return found + (self.lagged() if graded else [])
+        return [*found, self.codes.clone(), *(self.lagged() if graded else [])]
 
     def _renumber(self, owner) -> None:
         """Have a step or an equilibrium of the net take anew the numbers of contact that parameters may have changed."""
         if owner is not None and owner.arcs and (self.tables.given or self._numbered):
             self._numbered = self.tables.given
             owner.arcs.outdate()
+
+    def smooth_flags(self) -> list[torch.Tensor]:
+        """Flags (islands,) of every part, of steps through which gradients go everywhere."""
+        real = wp.dtype_to_torch(self.model.types.real)
+        return [torch.ones(len(part.islands), dtype=real, device=self.device) for part in self.integrator._parts]
 
     @property
     def solutions(self) -> list[wp.array]:
@@ -105,7 +140,7 @@ class Engine:
         """
         net = self.integrator._net
         if net is not None and net.newton.contact and not torch._C._are_functorch_transforms_active():
-            with torch.no_grad(), self.stream():
+            with torch.no_grad(), self.turn():
                 self.fill(self.source, state)
                 net.newton.contact.check(self.before.net.q)
 
@@ -131,7 +166,8 @@ class Engine:
                 frames = [frame.reshape((6, self.model.worlds, -1)).transpose((0, 2, 1)) for frame in frames]
             found = wp.ones(len(islands), dtype=real, device=device)
             none = 2 * [wp.zeros((0, 0, 0), dtype=real, device=device)]
-            read = [*islands.arrays, int(predictor is not None), *(frames or none), found]
+            read = [*islands.arrays, int(predictor is not None), *(frames or none), part.islands_each]
+            read += [found, self._codes, self._told_of.array]
             launch = wp.launch(smooth_kernel(real), len(islands), read, device=device, record_cmd=True)
             self._flagged[key] = part, predictor, launch, found, view(found)
         _, predictor, launch, _, flags = self._flagged[key]
@@ -146,13 +182,17 @@ class Engine:
     # gradients
 
     def backward(
-        self, start: float, dt: float, before, after, lagged, given, controls: dict
-    ) -> tuple[list[torch.Tensor], list]:
-        """Derivatives by the state before a step, and by what else it read, part by part.
+        self, start: float, dt: float, before, after, told, given, controls: dict
+    ) -> tuple[list[torch.Tensor], list, list[torch.Tensor]]:
+        """Derivatives by the state before a step, and by what else it read, part by part, and what they are multiplied by (islands,).
+
+        These flags are not numbers where an island has no gradient and is asked for one, by derivatives other than zero. Worlds that
+        failed are taken to be at rest, so that nothing is not a number where nothing is asked.
 
         Args:
             start, dt: time and length of the step.
-            before, after, lagged, given: tensors of the states at its ends, `lagged` of it, and those of the derivatives by its end.
+            before, after, told, given: tensors of the state before it, those that `forward` gave, of which `told` are what follows the
+                state, and those of the derivatives by its end.
             controls: which it was given.
         """
         adjoint = self._adjoint()
@@ -161,22 +201,20 @@ class Engine:
         self.fill(self.source, before)
         self.fill([self.target[i] for i in self._read], [after[i] for i in self._read])
         self.fill(self._by_state, given)
+        self.fill(self._told_places, told)
         if adjoint.upload(start, dt, self.tables.given):
             self._graphs.clear()
+        self._graphs.replay("clean", self._clean)
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):
             for middle, *ends in ((kept.x, end.x, kept.before.x), (kept.theta, end.theta, kept.before.theta)):
                 torch.mul(sum(view(array) for array in ends), 0.5, out=view(middle))
         if adjoint.net:
-            parts.append(self._net_kept(start, dt, lagged))
-
-        told = [self._told_by(own.solve.failed) for own in adjoint.parts]
-        self._solved_by = [place[-1] for place in told]
+            parts.append(self._net_kept(start, dt))
 
         def launch():
             self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
-            for failed, place, _ in told:
-                wp.launch(self._solves, failed.shape, [failed], [place], device=failed.device)
+            self._judge()
 
         self._graphs.replay(dt, launch)
         while adjoint.outgrown(parts):
@@ -189,7 +227,42 @@ class Engine:
             self.by_poses = self.poses.by_end
         if self._by_start is None:  # whose memory stays
             self._by_start = tensors(found, self.fields)
-        return self._by_start, inputs
+        return self._by_start, inputs, self._flag_tensors
+
+    def _clean(self) -> None:
+        """Put worlds that failed to rest, before a reverse; launches alone."""
+        worlds, (mask, some) = self.integrator._worlds, self._failures
+        some.zero_()
+        wp.launch(self._fails, len(mask), [self._codes_then], [mask, some], device=mask.device)
+        wp.capture_if(some, lambda: self._to_rest(worlds, mask))
+
+    def _to_rest(self, worlds, mask: wp.array) -> None:
+        for state in (self.before, self.after):
+            worlds.take_over(mask, self._rest, state)
+        net = self._rest.net
+        for array in self._net.lagged if net else ():
+            worlds.take_array(mask, net.q, array, self.model.worlds)
+
+    def _judge(self) -> None:
+        """Find the flags of a reverse; launches alone."""
+        lost = self._lost
+        lost.zero_()
+        for own, flags, found, asked in zip(self.adjoint.parts, *self._flags, strict=True):
+            failed = own.solve.failed
+            outputs = [found, asked, lost, self._told_of.array]
+            wp.launch(self._solves, failed.shape, [failed, flags], outputs, device=failed.device)
+        wp.capture_if(lost, self._ask)
+
+    def _ask(self) -> None:
+        """Excuse islands that are asked for no gradient."""
+        given = [part for name, part in self._given.parts().items() if name != "grips"]
+        for part, found, asked in zip(given, *self._flags[1:], strict=True):
+            for name, array in part.arrays().items():
+                if name.rstrip("_0123456789") in GRADIENTS and array.shape[-1] % len(found) == 0:
+                    cube, kernel = cubed(array), asked_kernel(array.dtype, self.model.types.real)
+                    inputs = [found, cube, cube.shape[-1] // len(found)]
+                    wp.launch(kernel, cube.shape, inputs, [asked], device=array.device)
+            wp.launch(self._excuse, len(found), [asked], [found], device=found.device)
 
     def _adjoint(self) -> Adjoint:
         if self.adjoint is None:
@@ -213,20 +286,40 @@ class Engine:
                 self._net = NetKept(before, solved, None, lagged=[wp.clone(values) for values in self.solutions])
                 self._turned = wp.clone(before.q)  # scratch
             self.adjoint = adjoint
+            self._make_flags()
             self.poses = Poses(adjoint, self.midpoint) if self.model.grips else None
         return self.adjoint
 
+    def _make_flags(self) -> None:
+        """Memory of what a reverse is told of a step, and of what it tells."""
+        model, device = self.model, self.model.wp_device
+        self._codes_then, mask, some, self._lost = (
+            wp.zeros(count, dtype=int, device=device) for count in (model.worlds, model.worlds, 1, 1)
+        )
+        self._failures, self._rest = (mask, some), model.state()
+        counts = [len(part.islands) for part in self.integrator._parts]
+        # of the step, of its reverse, and whether that is asked for any
+        self._flags = [
+            [wp.zeros(count, dtype=dtype, device=device) for count in counts]
+            for dtype in (model.types.real, model.types.real, int)
+        ]
+        self._flag_tensors = [view(found) for found in self._flags[1]]
+        kept = self._net.lagged if self.adjoint.net else []
+        self._told_places = [view(place) for place in (*self._flags[0], self._codes_then, *kept)]
+
     def _load(self) -> None:
         kernels = [kernel for own in self.adjoint.parts for kernel in own.kernels]
-        arrays.load_kernels([*kernels, self._solves], self.model.wp_device)
+        types = {array.dtype for array in self._given.arrays().values()}
+        kernels += [asked_kernel(dtype, self.model.types.real) for dtype in types]
+        kernels += [self._solves, self._excuse, self._fails]
+        arrays.load_kernels(kernels, self.model.wp_device)
+        self.integrator._worlds.load_modules()
 
-    def _net_kept(self, start: float, dt: float, lagged) -> NetKept:
+    def _net_kept(self, start: float, dt: float) -> NetKept:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
         net, before, after, kept = self.model.net, self.before.net, self.after.net, self._net
         q = view(kept.solved.q)
         q.copy_(view(after.q))
-        for own, values in zip(kept.lagged, lagged, strict=True):
-            view(own).copy_(values)
         if self.midpoint:
             q.add_(view(before.q)).mul_(0.5)
             self._data_between(start, dt)
@@ -264,11 +357,7 @@ class Engine:
         solver = self._static({name: value for name, value in options.items() if name not in LOAD})
         self._renumber(solver.net)
         found = solver.load(start, controls=_on_host(controls), way=way, **load)
-        ones = [
-            torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)
-            for part in self.integrator._parts
-        ]
-        result = copies(tensors(found, self.fields)) + ones
+        result = copies(tensors(found, self.fields)) + self.smooth_flags()
         if graded and found.sliding is not None:
             result.append(torch.tensor([[at.time, at.sliding.increment] for at in way], dtype=torch.float64))
             for at in way:
@@ -325,26 +414,18 @@ class Engine:
 
     # what `ddg_warp.learn.step` asks
 
-    def stream(self):
-        """Launches on torch's stream; on the CPU there is one order for all."""
-        if not self.model.wp_device.is_cuda:
-            return nullcontext()
-        own = torch.cuda.current_stream(self.device)
-        if own not in self._streams:
-            self._streams[own] = wp.stream_from_torch(own)
-        return wp.ScopedStream(self._streams[own])
-
-    def solved(self, flags) -> list[torch.Tensor]:
-        """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum, and of nets that conjugate
-        gradients have not solved."""
-        return [flag * solved for flag, solved in zip(flags, self._solved_by, strict=True)]
-
-    def _told_by(self, failed: wp.array) -> tuple:
-        """What tells which islands a reverse has failed in, where a step leaves one or not a number for them, and that as a tensor."""
-        if id(failed) not in self._told:
-            place = wp.ones(failed.shape, dtype=self.model.types.real, device=failed.device)
-            self._told[id(failed)] = failed, place, view(place)
-        return self._told[id(failed)]
+    @contextmanager
+    def turn(self):
+        """Keep other threads out of the engine's memory, and launch on torch's stream; on the CPU there is one order for all."""
+        with alone(self):
+            if not self.model.wp_device.is_cuda:
+                yield
+                return
+            own = torch.cuda.current_stream(self.device)
+            if own not in self._streams:
+                self._streams[own] = wp.stream_from_torch(own)
+            with wp.ScopedStream(self._streams[own]):
+                yield
 
     @property
     def parts(self) -> int:
@@ -354,7 +435,7 @@ class Engine:
     @property
     def told(self) -> int:
         """How many tensors `forward` gives beside the state, at most."""
-        return self.parts + len(self.solutions)
+        return self.parts + 1 + len(self.solutions)
 
 
 def _on_host(controls: dict) -> Controls:

@@ -15,7 +15,7 @@ from ddg_warp.learn.rotations import turned
 from ddg_warp.learn.simulator import Simulator, WorldState
 from ddg_warp.model.controls import Controls
 
-CONVERGED = outcome.NAMES[outcome.CONVERGED]
+CONVERGED, NO_GRADIENT = (outcome.NAMES[code] for code in (outcome.CONVERGED, outcome.NO_GRADIENT))
 AXES = "xyz"
 
 
@@ -76,7 +76,7 @@ class EpisodeState:
     @property
     def failed(self) -> torch.Tensor:
         """Worlds whose last step could not be solved (B,); they rest as they were before it."""
-        return torch.as_tensor(self.outcomes != CONVERGED, device=self.poses.device)
+        return torch.as_tensor(~np.isin(self.outcomes, (CONVERGED, NO_GRADIENT)), device=self.poses.device)
 
 
 class Environment:
@@ -193,9 +193,9 @@ class Environment:
         for _ in range(self.substeps):
             moved = self._moved(poses, rates)
             after = self.simulator.step(world, self.parameters, {"poses": moved})
-            outcomes = np.where(outcomes == CONVERGED, self.simulator.outcomes(self.worlds), outcomes)
-            rest = torch.as_tensor(outcomes != CONVERGED, device=self.device)
-            if rest.any():  # which would set out again with the next step
+            outcomes = np.where(outcomes == CONVERGED, after.outcomes(), outcomes)
+            rest = after.failed
+            if rest.any():  # they stay where they were, and would set out again with the next step
                 after, moved = _selected(rest, world, after), torch.where(rest[:, None, None], poses, moved)
             world, poses = after, moved
         return EpisodeState(world, poses, now.goals, actions, now.steps + 1, outcomes.astype(str))
@@ -279,7 +279,8 @@ def _selected(mask: torch.Tensor, new: WorldState, old: WorldState) -> WorldStat
     values = []
     for field, a, b in zip(old.engine.fields, new.values, old.values, strict=True):
         values.append(torch.where(along(mask, field, b), a, b))
-    return WorldState(tuple(values), old.time, old.engine)
+    own = (torch.where(mask, a, b) for a, b in ((new.codes, old.codes), (new.differentiable, old.differentiable)))
+    return WorldState(tuple(values), old.time, old.engine, *own)
 
 
 def _shape(found) -> str:

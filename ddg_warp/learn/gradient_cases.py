@@ -98,7 +98,7 @@ class Case:
             values = self.engine.layout.turn_edges(
                 values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count)
             )
-        return WorldState(tuple(values), state.time, self.engine)
+        return replace(state, values=tuple(values))
 
     def _rates(self) -> torch.Tensor:
         """Random velocities (worlds, P, 3), of nodes on oblique planes within these."""
@@ -119,7 +119,7 @@ class Case:
 
     def end(self, simulator: Simulator, values=None, parameters=None, controls=None) -> WorldState:
         """The last state, from the tensors of the first one."""
-        state = WorldState(tuple(values or self.state.values), self.state.time, simulator.engine(WORLDS))
+        state = replace(self.state, values=tuple(values or self.state.values), engine=simulator.engine(WORLDS))
         controls = self.posed | (controls or {})
         if self.statics:
             begin = {"start": 0.0, "load_steps": STEPS} if self.slides else {"start": 1.0}
@@ -233,13 +233,13 @@ class Case:
     def reverse(self) -> dict[str, float]:
         """Derivatives by what is no tensor, from the reverse of every step."""
         self.engine.tables.write((), [])  # parameters are those of the model
-        states, lagged, sums = [self.state], [], {"time step": 0.0, "mass damping": 0.0}
+        states, told, sums = [self.state], [], {"time step": 0.0, "mass damping": 0.0}
         for _ in range(STEPS):
             states.append(self.simulator.step(states[-1], None, self.posed))
-            lagged.append(self.engine.lagged())
+            told.append([*self.engine.smooth_flags(), states[-1].codes, *self.engine.lagged()])
         given = self._by_end(states[-1])
-        for before, after, own in zip(states[-2::-1], states[:0:-1], lagged[::-1], strict=True):
-            given, read = self.engine.backward(before.time, DT, before.values, after.values, own, given, self.posed)
+        for before, after, own in zip(states[-2::-1], states[:0:-1], told[::-1], strict=True):
+            given, read, _ = self.engine.backward(before.time, DT, before.values, after.values, own, given, self.posed)
             for each in read:
                 by_rate = sum(own.numpy().sum() for own in (each.rate, *getattr(each, "elements_rate", ())))
                 # an implicit step is over dt, the midpoint rule's over half of it
@@ -249,6 +249,6 @@ class Case:
 
     def _by_end(self, state: WorldState) -> list[torch.Tensor]:
         leaves = [value.detach().requires_grad_() for value in state.values]
-        loss = self.loss(WorldState(tuple(leaves), state.time, self.engine))
+        loss = self.loss(replace(state, values=tuple(leaves)))
         found = torch.autograd.grad(loss, leaves, allow_unused=True)
         return [torch.zeros_like(own) if by is None else by for own, by in zip(leaves, found, strict=True)]

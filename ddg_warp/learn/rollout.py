@@ -22,15 +22,15 @@ class Plan:
     memory: int
 
 
-def plan(held: int, steps: int, save: int, every: int | None, memory: float | None) -> Plan:
+def plan(held: int, controls: int, steps: int, save: int, every: int | None, memory: float | None) -> Plan:
     """How a roll-out keeps its states.
 
-    All of them are steps x held. With checkpoints they are those at the start of every block, those within the block whose reverse is
-    at hand, and those that are returned; blocks of the square root of the number of steps hold least (Griewank and Walther, Evaluating
-    Derivatives, 2008, section 12.2: one checkpoint level).
+    All of them are steps x held, and the controls, which are kept in any case. With checkpoints they are those at the start of every
+    block, those within the block whose reverse is at hand, and those that are returned; blocks of the square root of the number of
+    steps hold least (Griewank and Walther, Evaluating Derivatives, 2008, section 12.2: one checkpoint level).
 
     Args:
-        held: by a step [bytes]; steps: how many.
+        held: by a step [bytes]; controls: those of all steps [bytes]; steps: how many.
         save: of how many states one is returned.
         every: of how many one is kept, if that is settled.
         memory: what may be held [bytes].
@@ -40,16 +40,17 @@ def plan(held: int, steps: int, save: int, every: int | None, memory: float | No
     """
 
     def in_blocks(size: int) -> int:
-        return (math.ceil(steps / size) + size + steps // save) * held
+        return (math.ceil(steps / size) + size + steps // save) * held + controls
 
-    if every is None and (memory is None or steps * held <= memory):
-        return Plan(None, steps * held)
+    if every is None and (memory is None or steps * held + controls <= memory):
+        return Plan(None, steps * held + controls)
     size = every or min(_sizes(steps), key=in_blocks)
     best = Plan(size, in_blocks(size))
     if memory is not None and best.memory > memory:
         raise SceneError(
-            f"rollout: {steps} steps hold {best.memory:,} bytes at least, {held:,} each, in blocks of {best.every} and with "
-            f"{steps // save} states that are returned; memory is {memory:,.0f}. Give more, save fewer states, or make fewer steps"
+            f"rollout: {steps} steps hold {best.memory:,} bytes at least, {held:,} each, in blocks of {best.every}, with "
+            f"{steps // save} states that are returned and {controls:,} bytes of controls; memory is {memory:,.0f}. Give more, save "
+            "fewer states, or make fewer steps"
         )
     return best
 
@@ -72,25 +73,26 @@ def roll(step, state, full, controls, steps: int, save: int, every: int | None) 
     """States after every `save` steps.
 
     Args:
-        step: (state, parameters, controls) -> state; controls: of a step, by its number.
+        step: (state, parameters, controls) -> state; controls: of a step, by its number. It is called once a step and in their order,
+            as what gives controls may have a memory or draw noise: steps that are made again take what it gave.
         every: see `Plan`.
     """
     result = []
 
-    def some(first: int, count: int, state, full) -> list:
+    def some(first: int, given: list, state, full) -> list:
         saved = []
-        for number in range(first, first + count):
-            state = step(state, full, controls(number))
+        for number, own in enumerate(given, first):
+            state = step(state, full, own)
             if (number + 1) % save == 0:
                 saved.append(state)
         return [*saved, state]
 
     for first in range(0, steps, every or 1):
-        count = min(every or 1, steps - first)
+        given = [controls(number) for number in range(first, min(first + (every or 1), steps))]
         if every and torch.is_grad_enabled():
-            found = checkpoint.checkpoint(some, first, count, state, full, use_reentrant=False)
+            found = checkpoint.checkpoint(some, first, given, state, full, use_reentrant=False)
         else:
-            found = some(first, count, state, full)
+            found = some(first, given, state, full)
         *saved, state = found
         result += saved
     return result

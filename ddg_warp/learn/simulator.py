@@ -1,23 +1,25 @@
 """Simulator: a model as a torch module. States go in and come out; nothing is kept between calls."""
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 import warp as wp
 
 from ddg_warp import arguments
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import GradientWarning, SceneError
+from ddg_warp.kernels import outcome
 from ddg_warp.learn.adjoint import refuse_gyroscopic
 from ddg_warp.learn.engine import Engine
 from ddg_warp.learn.layout import copies, tensors
-from ddg_warp.learn.recipe import Recipe
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, require_acting, shapes
 from ddg_warp.solve.dynamics import SCHEMES
+from ddg_warp.threads import alone
 
 
 @dataclass(frozen=True)
@@ -25,14 +27,26 @@ class WorldState:
     """A state of B worlds as tensors, which lie as the device likes it; `positions` and the like are in the user's order.
 
     Attributes:
-        values: the arrays of a `State` by the order of `Layout.fields`.
+        values: the arrays of a `State` by the order of `Layout.fields`; of worlds whose step failed, not numbers.
         time: [s], of all worlds.
-        engine: what knows their meaning.
+        engine: what knows their meaning; None of a state that was copied or loaded, see `Simulator.world_state`.
+        codes: outcomes of the step that led here (B,), see `kernels.outcome`; 0 of good ones, and where none did.
+        differentiable: bools (B,), whether a gradient goes through all steps that led here, as far as they were made for gradients.
+            Gradients of the others are not numbers, unless nothing is asked of these worlds: leave them out of a loss by this mask, and
+            take `torch.nan_to_num` of what is computed from worlds that failed.
     """
 
     values: tuple
     time: float
-    engine: Engine
+    engine: Engine | None
+    codes: torch.Tensor
+    differentiable: torch.Tensor
+
+    @classmethod
+    def begun(cls, values, time: float, engine: Engine) -> "WorldState":
+        """Return a state to which no step has led."""
+        codes = torch.zeros(engine.model.worlds, dtype=torch.int32, device=engine.device)
+        return cls(tuple(values), time, engine, codes, codes == 0)
 
     @property
     @torch.compiler.disable
@@ -52,20 +66,43 @@ class WorldState:
         """Angles of edges (B, edges) [rad], zero where there is no twist."""
         return self.engine.layout.edges(self.values)
 
+    @property
+    def failed(self) -> torch.Tensor:
+        """Worlds whose last step could not be made (B,)."""
+        return (self.codes != 0) & (self.codes != outcome.NO_GRADIENT)
+
+    def outcomes(self) -> np.ndarray:
+        """Names of what became of the last step of every world (B,), as of `Integrator.outcomes`; "no_gradient" where it converged and
+        no gradient goes through it, though gradients were asked for. Reads from the device."""
+        return _names(self.codes)
+
     def detach(self) -> "WorldState":
         """The same without history."""
-        return WorldState(tuple(value.detach() for value in self.values), self.time, self.engine)
+        values = tuple(value.detach() for value in self.values)
+        return replace(self, values=values, differentiable=torch.ones_like(self.differentiable))
+
+    def __getstate__(self):
+        return {own.name: getattr(self, own.name) for own in fields(self)} | {"engine": None}
+
+    def __deepcopy__(self, memo):
+        return replace(self.detach(), values=tuple(value.detach().clone() for value in self.values))
 
 
 torch.utils._pytree.register_pytree_node(
     WorldState,
-    lambda state: (list(state.values), (state.time, state.engine)),
-    lambda values, context: WorldState(tuple(values), *context),
+    lambda state: ([*state.values, state.codes, state.differentiable], (state.time, state.engine)),
+    lambda values, context: WorldState(tuple(values[:-2]), *context, *values[-2:]),
 )
 
 
+def _names(codes: torch.Tensor) -> np.ndarray:
+    """Names of outcomes by their codes."""
+    return np.array([outcome.NAMES[code or outcome.CONVERGED] for code in codes.tolist()])
+
+
 class Simulator(torch.nn.Module):
-    """Steps of a model as a differentiable module.
+    """Steps of a model as a differentiable module, by the parameters and rest shapes that the model has when they are made
+    (`Model.set_parameter`, `Model.set_rest`).
 
         simulator = Simulator(model, dt=0.01)
         state = simulator.initial_state(batch=8)
@@ -76,11 +113,14 @@ class Simulator(torch.nn.Module):
     Args:
         model: what to step. Worlds of a batch are copies of it: it is built anew with as many as a state has.
         dt: length of the steps [s].
-        scheme, options: as of `Integrator`. Worlds in which a step fails rest, see `outcomes`; gradients that go through a step that
-            failed, was made in parts or renewed its frames are not numbers, in these worlds alone.
+        scheme, options: as of `Integrator`. A world in which a step fails is not a number from there on; gradients that go through a
+            step that failed, was made in parts or renewed its frames (as edges turned by more than 90 degrees) are not, in these worlds
+            alone. Both are told by `outcomes`, by `WorldState.differentiable`, and the first time by a `GradientWarning`, which on CUDA
+            comes with a later call, as nothing waits for the device.
 
     Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`), or names of masses and of coefficients of drag (see
-    `ddg_warp.learn.constants`), to tensors (), (B, 1), (1, E) or (B, E), E the elements that have it. Controls are dictionaries of
+    `ddg_warp.learn.constants`), to tensors (), (B, 1), (1, E) or (B, E), E the elements that have it. A world that is given a value
+    which `set_parameter` would refuse is not stepped: its outcome is "invalid_parameter". Controls are dictionaries of
     "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see `Controls`.
 
     Raises:
@@ -94,22 +134,25 @@ class Simulator(torch.nn.Module):
         self.dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         self.model, self.scheme, self.options = model, scheme, options
         self._engines: dict[int, Engine] = {}
+        self._last: Engine | torch.Tensor | None = None  # what tells the outcomes of the last step
+        self._warned = False
 
     def engine(self, worlds: int) -> Engine:
-        """What steps so many worlds; made when it is first asked for."""
-        if worlds not in self._engines:
-            model = self.model
-            if worlds != model.worlds:
-                model = Recipe(model, worlds).build()
-            self._engines[worlds] = Engine(model, self.scheme, self.options)
-        return self._engines[worlds]
+        """What steps so many worlds, by the parameters that the model has; made when it is first asked for."""
+        engine = self._engines.get(worlds)
+        if engine is None:
+            with alone(self):
+                if worlds not in self._engines:
+                    self._engines[worlds] = Engine(self.model, worlds, self.scheme, self.options)
+                engine = self._engines[worlds]
+        engine.follow(self.model)
+        return engine
 
     def __getstate__(self):
-        return self.__dict__ | {"_engines": {}, "model": Recipe(self.model, self.model.worlds)}
-
-    def __setstate__(self, state):
-        self.__dict__.update(state)
-        self.model = state["model"].build()
+        return {name: value for name, value in self.__dict__.items() if name != "_lock"} | {
+            "_engines": {},
+            "_last": None,
+        }
 
     def __deepcopy__(self, memo):
         return type(self)(self.model, self.dt, scheme=self.scheme, **self.options)
@@ -138,24 +181,42 @@ class Simulator(torch.nn.Module):
             if name in moved:
                 values = engine.layout.put_points(values, *arrays, moved[name])
         engine.check(values)
-        return WorldState(tuple(values), 0.0, engine)
+        return WorldState.begun(values, 0.0, engine)
 
     def world_state(self, state) -> WorldState:
         """A `State` as one that steps start from, such as `model.state(points, velocities)` or a checkpoint; gradients begin there.
 
-        Unlike by `initial_state`, frames are those of the state, and dampers have its strains behind them, not those at rest.
+        Unlike by `initial_state`, frames are those of the state, and dampers have its strains behind them, not those at rest. A
+        `WorldState` that was loaded (`torch.load`, pickle), or is of another simulator of the same scene, goes on in this one.
 
         Raises:
             SceneError: it is no state of this simulator's model, which has as many worlds; or surfaces overlap that touch; or it was
                 given spins, and `gyroscopic` does not say whether these resist turns of their axes.
         """
+        if isinstance(state, WorldState):
+            return self._bound(state)
         validate.check_state("world_state", self.model, state)
         if "gyroscopic" not in self.options:
             refuse_gyroscopic("world_state", state.spun)
         engine = self.engine(self.model.worlds)
         values = copies(tensors(state, engine.fields))
         engine.check(values)
-        return WorldState(tuple(values), state.time, engine)
+        return WorldState.begun(values, state.time, engine)
+
+    def _bound(self, state: WorldState) -> WorldState:
+        """A `WorldState` from elsewhere as one of this simulator."""
+        engine = self.engine(len(state.codes))
+        wanted = tensors(engine.before, engine.fields)
+        shapes = [tuple(value.shape) for value in wanted], [tuple(value.shape) for value in state.values]
+        if shapes[0] != shapes[1]:
+            raise SceneError(
+                "world_state: the state is of another model: its arrays have other shapes than those of this simulator; give one of "
+                "the same scene"
+            )
+        values = [value.detach().to(like) for value, like in zip(state.values, wanted, strict=True)]
+        engine.check(values)
+        codes = state.codes.to(engine.device)
+        return WorldState(tuple(values), state.time, engine, codes, torch.ones_like(codes, dtype=torch.bool))
 
     @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
     def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:
@@ -202,10 +263,14 @@ class Simulator(torch.nn.Module):
             return self._controls(engine, controls(number) if callable(controls) else controls)
 
         arguments.count("steps", steps)
-        first = given(0)  # asked for once: what gives it may have a memory
-        every = self._plan(state, first, steps, save, checkpoint_every, memory).every
-        full = self._full(engine, parameters)
-        return roll(self._step, state, full, lambda number: given(number) if number else first, steps, save, every)
+        first = given(0)
+        every = self._plan(state, first, steps, save, checkpoint_every, memory, callable(controls)).every
+        full, version = self._full(engine, parameters), self.model.version
+
+        def step(state: WorldState, full: list, controls: dict) -> WorldState:
+            return self._step(state, full, controls, version)
+
+        return roll(step, state, full, lambda number: given(number) if number else first, steps, save, every)
 
     def plan(
         self,
@@ -217,19 +282,24 @@ class Simulator(torch.nn.Module):
         checkpoint_every: int | None = None,
         memory: float | None = None,
     ) -> Plan:
-        """What such a roll-out keeps for gradients, and how; arguments are those of `rollout`, `controls` those of a step."""
-        own = self._controls(self._own(state), controls)
-        return self._plan(state, own, arguments.count("steps", steps), save, checkpoint_every, memory)
+        """What such a roll-out keeps for gradients, and how; arguments are those of `rollout`. A function of controls is called once,
+        for the first step."""
+        several = callable(controls)
+        own = self._controls(self._own(state), controls(0) if several else controls)
+        return self._plan(state, own, arguments.count("steps", steps), save, checkpoint_every, memory, several)
 
-    def _plan(self, state: WorldState, controls: dict, steps: int, save: int, every, memory) -> Plan:
-        arguments.count("save", save)
+    def _plan(self, state: WorldState, controls: dict, steps: int, save: int, every, memory, several: bool) -> Plan:
+        """See `plan`; `several`: whether each step has controls of its own, which are kept all."""
+        if arguments.count("save", save) > steps:
+            raise SceneError(f"rollout: save = {save} of {steps} steps returns no state; give {steps} at most")
         if every is not None:
             arguments.count("checkpoint_every", every)
         if memory is not None:
             arguments.number("memory", memory, "bytes, more than none", lambda value: value > 0.0)
         flags = sum(len(part.islands) for part in state.engine.integrator._parts) * state.values[0].element_size()
-        told = flags + sum(values.capacity for values in state.engine.solutions)
-        return plan(bytes_of([*state.values, *controls.values()]) + told, steps, save, every, memory)
+        told = flags + 5 * len(state.codes) + sum(values.capacity for values in state.engine.solutions)
+        shared = bytes_of(controls.values())
+        return plan(bytes_of(state.values) + told, steps * shared if several else shared, steps, save, every, memory)
 
     @torch.compiler.disable
     def equilibrium(
@@ -268,11 +338,17 @@ class Simulator(torch.nn.Module):
         call = self._call(engine, end, full, controls)
         values = [*(value for _, own in full for value in own), *controls.values()]
         found = Balance.apply(call, tuple(options.items()), *(value.detach() for value in state.values), *values)
-        return WorldState(tuple(found[: len(engine.fields)]), end, engine)
+        return WorldState.begun(found[: len(engine.fields)], end, engine)
 
-    def outcomes(self, worlds: int | None = None) -> np.ndarray:
-        """What became of the last step of every world of so many; see `Integrator.outcomes`."""
-        return self.engine(worlds or self.model.worlds).integrator.outcomes()
+    def outcomes(self) -> np.ndarray:
+        """What became of the last step of every world of the batch that was stepped last (B,); see `WorldState.outcomes`.
+
+        Raises:
+            SceneError: no step was made yet.
+        """
+        if self._last is None:
+            raise SceneError("outcomes: no step was made yet; step or roll out first")
+        return _names(self._last.codes if isinstance(self._last, Engine) else self._last)
 
     def parameter(self, name: str, batch: int | None = None) -> torch.Tensor:
         """The values that the model has of a parameter (B, E)."""
@@ -283,17 +359,21 @@ class Simulator(torch.nn.Module):
         result = []
         for name, values in _named("parameters", "term.parameter", parameters).items():
             engine.tables.of(name)  # which refuses what there is not
-            if not isinstance(values, torch.Tensor):
+            judged = not isinstance(values, torch.Tensor)
+            if judged:
                 try:
-                    values = self._tensor(name, engine.tables.valid(name, values))
+                    values = engine.tables.valid(name, values)
                 except ValueError as error:
                     raise SceneError(f"parameters: {error}") from None
-            result.append((name, engine.tables.full(name, values)))
+            result.append((name, engine.tables.full(name, self._tensor(f"parameters: {name}", values), judged)))
         return result
 
     def _tensor(self, name: str, values) -> torch.Tensor:
         """Numbers as a tensor, in the precision of states where they have none of their own."""
         if isinstance(values, torch.Tensor):
+            if values.layout != torch.strided or values.is_meta or values.is_complex() or values.dtype == torch.bool:
+                kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
+                raise SceneError(f"{name} is a {kind} tensor of {values.dtype}; give a dense one of real numbers")
             return values
         try:
             return torch.as_tensor(values, dtype=wp.dtype_to_torch(self.model.types.real))
@@ -303,9 +383,12 @@ class Simulator(torch.nn.Module):
     def _own(self, state: WorldState) -> Engine:
         """The engine of a state, of this simulator."""
         if not isinstance(state, WorldState) or state.engine not in self._engines.values():
-            what = "another simulator's" if isinstance(state, WorldState) else repr(state)
-            raise SceneError(f"the state is {what}; take one that initial_state, step or equilibrium of this one gave")
-        return state.engine
+            what = "loaded, or another simulator's" if isinstance(state, WorldState) else f"{state!r:.80}"
+            raise SceneError(
+                f"the state is {what}; take one that initial_state, step or equilibrium of this one gave, or that world_state(...) "
+                "makes of it"
+            )
+        return self.engine(state.engine.model.worlds)
 
     def _controls(self, engine: Engine, controls: dict | None) -> dict:
         model, worlds = engine.model, engine.model.worlds
@@ -326,17 +409,38 @@ class Simulator(torch.nn.Module):
             result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
         return result
 
-    def _step(self, state: WorldState, full: list, controls: dict) -> WorldState:
+    def _step(self, state: WorldState, full: list, controls: dict, version: int | None = None) -> WorldState:
+        """A step, of a roll-out that began with a `version` of the model."""
         engine = state.engine
         call = self._call(engine, state.time, full, controls)
+        if version is not None:
+            call = replace(call, version=version)
+            call.engine_as_then()
         values = [value for _, own in full for value in own]
         found = Step.apply(call, *state.values, *values, *controls.values())
-        return WorldState(tuple(found[: len(engine.fields)]), state.time + self.dt, engine)
+        count, codes = len(engine.fields), found[len(engine.fields) + engine.parts]
+        self._last = engine if torch._C._are_functorch_transforms_active() else codes
+        self._tell(engine)
+        differentiable = state.differentiable & (codes == 0) if call.graded else state.differentiable
+        return WorldState(tuple(found[:count]), state.time + self.dt, engine, codes, differentiable)
+
+    def _tell(self, engine: Engine) -> None:
+        """Warn, once, of worlds that have no gradient."""
+        if engine.lost and not self._warned:
+            self._warned = True
+            warnings.warn(
+                "worlds have no gradient by what came before a step that failed, was made in parts or turned edges by more than 90 "
+                "degrees, or whose reverse was not solved: there gradients are not numbers; leave these worlds out by "
+                "state.differentiable (outcomes() names what became of them), or take shorter steps",
+                GradientWarning,
+                stacklevel=4,
+            )
 
     def _call(self, engine: Engine, start: float, full: list, controls: dict) -> Call:
         return Call(
-            engines=self.engine,
+            simulator=self,
             worlds=engine.model.worlds,
+            version=self.model.version,
             start=start,
             dt=self.dt,
             fields=tuple(engine.fields),

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from ddg_warp.errors import SceneError
 from ddg_warp.learn.poses import by_last_poses
 
 
@@ -13,15 +14,16 @@ class Call:
     """What of a step is no tensor: who makes it, when, and what the tensors are.
 
     Attributes:
-        engines: worlds -> `Engine`; worlds: how many there are.
+        simulator: whose step it is; worlds: how many there are; version: of its model's parameters.
         start, dt: time at its start and length [s].
         fields: tensors of the state.
         parameters, controls: names of those that follow; of a parameter as many as parts have it.
         graded: whether gradients may be asked for.
     """
 
-    engines: object
+    simulator: object
     worlds: int
+    version: int
     start: float
     dt: float
     fields: tuple
@@ -32,7 +34,20 @@ class Call:
     @property
     def engine(self):
         """Of so many worlds."""
-        return self.engines(self.worlds)
+        return self.simulator.engine(self.worlds)
+
+    def engine_as_then(self):
+        """That, for a reverse.
+
+        Raises:
+            SceneError: parameters of the model have changed since the step.
+        """
+        if self.version != self.simulator.model.version:
+            raise SceneError(
+                "backward: parameters or rest shapes of the model were changed (set_parameter, set_rest) after the step whose gradient "
+                "is asked for; call backward before, or hand what changes to steps as tensors"
+            )
+        return self.engine
 
     def split(self, tensors):
         """Tensors of the state, of the parameters, and those of the controls by name."""
@@ -56,7 +71,7 @@ class Step(torch.autograd.Function):
     @staticmethod
     def forward(call: Call, *tensors):
         engine = call.engine
-        with engine.stream():
+        with engine.turn():
             state, parameters, controls = call.split(tensors)
             engine.tables.write(call.parameters, parameters)
             return tuple(engine.forward(call.start, call.dt, state, controls, call.graded))
@@ -99,8 +114,9 @@ class Balance(torch.autograd.Function):
     def forward(call: Call, options: tuple, *tensors):
         engine = call.engine
         state, parameters, controls = call.split(tensors)
-        with engine.stream():
+        with engine.turn():
             engine.tables.write(call.parameters, parameters)
+            engine.tables.refuse_invalid()
             return tuple(engine.balance(state, controls, dict(options), call.graded))
 
     @staticmethod
@@ -115,12 +131,12 @@ class Balance(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *given):
         call, saved = ctx.call, ctx.saved_tensors
-        engine, count = call.engine, len(call.fields)
+        engine, count = call.engine_as_then(), len(call.fields)
         tensors, output = saved[: -ctx.results], saved[-ctx.results :]
         first, parameters, controls = call.split(tensors)
         flags, given, found = output[count : count + engine.parts], given[:count], []
         begin, end = ctx.options.get("start", 0.0), call.start
-        with engine.stream():
+        with engine.turn():
             engine.tables.write(call.parameters, parameters)
             for at, state, *way in reversed(engine.way(end, output)):
                 inputs = engine.balance_backward(at, state, controls, given, *way)
@@ -144,16 +160,15 @@ class Pull(torch.autograd.Function):
 
     @staticmethod
     def forward(call: Call, *tensors):
-        engine, count = call.engine, len(call.fields)
+        engine, count = call.engine_as_then(), len(call.fields)
         told = count + engine.told
         given, tensors = tensors[-count:], tensors[:-count]
         output, tensors = tensors[-told:], tensors[:-told]
         state, parameters, controls = call.split(tensors)
-        flags, lagged = output[count : count + engine.parts], output[count + engine.parts :]
-        with engine.stream():
+        with engine.turn():
             engine.tables.write(call.parameters, parameters)
-            found, inputs = engine.backward(call.start, call.dt, state, output[:count], lagged, given, controls)
-            flags = engine.solved(flags)
+            ends = output[:count], output[count:]
+            found, inputs, flags = engine.backward(call.start, call.dt, state, *ends, given, controls)
             by_state = engine.layout.flagged(found, flags)
             by_parameters = engine.tables.pull(call.parameters, inputs, flags)
             by_controls = [engine.controls.pull(name, controls[name], inputs, flags) for name in call.controls]

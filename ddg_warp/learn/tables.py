@@ -5,17 +5,23 @@ import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import outcome
 from ddg_warp.learn import constants
 from ddg_warp.learn.places import ArrayPlace, TermPlace
 from ddg_warp.model.parameters import valid_numbers
 
 
 class Tables:
-    """Of a model: what its parameters are, how tensors are put in their place, and derivatives by them."""
+    """Of a model: what its parameters are, how tensors are put in their place, and derivatives by them.
+
+    Attributes:
+        invalid: of every world the code of the outcome that one of its parameters is refused by, 0 where all are good (worlds,).
+    """
 
     def __init__(self, model):
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
-        self._found, self._written = {}, {}
+        self._found, self._written, self._rules = {}, {}, {}
+        self.invalid = torch.zeros(model.worlds, dtype=torch.int32, device=self.device)
 
     def of(self, name: str) -> tuple[int, list[TermPlace | ArrayPlace]]:
         """How many elements have a parameter, and where it lies.
@@ -51,11 +57,15 @@ class Tables:
             result.update(f"{part.term.name}.{name}" for name in part.parameters.values)
         return sorted(result) + [name for name in constants.NAMES if constants.array_places(model, name)[1]]
 
-    def full(self, name: str, values: torch.Tensor) -> list[torch.Tensor]:
-        """A parameter of shape (), (B,), (E,) or (B, E) as each place has it with one number an element and world."""
+    def full(self, name: str, values: torch.Tensor, judged: bool = False) -> list[torch.Tensor]:
+        """A parameter of shape (), (B,), (E,) or (B, E) as each place has it with one number an element and world.
+
+        Unless values have been `judged`, those that the parameter may not have are not numbers there; see `invalid`.
+        """
         count, found = self.of(name)
         worlds, real = self.model.worlds, wp.dtype_to_torch(self.model.types.real)
         shape = tuple(values.shape)
+        values = values if judged else torch.where(self._good(name, values), values, torch.nan)
         if shape == ():
             wide = values.expand(worlds, count)
         elif shape in ((worlds, 1), (1, count), (worlds, count), (1, 1)):
@@ -74,15 +84,31 @@ class Tables:
         alike = values.shape[-1:] in ((), (1,)) or shape == (worlds,) != (count,)
         return [place.full(wide, alike) for place in found]
 
+    def _good(self, name: str, values: torch.Tensor) -> torch.Tensor:
+        """Whether values are finite and such as a parameter may have, each; nothing is read from the device."""
+        _, holds = self._rule(name)
+        values, finite = values.detach(), torch.isfinite(values)
+        if holds is np.isfinite:
+            return finite
+        return finite & torch.as_tensor(holds(values), device=values.device)
+
+    def _rule(self, name: str) -> tuple:
+        """What values of a parameter are, in words, and whether numbers are that."""
+        if name not in self._rules:
+            if name in constants.NAMES:
+                self._rules[name] = constants.rule(name, self.value(name).cpu().numpy())
+            else:
+                term, parameter = name.rsplit(".", 1)
+                self._rules[name] = self.model.parameter_rule(term, parameter)
+        return self._rules[name]
+
     def valid(self, name: str, values) -> np.ndarray:
         """Values of a parameter that there is as an array of numbers.
 
         Raises:
             ValueError: they are no numbers, not finite, or none that the parameter may have.
         """
-        if name not in constants.NAMES:
-            return self.model.valid_values(*name.rsplit(".", 1), values)
-        return valid_numbers(name, values, *constants.rule(name, self.value(name).cpu().numpy()))
+        return valid_numbers(name, values, *self._rule(name))
 
     def value(self, name: str) -> torch.Tensor:
         """The values that the model has of a parameter (worlds, elements)."""
@@ -95,25 +121,64 @@ class Tables:
 
     def write(self, names: tuple, values: list[torch.Tensor]) -> None:
         """Put full parameters in place; what is there already stays, and others are as the model has them."""
-        values, given = iter(values), {}
+        values, given, anew = iter(values), {}, False
         for name in names:
             for place in self.of(name)[1]:
                 given.setdefault(place.key, []).append((place, next(values)))
         for (place, _), *_ in given.values():  # first, as this makes their memory anew
             if place.widen():
-                self.model.version += 1
+                self.model.layout += 1
                 # with what it holds; other tables still hold what was written
                 self._written = {
                     key: kept for key, kept in self._written.items() if kept[0][0].memory is not place.memory
                 }
         for key in self._written.keys() - given.keys():  # back to what the model has
             self._written.pop(key)[0][0].restore()
+            anew = True
         for key, entries in given.items():
             # the places and tensors that it holds, so that nothing else gets their ids
             kept = [(place, value, value._version) for place, value in entries]
             if not _alike(self._written.get(key, ()), kept):
                 entries[0][0].put(entries)
-                self._written[key] = kept
+                self._written[key], anew = kept, True
+        if anew:
+            self._judge()
+
+    def restore(self) -> None:
+        """Put back what the model has of all that was written."""
+        for (place, *_), *_ in self._written.values():
+            place.restore()
+        self._written = {}
+        self.invalid.zero_()
+
+    def refuse_invalid(self) -> None:
+        """Read from the device whether parameters are good.
+
+        Raises:
+            SceneError: one is not finite in a world, or none that it may be; names it.
+        """
+        for entries in self._written.values() if bool(self.invalid.any()) else ():
+            for place, value, _ in entries:
+                for world in torch.nonzero(self._bad(place, value)).flatten().tolist():
+                    name = self._name_of(place)
+                    raise SceneError(
+                        f"parameters: {name} is refused in world {world}; give values that are finite and {self._rule(name)[0]}"
+                    )
+
+    def _name_of(self, place) -> str:
+        return next(name for name, (_, places) in self._found.items() if any(own is place for own in places))
+
+    def _judge(self) -> None:
+        """Find the worlds in which a parameter that was written is not a number."""
+        self.invalid.zero_()
+        for entries in self._written.values():
+            for place, value, _ in entries:
+                self.invalid.masked_fill_(self._bad(place, value), outcome.INVALID_PARAMETER)
+
+    def _bad(self, place, value: torch.Tensor) -> torch.Tensor:
+        """Whether what was written to a place is not a number, in every world (worlds,)."""
+        bad = torch.isnan(value)
+        return bad.view(len(bad), self.model.worlds, -1).any(2).any(0) if place.chain else bad.any(1)
 
     @property
     def given(self) -> bool:

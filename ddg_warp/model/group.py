@@ -54,9 +54,11 @@ class Group:
         self.outer = put(_outer_forces(host, self.gravity_host, load, moment), real)
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
+        self._stiffnesses = None, ()  # and what they are of
 
-    def set_parameter(self, name: str, values: np.ndarray) -> None:
-        """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+    def set_parameter(self, name: str, values: np.ndarray) -> bool:
+        """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
+        `ParameterTable.set`."""
         elements = self.nodes
         if values.ndim == 0:
             new = values.reshape(1, 1)
@@ -75,7 +77,7 @@ class Group:
                 )
             along = np.pad(along, ((0, 0), (0, elements - along.shape[1])), mode="edge")
             new = np.repeat(np.broadcast_to(along, (self.worlds, elements)), self.rods, axis=0).T
-        self.parameters.set(**{name: new})
+        return self.parameters.set(**{name: new})
 
     @property
     def node_mass(self) -> wp.array:
@@ -91,7 +93,15 @@ class Group:
         return np.stack([mass] * self.dim + [rotary] * self.kind.twist, axis=-1).transpose(1, 0, 2).ravel()
 
     def stiffnesses(self, s: float) -> tuple[np.ndarray, ...]:
-        """Stiffnesses of every rod (columns,) over a step of s [s]; see `precision.stiffnesses`."""
+        """Stiffnesses of every rod (columns,) over a step of s [s]; see `precision.stiffnesses`.
+
+        The last ones are remembered, as a step asks for them several times after every change of a parameter.
+        """
+        if self._stiffnesses[0] != (s, self.parameters.version):
+            self._stiffnesses = (s, self.parameters.version), self._find_stiffnesses(s)
+        return self._stiffnesses[1]
+
+    def _find_stiffnesses(self, s: float) -> tuple[np.ndarray, ...]:
         host = self.host
         mass, length = host.mass.sum(0) / host.count, host.length
         if self.kind.drag:

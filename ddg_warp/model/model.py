@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.compile import memory
 from ddg_warp.compile.chains import compile_chains
 from ddg_warp.compile.conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
@@ -18,9 +19,10 @@ from ddg_warp.model import glue, validate
 from ddg_warp.model.group import Group
 from ddg_warp.model.order import Order
 from ddg_warp.model.parameters import valid_numbers
+from ddg_warp.model.recipe import Recipe
 from ddg_warp.model.state import GripState, GroupState, State
 from ddg_warp.scene.grip import Grip
-from ddg_warp.threads import launches
+from ddg_warp.threads import launches, one_at_a_time
 
 
 @launches
@@ -47,16 +49,20 @@ class Model:
         self.wp_device = _device(device)
         asked = getattr(scene.analysis, "precision", None) if precision is None else precision
         self.types = choose(asked, self.wp_device)
-        self.worlds = worlds
-        self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
+        self.worlds, self.allow_rounding = worlds, allow_rounding
+        self.version = self.layout = 0  # see `note_change`
+        memory.require(scene, needs_net(scene), worlds, self.precision, self.wp_device)
+        with memory.named("build", self.wp_device):
+            self._compile(scene)
+        warn_of_rounding(self, scene.analysis)
+
+    def _compile(self, scene) -> None:
         self.chains = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.grips = [motion for motion in self.motions if isinstance(motion, Grip)]
-        self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
+        self.groups = [Group(chain, scene, self.worlds, self.wp_device, self.types.real) for chain in self.chains]
         self.net = self._build_net() if needs_net(scene) else None
-        self.allow_rounding = allow_rounding
         self.order = Order(self)
-        warn_of_rounding(self, scene.analysis)
 
     def _build_net(self):
         from ddg_warp.compile.net.blocks import compile_net
@@ -80,6 +86,10 @@ class Model:
                 f"a net of {rods} rods, {shells} shells, {turned} shells of revolution ({net.host.blocks} blocks);"
             )
         return "\n ".join([*lines, "model.report() says more>"])
+
+    def __reduce__(self):
+        """Have pickle, torch.save and copy.deepcopy build the scene again, with the parameters and rest shapes that the model has."""
+        return Recipe.build, (Recipe(self, self.worlds),)
 
     @property
     def device(self) -> str:
@@ -142,6 +152,7 @@ class Model:
 
         return report(self)
 
+    @one_at_a_time
     def energies(self, state: State) -> dict[str, float]:
         """Energies by term at a state [J]; see `ddg_warp.ask.inquiry`."""
         from ddg_warp.ask.inquiry import energies
@@ -149,6 +160,7 @@ class Model:
         validate.check_state("energies", self, state)
         return energies(self, state)
 
+    @one_at_a_time
     def reactions(self, state: State, **options) -> list:
         """Forces and moments of the supports; see `ddg_warp.ask.inquiry.reactions`."""
         from ddg_warp.ask.inquiry import reactions
@@ -156,6 +168,7 @@ class Model:
         validate.check_state("reactions", self, state)
         return reactions(self, state, **options)
 
+    @one_at_a_time
     def drag(self, state: State):
         """Forces and power of the drag on rods, an `inquiry.Drag`; see `ddg_warp.ask.inquiry.drag`."""
         from ddg_warp.ask.inquiry import drag
@@ -163,6 +176,7 @@ class Model:
         validate.check_state("drag", self, state)
         return drag(self, state)
 
+    @one_at_a_time
     def pushed_apart(self, state: State, gap: float | None = None) -> tuple[State, float]:
         """A state like another at which nothing overlaps, and how far a node moved at most [m]; see `ask.pushed_apart`."""
         from ddg_warp.ask.pushed_apart import pushed_apart
@@ -170,6 +184,7 @@ class Model:
         validate.check_state("pushed_apart", self, state)
         return pushed_apart(self, state, gap)
 
+    @one_at_a_time
     def contacts(self, state: State):
         """What touches what at a state, `io.contacts.Contacts`; see `ask.contacts`."""
         from ddg_warp.ask.contacts import contacts
@@ -177,6 +192,7 @@ class Model:
         validate.check_state("contacts", self, state)
         return contacts(self, state)
 
+    @one_at_a_time
     def stresses(self, state: State) -> dict:
         """Axial forces and moments along the rods; see `ddg_warp.ask.inquiry.stresses`."""
         from ddg_warp.ask.inquiry import stresses
@@ -203,14 +219,22 @@ class Model:
         known = terms[term]
         if not isinstance(parameter, str) or parameter not in known:
             raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(known)}")
-        name, values = f"{term}.{parameter}", self.valid_values(term, parameter, values)
+        name, values, remade = f"{term}.{parameter}", self.valid_values(term, parameter, values), False
         for group in self.groups:
             if name in group.parameters.values:
-                group.set_parameter(name, values)
+                remade |= group.set_parameter(name, values)
         for part in parts:
             if part.term.name == term and parameter in part.parameters.values:
-                part.set_parameter(parameter, values)
+                remade |= part.set_parameter(parameter, values)
+        self.note_change(remade)
+
+    def note_change(self, remade: bool) -> None:
+        """Count a change of parameters or rest shapes, in `version`, and whether their memory was made anew, in `layout`.
+
+        What the host derives from parameters holds for one version, captured launches for one layout.
+        """
         self.version += 1
+        self.layout += remade
 
     def valid_values(self, term: str, parameter: str, values) -> np.ndarray:
         """Values of a parameter that there is as an array of numbers.
@@ -218,7 +242,11 @@ class Model:
         Raises:
             ValueError: they are no numbers, not finite, or none that the parameter may have.
         """
-        return valid_numbers(f"{term}.{parameter}", values, *self._terms()[term][parameter].valid)
+        return valid_numbers(f"{term}.{parameter}", values, *self.parameter_rule(term, parameter))
+
+    def parameter_rule(self, term: str, parameter: str) -> tuple:
+        """What values of a parameter that there is are, in words, and whether numbers are that."""
+        return self._terms()[term][parameter].valid
 
     def _terms(self) -> dict[str, dict]:
         """Parameters of all terms: term -> name -> `Parameter`."""

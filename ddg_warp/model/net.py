@@ -69,8 +69,9 @@ class DeviceSet:
         """Data of every world (rows, W E) at rest."""
         return wp.array(np.tile(self.host.data, (1, self.worlds)), dtype=self._real, device=self.device)
 
-    def set_parameter(self, name: str, values: np.ndarray) -> None:
-        """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+    def set_parameter(self, name: str, values: np.ndarray) -> bool:
+        """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
+        `ParameterTable.set`."""
         if values.ndim == 0:
             new = values.reshape(1, 1)
         elif values.shape == (self.worlds,) and self.worlds > 1:
@@ -82,10 +83,12 @@ class DeviceSet:
                 f"{self.term.name}.{name} has shape {values.shape}; give one number, ({self.worlds},), ({self.elements},) or "
                 f"({self.worlds}, {self.elements})"
             )
-        self.parameters.set(**{name: new})
+        return self.parameters.set(**{name: new})
 
-    def set_rest(self, first: int, parameters: dict[str, np.ndarray]) -> None:
+    def set_rest(self, first: int, parameters: dict[str, np.ndarray]) -> bool:
         """Replace what of the elements from `first` on belongs to their rest shape, in every world; stiffness stays.
+
+        Returns as of `ParameterTable.set`.
 
         Args:
             first: element.
@@ -97,7 +100,7 @@ class DeviceSet:
             full = np.repeat(now, self.elements // now.shape[1], axis=1)
             full[:, first : first + count] = parameters[name]
             changed[name] = full if len(full) > 1 else _short(full[0])[None]
-        self.parameters.set(**changed)
+        return self.parameters.set(**changed)
 
 
 class DeviceNet:

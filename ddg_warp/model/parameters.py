@@ -11,11 +11,13 @@ class ParameterTable:
 
     Attributes:
         values: arrays of two dimensions by name, of size 1 along what they do not depend on; `set` changes them.
+        version: rises with every change.
     """
 
     def __init__(self, values: dict[str, np.ndarray], along: int, real, device):
         """`along` is the dimension of the elements: 0 or 1."""
         self.values, self._along, self._real, self._device = dict(values), along, real, device
+        self.version = 0
         self.upload()
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -26,10 +28,25 @@ class ParameterTable:
         """Buffer and table, as kernels take them."""
         return self.buffer, self.table
 
-    def set(self, **values: np.ndarray) -> None:
-        """Replace parameters."""
-        self.values |= {name: np.ascontiguousarray(new) for name, new in values.items()}
-        self.upload()
+    def set(self, **values: np.ndarray) -> bool:
+        """Replace parameters, in place where they fit their memory; return whether the memory was made anew.
+
+        Values that broadcast to those before, one number for one an element, are written as many times. Kernels that were captured
+        read what is written in place, and have to be captured again otherwise.
+        """
+        own = {name: _spread(np.asarray(new, float), self.values[name].shape) for name, new in values.items()}
+        self.version += 1
+        fits = all(new.shape == self.values[name].shape for name, new in own.items())
+        self.values |= own
+        if not fits:
+            self.upload()
+            return True
+        sizes = np.cumsum([0, *(held.size for held in self.values.values())]).tolist()
+        for offset, name in zip(sizes, self.values, strict=False):
+            if name in own:
+                flat = wp.array(own[name].ravel(), dtype=self._real, device="cpu")
+                wp.copy(self.buffer, flat, dest_offset=offset)
+        return False
 
     def upload(self) -> None:
         """Bring what `values` holds to the device."""
@@ -42,6 +59,12 @@ class ParameterTable:
         flat = np.concatenate([np.ravel(values) for values in self.values.values()])
         self.buffer = wp.array(flat, dtype=self._real, device=self._device)
         self.table = wp.array(np.array(table, np.int32), dtype=int, device=self._device)
+
+
+def _spread(new: np.ndarray, shape: tuple) -> np.ndarray:
+    """Values in the shape that they had before, where they broadcast to it, else as they are."""
+    spreads = all(size in (1, before) for size, before in zip(new.shape, shape, strict=True))
+    return np.ascontiguousarray(np.broadcast_to(new, shape) if spreads else new)
 
 
 def valid_numbers(name: str, values, rule: str, holds) -> np.ndarray:

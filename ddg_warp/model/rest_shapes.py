@@ -126,9 +126,7 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     elements_of = shell_terms.shell_elements(surface, plate, held.kinds, bending, membrane)
     places = [(sets[e.term.name], held.first[e.term.name], e.parameters) for e in elements_of if len(e)]
     held.plate = plate  # from here on nothing can fail
-    for part, first, parameters in places:
-        part.set_rest(first, parameters)
-    model.version += 1
+    model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))
 
 
 def set_rest_strains(model, strains: dict) -> None:
@@ -158,9 +156,7 @@ def set_rest_strains(model, strains: dict) -> None:
             )
         values = np.broadcast_to(values, (model.worlds, count))
         found += [(group, name, np.concatenate(values[:, numbers], axis=1)) for group, _, numbers in groups]
-    for group, name, values in found:
-        group.parameters.set(**{name: values})
-    model.version += 1
+    model.note_change(any([group.parameters.set(**{name: values}) for group, name, values in found]))
 
 
 def _refuse_without_area(name: str, metric: np.ndarray) -> None:

@@ -110,6 +110,36 @@ class State:
         self.spun = False
         self.lead = 0.0
 
+    def __reduce__(self):
+        """Have pickle and torch.save keep the arrays, and the model of these, once for all states that are saved together."""
+        return State._loaded, (self.model, self.snapshot(), self._told())
+
+    def __copy__(self) -> "State":
+        return self.copy()
+
+    def __deepcopy__(self, memo) -> "State":
+        """Return a copy, of the same model unless that was copied before."""
+        model = memo.get(id(self.model), self.model)
+        return self.copy() if model is self.model else State._loaded(model, self.snapshot(), self._told())
+
+    def _told(self) -> dict:
+        """What a state says beside its `snapshot`, as a pickle holds it."""
+        told = {name: getattr(self, name) for name in (*EQUILIBRIUM, "lead")}
+        if self.sliding is not None:
+            told["sliding"] = self.sliding.velocity.numpy().copy(), self.sliding.increment
+        return told
+
+    @staticmethod
+    def _loaded(model, snapshot: dict, told: dict) -> "State":
+        state = model.restore(snapshot)
+        if told["sliding"] is not None:
+            velocity, increment = told["sliding"]
+            told = told | {
+                "sliding": Sliding(wp.array(velocity, dtype=state.net.v.dtype, device=state.net.v.device), increment)
+            }
+        vars(state).update(told)
+        return state
+
     def __repr__(self) -> str:
         model = self.model
         return f"<State at t = {self.time:g} s: {model.worlds} worlds of {model.points_count} points on {model.device}>"

@@ -24,7 +24,7 @@ from ddg_warp.model import validate
 from ddg_warp.model.state import State
 from ddg_warp.scene.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
 from ddg_warp.solve.corrector import ContinuationOptions, Corrector, Failed
-from ddg_warp.threads import launches
+from ddg_warp.threads import launches, stays_here
 
 FORK = 1e-2  # work of the load along the path, over its largest along any, at which a stationary load is no limit point
 CONTROLLED = 0.2  # of a change under control: how far the shape may be from the mean of its rates at both ends
@@ -32,6 +32,7 @@ LEAP = 4.0  # distance of two points over the length between them at which they 
 BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
 
 
+@stays_here
 @launches
 class Continuation:
     """Follows the equilibria of one model.

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arguments, arrays
+from ddg_warp.compile import memory
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
@@ -21,13 +22,14 @@ from ddg_warp.solve.gyroscopic import Gyroscope
 from ddg_warp.solve.motion import counts_turns, turns_between
 from ddg_warp.solve.net.step import NetStep
 from ddg_warp.solve.worlds import Worlds, outcomes
-from ddg_warp.threads import launches
+from ddg_warp.threads import launches, stays_here
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
 
+@stays_here
 @launches
 class Integrator:
     """Advances states of a model in time.
@@ -121,10 +123,11 @@ class Integrator:
         self.field, self.whole = None, False
         if model.magnetic:
             self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
-        self._chains = [ChainStep(self, model, group) for group in model.groups]
-        self._net = NetStep(self, model) if model.net is not None else None
-        self._worlds, self._first = Worlds(model), (None, None)
-        self._buffers = [Buffer(model), Buffer(model)]
+        with memory.named("Integrator", model.wp_device):
+            self._chains = [ChainStep(self, model, group) for group in model.groups]
+            self._net = NetStep(self, model) if model.net is not None else None
+            self._worlds, self._first = Worlds(model), (None, None)
+            self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
@@ -199,6 +202,7 @@ class Integrator:
         def launch():
             if anew:
                 self.forget()
+            self._worlds.bar(self._parts, self._buffers[source].own)
             self._launch(source)
 
         def replay():
@@ -228,7 +232,7 @@ class Integrator:
 
     def outcomes(self) -> np.ndarray:
         """What became of every world (worlds,): "converged", or the name of the outcome for which something in it was given up."""
-        return outcomes(self.model, self._parts)
+        return outcomes(self.model, self._parts, self._worlds.resting)
 
     def failure(self, state: State, world: int) -> str:
         """What was given up in a world, where it went wrong, and what to do; empty where nothing was.
@@ -350,28 +354,31 @@ class Integrator:
 
     def _weigh(self, dt: float, state: State) -> None:
         """What suits steps of dt, where they are longer than those before or parameters have changed: solve by it, or refuse them."""
-        if self.model.version != self._version:
-            self._version, self._longest = self.model.version, 0.0
-        if dt <= self._longest:
+        anew = self.model.version != self._version
+        if not anew and dt <= self._longest:
             return
         s = self._solved(dt)
-        if self.model.precision == "float32" and lost_in_rounding(self.model, s, state):
+        if self.model.precision == "float32":
+            lost = lost_in_rounding(self.model, s, state)
+            rounded = outcome.LOST_IN_ROUNDING if lost else outcome.CONVERGED_TO_ROUNDING
             for part in self._parts:
-                part.rounded = outcome.LOST_IN_ROUNDING
-            self._graphs.clear()
-        self._adapt(s)
-        self._longest = dt
+                if part.rounded != rounded and (lost or anew):
+                    part.rounded = rounded
+                    self._graphs.clear()
+        self._adapt(s, anew)
+        self._version, self._longest = self.model.version, dt
 
-    def _adapt(self, s: float) -> None:
-        """From now on solve by what suits a step of s; see `Means`."""
+    def _adapt(self, s: float, anew: bool = False) -> None:
+        """From now on solve by what suits a step of s, whatever suited those before where that is `anew`; see `Means`."""
         for i, chain in enumerate(self._chains):
-            if (means := chain.suited(s)) != chain.means:
+            if (means := chain.suited(s, anew)) != chain.means or (anew and chain.newton.outdated):
                 self._chains[i] = ChainStep(self, self.model, chain.group, means, counts_of=chain)
                 self._graphs.clear()
-        if self._net is not None and (means := self._net.suited(s)) != self._net.means:
+        net = self._net
+        if net is not None and ((means := net.suited(s, anew)) != net.means or (anew and net.newton.outdated)):
             self._net = NetStep(self, self.model, means, counts_of=self._net)
             self._graphs.clear()
-        if self._net is not None and self._net.adapt(s):
+        if self._net is not None and self._net.adapt(s, anew):
             self._graphs.clear()
 
     def _own(self, state: State) -> int:

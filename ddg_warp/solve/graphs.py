@@ -10,7 +10,7 @@ from ddg_warp.threads import capturing
 
 
 class Graphs:
-    """Captured launches of a model by name; made anew after the model has changed.
+    """Captured launches of a model by name; made anew after memory of the model was.
 
     Args:
         load: compiles and loads every kernel, which a capture can not.
@@ -18,17 +18,17 @@ class Graphs:
 
     def __init__(self, model, load: Callable[[], None]):
         self._model, self._load = model, load
-        self._graphs, self._version = {}, model.version
+        self._graphs, self._layout = {}, model.layout
 
     def clear(self) -> None:
         """Forget what was captured."""
         self._graphs.clear()
 
     def replay(self, name: Hashable, launch: Callable[[], None]) -> None:
-        """Launch what is captured under a name; at first, and where the model has changed since, capture it."""
-        if self._model.version != self._version:
+        """Launch what is captured under a name; at first, and where memory of the model was made anew since, capture it."""
+        if self._model.layout != self._layout:
             self.clear()
-            self._version = self._model.version
+            self._layout = self._model.layout
         if name not in self._graphs:
             with capturing():
                 self._capture(name, launch)

@@ -42,7 +42,6 @@ class RestPath:
         """Put rest shapes where a part of the way ends, 0 at its start and 1 at its end."""
         for put, start, end in self._changes:
             put({name: start[name] + part * (end[name] - start[name]) for name in end} if part != 1.0 else end)
-        self.model.version += bool(self._changes)
 
     def _find(self, key, given: Mapping) -> tuple[int | None, int | None]:
         """Index of the shell or of the rod that a key means; of an index of both what is given tells which."""
@@ -115,15 +114,15 @@ class RestPath:
                     count = int(group.host.count[columns[0] % group.rods]) - (
                         0 if group.kind.closed else term.measure.span
                     )
-                    yield _of_group(group, term, columns, count)
+                    yield _of_group(model, group, term, columns, count)
         for part in model.net.sets if model.net is not None else ():
             if part.term.rest and hasattr(part.host, "owner") and len(part.host.owner):
                 elements = np.flatnonzero(part.host.owner[0] == rod)
                 if elements.size and not part.term.measure.spins:
-                    yield _of_set(part, elements)
+                    yield _of_set(model, part, elements)
 
 
-def _of_group(group, term, columns: np.ndarray, count: int):
+def _of_group(model, group, term, columns: np.ndarray, count: int):
     def read(name):
         values = np.broadcast_to(group.parameters.values[name], (group.nodes, group.columns))
         return values[:count, columns[0]].copy()
@@ -135,12 +134,12 @@ def _of_group(group, term, columns: np.ndarray, count: int):
             full = np.array(np.broadcast_to(group.parameters.values[name], (group.nodes, group.columns)))
             full[:count, columns] = own[:, None]
             changed[name] = full
-        group.parameters.set(**changed)
+        model.note_change(group.parameters.set(**changed))
 
     return read, term, count, put
 
 
-def _of_set(part, elements: np.ndarray):
+def _of_set(model, part, elements: np.ndarray):
     def read(name):
         values = part.parameters.values[name.rpartition(".")[2]]
         return np.broadcast_to(values, (len(values), part.elements))[0, elements].copy()
@@ -152,6 +151,6 @@ def _of_set(part, elements: np.ndarray):
             full = np.array(np.broadcast_to(now, (len(now), part.elements)))
             full[:, elements] = own
             changed[name] = full
-        part.parameters.set(**changed)
+        model.note_change(part.parameters.set(**changed))
 
     return read, part.term, len(elements), put

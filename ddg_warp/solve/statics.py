@@ -38,7 +38,7 @@ from ddg_warp.solve.residuals import Residuals
 from ddg_warp.solve.rest_path import RestPath
 from ddg_warp.solve.supports import require_supports
 from ddg_warp.solve.tangent import Tangent
-from ddg_warp.threads import launches
+from ddg_warp.threads import launches, stays_here
 
 SOLVERS = ("auto", "direct", "pcg")
 DESCENTS = 8  # from saddles, in one solve
@@ -137,6 +137,7 @@ def solve(
     return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)
 
 
+@stays_here
 @launches
 class Equilibrium:
     """A static solver of one model; keeps its tangent between solves.
@@ -220,6 +221,8 @@ class Equilibrium:
                 "there is none; give start other than end, or friction=0"
             )
         found = checked(controls, self.model, "statics")
+        if self.net and self.net.newton.outdated:
+            self.net = NetEquilibrium(self)
         self.check_apart(state)
         self.tangent.give(found)
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None

@@ -87,7 +87,8 @@ class PartStep:
         if 0.5 ** (integrator.retry_limit // 2) < LEAST:
             newton.islands.patience.fill_(DETOURS_ALLOWED)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
-        self._limits, self._limited = {}, None  # by length of a solve, and the version of the model that they are of
+        # by length of a solve; of which stiffnesses they are; those that islands have
+        self._limits, self._limited, self._set = {}, None, None
 
     @property
     def islands(self):
@@ -99,9 +100,15 @@ class PartStep:
         """How many of them a world has."""
         return len(self.islands) // self.model.worlds
 
-    def suited(self, s: float) -> Means:
-        """What suits solves over s [s], and all shorter ones before."""
-        return suited(self.model.precision, self.means, self.float32_errors(s).max(), self.split_errors(s).max())
+    def suited(self, s: float, anew: bool = False) -> Means:
+        """What suits solves over s [s], and those before unless that is asked `anew`, as after a change of parameters."""
+        means = USUAL._replace(linear=self.model.types.linear) if anew else self.means
+        return suited(self.model.precision, means, self.float32_errors(s).max(), self.split_errors(s).max())
+
+    @property
+    def stiffness_version(self) -> int:
+        """Version of the stiffnesses that `limits` and errors of float32 are found of; zero where they are those of the scene."""
+        return 0
 
     def split_errors(self, s: float) -> np.ndarray:
         """The same with tensions as unknowns; infinite where they cannot be."""
@@ -109,16 +116,19 @@ class PartStep:
 
     def limit(self, s: float) -> None:
         """Set the `limits` of solves over s [s]."""
-        for name, values in self.limits(s).items():
-            getattr(self.islands, name).assign(values)
+        found = self.limits(s)
+        if found is not self._set:
+            for name, values in found.items():
+                getattr(self.islands, name).assign(values)
+            self._set = found
 
     def limits(self, s: float) -> dict[str, np.ndarray]:
         """Rows of all islands by name, for solves over s [s]: turns that are taken straight, see `precision.straight_turns`.
 
         Those of the last lengths are remembered: steps go to and fro between few, and 10,000 rods take 24 ms for each.
         """
-        if self._limited != self.model.version:
-            self._limits, self._limited = {}, self.model.version
+        if self._limited != self.stiffness_version:
+            self._limits, self._limited = {}, self.stiffness_version
         if s not in self._limits:
             if len(self._limits) == KEPT:
                 del self._limits[next(iter(self._limits))]

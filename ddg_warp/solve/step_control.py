@@ -2,18 +2,25 @@
 
 import math
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.model.controls import Controls
+from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
 from ddg_warp.solve.dynamics import Integrator
-from ddg_warp.threads import launches
+from ddg_warp.solve.motion import poses_between
+from ddg_warp.threads import launches, stays_here
 
 HALVINGS = 4
 ROOM = 0.8  # of the error, that the estimate of a step twice as long has to leave
 
 
+@stays_here
 @launches
 class StepControl:
     """Advances a state by steps that are halved while motion changes fast, and doubled while it is calm.
@@ -56,23 +63,54 @@ class StepControl:
         self.level, self.estimate, self.lengths = self.halvings, math.inf, Counter()
         self._changes, self._version = integrator.watch_changes(), None
 
-    def advance(self, state: State, dt: float, controls: Controls | None = None) -> State:
-        """The state dt [s] later, by steps of dt / 2^k; controls act in all of them.
+    def advance(
+        self, state: State, dt: float, controls: Controls | None = None, start: Controls | None = None
+    ) -> State:
+        """Return the state dt [s] later, by steps of dt / 2^k.
+
+        Args:
+            state, controls: as of `Integrator.step`. Grips move evenly from where they are in the state to the poses of the controls,
+                and turn at a constant rate; loads, gravity and field are constant over dt, as in one step of it.
+            start: loads, gravity and field at the start, from which they go linearly to those of `controls`; what only one of both
+                gives is zero, or the gravity of the scene, in the other.
 
         Raises:
             SolverError, SceneError: as of `Integrator.step`.
         """
         dt = arguments.positive("StepControl: dt", dt, "s")
+        between = self._between(state, controls, start)
         units, done = 2**self.halvings, 0
         while done < units:
             while done % (units >> self.level):  # steps begin at multiples of their length
                 self.level += 1
             part = units >> self.level
-            after = self.integrator.step(state, dt * part / units, controls)
+            after = self.integrator.step(state, dt * part / units, between((done + part) / units))
             self.lengths[dt * part / units] += 1
             self._judge()
             state, done = after, done + part
         return state
+
+    def _between(self, state: State, controls: Controls | None, start: Controls | None) -> Callable:
+        """Controls of a step by the part of dt at its end."""
+        model = self.model
+        validate.check_state("StepControl.advance", model, state)
+        end, begin = (checked(given, model, "StepControl.advance") for given in (controls, start))
+        if "poses" in begin:
+            raise SceneError("StepControl.advance: poses begin where the state has them; leave them out of start")
+        usual = {"gravity": np.array(model.scene.gravity, float)[None]}
+        ramps = {
+            name: [own.get(name, usual.get(name, 0.0)) for own in (begin, end)]
+            for name in ((begin | end).keys() - {"poses"} if begin else ())
+        }
+        poses = poses_between(state, end["poses"], 0.0, 1.0) if "poses" in end else None
+
+        def at(part: float) -> Controls | None:
+            given = {name: (1.0 - part) * first + part * last for name, (first, last) in ramps.items()}
+            if poses:
+                given["poses"] = poses(part)
+            return replace(controls or Controls(), **given) if given else controls
+
+        return at
 
     def _judge(self) -> None:
         """How long the next step is, by what the last one has changed."""

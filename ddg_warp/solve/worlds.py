@@ -6,14 +6,15 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.worlds import forget_kernel, island_kernels, select_kernel
+from ddg_warp.kernels.worlds import blank_kernels, forget_kernel, island_kernels, select_kernel
 from ddg_warp.model.state import State
 from ddg_warp.threads import capturing
 
 
-def outcomes(model, parts: list) -> np.ndarray:
-    """Names (worlds,) of what became of each world: of the first reason why something in it was given up, else "converged"."""
-    codes = np.zeros(model.worlds, int)
+def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
+    """Return names (worlds,) of what became of each world: of the first reason why something in it was given up, or why it rests, else
+    "converged"."""
+    codes = resting.numpy()
     for part in parts:
         islands = part.islands
         given_up = islands.status.numpy() == outcome.GIVEN_UP
@@ -24,39 +25,73 @@ def outcomes(model, parts: list) -> np.ndarray:
 class Worlds:
     """The worlds of an integrator.
 
-    A world in which something was given up rests: all of it is as it was before the step, and stays so until it is reset.
+    A world in which something was given up rests: all of it is as it was before the step, and stays so until it is reset. Where worlds
+    are `watch`ed, it is not a number instead.
 
     Attributes:
         resting: of every world the code of the outcome that it rests for, 0 where it goes on; see `kernels.outcome`.
+        invalid: of every world that is watched the code of an outcome that its parameters are refused by, 0 where they are good.
     """
 
     def __init__(self, model):
         self.model = model
         self.resting, self._failed, self._mask = (self._zeros(model.worlds) for _ in range(3))
         self._any = self._zeros(1)
-        self._note, self._seal, self._enter, self._clear = island_kernels()
+        self._note, self._seal, self._enter, self._clear, self._find = island_kernels()
         self._serial, self._loaded = arrays.serial(model.wp_device), False
+        self.invalid: wp.array | None = None
 
     def _zeros(self, count: int) -> wp.array:
         return wp.zeros(count, dtype=int, device=self.model.wp_device)
 
+    def watch(self) -> None:
+        """From now on take worlds out of steps whose parameters are `invalid` or whose state is not a number, and leave those that fail
+        not a number."""
+        self.invalid = self._zeros(self.model.worlds)
+
+    def bar(self, parts: list, before: State) -> None:
+        """Before a step: have watched worlds rest that are taken out of it; launches alone, so that it can be captured."""
+        if self.invalid is None:
+            return
+        values = next(array for array in before.arrays().values() if array.size > 1)
+        cube, (_, bar) = cubed(values), blank_kernels(values.dtype)
+        inputs = [self.invalid, cube, cube.shape[-1] // self.model.worlds]
+        self._launch(bar, self.model.worlds, inputs, [self.resting])
+        for part in parts:
+            inputs = [self.resting, part.islands_each]
+            self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])
+
     def settle(self, parts: list, before: State, after: State) -> None:
         """After a step: have worlds rest in which something was given up; launches alone, so that it can be captured."""
-        self._failed.zero_()
         self._any.zero_()
+        if self.invalid is None:
+            self._failed.zero_()
+        else:
+            wp.copy(self._failed, self.resting)
+            self._launch(self._find, self.model.worlds, [self._failed], [self._any])
         for part in parts:
             inputs = [part.islands.arrays[0], part.islands_each, self.resting, self._failed]
             self._launch(self._note, len(part.islands), inputs, [self._any])
         wp.capture_if(self._any, lambda: self._rest(parts, before, after))
-        if after.grips is not None:  # which go where they are told, but for worlds that rest
+        if after.grips is not None and self.invalid is None:  # which go where they are told, but for worlds that rest
             self.take_part(self.resting, before.grips, after.grips, before.model.worlds)
 
     def _rest(self, parts: list, before: State, after: State) -> None:
-        self.take_over(self._failed, before, after)
+        if self.invalid is None:
+            self.take_over(self._failed, before, after)
+        else:
+            self._blank(after)
         for part in parts:
             inputs = [self._failed, part.islands_each]
             self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])
         self._launch(self._enter, self.model.worlds, [self._failed], [self.resting])
+
+    def _blank(self, state: State) -> None:
+        """Make a state not a number in worlds that failed."""
+        for array in state.arrays().values():
+            if array.shape[-1] % self.model.worlds == 0:
+                cube, (blank, _) = cubed(array), blank_kernels(array.dtype)
+                self._launch(blank, cube.shape, [self._failed, cube.shape[-1] // self.model.worlds], [cube])
 
     def take_over(self, mask: wp.array, source: State, target: State) -> None:
         """Put everything of a state into another one, in worlds of a mask; a state of one world goes into each of them."""
@@ -65,15 +100,19 @@ class Worlds:
 
     def take_part(self, mask: wp.array, source, target, worlds: int) -> None:
         """As `take_over`, of a part of a state, from one of so many worlds."""
-        several, given = self.model.worlds, source.arrays()
+        given = source.arrays()
         for name, array in target.arrays().items():
-            if array.shape[-1] % several:
-                continue  # not there, but for one number
-            share = array.shape[-1] // several
-            stride = share if worlds == several else 0
-            kernel, cubes = select_kernel(array.dtype, self._serial), [_cube(a) for a in (given[name], array)]
-            dim = (1, 1, several, 1) if self._serial else (*cubes[1].shape[:2], several, share)
-            self._launch(kernel, dim, [mask, share, stride, cubes[0]], [cubes[1]])
+            if array.shape[-1] % self.model.worlds == 0:  # else it is not there, but for one number
+                self.take_array(mask, given[name], array, worlds)
+
+    def take_array(self, mask: wp.array, source: wp.array, target: wp.array, worlds: int) -> None:
+        """As `take_over`, of an array."""
+        several = self.model.worlds
+        share = target.shape[-1] // several
+        stride = share if worlds == several else 0
+        kernel, cubes = select_kernel(target.dtype, self._serial), [cubed(array) for array in (source, target)]
+        dim = (1, 1, several, 1) if self._serial else (*cubes[1].shape[:2], several, share)
+        self._launch(kernel, dim, [mask, share, stride, cubes[0]], [cubes[1]])
 
     def mask(self, mask) -> wp.array:
         """A mask that a user gives, on the device.
@@ -142,8 +181,11 @@ class Worlds:
                 self._seal,
                 self._enter,
                 self._clear,
+                self._find,
                 *(select_kernel(dtype, self._serial) for dtype in types),
             ]
+            if self.invalid is not None:
+                kernels += [kernel for dtype in types for kernel in blank_kernels(dtype)]
             kernels += [forget_kernel(dtype) for dtype in (int, self.model.types.real)]
             arrays.load_kernels(kernels, self.model.wp_device)
         self._loaded = True
@@ -152,7 +194,7 @@ class Worlds:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
 
 
-def _cube(array: wp.array) -> wp.array:
+def cubed(array: wp.array) -> wp.array:
     """An array seen with three axes."""
     lead = 3 - array.ndim
     shape, strides = (1,) * lead + array.shape, array.strides[:1] * lead + array.strides

@@ -231,7 +231,7 @@ def angle_kernel(dim: int, real, midpoint: bool):
 @cache
 def smooth_kernel(real):
     """smooth(...): one for islands whose step was one solve in the frames that it began with, else not a number; at the first attempt,
-    where that is asked (`once`).
+    where that is asked (`once`). Worlds that have another one, and no outcome yet, get that of no gradient, and are told of.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -241,9 +241,12 @@ def smooth_kernel(real):
         once: int,
         frame: wp.array3d(dtype=real),
         began: wp.array3d(dtype=real),
+        share: int,
         smooth_out: wp.array(dtype=real),
+        codes: wp.array(dtype=int),
+        told: wp.array(dtype=int),
     ):
-        """Frames (component, edge, island) are those of the last solve and of the start."""
+        """Frames (component, edge, island) are those of the last solve and of the start; a world has a `share` of the islands."""
         r = wp.tid()
         same = flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING) and scalars[PORTION, r] == real(1.0)
         same = same and (once == 0 or flags[RETRIES, r] == 0)
@@ -251,17 +254,67 @@ def smooth_kernel(real):
             for c in range(frame.shape[0]):
                 same = same and frame[c, k, r] == began[c, k, r]
         smooth_out[r] = wp.where(same, real(1.0), real(wp.nan))
+        if not same:
+            told[0] = 1
+            wp.atomic_cas(codes, r / share, 0, wp.static(outcome.NO_GRADIENT))
 
     return smooth
 
 
 @cache
-def solved_kernel(real):
-    """solved(...): one for islands whose linear system has not `failed`, else not a number."""
+def flag_kernels(real):
+    """solved(...): flags of islands, not numbers where their linear system has failed; excuse(...): one instead where nothing was
+    asked; failed(...): which worlds failed.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def solved(failed: wp.array(dtype=int), solved_out: wp.array(dtype=real)):
+    def solved(
+        failed: wp.array(dtype=int),
+        flags: wp.array(dtype=real),
+        out: wp.array(dtype=real),
+        asked: wp.array(dtype=int),
+        lost: wp.array(dtype=int),
+        told: wp.array(dtype=int),
+    ):
         r = wp.tid()
-        solved_out[r] = wp.where(failed[r] == 0, real(1.0), real(wp.nan))
+        out[r] = wp.where(failed[r] == 0, flags[r], real(wp.nan))
+        asked[r] = 0
+        if wp.isnan(out[r]):
+            lost[0] = 1
+            if not wp.isnan(flags[r]):
+                told[0] = 1
 
-    return solved
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def excuse(asked: wp.array(dtype=int), out: wp.array(dtype=real)):
+        r = wp.tid()
+        if asked[r] == 0:
+            out[r] = real(1.0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def failed(codes: wp.array(dtype=int), mask: wp.array(dtype=int), any_failed: wp.array(dtype=int)):
+        w = wp.tid()
+        mask[w] = wp.where(codes[w] != 0 and codes[w] != wp.static(outcome.NO_GRADIENT), 1, 0)
+        if mask[w] != 0:
+            any_failed[0] = 1
+
+    return solved, excuse, failed
+
+
+@cache
+def asked_kernel(dtype, real):
+    """asked(...): whether derivatives by an array are other than zero in an island whose flag is not a number; each has a `share`."""
+    several = hasattr(dtype, "_wp_scalar_type_")
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def asked(flags: wp.array(dtype=real), given: wp.array3d(dtype=dtype), share: int, asked_out: wp.array(dtype=int)):
+        i, j, k = wp.tid()
+        if wp.isnan(flags[k / share]):
+            value = given[i, j, k]
+            if wp.static(several):
+                if wp.length_sq(value) != real(0.0):
+                    asked_out[k / share] = 1
+            else:
+                if value != real(0.0):
+                    asked_out[k / share] = 1
+
+    return asked

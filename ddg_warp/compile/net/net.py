@@ -114,6 +114,10 @@ class Net(Storage):
     markers: list[np.ndarray] = field(default_factory=list)
     touching: Touching | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
+    _stiffnesses: tuple = (
+        None,
+        None,
+    )  # length of the step that they were last asked for, and `rod_stiffnesses` over it
 
     @property
     def blocks(self) -> int:
@@ -227,7 +231,9 @@ class Net(Storage):
         return [(piece, *np.array(rows).T) for piece, rows in found.values()]
 
     def rod_stiffnesses(self, s: float) -> np.ndarray:
-        """Stiffnesses of every rod over a step of s [s] (3, rods); see `precision.stiffnesses`."""
+        """Stiffnesses of every rod over a step of s [s] (3, rods), by the parameters of the scene; see `precision.stiffnesses`."""
+        if self._stiffnesses[0] == s:
+            return self._stiffnesses[1]
         found = np.empty((3, len(self.rods)))
         for p, rods, rows in self._pieces:
             mass = (
@@ -235,6 +241,7 @@ class Net(Storage):
             )
             parameters = {name: v.T for name, v in p.parameters.items()}
             found[:, rods] = np.array(stiffnesses(p.kind, mass, p.length, parameters, s))[:, rows]
+        self._stiffnesses = s, found
         return found
 
     def rod_errors(self, s: float) -> np.ndarray:

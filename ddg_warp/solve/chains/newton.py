@@ -143,6 +143,11 @@ class ChainNewton:
         return "progressive" if any(group.parameters[name].any() for name in rest) else "gauss_newton"
 
     @property
+    def outdated(self) -> bool:
+        """Whether parameters have changed so that another mode suits the rods than the one that was chosen."""
+        return self.options.psd == "auto" and self.psd != self.automatic_psd()
+
+    @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         return [*self.kernels_around, (self._sweep, self._threads), self._adjust]

@@ -130,6 +130,11 @@ class ChainStep(PartStep):
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
         return kernels
 
+    @property
+    def stiffness_version(self) -> int:
+        """As of `PartStep`."""
+        return self.group.parameters.version
+
     def float32_errors(self, s: float) -> np.ndarray:
         """Of every rod; see `precision.float32_error`."""
         return self.group.float32_errors(s)

@@ -65,11 +65,11 @@ class Alone:
         own += [self._wait] if self.net.worlds > 1 else []
         return own + ([self._stay, self._follow] if len(self._obstacles) else [])
 
-    def adapt(self, s: float) -> bool:
+    def adapt(self, s: float, anew: bool = False) -> bool:
         """As of `NetStep`."""
-        changed = False
+        changed = any([places.take_parameters() for places in self._places])
         for i, chain in enumerate(self.chains):
-            if (means := chain.suited(s)) != chain.means:
+            if (means := chain.suited(s, anew)) != chain.means or (anew and chain.newton.outdated):
                 self.chains[i], changed = self._chain(chain.group, means=means, counts_of=chain), True
         return changed
 
@@ -199,6 +199,7 @@ class Places:
 
     def __init__(self, net, group: Group):
         host, kind = net.host, group.kind
+        self._net, self._group, self._taken = net, group, {}
         by_rod = {rod.rod: rod for rod in host.rods}
         rods = [by_rod[rod] for rod in group.host.rods.tolist()]
         self._sets, elements = {}, {}
@@ -209,12 +210,34 @@ class Places:
         none = [np.zeros(0, int)] * len(rods)
         lists = [rod.all_nodes for rod in rods], [rod.all_edges for rod in rods], elements.get(2, none), elements[1]
         rows = np.concatenate([np.transpose([_evenly(places) for places in each]) for each in lists])
+        self._elements = {span: _padded(elements[span], group.nodes) for span in elements}
         self.rows = wp.array(np.ascontiguousarray(rows, np.int32), dtype=int, device=net.device)
         sizes = [net.sets[self._sets[span]].elements if span in self._sets else 0 for span in (2, 1)]
         self.sizes = wp.vec4i(net.blocks, net.edges, *sizes)
         self.whole = all(
             net.sets[self._sets[term.measure.span]].term.density.lagged == term.density.lagged for term in kind.terms
         )
+
+    def take_parameters(self) -> bool:
+        """Give the group the parameters that the net has by now; return whether memory was made anew."""
+        group, changed = self._group, {}
+        for term in group.kind.terms:
+            table, elements = (
+                self._net.sets[self._sets[term.measure.span]].parameters,
+                self._elements[term.measure.span],
+            )
+            for parameter, values in table.values.items():
+                name, (worlds, along) = f"{term.name}.{parameter}", values.shape
+                if self._taken.get(name) is values:
+                    continue
+                self._taken[name], own = values, values.reshape(worlds, -1, 1)
+                if along > 1:
+                    own = values[:, elements]
+                if worlds > 1 or along > 1:
+                    own = np.broadcast_to(own, (group.worlds, *own.shape[1:]))
+                    own = np.broadcast_to(own, (*own.shape[:2], group.rods)).transpose(1, 0, 2)
+                changed[name] = own.reshape(len(own), -1)
+        return bool(changed) and group.parameters.set(**changed)
 
     def lagged(self, state) -> list[wp.array]:
         """Lagged data of a net's state: frames, own rows of bending, strains of bending and of stretch."""
@@ -231,10 +254,10 @@ def uncoupled(model) -> bool:
 
 
 def suits(integrator) -> bool:
-    """Whether an integrator can step what is `uncoupled` rod by rod: by parameters as they were built, loads that no controls give, and
-    solvers about which nothing is said."""
+    """Whether an integrator can step what is `uncoupled` rod by rod: by loads that no controls give, and solvers about which nothing is
+    said."""
     usual = integrator.solver == "newton" and integrator.linear == "auto" and integrator.scheme == "implicit_euler"
-    return usual and integrator.given is None and not integrator.whole and integrator.model.version == 0
+    return usual and integrator.given is None and not integrator.whole
 
 
 def rods_of(model) -> list[Group]:
@@ -249,6 +272,13 @@ def _of_rods(owner: np.ndarray, rods: np.ndarray) -> list[np.ndarray]:
     order = np.argsort(owner, kind="stable")
     starts, ends = (np.searchsorted(owner[order], rods, side) for side in ("left", "right"))
     return [order[start:end] for start, end in zip(starts, ends, strict=True)]
+
+
+def _padded(elements: list[np.ndarray], nodes: int) -> np.ndarray:
+    """Elements of rods (nodes, R), the last one again where a rod has fewer."""
+    return np.column_stack(
+        [np.pad(own, (0, nodes - len(own)), mode="edge") if len(own) else [0] * nodes for own in elements]
+    )
 
 
 def _evenly(places: np.ndarray) -> tuple[int, int]:

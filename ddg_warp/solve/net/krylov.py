@@ -167,10 +167,11 @@ class ConjugateGradients:
 
 
 class Directions(ConjugateGradients):
-    """Those of a `NetNewton`, as exactly as its `forcing` and `goal` say."""
+    """Those of a `NetNewton`, as exactly as its `forcing` and `goal` say; `scale` is that of `ConjugateGradients`."""
 
     def __init__(self, newton, multilevel: bool):
-        super().__init__(newton, multilevel, scale=natural_scale(newton.net))
+        self.scale = natural_scale(newton.net)
+        super().__init__(newton, multilevel, scale=self.scale)
         real = newton.real
         self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], real, newton.device, largest=True)
         self._compare, self._confirm = krylov.confirm_kernels(real, newton.linear)

@@ -19,7 +19,7 @@ from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.net.frozen import Frozen
-from ddg_warp.solve.net.krylov import SPARE, Directions
+from ddg_warp.solve.net.krylov import SPARE, Directions, natural_scale
 from ddg_warp.solve.net.outliers import Outliers
 from ddg_warp.solve.net.planes import DevicePlanes
 from ddg_warp.solve.net.resting import Resting
@@ -29,6 +29,7 @@ from ddg_warp.solve.net.turns import Turns
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 STRAIGHT = 1e-9  # turn between edges of a rod at rest that may be rounding [rad]
+RESCALED = 2.0**12  # change of the natural scale that conjugate gradients take as it is
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
 
@@ -181,6 +182,13 @@ class NetNewton:
         bending = [part for part in self.net.sets if part.term.measure.packed and not self.frozen]
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
         return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
+
+    @property
+    def outdated(self) -> bool:
+        """As of `ChainNewton`; or stretching is stiffer or softer by so much that conjugate gradients need another scale."""
+        if self.options.psd == "auto" and self.psd != self.automatic_psd():
+            return True
+        return not 1.0 / RESCALED < natural_scale(self.net) / self.krylov.scale < RESCALED
 
     def _part(self, part, exact: bool, local: bool, split: bool, make, H) -> dict:
         """What the elements of a set write."""

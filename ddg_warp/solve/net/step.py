@@ -198,15 +198,18 @@ class NetStep(PartStep):
         """Steps of its rods on their own, where there are any."""
         return self.alone.chains if self.alone else []
 
-    def adapt(self, s: float) -> bool:
-        """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before."""
+    def adapt(self, s: float, anew: bool = False) -> bool:
+        """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before.
+
+        `anew` as of `PartStep.suited`.
+        """
         before = self.alone
         if not (uncoupled(self.model) and suits(self.integrator)):
             self.alone = None
         elif self.alone is None:
             self._groups = self._groups or rods_of(self.model)
             self.alone = Alone(self, self._groups)
-        return self.alone is not before or (self.alone is not None and self.alone.adapt(s))
+        return self.alone is not before or (self.alone is not None and self.alone.adapt(s, anew))
 
     def outgrown(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.

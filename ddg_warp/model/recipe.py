@@ -6,10 +6,10 @@ from ddg_warp.errors import SceneError
 
 
 class Recipe:
-    """A model of so many worlds that can be built again elsewhere, with the parameters and rest shapes that it has.
+    """A model of a number of worlds that can be built again elsewhere, with the parameters and rest shapes that it has.
 
     Raises:
-        SceneError: a parameter differs between its worlds, and there are to be others.
+        SceneError: a parameter differs between the model's worlds, and there are to be others.
     """
 
     def __init__(self, model, worlds: int):
@@ -20,6 +20,7 @@ class Recipe:
             "worlds": worlds,
             "allow_rounding": model.allow_rounding,
         }
+        self.version = model.version
         self.parameters = [
             {name: _in_worlds(name, values, axis, model.worlds, worlds) for name, values in table.values.items()}
             for table, axis in _tables(model)
@@ -27,13 +28,21 @@ class Recipe:
         self.plates = [shell.plate for shell in _shells(model)]
 
     def build(self):
-        """The model."""
+        """Return the model."""
         model = self.scene.build(**self.options)
+        if self.version:  # else it is as it was built
+            self.put(model)
+        return model
+
+    def put(self, model) -> None:
+        """Give a model of the same scene and as many worlds these parameters and rest shapes, where it has others."""
+        remade = False
         for (table, _), values in zip(_tables(model), self.parameters, strict=True):
-            table.set(**values)
+            changed = {name: new for name, new in values.items() if not np.array_equal(table.values[name], new)}
+            remade |= bool(changed) and table.set(**changed)
         for shell, plate in zip(_shells(model), self.plates, strict=True):
             shell.plate = plate
-        return model
+        model.note_change(remade)
 
 
 def _tables(model) -> list:
@@ -47,7 +56,7 @@ def _shells(model) -> list:
 
 
 def _in_worlds(name: str, values: np.ndarray, axis: int, worlds: int, wanted: int) -> np.ndarray:
-    """A parameter of so many worlds as one of others."""
+    """A parameter of one number of worlds as one of another."""
     if worlds == wanted or values.shape[axis] == 1:
         return values
     own = np.stack(np.split(values, worlds, axis))

@@ -1,0 +1,91 @@
+"""Memory that a model and an integrator of it need, against what a device has left: told before anything is allocated."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ddg_warp.errors import SceneError, SolverError
+
+# Least bytes that a block of three dofs takes in float64, constant arrays, states and solver together: of rods on their own, and of
+# what is joined or touches. Measured: 600 to 750, and 1340 (joined rods) to 3360 (contact).
+ALONE, COUPLED = 550, 1300
+LESS = {"float64": 1.0, "mixed": 0.6, "float32": 0.5}  # of that; 0.58 to 0.81 measured in mixed precision
+MOST = 2**31 - 1  # what an index on a device counts to
+
+
+def require(scene, coupled: bool, worlds: int, precision: str, device) -> None:
+    """Refuse worlds of a scene that the memory of a device cannot hold, or that its indices do not count.
+
+    Raises:
+        SceneError: names the bytes needed and the bytes there, and how many worlds there is room for.
+    """
+    blocks = _blocks(scene)
+    if worlds * blocks > MOST:
+        raise SceneError(
+            f"worlds = {worlds}: indices on a device count to {MOST}, and each world has {blocks} nodes and angles; build "
+            f"{MOST // blocks} worlds at most, in several models if need be"
+        )
+    each = blocks * (COUPLED if coupled else ALONE) * LESS[precision]
+    there = free_bytes(device)
+    if worlds * each > there:
+        fits = int(there // each)
+        fewer = f"build {fits} worlds at most" if fits else "coarsen what is in the scene"
+        raise SceneError(
+            f"worlds = {worlds}: the model and an integrator of it need {_size(worlds * each)} at least, and {device} has "
+            f"{_size(there)} left; {fewer}, take precision 'mixed' or 'float32', or free what is held"
+        )
+
+
+@contextmanager
+def named(what: str, device) -> Iterator[None]:
+    """Name what runs out of memory, and how much is left.
+
+    Raises:
+        SceneError: an allocation failed.
+    """
+    try:
+        yield
+    except SolverError:
+        raise
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate" not in str(error):
+            raise
+        raise SceneError(
+            f"{what}: out of memory ({error}); {device} has {_size(free_bytes(device))} left; build fewer worlds, take precision "
+            "'mixed' or 'float32', or free what is held"
+        ) from error
+
+
+def free_bytes(device) -> float:
+    """Return the bytes of memory that a device has left; infinite where nobody tells."""
+    if device.is_cuda:
+        return float(device.free_memory)
+    group = "/sys/fs/cgroup/memory"
+    limit, used, cached = _number(f"{group}.max"), _number(f"{group}.current"), _entry(f"{group}.stat", "inactive_file")
+    of_group = limit - used + cached if max(limit, used, cached) < float("inf") else float("inf")
+    return min(1024.0 * _entry("/proc/meminfo", "MemAvailable:"), of_group)
+
+
+def _blocks(scene) -> int:
+    """Nodes of rods, shells and meridians, and angles of edges with twist, in a world."""
+    rods = sum(batch.rods * batch.nodes * (2 if batch.twist else 1) for batch in scene.batches)
+    return rods + sum(len(shell.points) for shell in (*scene.shells, *scene.axisymmetric_shells))
+
+
+def _entry(path: str, name: str) -> float:
+    try:
+        lines = Path(path).read_text().splitlines()
+    except OSError:
+        return float("inf")
+    return next((float(line.split()[1]) for line in lines if line.startswith(name)), float("inf"))
+
+
+def _number(path: str) -> float:
+    try:
+        return float(Path(path).read_text())
+    except (OSError, ValueError):  # "max" without a limit
+        return float("inf")
+
+
+def _size(count: float) -> str:
+    return f"{count / 2**30:.3g} GiB"

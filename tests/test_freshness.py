@@ -1,0 +1,71 @@
+"""Family "freshness": whatever is changed, by whatever route, the next step is that of a new model with these values, bit for bit."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.learn.gradient_objects import OBJECTS, scene_of
+from ddg_warp.model.recipe import Recipe
+
+WORLDS, DT = 2, 2e-3
+
+
+def built(name: str, device, worlds: int = WORLDS):
+    return scene_of(name).build(device, "float64", worlds=worlds)
+
+
+def moving(model):
+    """A state of which every term has a strain and a rate."""
+    points = model.state().points()
+    random = np.random.default_rng(3)
+    axes = [1.0, 0.0, 1.0] if model.scene.dimension == 2 or model.scene.axisymmetric_shells else [1.0, 1.0, 1.0]
+    return model.state(points, velocities=0.02 * random.normal(size=points.shape) * axes)
+
+
+def changed(model) -> dict[str, np.ndarray]:
+    """Other values of every parameter of a model's terms, one a world (worlds,), by "term.parameter"."""
+    found = {}
+    for term, known in model._terms().items():
+        for name, parameter in known.items():
+            values = [v for key, v in model.parameters().items() if key.split("/")[-2:] == [term, name]]
+            usual = float(np.ravel(values[0])[0]) if values else 0.0
+            factors = 1.0 + 0.02 * np.arange(1, model.worlds + 1)
+            found[f"{term}.{name}"] = usual * factors if usual else 1e-3 * (factors - 1.0)
+            assert parameter.valid[1](found[f"{term}.{name}"]).all()
+    return found
+
+
+def set_to(model, name: str, values) -> None:
+    model.set_parameter(*name.rsplit(".", 1), values)
+
+
+def same(one, other) -> None:
+    """Two states are alike bit for bit in all arrays."""
+    one, other = one.snapshot(), other.snapshot()
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+
+
+def set_back(model, name: str) -> None:
+    """Put back all parameters of the scene."""
+    Recipe(built(name, model.device), WORLDS).put(model)
+
+
+@pytest.mark.parametrize("name", [name for name in OBJECTS if "curved membrane" not in name])
+def test_a_parameter_that_is_set_is_that_of_a_new_model(device, name):
+    """Set between two steps, in new memory and in place, and put back: in an integrator that has stepped as in a new one."""
+    model = built(name, device)
+    integrator, start = ddg.Integrator(model), moving(model)
+    usual, moved = integrator.step(start.copy(), DT).copy(), 0
+    for parameter, values in changed(model).items():
+        fresh = built(name, device)
+        set_to(fresh, parameter, values)
+        wanted = ddg.Integrator(fresh).step(fresh.restore(start.snapshot()), DT)
+        for given in (1.01 * values, values):  # the first makes memory anew, the other writes in place
+            set_to(model, parameter, given)
+            found = integrator.step(start.copy(), DT)
+        same(found, wanted)
+        moved += bool((found.points() != usual.points()).any())
+        set_back(model, name)
+        same(integrator.step(start.copy(), DT), usual)
+    assert moved, "no parameter had any effect"
