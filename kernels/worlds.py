@@ -55,12 +55,20 @@ def blank_kernels(dtype):
             out[i, j, k] = dtype(scalar(wp.nan))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def bar(invalid: wp.array(dtype=int), values: wp.array3d(dtype=dtype), share: int, resting: wp.array(dtype=int)):
+    def bar(
+        invalid: wp.array(dtype=int),
+        values: wp.array3d(dtype=dtype),
+        share: int,
+        resting: wp.array(dtype=int),
+        any_resting: wp.array(dtype=int),
+    ):
         w = wp.tid()
         code = invalid[w]
         if code == 0 and wp.isnan(values[0, 0, w * share]):
             code = wp.static(outcome.GIVEN_UP)
         resting[w] = code
+        if code != 0:
+            any_resting[0] = 1
 
     return blank, bar
 

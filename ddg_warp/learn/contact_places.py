@@ -79,7 +79,10 @@ class ContactPlace:
                 f"parameters: contact.range of {one!r} and {other!r} is {float(values[world, pair]):.6g} m in world {world}, but what "
                 f"may touch is searched for within {self._reach:.6g} m; build the scene with the largest range that is to be used"
             )
-        self._assign(values)
+        usual = torch.as_tensor(self._usual, dtype=values.dtype, device=values.device)
+        self._assign(
+            torch.where(torch.isnan(values), usual, values)
+        )  # searches are of all worlds, refused ones among them
 
     def restore(self) -> None:
         """As of `TermPlace`."""

@@ -238,8 +238,8 @@ class Engine:
 
     def _to_rest(self, worlds, mask: wp.array) -> None:
         for state in (self.before, self.after):
-            worlds.take_over(mask, self._rest, state)
-        net = self._rest.net
+            worlds.take_over(mask, worlds.start, state)
+        net = worlds.start.net
         for array in self._net.lagged if net else ():
             worlds.take_array(mask, net.q, array, self.model.worlds)
 
@@ -296,7 +296,7 @@ class Engine:
         self._codes_then, mask, some, self._lost = (
             wp.zeros(count, dtype=int, device=device) for count in (model.worlds, model.worlds, 1, 1)
         )
-        self._failures, self._rest = (mask, some), model.state()
+        self._failures = mask, some
         counts = [len(part.islands) for part in self.integrator._parts]
         # of the step, of its reverse, and whether that is asked for any
         self._flags = [

@@ -177,6 +177,8 @@ class Case:
             usual = 0.9 * usual
             values = self._begun(name, usual)
         size = float(usual.abs().max()) or self._size_of_family(name)
+        if self.engine.tables.rule(name)[0] == "not negative":  # of which differences take less, too
+            usual = torch.where(usual > 0.0, usual, size)
         direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
 
         return Input(name, size, lambda x: self.loss(self.end(self.simulator, values, {name: usual + x * direction})))

@@ -86,17 +86,17 @@ class Tables:
 
     def _good(self, name: str, values: torch.Tensor) -> torch.Tensor:
         """Whether values are finite and such as a parameter may have, each; nothing is read from the device."""
-        _, holds = self._rule(name)
+        _, holds = self.rule(name)
         values, finite = values.detach(), torch.isfinite(values)
         if holds is np.isfinite:
             return finite
         return finite & torch.as_tensor(holds(values), device=values.device)
 
-    def _rule(self, name: str) -> tuple:
+    def rule(self, name: str) -> tuple:
         """What values of a parameter are, in words, and whether numbers are that."""
         if name not in self._rules:
             if name in constants.NAMES:
-                self._rules[name] = constants.rule(name, self.value(name).cpu().numpy())
+                self._rules[name] = constants.rule(name, self._usual(name))
             else:
                 term, parameter = name.rsplit(".", 1)
                 self._rules[name] = self.model.parameter_rule(term, parameter)
@@ -108,16 +108,20 @@ class Tables:
         Raises:
             ValueError: they are no numbers, not finite, or none that the parameter may have.
         """
-        return valid_numbers(name, values, *self._rule(name))
+        return valid_numbers(name, values, *self.rule(name))
 
     def value(self, name: str) -> torch.Tensor:
         """The values that the model has of a parameter (worlds, elements)."""
+        real = wp.dtype_to_torch(self.model.types.real)
+        return torch.tensor(self._usual(name), dtype=real, device=self.device)
+
+    def _usual(self, name: str) -> np.ndarray:
         count, found = self.of(name)
         result = np.zeros((self.model.worlds, count))
         for place in found:
             elements, values = place.values()
             result[:, elements] = values
-        return torch.tensor(result, dtype=wp.dtype_to_torch(self.model.types.real), device=self.device)
+        return result
 
     def write(self, names: tuple, values: list[torch.Tensor]) -> None:
         """Put full parameters in place; what is there already stays, and others are as the model has them."""
@@ -162,7 +166,7 @@ class Tables:
                 for world in torch.nonzero(self._bad(place, value)).flatten().tolist():
                     name = self._name_of(place)
                     raise SceneError(
-                        f"parameters: {name} is refused in world {world}; give values that are finite and {self._rule(name)[0]}"
+                        f"parameters: {name} is refused in world {world}; give values that are finite and {self.rule(name)[0]}"
                     )
 
     def _name_of(self, place) -> str:

@@ -202,7 +202,7 @@ class Integrator:
         def launch():
             if anew:
                 self.forget()
-            self._worlds.bar(self._parts, self._buffers[source].own)
+            self._worlds.bar(self._parts, self._buffers[source].own, self._buffers[1 - source].own)
             self._launch(source)
 
         def replay():

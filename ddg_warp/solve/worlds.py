@@ -31,6 +31,7 @@ class Worlds:
     Attributes:
         resting: of every world the code of the outcome that it rests for, 0 where it goes on; see `kernels.outcome`.
         invalid: of every world that is watched the code of an outcome that its parameters are refused by, 0 where they are good.
+        start: of worlds that are watched, the state that those are given which are taken out of a step.
     """
 
     def __init__(self, model):
@@ -40,6 +41,7 @@ class Worlds:
         self._note, self._seal, self._enter, self._clear, self._find = island_kernels()
         self._serial, self._loaded = arrays.serial(model.wp_device), False
         self.invalid: wp.array | None = None
+        self.start: State | None = None
 
     def _zeros(self, count: int) -> wp.array:
         return wp.zeros(count, dtype=int, device=self.model.wp_device)
@@ -47,16 +49,21 @@ class Worlds:
     def watch(self) -> None:
         """From now on take worlds out of steps whose parameters are `invalid` or whose state is not a number, and leave those that fail
         not a number."""
-        self.invalid = self._zeros(self.model.worlds)
+        self.invalid, self.start = self._zeros(self.model.worlds), self.model.state()
 
-    def bar(self, parts: list, before: State) -> None:
-        """Before a step: have watched worlds rest that are taken out of it; launches alone, so that it can be captured."""
+    def bar(self, parts: list, before: State, after: State) -> None:
+        """Before a step: have watched worlds rest that are taken out of it, as they are at rest; launches alone, so that it can be
+        captured."""
         if self.invalid is None:
             return
+        # of worlds that failed in the last step, entries of no node stay, which a step does not write
+        wp.capture_if(self._any, lambda: self.take_over(self._failed, self.start, after))
         values = next(array for array in before.arrays().values() if array.size > 1)
         cube, (_, bar) = cubed(values), blank_kernels(values.dtype)
         inputs = [self.invalid, cube, cube.shape[-1] // self.model.worlds]
-        self._launch(bar, self.model.worlds, inputs, [self.resting])
+        self._any.zero_()
+        self._launch(bar, self.model.worlds, inputs, [self.resting, self._any])
+        wp.capture_if(self._any, lambda: self.take_over(self.resting, self.start, before))
         for part in parts:
             inputs = [self.resting, part.islands_each]
             self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])

@@ -367,9 +367,24 @@ def test_what_gradients_and_controls_need_is_solved_with_the_net(device):
     assert integrator._net.alone is not None
     state = integrator.step(state, DT, ddg.Controls(gravity=(0.0, 0.0, -1.0)))
     assert integrator._net.alone is None
-    model = scene.build(device=device)
-    integrator, state = ddg.Integrator(model), model.state()
-    state = integrator.step(state, DT)
-    model.set_parameter("rod_stretch", "stiffness", 10.0)
-    integrator.step(state, DT)
-    assert integrator._net.alone is None
+
+
+def test_parameters_that_change_go_to_rods_on_their_own(device):
+    """Which stay that: the step is what the net would make of it, and no longer what it was."""
+    points = []
+    for whole, stiffness in ((False, None), (False, 10.0), (True, 10.0)):
+        scene, _ = falling()
+        model = scene.build(device=device, precision="float64")
+        integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
+        if whole:
+            integrator.step_whole()
+        state = integrator.step(state, DT)
+        if stiffness:
+            model.set_parameter("rod_stretch", "stiffness", stiffness)
+        for _ in range(3):
+            state = integrator.step(state, DT)
+        assert (integrator._net.alone is None) == whole
+        points.append(state.points())
+    usual, alone, together = points
+    np.testing.assert_allclose(alone, together, atol=1e-10)
+    assert np.abs(alone - usual).max() > 1e-6

@@ -103,17 +103,22 @@ def test_a_coefficient_of_friction_is_found_again():
     """From where a rod that slides has come to."""
     own, start = simulator("rod on plane", **RUBBING)
     goal = own.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
-    mu = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([mu], lr=1.0, line_search_fn="strong_wolfe", max_iter=30, tolerance_change=1e-14)
+    logarithm = torch.tensor(0.2, dtype=torch.float64).log().requires_grad_()
+    optimiser = torch.optim.LBFGS(
+        [logarithm], lr=1.0, line_search_fn="strong_wolfe", max_iter=30, tolerance_change=1e-14
+    )
 
     def closure():
         optimiser.zero_grad()
-        loss = 1e10 * ((own.rollout(start, {"contact.friction": mu}, steps=8)[-1].positions - goal) ** 2).sum()
+        loss = (
+            1e10
+            * ((own.rollout(start, {"contact.friction": logarithm.exp()}, steps=8)[-1].positions - goal) ** 2).sum()
+        )
         loss.backward()
         return loss
 
     optimiser.step(closure)
-    assert abs(float(mu.detach()) - 0.45) < 1e-6
+    assert abs(float(logarithm.detach().exp()) - 0.45) < 1e-6
 
 
 @pytest.mark.parametrize("lags", [1, 2])
@@ -247,7 +252,9 @@ def test_what_turns_far_has_no_gradient_and_counts_no_more_than_half_a_turn():
     for turn, finite in ((0.01, True), (0.5, False)):
         poses = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, turn]], dtype=torch.float64, requires_grad=True)
         end = own.step(own.initial_state(), controls={"poses": poses})
-        assert torch.isfinite(end.positions).all() and own.outcomes().tolist() == ["converged"]
+        assert torch.isfinite(end.positions).all()
+        assert own.outcomes().tolist() == ["converged" if finite else "no_gradient"]
+        assert end.differentiable.tolist() == [finite]
         end.positions.sum().backward()
         assert bool(torch.isfinite(poses.grad).all()) == finite
     with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.7 turns"):
