@@ -17,7 +17,7 @@ ENERGY_DRIFT = 9  # the midpoint rule would have made or lost more energy than i
 CROSSED = 10  # things would have passed through each other
 NO_ROOM = 11  # surfaces have come so near that a barrier, whose forces grow without bound, has lost its digits
 TURNED_TOO_FAR = 12  # supports or obstacles would turn farther in a step than substeps resolve
-INVALID_PARAMETER = 13  # a parameter that a step was handed as a tensor is not finite, or none that it may be
+INVALID_INPUT = 13  # a parameter or control that a step was handed as a tensor is not finite, or none that it may be
 NO_GRADIENT = 14  # a step that converged, through which no gradient goes; see `ddg_warp.learn.engine`
 
 NAMES = {
@@ -33,6 +33,6 @@ NAMES = {
     CROSSED: "crossed",
     NO_ROOM: "no_room",
     TURNED_TOO_FAR: "turned_too_far",
-    INVALID_PARAMETER: "invalid_parameter",
+    INVALID_INPUT: "invalid_input",
     NO_GRADIENT: "no_gradient",
 }

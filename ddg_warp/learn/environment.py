@@ -15,7 +15,7 @@ from ddg_warp.learn.rotations import turned
 from ddg_warp.learn.simulator import Simulator, WorldState
 from ddg_warp.model.controls import Controls
 
-CONVERGED, NO_GRADIENT = (outcome.NAMES[code] for code in (outcome.CONVERGED, outcome.NO_GRADIENT))
+GOOD = CONVERGED, _ = tuple(outcome.NAMES[code] for code in (outcome.CONVERGED, outcome.NO_GRADIENT))
 AXES = "xyz"
 
 
@@ -76,7 +76,7 @@ class EpisodeState:
     @property
     def failed(self) -> torch.Tensor:
         """Worlds whose last step could not be solved (B,); they rest as they were before it."""
-        return torch.as_tensor(~np.isin(self.outcomes, (CONVERGED, NO_GRADIENT)), device=self.poses.device)
+        return torch.as_tensor(~np.isin(self.outcomes, GOOD), device=self.poses.device)
 
 
 class Environment:
@@ -190,11 +190,13 @@ class Environment:
         rates = torch.zeros((self.worlds, 6 * len(self.model.grips)), dtype=self.dtype, device=self.device)
         rates = rates.index_copy(1, self._places, actions).reshape(self.worlds, -1, 6)
         world, poses, outcomes = now.world, now.poses, np.full(self.worlds, CONVERGED, dtype=object)
+        rest = torch.zeros(self.worlds, dtype=torch.bool, device=self.device)
         for _ in range(self.substeps):
             moved = self._moved(poses, rates)
             after = self.simulator.step(world, self.parameters, {"poses": moved})
-            outcomes = np.where(outcomes == CONVERGED, after.outcomes(), outcomes)
-            rest = after.failed
+            told = after.outcomes()
+            outcomes = np.where(np.isin(outcomes, GOOD) & (told != CONVERGED), told, outcomes)
+            rest = rest | after.failed
             if rest.any():  # they stay where they were, and would set out again with the next step
                 after, moved = _selected(rest, world, after), torch.where(rest[:, None, None], poses, moved)
             world, poses = after, moved

@@ -13,7 +13,7 @@ from ddg_warp.errors import GradientWarning, SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.learn.adjoint import refuse_gyroscopic
 from ddg_warp.learn.engine import Engine
-from ddg_warp.learn.layout import copies, tensors
+from ddg_warp.learn.layout import Layout, copies, tensors
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
@@ -49,22 +49,35 @@ class WorldState:
         return cls(tuple(values), time, engine, codes, codes == 0)
 
     @property
+    def layout(self) -> Layout:
+        """What the tensors of a state are.
+
+        Raises:
+            SceneError: the state was loaded, and belongs to no simulator.
+        """
+        if self.engine is None:
+            raise SceneError(
+                "the state was loaded, and belongs to no simulator yet; give it to world_state(...) of one"
+            )
+        return self.engine.layout
+
+    @property
     @torch.compiler.disable
     def positions(self) -> torch.Tensor:
         """Points (B, P, 3) [m], in the order of `State.points`."""
-        return self.engine.layout.points(self.values, "x", "q")
+        return self.layout.points(self.values, "x", "q")
 
     @property
     @torch.compiler.disable
     def velocities(self) -> torch.Tensor:
         """Their velocities (B, P, 3) [m/s]."""
-        return self.engine.layout.points(self.values, "v", "v")
+        return self.layout.points(self.values, "v", "v")
 
     @property
     @torch.compiler.disable
     def angles(self) -> torch.Tensor:
         """Angles of edges (B, edges) [rad], zero where there is no twist."""
-        return self.engine.layout.edges(self.values)
+        return self.layout.edges(self.values)
 
     @property
     def failed(self) -> torch.Tensor:
@@ -119,9 +132,10 @@ class Simulator(torch.nn.Module):
             comes with a later call, as nothing waits for the device.
 
     Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`), or names of masses and of coefficients of drag (see
-    `ddg_warp.learn.constants`), to tensors (), (B, 1), (1, E) or (B, E), E the elements that have it. A world that is given a value
-    which `set_parameter` would refuse is not stepped: its outcome is "invalid_parameter". Controls are dictionaries of
-    "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see `Controls`.
+    `ddg_warp.learn.constants`), to tensors (), (B, 1), (1, E) or (B, E), E the elements that have it. Controls are dictionaries
+    of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see
+    `Controls`. A world that is given a value which `set_parameter` would refuse, or a control that is not finite, is not stepped: its
+    outcome is "invalid_input".
 
     Raises:
         SceneError: the model has something that no gradient goes through, once one is asked for.

@@ -177,7 +177,7 @@ class Tables:
         self.invalid.zero_()
         for entries in self._written.values():
             for place, value, _ in entries:
-                self.invalid.masked_fill_(self._bad(place, value), outcome.INVALID_PARAMETER)
+                self.invalid.masked_fill_(self._bad(place, value), outcome.INVALID_INPUT)
 
     def _bad(self, place, value: torch.Tensor) -> torch.Tensor:
         """Whether what was written to a place is not a number, in every world (worlds,)."""

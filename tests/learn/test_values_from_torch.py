@@ -1,0 +1,313 @@
+"""What torch hands over is judged as `Model.set_parameter` judges it; worlds that fail or have no gradient say so."""
+
+import copy
+import io
+import pickle
+import threading
+import warnings
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import GradientWarning, SceneError
+from ddg_warp.learn.gradient_objects import scene_of
+from tests.learn import differences
+
+torch = pytest.importorskip("torch")
+from ddg_warp.torch import Simulator, WorldState  # noqa: E402
+
+REAL = torch.float64
+INVALID = {"nan": float("nan"), "inf": float("inf"), "negative": -1.0}
+
+
+def simulator(name: str, worlds: int = 1, dt: float = 2e-3, **options) -> Simulator:
+    return Simulator(scene_of(name).build(differences.DEVICE, "float64", worlds=worlds), dt, **options)
+
+
+def gripped(worlds: int = 1, nodes: int = 9, dt: float = 0.02) -> Simulator:
+    """A rod of 0.3 m that a grip holds at an end."""
+    scene = ddg.Scene()
+    points = np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), nodes)
+    rod = scene.add_rod(points, section=ddg.Circle(0.004), material=ddg.Material(1e6, density=1000.0))
+    scene.clamp(rod, motion=ddg.Grip())
+    return Simulator(scene.build(differences.DEVICE, "float64", worlds=worlds), dt)
+
+
+# --- values that parameters may not have ---
+@pytest.mark.parametrize("value", INVALID)
+@pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "shell, hinge", "rod with drag", "rods in contact"])
+def test_a_value_that_is_refused_takes_its_world_out_of_the_step(name, value):
+    """Every parameter, in the second of three worlds: that one is not a number and names why; the others are, bit for bit, what they
+    are without it. The step after that is good again."""
+    own = simulator(name, 3)
+    start, engine = own.initial_state(), own.engine(3)
+    for parameter in engine.tables.names():
+        if np.isfinite(INVALID[value]) and engine.tables.rule(parameter)[1](np.array(INVALID[value])):
+            continue  # this one may be that
+        usual = own.parameter(parameter)
+        good = own.step(start, {parameter: usual})
+        given = usual.clone()
+        given[1] = INVALID[value]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GradientWarning)
+            bad = own.step(start, {parameter: given})
+        codes = ["converged", "invalid_input", "converged"]
+        assert bad.outcomes().tolist() == own.outcomes().tolist() == codes, parameter
+        assert bad.failed.tolist() == [False, True, False]
+        assert torch.isnan(bad.positions[1]).all() and torch.isnan(bad.velocities[1]).all()
+        torch.testing.assert_close(bad.positions[[0, 2]], good.positions[[0, 2]], rtol=0.0, atol=0.0)
+        with torch.no_grad():
+            after = own.step(bad, {parameter: usual})  # a world that failed stays what it is
+        assert after.outcomes().tolist() == ["converged", "given_up", "converged"]
+        again = own.step(start, {parameter: usual})
+        torch.testing.assert_close(again.positions, good.positions, rtol=0.0, atol=0.0)
+
+
+def test_plain_numbers_are_refused_as_set_parameter_refuses_them():
+    own = simulator("rod")
+    for value in (float("nan"), float("inf"), -1.0, [1.0, -2.0]):
+        with pytest.raises(SceneError, match=r"rod_bend_twist\.stiffness_1"):
+            own.step(own.initial_state(), {"rod_bend_twist.stiffness_1": value})
+
+
+@pytest.mark.parametrize(
+    ("tensor", "said"),
+    [
+        (torch.ones(1, 1, device="meta"), "meta"),
+        (torch.ones(1, 1).to_sparse(), "sparse"),
+        (torch.ones(1, 1, dtype=torch.complex64), "complex"),
+        (torch.ones(1, 1, dtype=torch.bool), "bool"),
+    ],
+    ids=["meta", "sparse", "complex", "bool"],
+)
+def test_tensors_that_hold_no_real_numbers_are_refused(tensor, said):
+    own = simulator("rod")
+    start, points = own.initial_state(), own.model.points_count
+    with pytest.raises(SceneError, match=said):
+        own.step(start, {"rod_bend_twist.stiffness_1": tensor})
+    wide = torch.zeros(points, 3).to_sparse() if said == "sparse" else tensor.expand(points, 3)
+    with pytest.raises(SceneError, match=said):
+        own.step(start, None, {"forces": wide})
+    with pytest.raises(SceneError, match=said):
+        own.initial_state(positions=wide)
+
+
+def test_an_equilibrium_names_the_world_and_the_parameter():
+    own = simulator("rod", 3)
+    given = own.parameter("rod_bend_twist.stiffness_1").clone()
+    given[2] = -1.0
+    with pytest.raises(SceneError, match=r"rod_bend_twist\.stiffness_1 is refused in world 2"):
+        own.equilibrium({"rod_bend_twist.stiffness_1": given})
+
+
+def test_a_control_that_is_no_number_fails_its_world_alone():
+    own = simulator("rods joined rigidly", 3)
+    forces = torch.zeros(3, own.model.points_count, 3, dtype=REAL)
+    good = own.step(own.initial_state(), None, {"forces": forces})
+    forces[1, 0, 2] = torch.nan  # on a node that is held
+    bad = own.step(own.initial_state(), None, {"forces": forces})
+    assert bad.outcomes().tolist() == ["converged", "invalid_input", "converged"]
+    assert torch.isnan(bad.positions[1]).all()
+    torch.testing.assert_close(bad.positions[[0, 2]], good.positions[[0, 2]], rtol=0.0, atol=0.0)
+
+
+# --- worlds without a gradient ---
+def turned(own: Simulator, angles, steps: int = 1):
+    """Poses of a grip that turns by an angle (B,) about its own direction of y, and the states of so many steps."""
+    poses = torch.zeros(len(angles), 1, 6, dtype=REAL)
+    poses[:, 0, 4] = torch.as_tensor(angles)
+    poses.requires_grad_()
+    states = own.rollout(own.initial_state(len(angles)), None, lambda k: {"poses": (k + 1) * poses}, steps=steps)
+    return poses, states
+
+
+def test_worlds_that_lose_their_gradient_are_told_and_left_out():
+    """Turned by more than 90 degrees in a step; of a loss that leaves this world out by the mask, gradients are those of the others."""
+    own = gripped()
+    with pytest.warns(GradientWarning, match="state.differentiable") as caught:
+        poses, (end,) = turned(own, [0.1, 1.8, 0.2])
+        turned(own, [0.1, 1.8, 0.2])
+    assert len(caught) == 1  # once
+    assert end.differentiable.tolist() == [True, False, True]
+    assert own.outcomes().tolist() == ["converged", "no_gradient", "converged"]
+    assert torch.isfinite(end.positions).all() and not end.failed.any()
+    tips = end.positions[:, -1, 2]
+    (whole,) = torch.autograd.grad(tips.sum(), poses, retain_graph=True)
+    assert torch.isfinite(whole[[0, 2]]).all() and torch.isnan(whole[1]).any()
+    (masked,) = torch.autograd.grad((tips * end.differentiable).sum(), poses)
+    torch.testing.assert_close(masked[[0, 2]], whole[[0, 2]], rtol=0.0, atol=0.0)
+    assert (masked[1] == 0.0).all()
+
+
+@pytest.mark.parametrize("checkpoint_every", [None, 2])
+def test_a_lost_gradient_is_remembered_along_a_rollout(checkpoint_every):
+    own = gripped(dt=0.05)
+    poses = torch.zeros(2, 1, 6, dtype=REAL, requires_grad=True)
+    turns = torch.zeros(4, 2, 1, 6, dtype=REAL)
+    turns[1:, 1, 0, 4] = 1.8  # in the second step alone
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GradientWarning)
+        start = own.initial_state(2)
+        given = {"steps": 4, "checkpoint_every": checkpoint_every}
+        states = own.rollout(start, None, lambda k: {"poses": poses + turns[k]}, **given)
+    assert [state.differentiable.tolist() for state in states] == [[True, True], *3 * [[True, False]]]
+    (found,) = torch.autograd.grad((states[-1].positions.sum((1, 2)) * states[-1].differentiable).sum(), poses)
+    assert torch.isfinite(found).all() and (found[1] == 0.0).all() and (found[0] != 0.0).any()
+    assert states[-1].detach().differentiable.all()
+
+
+@pytest.mark.parametrize(
+    "name", ["rod", "rods joined rigidly", "shell, hinge", "rods in contact", "held rod that rubs a gripped ball"]
+)
+def test_worlds_that_failed_spoil_no_gradient_of_others(name):
+    """A world that is not a number, of which a loss takes nothing: derivatives by what all share are those of the other worlds."""
+    own, parameter = simulator(name, 2), None
+    for parameter in own.engine(2).tables.names():
+        if parameter.endswith(("stiffness", "stiffness_1")):
+            break
+    wide = simulator(name, 3)
+    found = []
+    for each, spoiled in ((own, False), (wide, True)):
+        factor = torch.ones((), dtype=REAL, requires_grad=True)
+        value = factor * each.parameter(parameter)
+        if spoiled:
+            value = torch.cat([value[:1], -value[:1], value[1:2]])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GradientWarning)
+            *_, state = each.rollout(each.initial_state(), {parameter: value}, steps=3)
+        kept = state.positions[state.differentiable]
+        assert len(kept) == 2
+        found.append(torch.autograd.grad((kept**2).sum(), factor)[0])
+    torch.testing.assert_close(*found, rtol=1e-12, atol=0.0)
+
+
+def test_outcomes_are_those_of_the_last_batch():
+    own = simulator("rod")
+    with pytest.raises(SceneError, match="no step"):
+        own.outcomes()
+    for batch in (4, 2):
+        own.step(own.initial_state(batch))
+        assert own.outcomes().tolist() == ["converged"] * batch
+
+
+# --- parameters of the model that change between calls ---
+@pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "shell, hinge"])
+def test_steps_follow_the_model_for_every_batch_size(name):
+    """Bit for bit as a new simulator, whether tensors were handed in before or not."""
+    own = simulator(name)
+    parameter = next(n for n in own.engine(1).tables.names() if n.endswith(("stiffness", "stiffness_1")))
+    for factor in (1.0, 1.5, 0.7):
+        own.model.set_parameter(*parameter.rsplit(".", 1), factor * float(simulator(name).parameter(parameter).max()))
+        fresh = Simulator(own.model, own.dt)
+        for batch in (1, 2, 3):
+            own.step(own.initial_state(batch), {parameter: 2.0 * own.parameter(parameter, batch)})
+            one, other = (each.rollout(each.initial_state(batch), steps=2)[-1] for each in (own, fresh))
+            for a, b in zip(one.values, other.values, strict=True):
+                torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
+
+
+def test_rest_shapes_that_change_are_followed():
+    model = scene_of("shell, hinge").build(differences.DEVICE, "float64")
+    own = Simulator(model, 2e-3)
+    before = [own.step(own.initial_state(batch)).positions for batch in (1, 2)]
+    model.set_rest(0, points=1.1 * model.state().points())
+    for batch, old in zip((1, 2), before, strict=True):
+        found = own.step(own.initial_state(batch)).positions
+        assert (found != old).any()
+        fresh = Simulator(model, 2e-3)
+        torch.testing.assert_close(found, fresh.step(fresh.initial_state(batch)).positions, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("checkpoint_every", [None, 2])
+def test_a_parameter_that_changes_before_the_reverse_is_refused(checkpoint_every):
+    own = simulator("rod")
+    factor = torch.ones((), dtype=REAL, requires_grad=True)
+    value = factor * own.parameter("rod_bend_twist.stiffness_1")
+    parameters = {"rod_bend_twist.stiffness_1": value}
+    *_, end = own.rollout(own.initial_state(), parameters, steps=4, checkpoint_every=checkpoint_every)
+    own.model.set_parameter("rod_stretch", "stiffness", 1.1 * float(own.parameter("rod_stretch.stiffness")[0, 0]))
+    with pytest.raises(SceneError, match="set_parameter"):
+        end.positions.sum().backward()
+
+
+def test_tensors_stay_out_of_what_others_step():
+    """A simulator leaves the model that it was made of as it is, for an integrator of that."""
+    own, usual = simulator("rods joined rigidly"), simulator("rods joined rigidly").model
+    own.step(own.initial_state(), {"rod_stretch.stiffness": 3.0 * own.parameter("rod_stretch.stiffness")})
+    one, other = (ddg.Integrator(model).step(model.state(), 2e-3).points() for model in (own.model, usual))
+    np.testing.assert_array_equal(one, other)
+
+
+# --- roll-outs whose controls have a memory ---
+@pytest.mark.parametrize("how", [{"checkpoint_every": 3}, {"memory": 1.1e4}], ids=["checkpoints", "memory"])
+def test_controls_with_a_memory_have_the_same_gradient(how):
+    """A function that draws noise and counts its calls is called once a step, in their order."""
+    found, called = [], []
+    for given in ({}, how):
+        own = gripped()
+        random, memory = np.random.default_rng(0), [0.0]
+        gain = torch.full((), 0.1, dtype=REAL, requires_grad=True)
+
+        def poses(number, random=random, memory=memory, gain=gain):
+            called.append(number)
+            memory[0] = 0.5 * memory[0] + float(random.normal())
+            pose = torch.zeros(1, 6, dtype=REAL)
+            pose[0, 2] = 0.01
+            return {"poses": gain * memory[0] * pose}
+
+        *_, end = own.rollout(own.initial_state(), None, poses, steps=8, save=8, **given)
+        found.append((end.positions, *torch.autograd.grad((end.positions**2).sum(), gain)))
+        if given.get("memory"):
+            assert own.plan(own.initial_state(), poses, steps=8, save=8, **given).every is not None
+            called.pop()  # by the plan
+    assert called == 2 * list(range(8))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=0.0, atol=0.0)
+
+
+def test_a_rollout_that_saves_no_state_is_refused():
+    own = simulator("rod")
+    with pytest.raises(SceneError, match="save = 3 of 2 steps"):
+        own.rollout(own.initial_state(), steps=2, save=3)
+
+
+# --- copies, pickles and threads ---
+def test_states_of_worlds_are_saved_and_go_on_elsewhere():
+    own = gripped()
+    state = own.step(own.initial_state(2))
+    file = io.BytesIO()
+    torch.save({"simulator": own, "state": state}, file)
+    file.seek(0)
+    loaded = torch.load(file, weights_only=False)
+    other, again = loaded["simulator"], loaded["state"]
+    with pytest.raises(SceneError, match="world_state"):
+        other.step(again)
+    with pytest.raises(SceneError, match="world_state"):
+        assert again.positions
+    one, two, three = own.step(state), other.step(other.world_state(again)), own.step(copy.deepcopy(state))
+    for found in (two, three):
+        torch.testing.assert_close(found.positions, one.positions, rtol=0.0, atol=0.0)
+    with pytest.raises(SceneError, match="other shapes"):
+        gripped(nodes=7).world_state(pickle.loads(pickle.dumps(state)))
+    assert isinstance(again, WorldState)
+
+
+def test_one_simulator_serves_several_threads():
+    """Steps of other values in each, bit for bit as one after the other."""
+    own = gripped()
+    values = [float(factor * own.parameter("rod_bend_twist.stiffness_1")[0, 0]) for factor in (1.0, 2.0, 3.0)]
+
+    def run(value: float) -> torch.Tensor:
+        factor = torch.tensor(value, dtype=REAL, requires_grad=True)
+        *_, end = own.rollout(own.initial_state(), {"rod_bend_twist.stiffness_1": factor}, steps=15)
+        return torch.stack([end.positions[0, -1, 2].detach(), *torch.autograd.grad(end.positions.sum(), factor)])
+
+    alone, together = [run(value) for value in values], {}
+    threads = [threading.Thread(target=lambda v=v: together.update({v: run(v)})) for v in values]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for value, wanted in zip(values, alone, strict=True):
+        torch.testing.assert_close(together[value], wanted, rtol=0.0, atol=0.0)
