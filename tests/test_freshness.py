@@ -6,6 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.learn.gradient_objects import OBJECTS, scene_of
 from ddg_warp.model.recipe import Recipe
+from ddg_warp.solve import statics
 
 WORLDS, DT = 2, 2e-3
 
@@ -69,3 +70,67 @@ def test_a_parameter_that_is_set_is_that_of_a_new_model(device, name):
         set_back(model, name)
         same(integrator.step(start.copy(), DT), usual)
     assert moved, "no parameter had any effect"
+
+
+@pytest.mark.parametrize("name", [name for name in OBJECTS if "curved membrane" not in name])
+def test_a_tensor_is_what_set_parameter_sets(device, name):
+    """Every parameter, handed to a step as a tensor or set in the model, by the simulator of that; without it the model's is back."""
+    torch = pytest.importorskip("torch")
+    from ddg_warp.torch import Simulator
+
+    model = built(name, device)
+    own, other = (Simulator(each, DT) for each in (model, built(name, device)))
+    with torch.no_grad():
+        start, begin = (each.world_state(moving(each.model)) for each in (own, other))
+        usual = own.step(start)
+        for parameter, values in changed(model).items():
+            given = torch.tensor(values, dtype=usual.values[0].dtype, device=usual.values[0].device)[:, None]
+            found = other.step(begin, {parameter: given})
+            set_to(model, parameter, values)
+            wanted = own.step(start)
+            set_back(model, name)
+            back = other.step(begin)
+            for field, a, b, c, d in zip(
+                own.engine(WORLDS).fields, found.values, wanted.values, back.values, usual.values, strict=True
+            ):
+                assert torch.equal(a, b), f"{parameter}: {field.name}"
+                assert torch.equal(c, d), f"{parameter}: {field.name} is not back"
+
+
+@pytest.mark.parametrize(
+    "name", ["rod", "rods joined rigidly", "shell, hinge", "shell, curved membrane", "shell of revolution"]
+)
+def test_equilibria_follow_the_model(device, name):
+    """By a solver that is kept, as by a new one."""
+    model = built(name, device)
+    kept = statics.Equilibrium(model)
+    usual = kept.load(model.state(), 2).snapshot()
+    for parameter, values in list(changed(model).items())[:4]:
+        set_to(model, parameter, values)
+        same(kept.load(model.state(), 2), statics.Equilibrium(model).load(model.state(), 2))
+    set_back(model, name)
+    found = kept.load(model.state(), 2).snapshot()
+    for key, value in found.items():
+        np.testing.assert_array_equal(value, usual[key], err_msg=key)
+
+
+@pytest.mark.parametrize("precision", ["mixed", "float64"])
+@pytest.mark.parametrize("name", ["rod", "rods joined rigidly"])
+def test_solvers_suit_what_parameters_have_become(device, name, precision):
+    """Stiffer by 1e6 along, and back: what solves is chosen anew, as for a new model, and forgets what it was."""
+    model = scene_of(name).build(device, precision)
+    stiffness = float(
+        np.ravel(next(v for k, v in model.parameters().items() if k.endswith("rod_stretch/stiffness")))[0]
+    )
+    model.set_parameter("rod_stretch", "stiffness", stiffness)  # of all rods alike
+    integrator, start = ddg.Integrator(model), model.state()
+    usual = integrator.step(start.copy(), DT).copy()
+    before = integrator.statistics()["linear"]
+    for factor in (1e6, 1.0):
+        model.set_parameter("rod_stretch", "stiffness", factor * stiffness)
+        found = integrator.step(start.copy(), DT)
+        fresh = ddg.Integrator(model)
+        same(found, fresh.step(start.copy(), DT))
+        assert integrator.statistics()["linear"] == fresh.statistics()["linear"]
+        assert (integrator.statistics()["linear"] == before) == (factor == 1.0 or precision == "float64")
+    same(integrator.step(start.copy(), DT), usual)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
@@ -138,3 +139,62 @@ def test_refusals(device):
         ddg.StepControl(ddg.Integrator(model, scheme="implicit_midpoint"), 1e-3)
     with pytest.raises(ddg.SceneError, match="dt"):
         ddg.StepControl(integrator, 1e-3).advance(model.state(), -1.0)
+
+
+def held_by_a_grip() -> ddg.Scene:
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    points = np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 12)
+    rod = scene.add_rod(points, section=ddg.Circle(0.004), material=ddg.Material(1e6, density=1000.0))
+    scene.clamp(rod, motion=ddg.Grip())
+    return scene
+
+
+def test_grips_move_evenly_over_the_steps(device):
+    """10 mm and 0.4 rad in 20 ms: 0.5 m/s and 20 rad/s in all steps, from wherever the grip is; at the end it is where it was told."""
+    seen, scene = [], held_by_a_grip()
+    scene.callbacks = [lambda state: seen.append((state.time, state.poses()[0]))]
+    model = scene.build(device, "float64")
+    steps, state = ddg.StepControl(ddg.Integrator(model), 5e-3), model.state()
+    ends = np.array([[0.0, 0.0, 0.01, 0.0, 0.4, 0.0], [0.004, 0.0, 0.01, 0.3, 0.4, 0.0]])
+    for end in ends:
+        begin, first = state.poses()[0].copy(), len(seen)
+        start = state.time
+        state = steps.advance(state, 0.02, ddg.Controls(poses=[end]))
+        np.testing.assert_array_equal(state.poses()[0], end)
+        turn = Rotation.from_rotvec(end[3:]) * Rotation.from_rotvec(begin[3:]).inv()
+        assert len(seen) - first > 4
+        for time, pose in seen[first:]:
+            part = (time - start) / 0.02
+            np.testing.assert_allclose(pose[:3], begin[:3] + part * (end - begin)[:3], atol=1e-12)
+            rotation = Rotation.from_rotvec(part * turn.as_rotvec()) * Rotation.from_rotvec(begin[3:])
+            np.testing.assert_allclose(pose[3:], rotation.as_rotvec(), atol=1e-12)
+
+
+def test_loads_are_constant_or_go_linearly(device):
+    """A free rod of mass m under F for T gains F T / m; under one that grows from zero, by steps of implicit Euler of length h,
+    F / m (T / 2 + h / 2), whose force is that at the end of each step."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_rod(
+        np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 5),
+        section=ddg.Circle(0.004),
+        material=ddg.Material(1e8, density=1e3),
+    )
+    model = scene.build(device, "float64")
+    mass = 1e3 * np.pi * 0.004**2 * 0.3
+    whole = np.array([0.5, 1.0, 1.0, 1.0, 0.5])[:, None] / 4.0 * [0.0, 0.0, 1e-3]  # as the masses are
+    T, halvings = 0.02, 3
+    for start, wanted in ((None, T), (ddg.Controls(forces=0.0 * whole), 0.5 * T + 0.5 * T / 2**halvings)):
+        steps = ddg.StepControl(ddg.Integrator(model), 1e-12, halvings)
+        state = steps.advance(model.state(), T, ddg.Controls(forces=whole), start)
+        np.testing.assert_allclose(state.velocities()[:, 2], 1e-3 / mass * wanted, rtol=1e-9)
+    # what one of both leaves out is the scene's: gravity of zero
+    steps = ddg.StepControl(ddg.Integrator(model), 1e-12, halvings)
+    state = steps.advance(model.state(), T, None, ddg.Controls(gravity=(0.0, 0.0, -8.0)))
+    np.testing.assert_allclose(state.velocities()[:, 2], -8.0 * (0.5 * T - 0.5 * T / 2**halvings), rtol=1e-9)
+
+
+def test_poses_are_no_start(device):
+    model = held_by_a_grip().build(device, "float64")
+    steps = ddg.StepControl(ddg.Integrator(model), 5e-3)
+    with pytest.raises(ddg.SceneError, match="poses begin where the state has them"):
+        steps.advance(model.state(), 0.02, None, ddg.Controls(poses=np.zeros((1, 6))))

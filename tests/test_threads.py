@@ -112,3 +112,43 @@ def test_calls_are_alone_where_threads_share_a_stream(monkeypatch, shared):
     for thread in both:
         thread.join()
     assert met.is_set()
+
+
+SHARED = """
+import sys, threading
+import numpy as np
+import ddg_warp as ddg
+
+scene = ddg.Scene()
+points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 12)
+for number in range(2):
+    scene.clamp(scene.add_rod(points + [0.0, 0.1 * number, 0.0], section=ddg.Circle(0.005), material=ddg.Material(1e7)))
+scene.contact()
+model = scene.build(sys.argv[1], "float64")
+integrator = ddg.Integrator(model)
+
+def run(number, found):
+    state = model.state(velocities=np.tile([0.0, 0.0, 0.3 * number], (24, 1)))
+    for step in range(30):
+        state = integrator.step(state, 0.01)
+        found.append((state.points(), len(model.contacts(state).gap)))
+
+alone, together = ([[] for _ in range(3)] for _ in range(2))
+threads = [threading.Thread(target=run, args=(number, together[number])) for number in range(3)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+for number in range(3):
+    run(number, alone[number])
+    assert len(alone[number]) == len(together[number]) == 30
+    for one, other in zip(alone[number], together[number], strict=True):
+        assert np.allclose(one[0], other[0], rtol=0.0, atol=0.0 if sys.argv[1] == "cpu" else 1e-9) and one[1] == other[1]
+print("alike")
+"""
+
+
+def test_one_integrator_serves_several_threads(device):
+    """Each with states of its own: every step, and every question about contact, is what it is in one thread."""
+    done = subprocess.run([sys.executable, "-c", SHARED, device], capture_output=True, text=True, check=False)
+    assert done.stdout.endswith("alike\n"), done.stderr[-2000:]

@@ -139,7 +139,7 @@ def net_lines(model) -> list[str]:
     if uncoupled(model):
         lines.append("  in steps in which nothing comes near: rods on their own, one Newton loop a rod")
     return lines + step_lines(
-        model, lambda s: (host.rod_errors(s), host.split_errors(s) if split else np.array([np.inf]))
+        model, lambda s: (model.net.rod_errors(s), model.net.split_errors(s) if split else np.array([np.inf]))
     )
 
 

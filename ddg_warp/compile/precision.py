@@ -113,9 +113,12 @@ def rounding(model, s: float = np.inf) -> tuple[float, str]:
         worst.append((float(errors.max()), f"rod {rod} ('{model.curves.names[rod]}')"))
     if model.net is not None:
         host = model.net.host
-        names = [f"rod {rod.rod} ('{model.curves.names[rod.rod]}')" for rod in host.rods]
+        errors = model.net.rod_errors(s)
+        names = [f"rod {rod.rod} ('{model.curves.names[rod.rod]}')" for rod in host.rods] * (
+            len(errors) // max(1, len(host.rods))
+        )
         names += [f"shell {i} ('{shell.name}')" for i, shell in enumerate(model.scene.shells)]
-        worst += zip(np.concatenate([host.rod_errors(s), host.shell_errors(s)]).tolist(), names, strict=True)
+        worst += zip(np.concatenate([errors, host.shell_errors(s)]).tolist(), names, strict=True)
     return max(worst)
 
 

@@ -26,6 +26,7 @@ class TermPlace:
         self.name = name if chain else name.rpartition(".")[2]
         self.key = id(self.memory), self.name
         self._row = list(self.memory.values).index(self.name)
+        self._rest = self.name.rpartition(".")[2].startswith("rest")
         self._numbers = elements
         self.elements = torch.as_tensor(elements, device=str(wp.device_to_torch(model.wp_device)))
         self._buffer = self._view = self._by = self._by_view = None
@@ -65,10 +66,20 @@ class TermPlace:
     def put(self, given: list) -> None:
         """Put (place, tensor) in the memory, of which there is one."""
         self._look().copy_(given[0][1])
+        if self.name not in self.memory.foreign:
+            self.memory.foreign.add(self.name)
+            self._note()
 
     def restore(self) -> None:
         """Put back what the model has."""
         self._look().copy_(torch.tensor(self.memory[self.name]))
+        self.memory.foreign.discard(self.name)
+        self._note()
+
+    def _note(self) -> None:
+        """Have solvers chosen anew that go by whether rods are curved at rest."""
+        if self._rest:
+            self.model.note_change(False)
 
     def pull(self, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what was put there."""

@@ -60,9 +60,9 @@ class Group:
         """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
         `ParameterTable.set`."""
         elements = self.nodes
-        if values.ndim == 0:
+        if values.shape in ((), (1,)) and (values.ndim == 0 or self.worlds == 1):
             new = values.reshape(1, 1)
-        elif values.shape == (self.worlds,) and self.worlds > 1:
+        elif values.shape == (self.worlds,):
             new = np.repeat(values, self.rods)[None]
         else:
             along = np.atleast_2d(values)

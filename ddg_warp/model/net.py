@@ -6,10 +6,12 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile.net.net import Net
+from ddg_warp.compile.net.net import Net, inert_mass
+from ddg_warp.compile.precision import float32_error, stiffnesses
 from ddg_warp.kernels.net import elements, frames
 from ddg_warp.kernels.search import RELAG
 from ddg_warp.model.parameters import ParameterTable
+from ddg_warp.model.rod_elements import RodElements
 
 
 @dataclass
@@ -72,9 +74,9 @@ class DeviceSet:
     def set_parameter(self, name: str, values: np.ndarray) -> bool:
         """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
         `ParameterTable.set`."""
-        if values.ndim == 0:
+        if values.shape in ((), (1,)) and (values.ndim == 0 or self.worlds == 1):
             new = values.reshape(1, 1)
-        elif values.shape == (self.worlds,) and self.worlds > 1:
+        elif values.shape == (self.worlds,):
             new = values[:, None]
         elif values.shape in ((self.elements,), (self.worlds, self.elements)):
             new = np.atleast_2d(values)
@@ -121,6 +123,10 @@ class DeviceNet:
         self.edges = host.rod_edges
         self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
         self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
+        self._stiffnesses, self._along = (
+            (None, None),
+            {},
+        )  # the last ones and what they are of; elements of pieces of rods
         self.weighed, self.drag, felt = False, None, np.zeros((host.blocks, 3))
         if host.drag:
             ends, angles, coefficients = host.drag
@@ -213,6 +219,42 @@ class DeviceNet:
             if len(part.host.lag):
                 lag.assign(np.tile(part.host.lag, (1, self.worlds)))
         return state
+
+    @property
+    def version(self) -> int:
+        """Rises with every change of a parameter of its sets."""
+        return sum(part.parameters.version for part in self.sets)
+
+    def rod_stiffnesses(self, s: float) -> np.ndarray:
+        """Stiffnesses of every rod over a step of s [s], by the parameters that it has in every world (3, W rods); one world stands for
+        all where parameters are those of the scene. See `precision.stiffnesses`.
+
+        The last ones are remembered, as of a `Group`.
+        """
+        key = s, self.version
+        if self._stiffnesses[0] != key:
+            self._stiffnesses = key, self._find_stiffnesses(s) if self.version else self.host.rod_stiffnesses(s)
+        return self._stiffnesses[1]
+
+    def _find_stiffnesses(self, s: float) -> np.ndarray:
+        found = np.empty((3, self.worlds, len(self.host.rods)))
+        for piece, rods, rows in self.host.pieces:
+            if id(piece) not in self._along:
+                indices = np.array([self.host.rods[rod].rod for rod in rods])
+                self._along[id(piece)] = RodElements(self, piece.kind, indices, piece.mass.shape[1])
+            mass, length = (np.tile(values[rows], self.worlds) for values in (inert_mass(piece, s), piece.length))
+            own = stiffnesses(piece.kind, mass, length, self._along[id(piece)].parameters(), s)
+            found[:, :, rods] = np.reshape(own, (3, self.worlds, -1))
+        return found.reshape(3, -1)
+
+    def rod_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of these rods over a step of s [s]; see `precision.float32_error`."""
+        stretching, _, softest = self.rod_stiffnesses(s)
+        return float32_error(stretching, softest)
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """As of `Net`, of rods of every world."""
+        return self.host.split_errors(self.rod_stiffnesses(s))
 
     def elements(self, state: NetState, index: int, q=None, rate=None):
         """What every kernel of a term reads of set `index` at a state, or at other dofs `q`, at rest or at a rate."""

@@ -12,16 +12,21 @@ class ParameterTable:
     Attributes:
         values: arrays of two dimensions by name, of size 1 along what they do not depend on; `set` changes them.
         version: rises with every change.
+        foreign: names of parameters whose values on the device are others than these, as tensors are; the host does not know them.
     """
 
     def __init__(self, values: dict[str, np.ndarray], along: int, real, device):
         """`along` is the dimension of the elements: 0 or 1."""
         self.values, self._along, self._real, self._device = dict(values), along, real, device
-        self.version = 0
+        self.version, self.foreign = 0, set()
         self.upload()
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.values[name]
+
+    def may_be_other_than_zero(self, name: str) -> bool:
+        """Whether a parameter is other than zero anywhere, or may be, as far as the host knows."""
+        return name in self.foreign or bool(self.values[name].any())
 
     @property
     def arrays(self) -> tuple[wp.array, wp.array]:

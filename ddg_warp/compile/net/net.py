@@ -114,10 +114,6 @@ class Net(Storage):
     markers: list[np.ndarray] = field(default_factory=list)
     touching: Touching | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
-    _stiffnesses: tuple = (
-        None,
-        None,
-    )  # length of the step that they were last asked for, and `rod_stiffnesses` over it
 
     @property
     def blocks(self) -> int:
@@ -223,7 +219,7 @@ class Net(Storage):
         return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
 
     @cached_property
-    def _pieces(self) -> list[tuple]:
+    def pieces(self) -> list[tuple]:
         """Pieces of its rods, each with which of the rods it has, and their rows."""
         found = {}
         for number, rod in enumerate(self.rods):
@@ -232,29 +228,20 @@ class Net(Storage):
 
     def rod_stiffnesses(self, s: float) -> np.ndarray:
         """Stiffnesses of every rod over a step of s [s] (3, rods), by the parameters of the scene; see `precision.stiffnesses`."""
-        if self._stiffnesses[0] == s:
-            return self._stiffnesses[1]
         found = np.empty((3, len(self.rods)))
-        for p, rods, rows in self._pieces:
-            mass = (
-                p.mass.mean(1) + s * drag.least(p.drag) * p.length / p.mass.shape[1] if p.kind.drag else p.mass.mean(1)
-            )
+        for p, rods, rows in self.pieces:
             parameters = {name: v.T for name, v in p.parameters.items()}
-            found[:, rods] = np.array(stiffnesses(p.kind, mass, p.length, parameters, s))[:, rows]
-        self._stiffnesses = s, found
+            found[:, rods] = np.array(stiffnesses(p.kind, inert_mass(p, s), p.length, parameters, s))[:, rows]
         return found
 
-    def rod_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_error`."""
-        stretching, _, softest = self.rod_stiffnesses(s)
-        return float32_error(stretching, softest)
-
-    def split_errors(self, s: float) -> np.ndarray:
-        """The same with tensions as unknowns; infinite where they cannot be, of more than one stretch."""
-        _, bending, softest = self.rod_stiffnesses(s)
+    def split_errors(self, found: np.ndarray) -> np.ndarray:
+        """What float32 makes of rods with such stiffnesses (3, W rods) where tensions are unknowns; infinite where they cannot be, of
+        more than one stretch."""
+        _, bending, softest = found
         errors = float32_error(np.maximum(bending, largest_carried(softest.min(initial=np.inf))), softest)
         kinds = (rod.piece.kind for rod in self.rods)
-        return np.where([kind.edge_strains == kind.tensions == 1 for kind in kinds], errors, np.inf)
+        splits = np.array([kind.edge_strains == kind.tensions == 1 for kind in kinds], bool)
+        return np.where(np.resize(splits, errors.shape), errors, np.inf)
 
     def shell_errors(self, s: float) -> np.ndarray:
         """The same of shells (shells,): their membrane against inertia over a step and the lowest bending mode of a plate."""
@@ -270,3 +257,11 @@ class Net(Storage):
     def rod_edges(self) -> int:
         """Angles that belong to rod edges; they come first."""
         return len(self.ends)
+
+
+def inert_mass(piece, s: float) -> np.ndarray:
+    """Mean mass of the nodes of every rod of a piece (R,) [kg], with what drag resists over a step of s [s]."""
+    mass = piece.mass.mean(1)
+    if piece.kind.drag:
+        mass = mass + s * drag.least(piece.drag) * piece.length / piece.mass.shape[1]
+    return mass

@@ -140,7 +140,7 @@ class ChainNewton:
         """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""
         group = self.group
         rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
-        return "progressive" if any(group.parameters[name].any() for name in rest) else "gauss_newton"
+        return "progressive" if any(map(group.parameters.may_be_other_than_zero, rest)) else "gauss_newton"
 
     @property
     def outdated(self) -> bool:

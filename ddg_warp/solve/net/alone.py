@@ -18,6 +18,7 @@ from ddg_warp.compile.rods import net_rods
 from ddg_warp.kernels.contact.runs import KNOWN
 from ddg_warp.kernels.net import alone as kernels
 from ddg_warp.model.group import Group
+from ddg_warp.model.rod_elements import RodElements
 from ddg_warp.solve.chains.step import ChainStep
 from ddg_warp.solve.contact.runs import Runs
 
@@ -199,18 +200,14 @@ class Places:
 
     def __init__(self, net, group: Group):
         host, kind = net.host, group.kind
-        self._net, self._group, self._taken = net, group, {}
+        self._group, self._taken = group, {}
         by_rod = {rod.rod: rod for rod in host.rods}
         rods = [by_rod[rod] for rod in group.host.rods.tolist()]
-        self._sets, elements = {}, {}
-        for term in kind.terms:
-            index = next(i for i, part in enumerate(net.sets) if part.term.law == term.law)
-            self._sets[term.measure.span] = index
-            elements[term.measure.span] = _of_rods(host.sets[index].owner[0], group.host.rods)
+        self._elements = RodElements(net, kind, group.host.rods, group.nodes)
+        self._sets, elements = self._elements.sets, self._elements.lists
         none = [np.zeros(0, int)] * len(rods)
         lists = [rod.all_nodes for rod in rods], [rod.all_edges for rod in rods], elements.get(2, none), elements[1]
         rows = np.concatenate([np.transpose([_evenly(places) for places in each]) for each in lists])
-        self._elements = {span: _padded(elements[span], group.nodes) for span in elements}
         self.rows = wp.array(np.ascontiguousarray(rows, np.int32), dtype=int, device=net.device)
         sizes = [net.sets[self._sets[span]].elements if span in self._sets else 0 for span in (2, 1)]
         self.sizes = wp.vec4i(net.blocks, net.edges, *sizes)
@@ -220,24 +217,8 @@ class Places:
 
     def take_parameters(self) -> bool:
         """Give the group the parameters that the net has by now; return whether memory was made anew."""
-        group, changed = self._group, {}
-        for term in group.kind.terms:
-            table, elements = (
-                self._net.sets[self._sets[term.measure.span]].parameters,
-                self._elements[term.measure.span],
-            )
-            for parameter, values in table.values.items():
-                name, (worlds, along) = f"{term.name}.{parameter}", values.shape
-                if self._taken.get(name) is values:
-                    continue
-                self._taken[name], own = values, values.reshape(worlds, -1, 1)
-                if along > 1:
-                    own = values[:, elements]
-                if worlds > 1 or along > 1:
-                    own = np.broadcast_to(own, (group.worlds, *own.shape[1:]))
-                    own = np.broadcast_to(own, (*own.shape[:2], group.rods)).transpose(1, 0, 2)
-                changed[name] = own.reshape(len(own), -1)
-        return bool(changed) and group.parameters.set(**changed)
+        changed = self._elements.parameters(self._taken)
+        return bool(changed) and self._group.parameters.set(**changed)
 
     def lagged(self, state) -> list[wp.array]:
         """Lagged data of a net's state: frames, own rows of bending, strains of bending and of stretch."""
@@ -265,20 +246,6 @@ def rods_of(model) -> list[Group]:
     real, device = model.types.real, model.wp_device
     chains: list[ChainGroup] = compile_chains(model.scene, net_rods(model.scene))
     return [Group(chain, model.scene, model.worlds, device, real) for chain in chains]
-
-
-def _of_rods(owner: np.ndarray, rods: np.ndarray) -> list[np.ndarray]:
-    """Elements of every one of some rods, of the rods (E,) that own them, in order."""
-    order = np.argsort(owner, kind="stable")
-    starts, ends = (np.searchsorted(owner[order], rods, side) for side in ("left", "right"))
-    return [order[start:end] for start, end in zip(starts, ends, strict=True)]
-
-
-def _padded(elements: list[np.ndarray], nodes: int) -> np.ndarray:
-    """Elements of rods (nodes, R), the last one again where a rod has fewer."""
-    return np.column_stack(
-        [np.pad(own, (0, nodes - len(own)), mode="edge") if len(own) else [0] * nodes for own in elements]
-    )
 
 
 def _evenly(places: np.ndarray) -> tuple[int, int]:

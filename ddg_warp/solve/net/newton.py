@@ -180,6 +180,8 @@ class NetNewton:
         if self.net.host.touching:
             return "progressive"
         bending = [part for part in self.net.sets if part.term.measure.packed and not self.frozen]
+        if any(part.parameters.foreign.intersection(part.term.rest) for part in bending):
+            return "progressive"
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
         return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
 

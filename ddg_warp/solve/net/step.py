@@ -310,16 +310,21 @@ class NetStep(PartStep):
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
 
+    @property
+    def stiffness_version(self) -> int:
+        """As of `PartStep`."""
+        return self.net.version
+
     def float32_errors(self, s: float) -> np.ndarray:
         """The largest of a rod (1,); see `precision.float32_error`."""
-        return self.net.host.rod_errors(s).max(initial=0.0, keepdims=True)
+        return self.net.rod_errors(s).max(initial=0.0, keepdims=True)
 
     def split_errors(self, s: float) -> np.ndarray:
         """The same with tensions as unknowns; infinite where they cannot be."""
-        chains, host = self.newton.chains, self.net.host
+        chains = self.newton.chains
         if not (chains and chains.splits) or self.newton.frozen:
             return super().split_errors(s)
-        return host.split_errors(s).max(initial=0.0, keepdims=True)
+        return self.net.split_errors(s).max(initial=0.0, keepdims=True)
 
     def limit(self, s: float) -> None:
         """As of `PartStep`."""
@@ -331,7 +336,7 @@ class NetStep(PartStep):
         """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
         found = super()._find_limits(s)
         if any(self.newton.split):
-            softest = self.net.host.rod_stiffnesses(s)[2].min()
+            softest = self.net.rod_stiffnesses(s)[2].min()
             found["carried"] = np.full(len(self.islands), largest_carried(softest))
         return found
 
