@@ -10,12 +10,14 @@
                   any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `Touching`, parameters/NAME,
                   attributes/NAME of rods
     /control      how the run was driven
-    /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which
+    /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which; below each,
+                  run/NAME is what the run has counted up to that frame, see `Counts`
     /VTKHDF       the same points for ParaView, see `vtkhdf`
     attributes    provenance: version, date, machine and what the caller adds
 
 Frames are appended a block at a time, each block with its checkpoint in one transaction (see `journal`): a process
-killed at any time leaves a file that ends with a complete block, from which the run resumes.
+killed at any time leaves a file that ends with a complete block, from which the run resumes. Every block of a field has a
+checksum (HDF5's Fletcher32), model and checkpoints have one each (CRC-32), and readers verify them.
 
 ParaView and VTK's reader know the format by the suffix .vtkhdf: a link of that name stands beside the file.
 """
@@ -27,6 +29,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields as fields_of
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -35,7 +38,16 @@ import numpy as np
 
 from ddg_warp.io import Shapes, existing
 from ddg_warp.io.contacts import Contacts
-from ddg_warp.io.hdf5_read import TrajectoryError, TrajectoryReader, read_rods, undamaged
+from ddg_warp.io.hdf5_read import (
+    COUNTS,
+    CURVE_FIELDS,
+    TrajectoryError,
+    TrajectoryReader,
+    all_arrays,
+    read_rods,
+    seal,
+    undamaged,
+)
 from ddg_warp.io.hdf5_write import (
     cut_contacts,
     extend,
@@ -46,7 +58,6 @@ from ddg_warp.io.hdf5_write import (
     write_model,
 )
 from ddg_warp.io.journal import recover, transaction
-from ddg_warp.io.obstacles import same_obstacles
 from ddg_warp.io.vtkhdf import write_view
 
 __all__ = ["TrajectoryError", "TrajectoryReader", "TrajectoryWriter", "read_rods"]
@@ -71,7 +82,13 @@ class TrajectoryWriter:
         at_cells: Names of fields of the triangles.
         attributes: Values of each rod by name, shape (R,), stored in /model/attributes.
         contacts: Whether frames come with contacts.
+        time: What the times of frames are, "state" or "frame", stored with them; see `Recorder`.
+
+    Attributes:
+        checkpoint: The state that a resumed file goes on from, as of `State.snapshot`; None where there was none.
     """
+
+    checkpoint: dict[str, np.ndarray] | None = None
 
     def __init__(
         self,
@@ -87,6 +104,7 @@ class TrajectoryWriter:
         at_cells: Sequence[str] = (),
         attributes: Mapping[str, np.ndarray] | None = None,
         contacts: bool = False,
+        time: str = "state",
     ):
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
         names += ["obstacle_points"] * (model.obstacles is not None and bool(model.obstacles.moved.any()))
@@ -98,8 +116,10 @@ class TrajectoryWriter:
             write_model(file.create_group("model"), model)
             for name, values in (attributes or {}).items():
                 overwrite(file.require_group("model/attributes"), name, np.asarray(values))
+            seal(file["model"])
             write_control(file.create_group("control"), control or {})
             trajectory = file.create_group("trajectory")
+            trajectory.attrs["time"] = time
             extend(trajectory, "time", np.zeros(0), block)
             for name in names:
                 extend(trajectory, name, np.zeros((0, *self._shape(name))), block)
@@ -126,21 +146,20 @@ class TrajectoryWriter:
         recover(path)
         with TrajectoryReader(path) as reader:
             frame, slot, names = reader.checkpoint_frame, reader.checkpoint_slot, reader.recorded
-            contacts = reader.contacts is not None
-            same = np.array_equal(reader.curves.counts, model.curves.counts)
-            if not (same and np.array_equal(reader.curves.closed, model.curves.closed)):
-                raise TrajectoryError(f"{path}: the file holds other rods than the model; resume with its own scene")
-            if not np.array_equal(_triangles(reader.surfaces), _triangles(model.surfaces)):
+            contacts, checkpoint = reader.contacts is not None, reader.checkpoint()
+            if other := _other(reader, model):
+                what, which = other
                 raise TrajectoryError(
-                    f"{path}: the file holds other surfaces than the model; resume with its own scene"
-                )
-            if not same_obstacles(reader.obstacles, model.obstacles):
-                raise TrajectoryError(
-                    f"{path}: the file holds other obstacles than the model; resume with its own scene"
+                    f"{path}: the file holds other {what} than the model; resume with its own scene{which and f' ({which} differs)'}"
                 )
         writer = cls.__new__(cls)
         writer._prepare(path, model, block, names, contacts)
-        writer._slot = OTHER_SLOT[slot]
+        if frame and reader.points.shape[1:] != writer._shape("points"):
+            raise TrajectoryError(
+                f"{path}: frames of the file have shape {reader.points.shape[1:]}, those of the model {writer._shape('points')}; "
+                "resume with its own scene and as many worlds"
+            )
+        writer._slot, writer.checkpoint = OTHER_SLOT[slot], checkpoint
         writer._cut(frame, provenance)
         return writer
 
@@ -167,6 +186,8 @@ class TrajectoryWriter:
         observed: Mapping[str, float] | None = None,
         fields: Mapping | None = None,
         contacts: Contacts | None = None,
+        counts: Mapping[str, np.ndarray] | None = None,
+        time: float | None = None,
     ) -> None:
         """Adds the frame of a state and what was observed of it; every frame observes the same names.
 
@@ -175,6 +196,8 @@ class TrajectoryWriter:
             observed: Numbers by name.
             fields: Fields by name: of points (worlds, P), of triangles (worlds, T).
             contacts: What touches, where that is recorded.
+            counts: What the run has counted up to this state, by name.
+            time: Time of the frame; by default that of the state [s].
         """
         observed = dict(observed or {})
         if self._frames and observed.keys() != self._frames[0]["series"].keys():
@@ -183,10 +206,13 @@ class TrajectoryWriter:
         for name in (name for name in self._names if "/" in name):
             values = np.ravel((fields or {})[name.rpartition("/")[2]])
             frame[name] = np.concatenate([np.full(self._shape(name)[0] - len(values), np.nan), values])
-        self._frames.append({"time": state.time, "series": observed, "contacts": contacts, **frame})
+        self._frames.append(
+            {"time": state.time if time is None else time, "series": observed, "contacts": contacts, **frame}
+        )
         self._pairs += len(contacts) if self.contacts else 0
         # The solver may reuse the state's buffers before the block is written: keep a copy now.
         self._snapshot = {name: np.array(value) for name, value in state.snapshot().items()}
+        self._snapshot |= {f"{COUNTS}/{name}": np.array(value) for name, value in (counts or {}).items()}
         if len(self._frames) == self._block or PAIR_BYTES * self._pairs > BLOCK_BYTES:
             self.flush()
 
@@ -209,8 +235,11 @@ class TrajectoryWriter:
             write_view(file, self._shapes)
             checkpoint = file.require_group(f"checkpoint/{slot}")
             checkpoint.attrs["frame"] = len(trajectory["time"])
+            for name in all_arrays(checkpoint).keys() - self._snapshot.keys():
+                del checkpoint[name]
             for name, value in self._snapshot.items():
                 overwrite(checkpoint, name, value)
+            seal(checkpoint)
             file["checkpoint"].attrs["current"] = slot
         self._slot = OTHER_SLOT[slot]
         self._frames.clear()
@@ -294,6 +323,32 @@ def _origin() -> dict[str, str]:
         ours = "unknown"
     date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     return {"program": "ddg_warp", "version": ours, "date": date, "machine": platform.platform()}
+
+
+def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
+    """What in a file is not of this model, and which part of it; None where all is."""
+    for name in CURVE_FIELDS:
+        if not _equal(getattr(reader.curves, name), getattr(model.curves, name)):
+            return "rods", name
+    for what in ("surfaces", "obstacles", "touching"):
+        found, wanted = getattr(reader, what), getattr(model, what)
+        what = "contact" if what == "touching" else what
+        if found is None or wanted is None:
+            if found is not wanted:
+                return what, ""
+            continue
+        for each in fields_of(found):
+            if not _equal(getattr(found, each.name), getattr(wanted, each.name)):
+                return what, each.name
+    parameters = model.parameters()
+    for name in sorted(reader.parameters.keys() | parameters.keys()):
+        if not (name in parameters and _equal(reader.parameters.get(name), parameters[name])):
+            return "parameters", name
+    return None
+
+
+def _equal(found, wanted) -> bool:
+    return np.array_equal(np.asarray(found), np.asarray(wanted))
 
 
 def _triangles(surfaces) -> np.ndarray:

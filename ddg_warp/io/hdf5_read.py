@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields as fields_of
@@ -11,19 +12,24 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.io import CurveError, Curves, CurveSet, Surfaces, checked_curves, existing
 from ddg_warp.io.contacts import FIELDS as PAIR_FIELDS
 from ddg_warp.io.contacts import Contacts, Touching
-from ddg_warp.io.journal import open_to_read
+from ddg_warp.io.journal import TrajectoryError, open_to_read
 from ddg_warp.io.obstacles import Obstacles
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
+COUNTS = "run"  # group of a checkpoint: what the run had counted up to there
 FRAMES = ("points", "velocities", "directors", "obstacle_points")
 
 
-class TrajectoryError(ValueError):
-    """A trajectory cannot be read or continued; the message names the file, what is wrong with it and the remedy."""
+RATIO = 1024  # times its file that a dataset can be large; what compresses better is made up of fill values
+
+
+class MissingFrameError(TrajectoryError, IndexError):
+    """A trajectory has no such frame."""
 
 
 @contextmanager
@@ -33,7 +39,16 @@ def undamaged(path: Path) -> Iterator[None]:
         yield
     except (TrajectoryError, CurveError):
         raise
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+    except (
+        OSError,
+        RuntimeError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        MemoryError,
+        TypeError,
+        ValueError,
+    ) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         raise TrajectoryError(
@@ -52,8 +67,122 @@ class Frames:
         return self.shape[0]
 
     def __getitem__(self, frames) -> np.ndarray:
-        with undamaged(self._path):
-            return self._dataset[frames]
+        if isinstance(frames, int | np.integer) and not -len(self) <= frames < len(self):
+            raise MissingFrameError(f"{self._path}: there is no frame {frames}; it has {len(self)}, counted from 0")
+        return rows(self._dataset, self._path, frames)
+
+
+def rows(dataset: h5py.Dataset, path: Path, chosen=slice(None)) -> np.ndarray:
+    """Rows of a dataset, in memory.
+
+    Raises:
+        TrajectoryError: Their checksum says that the file has changed since they were written; names them, and the rows that can be
+            read. Or they cannot be chosen so.
+    """
+    with undamaged(path):
+        _check_size(dataset)
+        try:
+            return dataset[chosen]
+        except (TypeError, ValueError, IndexError) as error:
+            name = dataset.name.rpartition("/")[2]
+            raise TrajectoryError(
+                f"{path}: {name}[{chosen!r}]: {error}; choose frames by a number, a slice or increasing numbers of them"
+            ) from error
+        except OSError as error:
+            if error.errno is not None or not dataset.chunks:
+                raise
+            raise _told(dataset, path) from error
+
+
+def _told(dataset: h5py.Dataset, path: Path) -> TrajectoryError:
+    """Which rows of a dataset cannot be read, and which can."""
+    count, size = len(dataset), dataset.chunks[0]
+    lost = [first for first in range(0, count, size) if not _readable(dataset, first)]
+    bad = np.zeros(count, bool)
+    for first in lost:
+        bad[first : first + size] = True
+    rest = f"{_ranges(~bad)} can be read" if not bad.all() else "no others can be read"
+    return TrajectoryError(
+        f"{path}: {dataset.name} is damaged: the checksum of frames {_ranges(bad)} is not that of what was written; {rest}. Take a "
+        "copy of the file, or record the run anew"
+    )
+
+
+def _readable(dataset: h5py.Dataset, row: int) -> bool:
+    try:
+        dataset[row]
+    except OSError:
+        return False
+    return True
+
+
+def _ranges(chosen: np.ndarray) -> str:
+    """Indices of a mask as text: "0 to 3, 8 to 9"."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
+    return ", ".join(f"{first} to {stop - 1}" for first, stop in edges.reshape(-1, 2))
+
+
+def checksum(group: h5py.Group) -> int:
+    """CRC-32 of all datasets below a group: their paths, kinds and values."""
+    found = 0
+    for name, value in sorted(all_arrays(group).items()):
+        content = "\0".join(value.ravel()).encode() if value.dtype.kind == "U" else np.ascontiguousarray(value)
+        found = zlib.crc32(content, zlib.crc32(f"{name} {value.shape} {value.dtype.kind}".encode(), found))
+    return found
+
+
+def seal(group: h5py.Group) -> None:
+    """Stores the checksum of a group with it, for `check_seal`."""
+    group.attrs["crc32"] = checksum(group)
+
+
+def check_seal(group: h5py.Group, path: Path) -> None:
+    """Refuses a group whose datasets have changed since they were sealed; those of older files have no seal."""
+    if "crc32" in group.attrs and group.attrs["crc32"] != checksum(group):
+        raise TrajectoryError(
+            f"{path}: {group.name} is damaged: its checksum is not that of what was written; take a copy of the file, or record the "
+            "run anew"
+        )
+
+
+def _check_size(dataset: h5py.Dataset) -> None:
+    """Refuses a dataset that holds nothing, or more than its file can."""
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+        raise TypeError(
+            f"{dataset.name} is {'empty' if isinstance(dataset, h5py.Dataset) else 'a group'}, not an array"
+        )
+    size = dataset.size * dataset.dtype.itemsize
+    if size > RATIO * 2**20 and size > RATIO * dataset.file.id.get_filesize():
+        raise MemoryError(
+            f"{dataset.name} of shape {dataset.shape} is said to have {size} bytes, more than the file can hold"
+        )
+
+
+def refuse_links(file: h5py.File, path: Path) -> None:
+    """Refuses a file whose data are in other files, which may be anybody's.
+
+    Raises:
+        TrajectoryError: Names the first object of the file that is elsewhere.
+    """
+
+    def elsewhere(name: str, link) -> str | None:
+        if isinstance(link, h5py.ExternalLink):
+            return f"{name} is a link to {link.filename}"
+        item = file.get(name) if isinstance(link, h5py.HardLink) else None
+        if isinstance(item, h5py.Dataset) and item.external:
+            return f"the values of {name} are in {item.external[0][0]}"
+        others = {each.file_name for each in item.virtual_sources()} - {"."} if _is_virtual(item) else ()
+        return f"the values of {name} are in {min(others)}" if others else None
+
+    if found := file.visititems_links(elsewhere):
+        raise TrajectoryError(
+            f"{path}: {found}: data of other files are not read; put them into this one, or read it with other_files=True if you "
+            "know where it comes from"
+        )
+
+
+def _is_virtual(item) -> bool:
+    return isinstance(item, h5py.Dataset) and item.is_virtual
 
 
 class ContactFrames:
@@ -61,23 +190,32 @@ class ContactFrames:
 
     def __init__(self, group: h5py.Group, names: list[str], path: Path):
         self._group, self._names, self._path = group, names, path
-        self._ends = np.concatenate([[0], group["ends"][:]])
+        self._ends = np.concatenate([[0], rows(group["ends"], path)])
 
     def __len__(self) -> int:
         return len(self._ends) - 1
 
     def __getitem__(self, frame: int) -> Contacts:
+        if not isinstance(frame, int | np.integer) or not -len(self) <= frame < len(self):
+            raise MissingFrameError(
+                f"{self._path}: there are no contacts of frame {frame!r}; choose one of {len(self)} by its number, from 0"
+            )
         first, last = self._ends[range(len(self))[frame] :][:2]
         with undamaged(self._path):
-            found = {name: self._group[name][first:last] for name in PAIR_FIELDS}
+            found = {name: rows(self._group[name], self._path, slice(first, last)) for name in PAIR_FIELDS}
         return Contacts(names=self._names, **found)
 
 
 class TrajectoryReader:
     """Reads a trajectory file, also one that is being written or whose writer was killed.
 
+    Args:
+        path: The file.
+        other_files: Whether it may have its data in other files: by external links, external storage or virtual datasets.
+
     Attributes:
         time: Times of the frames [s], shape (F,).
+        time_is: What they are: "state", times of their states, or "frame", their numbers; see `Recorder`.
         points: Positions [m], shape (F, P, 3) or (F, B, P, 3), read when indexed: `reader.points[f]`.
         velocities: Velocities [m/s], like `points`, or None.
         directors: First material directors, shape (F, E, 3) or (F, B, E, 3), read when indexed, or None.
@@ -95,12 +233,14 @@ class TrajectoryReader:
         recorded: Names of the recorded fields.
     """
 
-    def __init__(self, path):
+    def __init__(self, path, *, other_files: bool = False):
         self.path = existing(path)
         with undamaged(self.path):
             self._file = open_to_read(self.path)
         try:
             with undamaged(self.path):
+                if not arguments.flag("other_files", other_files):
+                    refuse_links(self._file, self.path)
                 self._read()
         except BaseException:
             self._file.close()
@@ -111,14 +251,15 @@ class TrajectoryReader:
         if "trajectory" not in self._file:
             raise TrajectoryError(f"{self.path}: there is no group /trajectory; is it a trajectory.h5?")
         trajectory, model = self._file["trajectory"], self._file["model"]
-        self.time = trajectory["time"][:]
+        check_seal(model, self.path)
+        self.time, self.time_is = rows(trajectory["time"], self.path), str(trajectory.attrs.get("time", "state"))
         self.recorded = [name for name in FRAMES if name in trajectory]
         self.recorded += [f"{at}/{name}" for at in ("at_points", "at_cells") for name in trajectory.get(at, ())]
         fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
         self.points, self.velocities = fields["points"], fields.get("velocities")
         self.directors = fields.get("directors")
         self.fields = {name.rpartition("/")[2]: frames for name, frames in fields.items() if "/" in name}
-        self.series = {name: values[:] for name, values in trajectory.get("series", {}).items()}
+        self.series = {name: rows(values, self.path) for name, values in trajectory.get("series", {}).items()}
         self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
         self.surfaces = None
         if "surfaces" in model:
@@ -135,8 +276,8 @@ class TrajectoryReader:
         if "contacts" in trajectory:
             self.contacts = ContactFrames(trajectory["contacts"], self.touching.names, self.path)
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
-        self.parameters = _all_arrays(model["parameters"])
-        self.attributes = _all_arrays(model["attributes"]) if "attributes" in model else {}
+        self.parameters = all_arrays(model["parameters"])
+        self.attributes = all_arrays(model["attributes"]) if "attributes" in model else {}
         self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
 
     def __enter__(self) -> TrajectoryReader:
@@ -182,14 +323,23 @@ class TrajectoryReader:
         if frame > len(self):
             raise TrajectoryError(f"{self.path}: the checkpoint is of frame {frame}, but there are {len(self)}")
         with undamaged(self.path):
-            return _all_arrays(self._file["checkpoint"][self.checkpoint_slot])
+            group = self._file["checkpoint"][self.checkpoint_slot]
+            check_seal(group, self.path)
+            return {name: value for name, value in all_arrays(group).items() if not name.startswith(f"{COUNTS}/")}
+
+    def run_counts(self) -> dict[str, np.ndarray]:
+        """What the run had counted up to its checkpoint, by name; empty where the file has none."""
+        with undamaged(self.path):
+            group = self._file["checkpoint"][self.checkpoint_slot]
+            check_seal(group, self.path)
+            return all_arrays(group[COUNTS]) if COUNTS in group else {}
 
     def close(self) -> None:
         """Closes the file; arrays already read stay."""
         self._file.close()
 
 
-def read_rods(path, frame: int = -1, world: int = 0) -> list[CurveSet]:
+def read_rods(path, frame: int = -1, world: int = 0, *, other_files: bool = False) -> list[CurveSet]:
     """Rods from an HDF5 file, of either kind.
 
     A trajectory gives one set for each batch of rods, at one frame (by default the last) of one world.
@@ -198,9 +348,11 @@ def read_rods(path, frame: int = -1, world: int = 0) -> list[CurveSet]:
     """
     path = existing(path)
     with undamaged(path), open_to_read(path) as file:
+        if not other_files:
+            refuse_links(file, path)
         if "points" in file:
             return [_read_plain(file, path)]
-    with TrajectoryReader(path) as reader:
+    with TrajectoryReader(path, other_files=other_files) as reader:
         if not len(reader):
             raise CurveError(f"{path}: the trajectory has no frames; read a file of a run that wrote a block")
         points = reader.points[frame]
@@ -208,16 +360,14 @@ def read_rods(path, frame: int = -1, world: int = 0) -> list[CurveSet]:
 
 
 def _read_plain(file: h5py.File, path: Path) -> CurveSet:
-    points = file["points"][()]
-    if "counts" in file:
-        counts = file["counts"][()]
-    elif points.ndim == 3:
-        counts = np.full(points.shape[0], points.shape[1])
-    else:
+    points, *others = (
+        _array(file[name]) if name in file else None for name in ("points", "counts", "closed", "radius")
+    )
+    counts, closed, radius = others
+    if counts is None and points.ndim != 3:
         raise CurveError(f"{path}: `points` has shape {points.shape} and there are no `counts`; add the points per rod")
-    closed = file["closed"][()] if "closed" in file else False
-    radius = file["radius"][()] if "radius" in file else None
-    return checked_curves(points, counts, closed, radius, "points", str(path))
+    counts = np.full(points.shape[0], points.shape[1]) if counts is None else counts
+    return checked_curves(points, counts, False if closed is None else closed, radius, "points", str(path))
 
 
 def _by_batch(curves: Curves, points: np.ndarray, path: Path) -> list[CurveSet]:
@@ -246,10 +396,11 @@ def _refuse_misfits(curves: Curves, surfaces: Surfaces | None, point_count: int)
 
 def _array(dataset: h5py.Dataset) -> np.ndarray:
     """A dataset in memory; texts as str."""
+    _check_size(dataset)
     return dataset.asstr()[()].astype(str) if h5py.check_string_dtype(dataset.dtype) else dataset[()]
 
 
-def _all_arrays(group: h5py.Group) -> dict[str, np.ndarray]:
+def all_arrays(group: h5py.Group) -> dict[str, np.ndarray]:
     """Every dataset below a group, by its path from there."""
     arrays = {}
     group.visititems(lambda name, item: arrays.update({name: _array(item)} if isinstance(item, h5py.Dataset) else {}))

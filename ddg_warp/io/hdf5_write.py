@@ -68,12 +68,14 @@ def cut_contacts(group: h5py.Group, frame: int) -> None:
 def extend(group: h5py.Group, name: str, rows: np.ndarray, block: int, dtype=np.float64) -> None:
     """Appends rows to a dataset, which is made if there is none.
 
-    Chunks hold a power of two of rows, at most a block and about a mebibyte: a block of 64 then fills whole chunks.
+    Chunks hold a power of two of rows, at most a block and about a mebibyte: a block of 64 then fills whole chunks. Each has a
+    checksum, which every reader verifies.
     """
     if name not in group:
         row_bytes = max(8, 8 * int(np.prod(rows.shape[1:])))
         chunk = 1 << int(np.log2(max(1, min(block, CHUNK_BYTES // row_bytes))))
         options = {"maxshape": (None, *rows.shape[1:]), "chunks": (chunk, *rows.shape[1:])}
+        options["fletcher32"] = True
         group.create_dataset(name, shape=(0, *rows.shape[1:]), dtype=dtype, **options)
     dataset = group[name]
     start = len(dataset)

@@ -8,6 +8,10 @@ with a checksum, and only then to the file. A process killed
     after it                          leaves a journal from which a reader, or the next writer, has the new content.
 This is redo logging as databases do it; appended data are written once, only the few changed pages twice.
 
+A journal belongs to one version of one file. Every transaction gives the file a new random token, at a place that stays; the journal
+names the place, both tokens and the size of the file before. Beside any other file, or another version of it, a journal is
+passed over by readers and refused by writers.
+
 HDF5 does not survive a write that fails: objects that it could not flush crash the process when they are closed. So a write
 for which the disk has no room ends in memory, as if all were well, and the transaction fails once HDF5 has let go of the file.
 
@@ -18,24 +22,51 @@ two places: the one not in use is declared `scratch` and written straight to the
 
 from __future__ import annotations
 
+import errno
 import io
 import os
+import secrets
 import struct
 import sys
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 if TYPE_CHECKING:
     import h5py
 
 PAGE = 4096  # bytes
-MAGIC = b"ddgwal01"
-HEADER = struct.Struct("<8sQQ")  # magic, size of the file afterwards, number of pages
+MAGIC = b"ddgwal02"
+TOKEN = 16  # bytes of the token that names a version of a file
+# magic; `Version`: sizes before and after, place of the token, tokens before and after; number of pages
+HEADER = struct.Struct(f"<8sQQQ{TOKEN}s{TOKEN}sQ")
 CHECKSUM = struct.Struct("<I")
+FORMAT = ("v110", "v110")  # of HDF5: checksums of metadata, read by HDF5 1.10 and later
 Pages = dict[int, bytearray]
+
+
+class TrajectoryError(ValueError):
+    """A trajectory cannot be read or continued; the message names the file, what is wrong with it and the remedy."""
+
+
+class Version(NamedTuple):
+    """The version of a file that a journal belongs to, and the one that it makes of it.
+
+    Attributes:
+        before, size: Length before, and with the pages of the journal [bytes].
+        place: Where the token stands in the file; 0 where the file has none yet.
+        token, next: The token before, and afterwards.
+    """
+
+    before: int
+    size: int = 0
+    place: int = 0
+    token: bytes = bytes(TOKEN)
+    next: bytes = bytes(TOKEN)
 
 
 class PagedFile(io.RawIOBase):
@@ -49,7 +80,7 @@ class PagedFile(io.RawIOBase):
     """
 
     def __init__(self, path: Path, mode: str, pages: Pages | None = None, size: int | None = None):
-        self._file = open(path, mode, buffering=0)
+        self._file = open(path, mode, buffering=0, opener=no_link if "+" in mode else None)
         self.size = os.fstat(self._file.fileno()).st_size if size is None else size
         self.pages: Pages = dict(pages or {})
         self._limit = -(-self.size // PAGE) * PAGE
@@ -153,23 +184,26 @@ def transaction(path, scratch: str = "", new: bool = False) -> Iterator[h5py.Fil
 
     Raises:
         OSError: The disk is full, or fails; the file is as it was.
+        TrajectoryError: The file is a link, or the journal beside it belongs to another file.
     """
     import h5py
 
     path = Path(path)
     if new:
-        path.write_bytes(b"")
+        path.unlink(missing_ok=True)
+        path.open("xb").close()
         _journal_of(path).unlink(missing_ok=True)
     recover(path)
     old_size = path.stat().st_size
     raw = PagedFile(path, "r+b")
     try:
-        with h5py.File(raw, "w" if new else "r+") as file:
+        with h5py.File(raw, "w" if new else "r+", libver=FORMAT) as file:
             if scratch in file:
                 raw.scratch = _places(file[scratch])
+            version = _next_version(file, old_size)
             yield file
         raw.sync()
-        _write_journal(_journal_of(path), raw.size, raw.pages)
+        _write_journal(_journal_of(path), version._replace(size=raw.size), raw.pages)
     except BaseException:
         raw.close()
         _journal_of(path).unlink(missing_ok=True)
@@ -177,6 +211,32 @@ def transaction(path, scratch: str = "", new: bool = False) -> Iterator[h5py.Fil
         raise
     raw.close()
     recover(path)
+
+
+def no_link(path, flags: int) -> int:
+    """Descriptor of a file that is opened to be written, refused where the name is a link: its target may be anybody's."""
+    try:
+        return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise TrajectoryError(
+            f"{path} is a link to {os.readlink(path)}, and links are not written through: use the directory that the file lies "
+            "in, or put the file itself in the place of the link"
+        ) from None
+
+
+def _next_version(file: h5py.File, size: int) -> Version:
+    """The version of a file before a transaction; the file gets the token of the next one."""
+    token = secrets.token_bytes(TOKEN)
+    values = np.frombuffer(token, np.uint8)
+    if "version" not in file:
+        file.create_dataset("version", data=values)
+        return Version(size, next=token)
+    found = file["version"]
+    before = found[:].tobytes()
+    found[...] = values
+    return Version(size, place=found.id.get_offset(), token=before, next=token)
 
 
 def _places(group: h5py.Group) -> list[tuple[int, int]]:
@@ -193,30 +253,49 @@ def _places(group: h5py.Group) -> list[tuple[int, int]]:
 
 
 def open_to_read(path) -> h5py.File:
-    """Opens an HDF5 file for reading, with the changes of a complete journal and without touching the disk."""
+    """Opens an HDF5 file for reading, with the changes of a complete journal of it and without touching the disk."""
     import h5py
 
     path = Path(path)
     journal = _read_journal(_journal_of(path))
-    if journal is None:
+    if journal is None or not _belongs(path, journal[0]):
         return h5py.File(path, "r")
-    size, pages = journal
-    return h5py.File(PagedFile(path, "rb", pages, size), "r")
+    version, pages = journal
+    return h5py.File(PagedFile(path, "rb", pages, version.size), "r")
 
 
 def recover(path) -> None:
-    """Carries out what a complete journal holds; removes the journal."""
+    """Carries out what a complete journal holds; removes the journal.
+
+    Raises:
+        TrajectoryError: The journal belongs to another file, or to another version of it.
+    """
     path = Path(path)
     journal = _read_journal(_journal_of(path))
     if journal is not None:
-        size, pages = journal
-        with open(path, "r+b", buffering=0) as file:
+        version, pages = journal
+        if not _belongs(path, version):
+            raise TrajectoryError(
+                f"{_journal_of(path)} belongs to another file, or to another version of {path.name}: move it back beside its own "
+                f"file, or remove it to go on with {path.name} as it is"
+            )
+        with open(path, "r+b", buffering=0, opener=no_link) as file:
             for start, content in _runs(pages):
                 file.seek(start)
                 file.write(content)
-            file.truncate(size)
+            file.truncate(version.size)
             os.fsync(file.fileno())
     _journal_of(path).unlink(missing_ok=True)
+
+
+def _belongs(path: Path, version: Version) -> bool:
+    """Whether a journal is of this file, whose pages may have been written already, all or some."""
+    with open(path, "rb") as file:
+        if os.fstat(file.fileno()).st_size < min(version.before, version.size):
+            return False
+        file.seek(version.place)
+        found = file.read(TOKEN) if version.place else version.token
+    return len(found) == TOKEN and all(a in pair for a, *pair in zip(found, version.token, version.next, strict=True))
 
 
 def _runs(pages: Pages) -> list[tuple[int, bytearray]]:
@@ -234,18 +313,20 @@ def _journal_of(path: Path) -> Path:
     return path.with_name(path.name + ".journal")
 
 
-def _write_journal(path: Path, size: int, pages: Pages) -> None:
+def _write_journal(path: Path, version: Version, pages: Pages) -> None:
     numbers = struct.pack(f"<{len(pages)}Q", *pages)
-    content = b"".join([HEADER.pack(MAGIC, size, len(pages)), numbers, *pages.values()])
-    with open(path, "wb") as file:
+    header = HEADER.pack(MAGIC, *version, len(pages))
+    content = b"".join([header, numbers, *pages.values()])
+    path.unlink(missing_ok=True)
+    with open(path, "xb") as file:
         file.write(content)
         file.write(CHECKSUM.pack(zlib.crc32(content)))
         file.flush()
         os.fsync(file.fileno())
 
 
-def _read_journal(path: Path) -> tuple[int, Pages] | None:
-    """(size of the file, pages), or None where there is no complete journal."""
+def _read_journal(path: Path) -> tuple[Version, Pages] | None:
+    """(version of the file that it belongs to, pages), or None where there is no complete journal."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -253,9 +334,10 @@ def _read_journal(path: Path) -> tuple[int, Pages] | None:
     if len(content) < HEADER.size + CHECKSUM.size:
         return None
     body, checksum = content[: -CHECKSUM.size], content[-CHECKSUM.size :]
-    magic, size, count = HEADER.unpack_from(body)
+    magic, *version, count = HEADER.unpack_from(body)
     if magic != MAGIC or CHECKSUM.unpack(checksum)[0] != zlib.crc32(body):
         return None
     numbers = struct.unpack_from(f"<{count}Q", body, HEADER.size)
     start = HEADER.size + 8 * count
-    return size, {page: bytearray(body[start + k * PAGE : start + (k + 1) * PAGE]) for k, page in enumerate(numbers)}
+    pages = {page: bytearray(body[start + k * PAGE : start + (k + 1) * PAGE]) for k, page in enumerate(numbers)}
+    return Version(*version), pages

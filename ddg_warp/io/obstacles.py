@@ -152,14 +152,6 @@ class Obstacles:
         return ends[second.astype(int)] + self.radius[k] * directions @ frame
 
 
-def same_obstacles(one: Obstacles | None, other: Obstacles | None) -> bool:
-    """Whether both are of the same shapes, and the same are moved."""
-    if one is None or other is None:
-        return one is other
-    names = ("kinds", "radius", "counts", "moved", "sizes", "triangles")
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
-
-
 @cache
 def _square() -> tuple[np.ndarray, np.ndarray]:
     """Points and triangles of a square of side 1, small enough to be sorted by their depth in pictures."""

@@ -5,12 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from stand_in import Model, step, surfaces
 
-from ddg_warp.io import CurveError, MeshError, read
-from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+from ddg_warp.io import CurveError, MeshError, journal, read
+from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader, read_rods
+from ddg_warp.io.journal import transaction
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.usd import validate
 from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
@@ -178,3 +180,147 @@ def test_mistakes_in_recording_are_named(tmp_path):
         recorder.record(model.state())
     with pytest.raises(ValueError, match=r"is closed: record before close\(\), or open another with resume=True"):
         recorder.record(step(model.state()))
+
+
+def journalled(path: Path, monkeypatch, value: float) -> Path:
+    """A complete journal beside a file, as left by a process killed before it was carried out; the time of frame 0 becomes `value`."""
+    with monkeypatch.context() as patch:
+        patch.setattr("ddg_warp.io.journal.recover", lambda path: None)
+        with transaction(path) as file:
+            file["trajectory/time"][0] = value
+    return path.with_name(path.name + ".journal")
+
+
+def first_time(path: Path) -> float:
+    with TrajectoryReader(path) as reader:
+        return reader.time[0]
+
+
+@pytest.mark.parametrize("other", ["another run", "an older copy", "a newer version"])
+def test_a_journal_of_another_file_is_not_applied(run, tmp_path, monkeypatch, other):
+    """Readers pass it over, writers refuse it by name; neither touches file or journal."""
+    path = run / TRAJECTORY
+    whole = path.read_bytes()
+    if other == "an older copy":
+        with transaction(path) as file:
+            file.attrs["note"] = "newer"
+    log = journalled(path, monkeypatch, -1.0)
+    if other == "another run":
+        with Recorder(Model(surfaces=surfaces()), tmp_path / "b", usd=False) as recorder:
+            recorder.record(recorder._model.state())
+        whole = (tmp_path / "b" / TRAJECTORY).read_bytes()
+    elif other == "a newer version":
+        content = log.read_bytes()
+        for _ in range(2):
+            with transaction(path) as file:
+                file.attrs["note"] = "newer"
+        whole = path.read_bytes()
+        log.write_bytes(content)
+    path.write_bytes(whole)
+    kept = log.read_bytes()
+    assert first_time(path) == (-1.0 if other == "a newer version" else 0.0)
+    with pytest.raises(TrajectoryError, match=r"trajectory.h5.journal belongs to another file, or to another version"):
+        resumed(path)
+    assert (path.read_bytes(), log.read_bytes()) == (whole, kept)
+
+
+def test_a_journal_goes_with_its_file(run, tmp_path, monkeypatch):
+    """File and journal copied together, and a file into which a part of the journal has gone already."""
+    path = run / TRAJECTORY
+    log = journalled(path, monkeypatch, -1.0)
+    (tmp_path / "copy").mkdir()
+    copy = tmp_path / "copy" / TRAJECTORY
+    version, pages = journal._read_journal(log)
+    for applied in range(len(pages) + 1):
+        copy.write_bytes(path.read_bytes())
+        copy.with_name(log.name).write_bytes(log.read_bytes())
+        with open(copy, "r+b") as file:
+            for number in list(pages)[:applied]:
+                file.seek(number * journal.PAGE)
+                file.write(pages[number])
+        assert first_time(copy) == -1.0
+        journal.recover(copy)
+        assert not copy.with_name(log.name).exists() and copy.stat().st_size == version.size
+        assert first_time(copy) == -1.0
+
+
+def test_a_flipped_byte_in_a_block_is_told(run):
+    """Of every field the frames concerned are named, and the others can be read."""
+    path = run / TRAJECTORY
+    with h5py.File(path) as file:
+        chunks = file["trajectory/points"].id
+        places = [chunks.get_chunk_info(k).byte_offset for k in range(chunks.get_num_chunks())]
+    content = path.read_bytes()
+    for block, place in enumerate(places):
+        damaged = bytearray(content)
+        damaged[place + 100] ^= 1
+        path.write_bytes(damaged)
+        with TrajectoryReader(path) as reader:
+            with pytest.raises(TrajectoryError, match=rf"{path}: /trajectory/points is damaged.*can be read") as caught:
+                reader.points[:]
+            first, last = 4 * block, min(9, 4 * block + 3)
+            assert f"the checksum of frames {first} to {last} is not" in str(caught.value)
+            for frame in set(range(10)) - set(range(first, last + 1)):
+                reader.points[frame]
+    with h5py.File(path) as file:
+        (place,) = (file["trajectory/time"].id.get_chunk_info(k).byte_offset for k in range(1, 2))
+    damaged = bytearray(content)
+    damaged[place + 3] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(
+        TrajectoryError, match=r"/trajectory/time is damaged: the checksum of frames 4 to 7.*0 to 3, 8 to 9 can"
+    ):
+        TrajectoryReader(path)
+
+
+@pytest.mark.parametrize("name", ["model/curves/radius", "model/parameters/density", "checkpoint/a/0/q"])
+def test_a_flipped_byte_elsewhere_is_told(run, name):
+    """In what the run is made of, and in the state that it goes on from."""
+    path = run / TRAJECTORY
+    with h5py.File(path) as file:
+        assert file["checkpoint"].attrs["current"] == "a"
+        place = file[name].id.get_offset()
+    with open(path, "r+b") as file:
+        file.seek(place + 6)
+        value = file.read(1)
+        file.seek(place + 6)
+        file.write(bytes([value[0] ^ 1]))
+    with pytest.raises(TrajectoryError, match=rf"{path}: /(model|checkpoint/a) is damaged: its checksum"):
+        resumed(path)
+
+
+def test_frames_are_chosen_as_of_an_array(run):
+    with TrajectoryReader(run / TRAJECTORY) as reader:
+        assert len(list(reader.points)) == 10
+        for frame in (10, -11):
+            with pytest.raises(IndexError, match=f"no frame {frame}; it has 10"):
+                reader.points[frame]
+        with pytest.raises(TrajectoryError, match="choose frames by a number"):
+            reader.points["first"]
+
+
+def elsewhere(path: Path, kind: str) -> None:
+    """A file whose points are in another one."""
+    with h5py.File(path.with_name("other.h5"), "w") as file:
+        file["points"] = np.arange(18.0).reshape(2, 3, 3)
+    with h5py.File(path, "w") as file:
+        if kind == "an external link":
+            file["points"] = h5py.ExternalLink("other.h5", "points")
+        elif kind == "external storage":
+            path.with_name("raw").write_bytes(np.arange(18.0).tobytes())
+            file.create_dataset("points", (2, 3, 3), "f8", external=[("raw", 0, h5py.h5f.UNLIMITED)])
+        else:
+            layout = h5py.VirtualLayout((2, 3, 3), "f8")
+            layout[...] = h5py.VirtualSource("other.h5", "points", (2, 3, 3))
+            file.create_virtual_dataset("points", layout)
+
+
+@pytest.mark.parametrize("kind", ["an external link", "external storage", "a virtual dataset"])
+def test_data_of_other_files_are_not_read(tmp_path, monkeypatch, kind):
+    """Unless it is asked for by name."""
+    monkeypatch.chdir(tmp_path)
+    elsewhere(tmp_path / "a.h5", kind)
+    with pytest.raises(TrajectoryError, match=r"a.h5: .*points.*(other.h5|raw): data of other files are not read"):
+        read(tmp_path / "a.h5")
+    (rods,) = read_rods(tmp_path / "a.h5", other_files=True)
+    np.testing.assert_array_equal(rods.points, np.arange(18.0).reshape(6, 3))
