@@ -118,12 +118,12 @@ def looped(angle: float, tail: float, edge: float) -> np.ndarray:
 
 def observe(model, state) -> dict[str, float]:
     """Torque [N m], tension [N], half of the distance of strands that touch [m], and the smallest gap [m]; of the middle of what
-    touches the angle [rad] between strands and axis and the mean distance [m] from it, and its length [m]."""
+    touches the angle [rad] between strands and axis and the mean distance [m] from it, both 0 before, and its length [m]."""
     points, found = state.points().reshape(-1, 3), model.contacts(state)
     push = np.linalg.norm(found.force, axis=1)
     reactions = model.reactions(state)
     inner, axis = wound(points, found.point)
-    angle = radius = np.nan
+    angle = radius = 0.0
     if len(inner) > 8:
         tangents = np.diff(points, axis=0)
         tangents /= np.linalg.norm(tangents, axis=1)[:, None]

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import os
+import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
 from ddg_warp.errors import SceneError
-from ddg_warp.io import Shapes
+from ddg_warp.io import CurveError, Shapes
 from ddg_warp.io.contacts import Contacts
-from ddg_warp.run.run_directory import LOCK, SCENE, TRAJECTORY, lock_directory, refuse_to_replace
+from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, RecordError, RunDirectory, refuse_to_replace, told
 
 DEFAULT_FPS = 24.0
 COLORS = ("strain", "curvature", "energy")
+TIMES = ("state", "frame")
 
-
-class RecordError(OSError):
-    """A run could not be written to its disk; what was complete is kept."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])
+__all__ = ["RecordError", "Recorder", "export_usd"]
 
 
 class Recorder:
@@ -33,28 +28,31 @@ class Recorder:
 
     Args:
         model: The model whose states are recorded.
-        directory: DIR; made if there is none.
+        directory: DIR; made if there is none. A `RunDirectory` stays held when the recorder closes.
         usd: Whether to write the scene.
         hdf5: Whether to write the trajectory; without it a run cannot be resumed.
         every: Record every so many calls, the first included.
         block: Frames written together.
         fps: Time codes per second of the scene; by default one time code a recorded frame, where the scene has a dt.
         tube: Whether the scene shows tubes instead of curves.
+        time: What the time of a frame is: "state", that of its state, which grows from call to call; or "frame", its number from 0 on,
+            for equilibria or designs that are recorded one after the other. A resumed run goes on with its own.
         color_by: What surfaces of the scene are colored by, "strain", "curvature" or "energy" (see `inquiry.triangle_fields`),
             and its values at the two ends of the scale. Frames replayed from a trajectory, at a resume, stay plain.
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
-        fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.ask.fields`; a resumed run goes on with its own.
+        fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.ask.fields`.
         contacts: Whether to record what touches, see `Model.contacts`: pairs, places, gaps and forces; in the scene as points, as
-            wide as forces say. A resumed run goes on with or without as it began.
+            wide as forces say.
         attributes: Values of each rod by name, shape (R,), such as the `attributes` of curves that were read: ids, groups.
         provenance: Attributes of the trajectory, beside version, date and machine.
         control: How the run is driven, stored in the trajectory.
-        resume: Whether to go on after the last complete block of DIR/trajectory.h5; the scene is written anew from it.
-        force: Whether to replace a run that DIR holds already.
+        resume: Whether to go on after the last complete block of DIR/trajectory.h5, with the fields that it has; the scene is written
+            anew from it.
+        force: Whether to replace a run that DIR holds already, with its summary and pictures.
 
     Raises:
-        ValueError: An option is no such option.
+        ValueError: An option is no such option, or the run to resume is of another model or has not the fields asked for.
         FileExistsError: DIR holds a run, or another process writes to it.
         RecordError: The disk is full, or fails; also from `record` and `close`.
     """
@@ -70,6 +68,7 @@ class Recorder:
         block: int = 64,
         fps: float | None = None,
         tube: bool = False,
+        time: str | None = None,
         color_by: tuple[str, float, float] | None = None,
         velocities: bool = False,
         directors: bool = False,
@@ -84,14 +83,20 @@ class Recorder:
         if not hasattr(model, "curves"):
             raise SceneError(f"Recorder: the model is {type(model).__name__}; give what scene.build() returns")
         every, block = arguments.count("Recorder: every", every), arguments.count("Recorder: block", block)
+        for name, value in {"usd": usd, "hdf5": hdf5, "tube": tube, "resume": resume, "force": force}.items():
+            arguments.flag(f"Recorder: {name}", value)
+        for name, value in {"velocities": velocities, "directors": directors, "contacts": contacts}.items():
+            arguments.flag(f"Recorder: {name}", value)
         if fps is not None:
             arguments.positive("Recorder: fps", fps, "1/s")
+        if time is not None:
+            arguments.choice("Recorder: time", time, TIMES)
         if resume and not hdf5:
             raise ValueError("a run resumes from its trajectory.h5: leave hdf5=True, or start again with resume=False")
-        self.directory = Path(directory)
-        self._model, self._every = model, every
-        self._calls, self._last = 0, None
+        self._model, self._every, self._given_fps = model, every, fps
+        self._calls, self._frame, self._last, self._names, self._checkpoint = 0, 0, None, None, None
         self._velocities, self._directors, self._color_by = velocities, directors, color_by
+        self._time = time or "state"
         self._wanted = check_fields(fields)
         if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
             raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
@@ -104,51 +109,79 @@ class Recorder:
             raise ValueError(
                 f"color_by {color_by[0]!r}: surfaces, if there are any, are colored by {', '.join(COLORS)}"
             )
-        self._trajectory = self._scene = self._lock = None
+        for end in color_by[1:] if color_by is not None else ():
+            arguments.number("Recorder: an end of color_by", end)
+        wanted = {"velocities": velocities, "directors": directors, "contacts": contacts}
+        wanted |= {"attributes": checked_attributes(attributes, len(model.curves.counts))}
+        wanted |= {"provenance": checked_notes("provenance", provenance), "control": checked_notes("control", control)}
+        wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
+        wanted["at_cells"] = [name for name in self._wanted if name in CELL_FIELDS]
+        self._trajectory = self._scene = self._held = None
+        self._handed = isinstance(directory, RunDirectory)
+        self._held = directory if self._handed else RunDirectory(directory)
+        self.directory = self._held.path
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            self._lock = lock_directory(self.directory)
             if not (resume or force):
                 refuse_to_replace(self.directory)
-            wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
-            wanted |= {"attributes": attributes, "contacts": contacts}
-            wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
-            wanted["at_cells"] = [name for name in self._wanted if name in CELL_FIELDS]
-            self._open(model, hdf5, usd, resume, block, fps or _fps_of(model, every), tube, wanted)
+            if hdf5:
+                self._open_trajectory(resume, block, wanted, time)
+            if usd:
+                self._open_scene(block, tube, wanted["attributes"])
+            if resume:
+                self._replay()
+            elif force:
+                self._held.clear()
         except BaseException as error:
             self._abandon()
             raise self._told(error) from error
 
-    def _open(self, model, hdf5: bool, usd: bool, resume: bool, block: int, fps: float, tube: bool, wanted) -> None:
-        """Begins both files, or goes on with them."""
-        if hdf5:
-            from ddg_warp.io.hdf5 import TrajectoryReader, TrajectoryWriter
+    def _open_trajectory(self, resume: bool, block: int, wanted: dict, time: str | None) -> None:
+        """Begins the trajectory, or goes on with it and what it has."""
+        from ddg_warp.io.hdf5 import TrajectoryReader, TrajectoryWriter
 
-            path = self.directory / TRAJECTORY
-            if resume:
-                self._trajectory = TrajectoryWriter.resume(path, model, block=block, provenance=wanted["provenance"])
-                self._wanted, self._contacts = tuple(self._trajectory.fields), self._trajectory.contacts
-                with TrajectoryReader(path) as reader:
-                    wanted["attributes"] = reader.attributes
-            else:
-                self._trajectory = TrajectoryWriter(path, model, block=block, **wanted)
-        if usd:
-            from ddg_warp.io.usd import CurvesWriter
+        path = self.directory / TRAJECTORY
+        if not resume:
+            self._trajectory = TrajectoryWriter(path, self._model, block=block, time=self._time, **wanted)
+            return
+        with TrajectoryReader(path) as reader:
+            self._refuse_more(reader, wanted, time)
+            wanted["attributes"], self._names = reader.attributes, reader.series.keys()
+        self._trajectory = TrajectoryWriter.resume(path, self._model, block=block, provenance=wanted["provenance"])
+        self._wanted, self._contacts = tuple(self._trajectory.fields), self._trajectory.contacts
+        self._velocities, self._directors = (name in reader.recorded for name in ("velocities", "directors"))
+        self._time, self._checkpoint = reader.time_is, self._trajectory.checkpoint
 
-            shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
-            self._scene = CurvesWriter(
-                self.directory / SCENE,
-                shapes,
-                fps=fps,
-                tube=tube,
-                block=block,
-                color_by=self._color_by,
-                attributes=wanted["attributes"],
-                obstacles=model.obstacles,
-                touching=model.touching if self._contacts else None,
+    def _refuse_more(self, reader, wanted: dict, time: str | None) -> None:
+        """Raises a ValueError where what a run is to go on with is not what it has."""
+        asked = [name for name in ("velocities", "directors", "contacts") if wanted[name]] + list(self._wanted)
+        found = {*reader.recorded, *reader.fields, *(["contacts"] if reader.contacts is not None else [])}
+        if missing := [name for name in asked if name not in found]:
+            raise ValueError(
+                f"{reader.path} has no {missing[0]}, and a resumed run goes on with what it has: leave {missing[0]} out, or record "
+                "the run anew"
             )
-        if resume:
-            self._replay()
+        if time not in (None, reader.time_is):
+            raise ValueError(
+                f"{reader.path} has time={reader.time_is!r}, not {time!r}: leave it out, or record the run anew"
+            )
+        if wanted["attributes"] and not _same_attributes(wanted["attributes"], reader.attributes):
+            raise ValueError(f"{reader.path} has other attributes: leave them out, or record the run anew")
+
+    def _open_scene(self, block: int, tube: bool, attributes: Mapping) -> None:
+        from ddg_warp.io.usd import CurvesWriter
+
+        model = self._model
+        self._scene = CurvesWriter(
+            self.directory / SCENE,
+            Shapes.of(model.curves, model.surfaces, model.worlds),
+            fps=self._given_fps or (_fps_of(model, self._every) if self._time == "state" else 1.0),
+            tube=tube,
+            block=block,
+            color_by=self._color_by,
+            attributes=attributes,
+            obstacles=model.obstacles,
+            touching=model.touching if self._contacts else None,
+        )
 
     def __enter__(self) -> Recorder:
         return self
@@ -158,20 +191,27 @@ class Recorder:
             return  # closed already
         self.close()
 
-    def record(self, state, observed: Mapping[str, float] | None = None) -> None:
+    def record(
+        self,
+        state,
+        observed: Mapping[str, float] | None = None,
+        counts: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
         """Takes note of a state, to be called once for the first state and once after every step.
 
-        A state no later than the last recorded one, as the first of a resumed run is, is passed over.
+        The first state of a resumed run may be that of its checkpoint, which is recorded already and passed over.
 
         Args:
             state: The state; it is only read.
-            observed: Numbers measured of it, by name; the same names at every call.
+            observed: Finite numbers measured of it, by name; the same names at every call.
+            counts: What the run has counted up to this state, by name; kept with the checkpoint, see `TrajectoryReader.run_counts`.
 
         Raises:
-            ValueError: The recorder is closed, or the state is of another model.
+            ValueError: The recorder is closed, the state is of another model or not later than the one before, or what was
+                observed is no finite number or has other names than before. Nothing of the call is recorded then.
             RecordError: The disk is full, or fails; the recorder is closed then.
         """
-        if self._lock is None:
+        if self._held is None:
             raise ValueError(
                 f"the recorder of {self.directory} is closed: record before close(), or open another with resume=True"
             )
@@ -180,28 +220,56 @@ class Recorder:
                 f"record: {state!r} is no state of the recorded model; give one that this model made, or make a Recorder for "
                 "its model, in a directory of its own"
             )
-        if self._last is not None and state.time <= self._last:
+        observed = checked_observed(observed, self._names)
+        if self._passes_over(state):
             return
+        self._names = observed.keys()
         due = self._calls % self._every == 0
         self._calls += 1
         if not due:
             return
-        self._last = state.time
+        time = state.time if self._time == "state" else float(self._frame)
+        self._frame += 1
         try:
             fields = self._fields_of(state)
             contacts = self._model.contacts(state) if self._contacts else None
             if self._trajectory is not None:
-                self._trajectory.append(state, observed, fields, contacts)
+                self._trajectory.append(state, observed, fields, contacts, counts, time)
             if self._scene is not None:
                 velocities = state.velocities() if self._velocities else None
                 if self._directors:
                     shape = (self._model.worlds, np.shape(state.points())[-2])
                     fields = fields | {"director": directors_at_points(self._model.curves, state.directors(), shape)}
                 others = (state.obstacle_points(), contacts)
-                self._show(state.time, state.points(), velocities, fields | self._colors(state), *others)
+                self._show(time, state.points(), velocities, fields | self._colors(state), *others)
         except OSError as error:
             self._abandon()
             raise self._told(error) from error
+
+    def _passes_over(self, state) -> bool:
+        """Whether a state is the checkpoint that a run is resumed from.
+
+        Raises:
+            SceneError: It is not later than the last.
+        """
+        if self._time == "frame":
+            return False
+        checkpoint, self._checkpoint = self._checkpoint, None
+        time = arguments.number("record: the time of the state", state.time)
+        if self._last is None or time > self._last:
+            self._last = time
+            return False
+        if checkpoint is not None and time == self._last:
+            if _is(state, checkpoint):
+                return True
+            raise SceneError(
+                f"record: a state at {time:g} s, where {self.directory} was recorded up to, but not the state of its checkpoint: go on "
+                "from model.restore(reader.checkpoint()), of a TrajectoryReader"
+            )
+        raise SceneError(
+            f"record: a state at {time:g} s follows one at {self._last:g} s; record states in the order of their times, each once, or "
+            'number them with Recorder(..., time="frame") where they are no motion'
+        )
 
     def close(self) -> None:
         """Writes what is left and closes the files; a second call does nothing."""
@@ -219,28 +287,32 @@ class Recorder:
         if self._scene is not None:
             self._scene.abandon()
         self._trajectory = self._scene = None
-        if self._lock is not None:
-            (self.directory / LOCK).unlink(missing_ok=True)
-            os.close(self._lock)  # which unlocks it
-            self._lock = None
+        if self._held is not None and not self._handed:
+            self._held.close()
+        self._held = None
 
     def _told(self, error: BaseException) -> BaseException:
         """The error, or for one of the disk what is lost, what is kept and what to do."""
         if not isinstance(error, OSError) or isinstance(error, FileExistsError | RecordError) or error.errno is None:
             return error
-        told = RecordError(
-            f"{self.directory}: {error.strerror}: the run cannot be recorded any further. Its complete blocks of frames are "
-            "kept: free some space and resume it, or write to another disk"
+        kept = "the run cannot be recorded any further. "
+        kept += (
+            "Its complete blocks of frames are kept: "
+            if error.errno in FULL
+            else "What was complete is kept where it is; "
         )
-        told.errno = error.errno
-        return told
+        return told(self.directory, error, kept)
 
     def _replay(self) -> None:
         """Brings scene and counters to where the trajectory ends."""
         from ddg_warp.io.hdf5 import TrajectoryReader
 
         with TrajectoryReader(self.directory / TRAJECTORY) as reader:
-            self._calls, self._last = 1, reader.time[-1]  # the checkpoint's state was the first call of a period
+            self._calls, self._frame, self._last = (
+                1,
+                len(reader),
+                reader.time[-1],
+            )  # the last state was the first of a period
             for frame in range(len(reader) if self._scene is not None else 0):
                 velocities = reader.velocities[frame] if self._velocities and reader.velocities is not None else None
                 fields = {name: values[frame] for name, values in reader.fields.items()}
@@ -296,6 +368,100 @@ class Recorder:
             obstacles=None if obstacles is None else np.reshape(obstacles, (-1, 3)),
             contacts=contacts,
         )
+
+
+def checked_observed(observed, names=None) -> dict[str, float]:
+    """What was observed of a state, as numbers by name.
+
+    Args:
+        observed: Given by the user; None for nothing.
+        names: Those of the states before; None of the first.
+
+    Raises:
+        SceneError: A value is no finite number, or a name cannot be that of a series or was not there before.
+    """
+    if observed is not None and not isinstance(observed, Mapping):
+        raise SceneError(f"observed is {type(observed).__name__}; give numbers by name, such as {{'tip': 0.1}}")
+    found = {}
+    for name, value in (observed or {}).items():
+        _check_name("observed", name)
+        found[name] = arguments.number(f"observed {name!r}", value)
+    if names is not None and found.keys() != set(names):
+        raise SceneError(
+            f"observed {sorted(found)}, before {sorted(names)}; give the same names at every call, or record the run anew"
+        )
+    return found
+
+
+def checked_attributes(attributes, count: int) -> dict[str, np.ndarray]:
+    """Values of each of so many rods by name, finite numbers or texts.
+
+    Raises:
+        SceneError, CurveError: They are something else.
+    """
+    if attributes is not None and not isinstance(attributes, Mapping):
+        raise SceneError(f"attributes are {type(attributes).__name__}; give values of each rod by name")
+    found = {}
+    for name, given in (attributes or {}).items():
+        _check_name("attributes", name)
+        try:
+            values = np.asarray(given)
+        except ValueError:
+            values = np.zeros((0, 0))
+        if values.shape != (count,):
+            found = f"{len(values)} values" if values.ndim == 1 else f"values of shape {values.shape}"
+            raise CurveError(f"attribute {name!r} has {found} for {count} rods; give one a rod")
+        texts = values.dtype.kind in "UO" and all(isinstance(value, str) and _is_text(value) for value in values)
+        numbers = values.dtype.kind in "biuf" and values.dtype.itemsize <= 8 and np.isfinite(values).all()
+        if not (texts or numbers):
+            raise SceneError(f"attribute {name!r} is of {values.dtype}: {given!r:.60}; give finite numbers or texts")
+        found[name] = values
+    return found
+
+
+def checked_notes(what: str, notes) -> dict:
+    """What is to be stored with a trajectory, by name.
+
+    Raises:
+        SceneError: It cannot be.
+    """
+    if notes is not None and not isinstance(notes, Mapping):
+        raise SceneError(f"{what} is {type(notes).__name__}; give values by name")
+    for name, value in (notes or {}).items():
+        _check_name(what, name)
+        try:
+            text = value if isinstance(value, str) else json.dumps(value, default=str)
+        except (TypeError, ValueError, RecursionError, OverflowError) as error:
+            raise SceneError(
+                f"{what} {name!r} cannot be stored ({error}); give text, numbers, or lists and dicts of them"
+            ) from error
+        if not _is_text(text):
+            raise SceneError(f"{what} {name!r} is no text of Unicode without zeros: {value!r:.60}; correct it")
+    return dict(notes or {})
+
+
+def _check_name(what: str, name) -> None:
+    """Raises a SceneError where a name cannot be that of a dataset."""
+    if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or not _is_text(name):
+        raise SceneError(f"{what}: {name!r} is no name; give a text that is not empty and has no slash")
+
+
+def _is_text(text: str) -> bool:
+    """Whether HDF5 can store a text."""
+    return "\0" not in text and text.encode(errors="replace") == text.encode(errors="surrogatepass")
+
+
+def _is(state, checkpoint: Mapping[str, np.ndarray]) -> bool:
+    """Whether a state is that of a checkpoint, bit by bit."""
+    found = {name: np.asarray(value) for name, value in state.snapshot().items()}
+    return found.keys() == checkpoint.keys() and all(
+        found[name].shape == value.shape and found[name].tobytes() == value.tobytes()
+        for name, value in checkpoint.items()
+    )
+
+
+def _same_attributes(one: Mapping, other: Mapping) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
 def _others(reader, frame: int) -> tuple[np.ndarray | None, Contacts | None]:
