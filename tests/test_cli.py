@@ -173,6 +173,125 @@ def test_a_run_is_kept_unless_forced(fall, capsys):
     assert len(points("out/fall")) == 6
 
 
+def without_clocks(directory) -> dict:
+    clocks = ("wall_time", "compile_time", "ms_per_step")
+    return {name: value for name, value in summary(directory).items() if name not in clocks}
+
+
+def test_the_summary_of_a_resumed_run_is_of_the_whole(fall):
+    """Every number but those of clocks is that of the run in one piece."""
+    assert fall("run", "--out", "straight") == 0
+    assert fall("run", "--out", "parts", "--duration", "0.02") == 0
+    assert fall("run", "--resume", "parts", "--duration", "0.05") == 0
+    assert without_clocks("parts") == without_clocks("straight")
+
+
+def test_a_finished_run_is_left_as_it_is(fall, tmp_path, capsys):
+    """It says so and how to go on; a duration that would cut the run changes nothing either."""
+    assert fall("run", "--duration", "0.03") == 0
+    before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in (tmp_path / "out/fall").iterdir()}
+    capsys.readouterr()
+    assert fall("run", "--resume", "out/fall") == 0
+    assert (
+        "is finished, at 0.03 s, and stays as it is; to go on with it give a longer --duration"
+        in capsys.readouterr().out
+    )
+    assert fall("run", "--resume", "out/fall", "--duration", "0.02") == 2
+    assert "a duration of 0.02 s would cut it: give a longer one" in capsys.readouterr().err
+    assert before == {
+        path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in (tmp_path / "out/fall").iterdir()
+    }
+
+
+def test_a_run_killed_before_its_summary_gets_one(fall, tmp_path, monkeypatch):
+    """Its frames are complete: resumed, it is judged, summarised and drawn, and no step is taken."""
+    import ddg_warp.run.cli
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    assert fall("run", "--out", "straight") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(ddg_warp.run.cli, "judged", killed)
+        assert fall("run") == 130
+    assert not (tmp_path / "out/fall/summary.json").exists()
+    assert fall("run", "--resume", "out/fall") == 0
+    assert without_clocks("out/fall") == without_clocks("straight")
+    assert (tmp_path / "out/fall/picture.png").exists()
+
+
+def test_a_run_is_alone_until_it_is_drawn(fall, tmp_path, monkeypatch, capsys):
+    """Another one with --force, while the first draws, is refused, and the first ends well."""
+    import ddg_warp.run.cli
+
+    draw, codes = ddg_warp.run.cli.draw, []
+
+    def meanwhile(*arguments):
+        if not codes:
+            codes.append(fall("run", "--force", "--n", "5"))
+        draw(*arguments)
+
+    monkeypatch.setattr(ddg_warp.run.cli, "draw", meanwhile)
+    assert fall("run") == 0
+    assert codes == [2] and "is recording a run there; wait for its end" in capsys.readouterr().err
+    assert points("out/fall").shape == (6, 4, 3) and summary()["parameters"]["n"] == 4
+    assert not (tmp_path / "out/fall/run.lock").exists()
+
+
+def test_force_leaves_nothing_of_the_run_before(fall, tmp_path, monkeypatch):
+    """Killed meanwhile, the new run has no summary and no picture of the old one beside it."""
+    import ddg_warp.run.simulate
+
+    assert fall("run") == 0
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ddg_warp.run.simulate, "advance", killed)
+    assert fall("run", "--force") == 130
+    assert {path.name for path in (tmp_path / "out/fall").iterdir()} == {
+        "trajectory.h5",
+        "trajectory.vtkhdf",
+        "scene.usdc",
+    }
+
+
+def test_pictures_and_summary_do_not_follow_links(fall, tmp_path):
+    (tmp_path / "other").write_text("precious")
+    (tmp_path / "out/fall").mkdir(parents=True)
+    for name in ("summary.json", "picture.png"):
+        (tmp_path / "out/fall" / name).symlink_to(tmp_path / "other")
+    assert fall("run") == 0
+    assert (tmp_path / "other").read_text() == "precious"
+    assert summary()["steps"] == 5
+
+
+def test_a_cache_that_cannot_be_written_to_is_named(fall, monkeypatch, capsys):
+    """With what helps: another place for the compiled kernels."""
+    import ddg_warp.run.cli
+
+    def read_only(_):
+        raise OSError(30, "Read-only file system", "/root/.cache")
+
+    monkeypatch.setattr(ddg_warp.run.cli, "require_device", read_only)
+    assert fall("run") == 2
+    assert "/root/.cache: Read-only file system: " in (said := capsys.readouterr().err) and "WARP_CACHE_PATH" in said
+
+
+@pytest.mark.parametrize("place", ["/proc/x.usda", "file/x.usda", "{}/x.usda".format("a" * 300)])
+def test_a_place_that_cannot_be_written_to_is_named(place, fall, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert fall("run") == 0
+    assert main(["export", "out/fall", "--to", place]) == 2
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert told.startswith(f"ddg-warp: {place}: ") and "give" in told and "room" not in told and "Errno" not in told
+    assert fall("run", "--out", "file") == 2
+    assert "file is a file" in capsys.readouterr().err
+    assert fall("run", "--force", "--json", "file/x.json") == 2
+    assert "file/x.json: " in capsys.readouterr().err
+    assert summary()["steps"] == 5
+
+
 def test_a_run_in_progress_is_left_alone(fall, capsys):
     """Another process records there: it is named, whatever was asked for."""
     import ddg_warp as ddg

@@ -123,7 +123,12 @@ class CurvesWriter:
             obstacles: Nodes of obstacles that something moves [m], shape (M, 3), world after world.
             contacts: What touches.
         """
-        code = Usd.TimeCode(round(time * self._fps, 6))
+        code = Usd.TimeCode(float(f"{time * self._fps:.12g}"))  # of whole numbers, as frames have
+        if self._frames and code.GetValue() <= self._stage.GetEndTimeCode():
+            raise CurveError(
+                f"{self.path}: a frame at {time} s has no later time code than the one before, at {self._fps} a second; write frames "
+                "in the order of their times, with a larger fps"
+            )
         frame = Frame(points, velocities, scalars or {}, triangle_scalars or {}, obstacles, contacts)
         for prim in self._prims:
             prim.write(code, frame)
@@ -142,6 +147,7 @@ class CurvesWriter:
         """
         self._save_stage(copies=1)
         copy = self.path.with_name(f"{self.path.stem}.copy{self.path.suffix}")
+        copy.unlink(missing_ok=True)
         try:
             shutil.copyfile(self._partial, copy)
             os.replace(copy, self.path)
@@ -155,7 +161,10 @@ class CurvesWriter:
         if self._stage is not None:
             self._save_stage(copies=0)
             self._prims, self._stage = [], None
-            os.replace(self._partial, self.path)
+            try:
+                os.replace(self._partial, self.path)
+            finally:
+                self._partial.unlink(missing_ok=True)
 
     def abandon(self) -> None:
         """Lets go of the stage; the final file keeps the frames saved last."""
@@ -194,13 +203,17 @@ def _size_of_defaults(stage: Usd.Stage) -> int:
 
 
 def _take_room(path: Path, size: int) -> None:
-    """Raises an OSError where no file of so many bytes fits beside `path`."""
+    """Raises an OSError, of `path`, where no file of so many bytes fits beside it."""
     trial = path.with_name(f"{path.stem}.room{path.suffix}")
     try:
-        with open(trial, "wb") as file:
-            os.posix_fallocate(file.fileno(), 0, size)
-    finally:
         trial.unlink(missing_ok=True)
+        try:
+            with open(trial, "xb") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+        finally:
+            trial.unlink(missing_ok=True)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from error
 
 
 def _drawable(curves) -> Shapes:

@@ -4,7 +4,7 @@ Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was aske
 """
 
 import argparse
-import errno
+import json
 import os
 import shlex
 import sys
@@ -24,9 +24,9 @@ from ddg_warp.run.catalog import (
     scene_name,
     stored_settings,
 )
+from ddg_warp.run.run_directory import FULL, PICTURES, SUMMARY, RunDirectory, refuse_to_replace, told
 
 DONE, FAILED, MISTAKE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what a disk may come to while a run writes to it
 PRECISIONS = ("float64", "mixed", "float32")
 
 
@@ -52,11 +52,23 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
     except (InputError, OSError) as error:
-        print(f"ddg-warp: {error}", file=sys.stderr)
+        print(f"ddg-warp: {_of_a_place(error)}", file=sys.stderr)
         return FAILED if getattr(error, "errno", None) in FULL else MISTAKE
     except KeyboardInterrupt:
         print("\nddg-warp: interrupted; what was recorded is kept", file=sys.stderr)
         return INTERRUPTED
+
+
+def _of_a_place(error: Exception) -> Exception:
+    """The error, or for one of the system the place that it is about and what to do."""
+    if not isinstance(error, OSError) or isinstance(error, ValueError) or error.filename is None:
+        return error
+    if "warp" in Path(os.fsdecode(error.filename)).parts or ".cache" in Path(os.fsdecode(error.filename)).parts:
+        return InputError(
+            f"{os.fsdecode(error.filename)}: {error.strerror}: kernels are compiled into a directory that can be written to; name one "
+            "by the variable WARP_CACHE_PATH"
+        )
+    return told(os.fsdecode(error.filename), error)
 
 
 def parser(arguments: list[str]) -> Parser:
@@ -150,29 +162,60 @@ def run_scene(chosen: argparse.Namespace) -> int:
     from ddg_warp.run.simulate import simulate
     from ddg_warp.run.summary import summary, write_json
 
-    scene = built(module, name, settings)
     directory = chosen.resume or chosen.out or Path("out") / name
-    with refused():
-        result = simulate(
-            scene,
-            device=chosen.device,
-            out=directory,
-            duration=chosen.duration,
-            resume=chosen.resume,
-            force=chosen.force,
-            fields=[name for name in (chosen.fields or "").split(",") if name],
-            observe=getattr(module, "observe", None),
-            provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
-            **run_settings,
-        )
-    checks = judged(module, result)
-    content = summary(name, settings, result, checks)
-    for path in filter(None, (directory / "summary.json", chosen.json)):
-        write_json(path, content)
-    if result.times:
-        draw(directory, module, result)
+    if chosen.resume is not None:
+        if chosen.force:
+            raise InputError("--resume goes on with a run, and --force replaces it: give one of them")
+        if ended := finished(directory, chosen.duration):
+            print(ended)
+            return DONE
+    scene = built(module, name, settings)
+    with RunDirectory(directory) as held:
+        if chosen.resume is None and not chosen.force:
+            refuse_to_replace(held.path)
+        with refused():
+            result = simulate(
+                scene,
+                device=chosen.device,
+                out=held,
+                duration=chosen.duration,
+                resume=held if chosen.resume is not None else None,
+                force=chosen.force,
+                fields=[name for name in (chosen.fields or "").split(",") if name],
+                observe=getattr(module, "observe", None),
+                provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
+                **run_settings,
+            )
+        checks = judged(module, result)
+        content = summary(name, settings, result, checks)
+        write_json(directory / SUMMARY, content)
+        if result.times:
+            draw(directory, module, result)
+        if chosen.json is not None:
+            write_json(chosen.json, content)
     say(result, content, checks, directory)
     return FAILED if result.failure or any(check.failed for check in checks) else DONE
+
+
+def finished(directory: Path, duration: float | None) -> str:
+    """What is said of a run that has reached its end, `duration` [s] or by default its own, and of which the summary is written.
+
+    Raises:
+        InputError: There is no run in the directory.
+    """
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    with refused(), TrajectoryReader(directory / "trajectory.h5") as reader:
+        end = float(reader.time[-1]) if len(reader) else 0.0
+        goal = reader.provenance.get("duration", end) if duration is None else duration
+        dt = reader.provenance["dt"]
+    try:
+        told_of = json.loads((directory / SUMMARY).read_text())["sim_time"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return ""
+    if abs(end - goal) > 0.5 * dt or told_of != end:
+        return ""
+    return f"the run in {directory} is finished, at {end:g} s, and stays as it is; to go on with it give a longer --duration"
 
 
 def built(module, name: str, settings: dict):
@@ -229,6 +272,11 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         f"{content['scene']}: {content['sim_time']:g} s in {steps}; "
         f"{content['wall_time']:.3g} s in all, {content['compile_time']:.3g} s to build and compile"
     )
+    if "counted_from" in content:
+        print(
+            f"counts and times are of the steps after {content['counted_from']:g} s: the file that was resumed does not say what was "
+            "counted before, nor the energy at the start"
+        )
     if "contact" in content:
         print(contact_line(content["contact"]))
     if "stable" in content:
@@ -260,6 +308,9 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         return
     from ddg_warp.io.hdf5 import TrajectoryReader
 
+    for path in (directory / name for name in PICTURES):
+        if path.is_symlink():
+            path.unlink()  # what it points to is not of this run
     title, unit = one_liner(Path(module.__file__)), getattr(module, "LENGTH_UNIT", "m")
     with TrajectoryReader(directory / "trajectory.h5") as reader:
         chosen = sorted({round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)})
@@ -361,9 +412,12 @@ def export_run(chosen: argparse.Namespace) -> int:
     target = chosen.to or chosen.directory / "export.usdc"
     if target.suffix not in (".usda", ".usdc"):
         raise InputError(f"--to {target}: the file must end in .usdc or .usda")
-    target.parent.mkdir(parents=True, exist_ok=True)
     if chosen.revolve and chosen.revolve < 3:
         raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise told(target, error) from error
     with refused():
         export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")

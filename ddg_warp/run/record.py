@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
 from ddg_warp.errors import SceneError
-from ddg_warp.io import CurveError, Shapes
+from ddg_warp.io import Shapes
 from ddg_warp.io.contacts import Contacts
+from ddg_warp.run.observed import checked_attributes, checked_notes, checked_observed
 from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, RecordError, RunDirectory, refuse_to_replace, told
 
 DEFAULT_FPS = 24.0
+LEAST_DT = 1e-300  # s, whose inverse is finite
 COLORS = ("strain", "curvature", "energy")
 TIMES = ("state", "frame")
 
@@ -50,6 +51,8 @@ class Recorder:
         resume: Whether to go on after the last complete block of DIR/trajectory.h5, with the fields that it has; the scene is written
             anew from it.
         force: Whether to replace a run that DIR holds already, with its summary and pictures.
+        counts: Asked with every recorded state: what the run has counted up to it, arrays by name, kept with the checkpoint; see
+            `TrajectoryReader.run_counts`.
 
     Raises:
         ValueError: An option is no such option, or the run to resume is of another model or has not the fields asked for.
@@ -79,6 +82,7 @@ class Recorder:
         control: Mapping | None = None,
         resume: bool = False,
         force: bool = False,
+        counts: Callable[[], Mapping[str, np.ndarray]] | None = None,
     ):
         if not hasattr(model, "curves"):
             raise SceneError(f"Recorder: the model is {type(model).__name__}; give what scene.build() returns")
@@ -96,7 +100,7 @@ class Recorder:
         self._model, self._every, self._given_fps = model, every, fps
         self._calls, self._frame, self._last, self._names, self._checkpoint = 0, 0, None, None, None
         self._velocities, self._directors, self._color_by = velocities, directors, color_by
-        self._time = time or "state"
+        self._time, self._counts = time or "state", counts
         self._wanted = check_fields(fields)
         if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
             raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
@@ -191,12 +195,7 @@ class Recorder:
             return  # closed already
         self.close()
 
-    def record(
-        self,
-        state,
-        observed: Mapping[str, float] | None = None,
-        counts: Mapping[str, np.ndarray] | None = None,
-    ) -> None:
+    def record(self, state, observed: Mapping[str, float] | None = None) -> None:
         """Takes note of a state, to be called once for the first state and once after every step.
 
         The first state of a resumed run may be that of its checkpoint, which is recorded already and passed over.
@@ -204,7 +203,6 @@ class Recorder:
         Args:
             state: The state; it is only read.
             observed: Finite numbers measured of it, by name; the same names at every call.
-            counts: What the run has counted up to this state, by name; kept with the checkpoint, see `TrajectoryReader.run_counts`.
 
         Raises:
             ValueError: The recorder is closed, the state is of another model or not later than the one before, or what was
@@ -234,7 +232,7 @@ class Recorder:
             fields = self._fields_of(state)
             contacts = self._model.contacts(state) if self._contacts else None
             if self._trajectory is not None:
-                self._trajectory.append(state, observed, fields, contacts, counts, time)
+                self._trajectory.append(state, observed, fields, contacts, self._counts and self._counts(), time)
             if self._scene is not None:
                 velocities = state.velocities() if self._velocities else None
                 if self._directors:
@@ -370,87 +368,6 @@ class Recorder:
         )
 
 
-def checked_observed(observed, names=None) -> dict[str, float]:
-    """What was observed of a state, as numbers by name.
-
-    Args:
-        observed: Given by the user; None for nothing.
-        names: Those of the states before; None of the first.
-
-    Raises:
-        SceneError: A value is no finite number, or a name cannot be that of a series or was not there before.
-    """
-    if observed is not None and not isinstance(observed, Mapping):
-        raise SceneError(f"observed is {type(observed).__name__}; give numbers by name, such as {{'tip': 0.1}}")
-    found = {}
-    for name, value in (observed or {}).items():
-        _check_name("observed", name)
-        found[name] = arguments.number(f"observed {name!r}", value)
-    if names is not None and found.keys() != set(names):
-        raise SceneError(
-            f"observed {sorted(found)}, before {sorted(names)}; give the same names at every call, or record the run anew"
-        )
-    return found
-
-
-def checked_attributes(attributes, count: int) -> dict[str, np.ndarray]:
-    """Values of each of so many rods by name, finite numbers or texts.
-
-    Raises:
-        SceneError, CurveError: They are something else.
-    """
-    if attributes is not None and not isinstance(attributes, Mapping):
-        raise SceneError(f"attributes are {type(attributes).__name__}; give values of each rod by name")
-    found = {}
-    for name, given in (attributes or {}).items():
-        _check_name("attributes", name)
-        try:
-            values = np.asarray(given)
-        except ValueError:
-            values = np.zeros((0, 0))
-        if values.shape != (count,):
-            found = f"{len(values)} values" if values.ndim == 1 else f"values of shape {values.shape}"
-            raise CurveError(f"attribute {name!r} has {found} for {count} rods; give one a rod")
-        texts = values.dtype.kind in "UO" and all(isinstance(value, str) and _is_text(value) for value in values)
-        numbers = values.dtype.kind in "biuf" and values.dtype.itemsize <= 8 and np.isfinite(values).all()
-        if not (texts or numbers):
-            raise SceneError(f"attribute {name!r} is of {values.dtype}: {given!r:.60}; give finite numbers or texts")
-        found[name] = values
-    return found
-
-
-def checked_notes(what: str, notes) -> dict:
-    """What is to be stored with a trajectory, by name.
-
-    Raises:
-        SceneError: It cannot be.
-    """
-    if notes is not None and not isinstance(notes, Mapping):
-        raise SceneError(f"{what} is {type(notes).__name__}; give values by name")
-    for name, value in (notes or {}).items():
-        _check_name(what, name)
-        try:
-            text = value if isinstance(value, str) else json.dumps(value, default=str)
-        except (TypeError, ValueError, RecursionError, OverflowError) as error:
-            raise SceneError(
-                f"{what} {name!r} cannot be stored ({error}); give text, numbers, or lists and dicts of them"
-            ) from error
-        if not _is_text(text):
-            raise SceneError(f"{what} {name!r} is no text of Unicode without zeros: {value!r:.60}; correct it")
-    return dict(notes or {})
-
-
-def _check_name(what: str, name) -> None:
-    """Raises a SceneError where a name cannot be that of a dataset."""
-    if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or not _is_text(name):
-        raise SceneError(f"{what}: {name!r} is no name; give a text that is not empty and has no slash")
-
-
-def _is_text(text: str) -> bool:
-    """Whether HDF5 can store a text."""
-    return "\0" not in text and text.encode(errors="replace") == text.encode(errors="surrogatepass")
-
-
 def _is(state, checkpoint: Mapping[str, np.ndarray]) -> bool:
     """Whether a state is that of a checkpoint, bit by bit."""
     found = {name: np.asarray(value) for name, value in state.snapshot().items()}
@@ -478,13 +395,35 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         fps: Time codes per second; by default one time code a frame.
         tube: Whether to write tubes instead of curves.
         revolve: Sides of the surfaces that the curves of the first world, meridians, sweep around z; 0 for none.
+
+    Raises:
+        ValueError: The trajectory cannot be read or has no frames, or an option is no such option.
+        RecordError: The file cannot be written.
     """
+    if fps is not None:
+        arguments.positive("export_usd: fps", fps, "1/s")
+    if arguments.count("export_usd: revolve", revolve, 0) in (1, 2):
+        raise SceneError(
+            f"export_usd: revolve = {revolve}; a surface of revolution has 3 sides at least, or 0 for none"
+        )
+    arguments.flag("export_usd: tube", tube)
+    try:
+        _export(trajectory, path, fps, tube, revolve)
+    except OSError as error:
+        if isinstance(error, ValueError) or error.errno is None:
+            raise
+        raise told(path, error) from error
+
+
+def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> None:
     from ddg_warp.io.hdf5 import TrajectoryReader
     from ddg_warp.io.revolve import Revolution
     from ddg_warp.io.usd import CurvesWriter
 
     with TrajectoryReader(trajectory) as reader:
         worlds = int(np.prod(reader.points.shape[1:-2]))
+        if not len(reader):
+            raise SceneError(f"{trajectory} has no frames; export a run that wrote a block")
         spacing = np.median(np.diff(reader.time)) if len(reader) > 1 else 1.0 / DEFAULT_FPS
         shapes = Shapes.of(reader.curves, reader.surfaces, worlds)
         count = int(np.sum(reader.curves.counts))
@@ -493,7 +432,7 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         shapes = turned.shapes if turned else shapes
         given = {"obstacles": reader.obstacles, "touching": reader.touching if reader.contacts is not None else None}
         given = {} if turned else given | {"attributes": reader.attributes}
-        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube, **given) as writer:
+        with CurvesWriter(path, shapes, fps=fps or frame_rate(spacing), tube=tube, **given) as writer:
             shape = (worlds, reader.points.shape[-2])
             for frame, time in enumerate(reader.time):
                 points = reader.points[frame].reshape(-1, 3)
@@ -511,7 +450,12 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
                 writer.write(time, points, velocities=velocities, scalars=directors, obstacles=nodes, contacts=contacts)
 
 
+def frame_rate(dt: float) -> float:
+    """Time codes per second, one a frame of dt [s]: to nine digits, so that frames have whole numbers."""
+    return float(f"{1.0 / max(dt, LEAST_DT):.9g}")
+
+
 def _fps_of(model, every: int) -> float:
     """One time code a frame where the scene's analysis has a time step."""
     dt = getattr(getattr(model.scene, "analysis", None), "dt", None)
-    return round(1.0 / (every * dt), 6) if dt else DEFAULT_FPS
+    return frame_rate(every * dt) if dt else DEFAULT_FPS

@@ -1,19 +1,27 @@
 """Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ddg_warp import arguments
 from ddg_warp.errors import SolverError
-from ddg_warp.run.catalog import InputError
+from ddg_warp.run.catalog import RUN_SETTINGS, InputError
+from ddg_warp.run.observed import checked_observed
 from ddg_warp.run.progress import progress_bar
 from ddg_warp.scene.descriptions import Dynamics, Statics
 from ddg_warp.scene.scene import Scene
+
+MOST_STEPS = 2**53  # that are told apart
 
 
 @dataclass(repr=False)
@@ -27,12 +35,15 @@ class Result:
         times: Time of each recorded state [s], the initial one first; in statics, the load
             parameter; along a path, the arc length.
         series: Observed values by name, one a recorded state.
-        statistics: `integrator.statistics()`, and the like of a static run.
-        energies: Energies by term [J] at "start" and "end".
+        statistics: `integrator.statistics()`, and the like of a static run; of a resumed run from its first state on.
+        energies: Energies by term [J] at "start" and "end"; None at the start of a run whose counts are not known from there on.
         dt: Time step [s]; None in statics.
-        step_times: Time that each step of this run took [s], by the clock of the run; the first includes compilation.
-        wall_time: Time from the scene to the end [s].
-        compile_time: Time from the scene to the end of the first step, less a steady step [s].
+        step_times: Time that each step of this run took [s], by the clock of the run; the first includes compilation. Of a resumed
+            run, of the steps since it was resumed.
+        wall_time: Time from the scene to the end [s]; of a resumed run, of all its parts.
+        compile_time: Time from the scene to the end of the first step, less a steady step [s]; of a resumed run, of all its parts.
+        counted_from: Time [s] from which statistics and times count, where they are not known from the first state on: the run was
+            resumed from a file that does not have them.
         failure: Why the run ended early; empty where it did not.
         outcome: "converged", or the name of the outcome that ended the run early.
         path: The path of equilibria that was followed, if that was the analysis (`ddg_warp.scene.path.Path`).
@@ -50,6 +61,7 @@ class Result:
     step_times: list[float] = field(default_factory=list)
     wall_time: float = 0.0
     compile_time: float = 0.0
+    counted_from: float | None = None
     failure: str = ""
     outcome: str = "converged"
     path: Any = None
@@ -119,10 +131,11 @@ def simulate(
         device: Warp device; by default CUDA if there is one.
         precision: "float64", "mixed" or "float32"; by default the scene's, else what suits the device.
         worlds: Independent copies.
-        out: Directory for trajectory.h5 and scene.usdc; None records nothing.
+        out: Directory for trajectory.h5 and scene.usdc, or a `RunDirectory`; None records nothing.
         dt: Time step [s] instead of the scene's.
         duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
-        resume: Directory of an earlier run, which this one continues.
+        resume: Directory of an earlier run, which this one continues with its time step, precision, worlds and fields. Nothing is
+            done or written where it has reached its end: then the result is that of the run as it was recorded.
         force: Whether to replace a run that `out` holds already.
         fields: What to record beside positions: "velocities", "directors", "contacts" and the names of `ddg_warp.ask.fields`.
         usd: Whether to record scene.usdc, too.
@@ -136,19 +149,43 @@ def simulate(
         The result; `failure` says why where the run ended early.
 
     Raises:
-        SceneError: The scene cannot be built.
-        InputError: The duration is no whole number of steps, or a static scene is to move.
+        SceneError: The scene cannot be built, or an argument is no such argument.
+        InputError: The duration is no whole number of steps, a static scene is to move, or the run to resume is another one, or
+            has gone on for longer.
     """
     began = time.perf_counter()
     if not isinstance(scene, Scene):
         raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
+    arguments.count("worlds", worlds)
+    for name, value in {"force": force, "usd": usd, "progress": progress}.items():
+        arguments.flag(name, value)
+    for name, value in {"observe": observe, "clock": clock}.items():
+        if value is not None and not callable(value):
+            raise InputError(f"{name} is {value!r}; give a function, or leave it out")
+    for name, value in {"provenance": provenance, "options": options}.items():
+        if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
+            raise InputError(f"{name} is {value!r}; give values by name, or leave it out")
+    if not isinstance(fields, list | tuple | set) or not all(isinstance(name, str) for name in fields):
+        raise InputError(f"fields = {fields!r}; give a list of names, such as ['velocities']")
+    for name, value in {"out": out, "resume": resume}.items():
+        if value is not None and not isinstance(value, str | os.PathLike):
+            raise InputError(f"{name} is {value!r}; give the path of a directory")
     analysis = scene.analysis
     dynamic = isinstance(analysis, Dynamics)
     if not dynamic and (dt, duration, resume) != (None, None, None):
         raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
     if dynamic:
-        dt = analysis.dt if dt is None else dt
-        duration = recorded_duration(resume, analysis.duration) if duration is None else duration
+        stored = {"dt": analysis.dt, "duration": analysis.duration}
+        if resume is not None:
+            if force or (out is not None and Path(out) != Path(resume)):
+                raise InputError(
+                    "a resumed run goes on in its directory, and replaces nothing: leave out `force` and `out`"
+                )
+            asked = {"dt": dt, "precision": precision, "worlds": worlds, "fields": set(fields) or None}
+            stored |= settings_to_resume(Path(resume), asked)
+            precision, fields = stored["precision"], ()
+        dt = stored["dt"] if dt is None else dt
+        duration = stored["duration"] if duration is None else duration
         run, steps = advance, step_count(dt, duration)
     elif isinstance(analysis, Statics):
         run, steps = equilibrate, analysis.load_steps
@@ -156,76 +193,114 @@ def simulate(
         run, steps = follow, analysis.stop.steps
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
-    try:
-        result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
-    except SolverError as error:
-        result = Result(scene, model, model.state(), dt=dt)
-        result.fail(error, "the first state could not be found: ")
-        return result
+    result = Result(scene, model, model.state(), dt=dt)
+    counts: dict[str, np.ndarray] = {}
     if resume is not None:
-        continue_from(result, Path(resume))
-    result.energies["start"] = energies(model, result.state)
+        counts = continue_from(result, Path(resume), duration)
+    elif scene.initial:
+        try:
+            result.state = scene.initial(model)
+        except SolverError as error:
+            result.fail(error, "the first state could not be found: ")
+            return result
+    done = max(0, len(result.times) - 1)
+    earlier = {name: float(counts.get(f"clock/{name}", 0.0)) for name in ("wall", "compile")}
+    counted: Callable[[], dict[str, np.ndarray]] | None = None
+
+    def clocks() -> dict[str, float]:
+        """Wall time so far, and of it that of building and compiling [s], of all parts of the run."""
+        own = max(0.0, result.compile_time - result.seconds_per_step)
+        return {"wall": earlier["wall"] + time.perf_counter() - began, "compile": earlier["compile"] + own}
+
+    def tallied() -> dict[str, np.ndarray]:
+        """What the run has counted so far, to be kept with a checkpoint; nothing where that is not known from its start on."""
+        if counted is None or result.counted_from is not None:
+            return {}
+        start = {f"energy/{name}": np.array(value) for name, value in result.energies["start"].items()}
+        return counted() | start | {f"clock/{name}": np.array(value) for name, value in clocks().items()}
+
     options = dict(options or {})
     with ExitStack() as stack:
         recorder = None
-        if out is not None or resume is not None:
+        if resume is not None and done >= steps:
+            progress = False  # nor is there anything to record
+        elif out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
             attributes |= {"duration": duration} if dynamic else {}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force, fields, usd))
+            given = {"provenance": attributes, "force": force, "fields": fields, "usd": usd, "counts": tallied}
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, **given))
+        if resume is not None:
+            for callback in scene.callbacks:  # parameters that they set by the time are what they were
+                callback(result.state)
+        else:
+            result.energies["start"] = energies(model, result.state)
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
-        done = max(0, len(result.times) - 1)
         bar = stack.enter_context(progress_bar(steps, done, progress))
 
-        def keep(state, **observed) -> None:
+        def keep(state, observed: Mapping | None = None, counts: Callable | None = None) -> None:
+            """Take note of a state, of what was observed of it, and of what `counts()` returns."""
+            nonlocal counted
+            counted = counts
             if len(result.step_times) == 1:
                 result.compile_time = time.perf_counter() - began
                 bar.set_description(refresh=False)
+            found = dict(observed or {}) | checked_observed(None if observe is None else observe(model, state))
+            found = checked_observed(found, result.series.keys() if result.times else None)
             result.state = state
             result.times.append(float(state.time))
-            observed |= {} if observe is None else observe(model, state)
-            for name, value in observed.items():
+            for name, value in found.items():
                 result.series.setdefault(name, []).append(value)
             if recorder is not None:
-                recorder.record(state, observed=observed)
+                recorder.record(state, observed=found)
 
         try:
-            if resume is None and run is not follow:
-                keep(result.state)
-            run(result, steps, keep, options=options, clock=clock or wall_clock(model.device), bar=bar)
+            given = {"options": options, "clock": clock or wall_clock(model.device), "bar": bar}
+            run(result, steps, keep, **given, **({"counts": counts} if dynamic else {}))
         except SolverError as error:
             result.fail(error)
             result.state = error.state if error.state is not None else result.state
-    result.compile_time = max(0.0, result.compile_time - result.seconds_per_step)
+    result.wall_time, result.compile_time = clocks().values()
     result.energies["end"] = energies(model, result.state)
-    result.wall_time = time.perf_counter() - began
     return result
 
 
-def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
-    """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`."""
+def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar, counts: Mapping) -> None:
+    """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`.
+
+    Args:
+        result: Of the run so far.
+        steps: Of the whole run.
+        keep, options, clock, bar: See `simulate`.
+        counts: What the run has counted so far, where it goes on; see `counts_of`.
+    """
+    from ddg_warp.run.counts import counts_of, go_on, statistics
     from ddg_warp.solve.dynamics import Integrator
 
     analysis = result.scene.analysis
     given = {name: getattr(analysis, name) for name in ("scheme", "rtol", "outliers")}
     integrator = Integrator(result.model, **given | options)
-    state = result.state
+    counted = partial(counts_of, integrator)
+    if not result.times:
+        keep(result.state, counts=counted)
+    state = go_on(integrator, result.state, result.dt, counts) if counts else result.state
     try:
         for _ in range(round(float(state.time) / result.dt), steps):
             started = clock()
             state = integrator.step(state, result.dt)
             result.step_times.append(clock() - started)
-            keep(state)
+            keep(state, counts=counted)
             bar.update()
         integrator.check(state)
     finally:
-        result.statistics = integrator.statistics()
+        result.statistics = statistics(integrator, counts)
 
 
 def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
     """Load step by step and `keep` each equilibrium."""
     from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
+    keep(result.state)
     equilibrium = Equilibrium(result.model, StaticsOptions(**options))
     state, iterations, outcomes = result.state, [], Counter()
     try:
@@ -265,7 +340,7 @@ def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, cloc
             state = point.state.copy()
             state.time = point.arclength
             state.stable = point.stable
-            keep(state, load=point.load, **point.values)
+            keep(state, {"load": point.load, **point.values})
             bar.update()
         result.step_times = [(clock() - started) / max(1, len(points))] * len(points)
         iterations = [point.iterations for point in points]
@@ -285,50 +360,85 @@ def step_count(dt: float, duration: float) -> int:
         number = isinstance(value, Real) and not isinstance(value, bool)
         if not (number and 0.0 < value < float("inf")):
             raise InputError(f"dt = {dt} s and duration = {duration} s must be positive and finite numbers")
+    if duration / dt > MOST_STEPS:
+        raise InputError(f"a duration of {duration} s is {duration / dt:.3g} steps of {dt} s; take longer steps")
     steps = round(duration / dt)
     if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
         raise InputError(f"a duration of {duration} s is no whole number of steps of {dt} s; change one of them")
     return steps
 
 
-def recorded_duration(resume: str | Path | None, scene: float) -> float:
-    """End of the run to resume [s]; that of the scene where there is none to resume, or it does not say."""
+def settings_to_resume(directory: Path, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Time step [s], precision, worlds and end [s] of the run in a directory.
+
+    Args:
+        directory: Where it was recorded.
+        asked: Of these and of its fields what it is to go on with, by name; None for what it has.
+
+    Raises:
+        InputError: The directory holds no run, or one with other settings than those asked for.
+    """
     from ddg_warp.io.hdf5 import TrajectoryReader
 
-    if resume is None:
-        return scene
-    with TrajectoryReader(Path(resume) / "trajectory.h5") as reader:
-        return reader.provenance.get("duration", scene)
+    path = directory / "trajectory.h5"
+    if not path.is_file():
+        raise InputError(f"there is no run to resume in {directory}: {path} is missing")
+    with TrajectoryReader(path) as reader:
+        stored = reader.provenance
+        fields = {*reader.recorded, *reader.fields, *(["contacts"] if reader.contacts is not None else [])}
+    if not {*RUN_SETTINGS} <= stored.keys():
+        raise InputError(f"{path} is not of `simulate`: resume it where it was made, with Recorder(resume=True)")
+    settings = {name: stored[name] for name in (*RUN_SETTINGS, "duration") if name in stored}
+    recorded = {name for name in fields if name not in ("points", "obstacle_points") and "/" not in name}
+    for name, value in (asked or {}).items():
+        found = settings.get(name, recorded)
+        if value is not None and value != found:
+            found = ", ".join(sorted(recorded)) or "none" if name == "fields" else found
+            raise InputError(f"the run in {directory} has {name} = {found}; resume it with these, not with others")
+    return settings
 
 
-def continue_from(result: Result, directory: Path) -> None:
+def continue_from(result: Result, directory: Path, duration: float) -> dict[str, np.ndarray]:
     """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result.
 
-    The scene's callbacks see the state, so that parameters which they set by the time are what they were.
+    Returns:
+        What the run has counted up to there, for `advance`; empty where the file does not have it.
+
+    Raises:
+        InputError: It has gone on beyond `duration` [s].
     """
     from ddg_warp.io.hdf5 import TrajectoryReader
 
     with TrajectoryReader(directory / "trajectory.h5") as reader:
-        frames = reader.checkpoint_frame
+        frames, counts = reader.checkpoint_frame, reader.run_counts()
+        end = float(reader.time[frames - 1])
+        if end > duration + 0.5 * result.dt:
+            raise InputError(
+                f"the run in {directory} is recorded up to {end:g} s; a duration of {duration:g} s would cut it: give a longer one, or "
+                "record another run"
+            )
         result.state = result.model.restore(reader.checkpoint())
-        for callback in result.scene.callbacks:
-            callback(result.state)
         result.times = reader.time[:frames].tolist()
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
+    start = {
+        name.removeprefix("energy/"): value.tolist() for name, value in counts.items() if name.startswith("energy/")
+    }
+    result.energies["start"] = start or None
+    result.counted_from = None if counts else end
+    return counts
 
 
-def open_recorder(model, out, resume, dt, provenance, force, fields, usd):
+def open_recorder(model, out, resume, dt, *, provenance, fields, **options):
     """The recorder of a run in `out`, or of the run that it resumes."""
-    from ddg_warp.run.record import Recorder
+    from ddg_warp.run.record import Recorder, frame_rate
 
-    fps = round(1.0 / dt, 6) if dt else None  # one time code a step
-    directory, again = Path(resume or out), resume is not None
+    again = resume is not None
     if again:  # where it comes from stays what it was
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
     asked = {name: name in fields for name in ("velocities", "directors", "contacts")}
     fields = [name for name in fields if name not in asked]
-    options = {"fps": fps, "resume": again, "force": force, "fields": fields, "usd": usd, "provenance": provenance}
-    return Recorder(model, directory, **options, **asked)
+    options |= {"fps": frame_rate(dt) if dt else None, "resume": again, "fields": fields, "provenance": provenance}
+    return Recorder(model, out if out is not None else resume, **options, **asked)
 
 
 def wall_clock(device: str) -> Callable[[], float]:

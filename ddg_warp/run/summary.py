@@ -10,6 +10,8 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from ddg_warp.run.run_directory import told
+
 BLANK = ("measured", "reference", "error", "tolerance")
 PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matplotlib", "torch")
 
@@ -18,7 +20,9 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
     """The content of summary.json.
 
     `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked); `contact`, its law and
-    `statistics()["contact"]` of the integrator or the search for equilibria, only of scenes with contact.
+    `statistics()["contact"]` of the integrator or the search for equilibria, only of scenes with contact. All is of the whole run,
+    however often it was resumed, but `ms_per_step`, which is of its last part; where the file of a resumed run does not say what was
+    counted before, `counted_from` is the time [s] from which counts and times are, and the energy at the start is null.
     """
     statistics = result.statistics
     content = {
@@ -40,6 +44,8 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
     }
     if "contact" in statistics:
         content["contact"] = {"law": result.scene.touching.law, **statistics["contact"]}
+    if result.counted_from is not None:
+        content["counted_from"] = result.counted_from
     if result.dt is None:
         content["stable"] = result.state.stable
     return content | ({"failure": result.failure} if result.failure else {})
@@ -60,12 +66,25 @@ def contact_line(contact: Mapping) -> str:
 
 
 def write_json(path: str | Path, content) -> None:
-    """Write JSON in one piece: a reader finds the old file or the new one. Numbers that are not finite become null."""
+    """Write JSON in one piece: a reader finds the old file or the new one. Numbers that are not finite become null.
+
+    Raises:
+        RecordError: It cannot be written there.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
-    partial.replace(path)
+    text = json.dumps(plain(content), indent=2, allow_nan=False) + "\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)
+        try:
+            with open(partial, "x") as file:
+                file.write(text)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise told(path, error) from error
 
 
 def write_table(stem: Path, rows: list[Mapping], origin: Mapping) -> None:

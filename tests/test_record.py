@@ -1,0 +1,460 @@
+"""Recorder and resumed runs: what is recorded is what was given, and a run in parts is the run in one piece."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from ddg_warp.geometry import meshes
+from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+from ddg_warp.io.journal import transaction
+from ddg_warp.run import simulate as simulate_module
+from ddg_warp.run.catalog import InputError
+from ddg_warp.run.record import Recorder
+from ddg_warp.run.run_directory import RunDirectory
+from ddg_warp.run.simulate import simulate
+from ddg_warp.run.summary import summary
+
+RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+CLOCKS = ("wall_time", "compile_time", "ms_per_step")
+TERMS = {"curvature_1", "twist", "axial_force"}
+
+
+def rods(scene, height: float = 0.0) -> None:
+    """Two open rods and a ring."""
+    line = np.linspace((0.0, 0.0, height), (1.0, 0.0, height + 0.1), 5)
+    for y in (0.0, 0.3):
+        scene.add_rod(line + [0.0, y, 0.0], section=ddg.Circle(0.02), material=RUBBER, name="strand")
+    turn = np.linspace(0.0, 2.0 * np.pi, 6, endpoint=False)
+    ring = np.stack([0.3 * np.cos(turn), 1.0 + 0.3 * np.sin(turn), np.full(6, height)], axis=1)
+    scene.add_rod(ring, section=ddg.Circle(0.02), material=RUBBER, closed=True, name="ring")
+
+
+def scene_of(kind: str, dt: float = 0.004, duration: float = 0.08, **analysis) -> ddg.Scene:
+    """A small scene of "rods", a "net" of them, a "shell", or rods on a floor with friction in "contact"."""
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration, **analysis))
+    if kind == "shell":
+        scene.add_shell(*meshes.rectangle(3, 2), thickness=0.01, material=RUBBER, name="sheet")
+        scene.hold(0, [0, 1])
+        return scene
+    rods(scene, 0.021 if kind == "contact" else 0.0)
+    if kind == "net":
+        scene.add_rod([[1.0, 0.0, 0.1], [1.0, 0.2, 0.2], [1.0, 0.4, 0.3]], section=ddg.Circle(0.02), material=RUBBER)
+        scene.join([(0, 4), (3, 0)])
+    if kind == "contact":
+        scene.contact(friction=0.3, range=0.01)
+        scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), name="floor")
+    else:
+        scene.clamp(0, [0])
+    return scene
+
+
+def stepped(model, count: int):
+    """Some states of a model, copied."""
+    integrator, state = ddg.Integrator(model), model.state()
+    found = [state.copy()]
+    for _ in range(count - 1):
+        state = integrator.step(state, 0.004)
+        found.append(state.copy())
+    return found
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+@pytest.mark.parametrize("kind", ["rods", "net", "shell", "contact"])
+def test_what_is_recorded_is_what_was_given(kind, worlds, device, tmp_path):
+    """Bit for bit, with every option, over several blocks, the last of them not full."""
+    model = scene_of(kind).build(device, worlds=worlds)
+    states = stepped(model, 7)
+    names = ["shell_strain", "shell_energy"] if kind == "shell" else sorted(TERMS)
+    count = len(model.curves.counts)
+    attributes = (
+        {}
+        if kind == "shell"
+        else {
+            "id": np.arange(count),
+            "group": np.array(["a", "bc", "d", "e"][:count]),
+            "w": np.linspace(0, 1, count),
+        }
+    )
+    observed = [{"a": float(state.points().flat[-1]), "b c": k} for k, state in enumerate(states)]
+    options = {"velocities": True, "directors": kind != "shell", "fields": names, "contacts": kind == "contact"}
+    notes = {"provenance": {"by": "test", "n": 3, "list": [1, {"x": None}]}, "control": {"field": np.eye(3), "dt": 0.1}}
+    with Recorder(model, tmp_path, block=3, attributes=attributes, **options, **notes) as recorder:
+        for state, found in zip(states, observed, strict=True):
+            recorder.record(state, found)
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        assert len(reader) == 7
+        assert reader.time.tolist() == [state.time for state in states]
+        for frame, state in enumerate(states):
+            np.testing.assert_array_equal(reader.points[frame], state.points())
+            np.testing.assert_array_equal(reader.velocities[frame], state.velocities())
+            if options["directors"]:
+                np.testing.assert_array_equal(reader.directors[frame], state.directors())
+            for name in names:
+                values = (ddg.ask.fields.point_fields if name in TERMS else ddg.ask.fields.cell_fields)(
+                    model, state, [name]
+                )[name]
+                np.testing.assert_array_equal(reader.fields[name][frame][-values.size :], values.ravel())
+            if options["contacts"]:
+                for name, wanted in vars(model.contacts(state)).items():
+                    np.testing.assert_array_equal(getattr(reader.contacts[frame], name), wanted)
+        for name in observed[0]:
+            assert reader.series[name].tolist() == [found[name] for found in observed]
+        for name, values in attributes.items():
+            np.testing.assert_array_equal(reader.attributes[name], values)
+        for name, value in notes["provenance"].items():
+            assert reader.provenance[name] == value
+        restored = model.restore(reader.checkpoint()).snapshot()
+        for name, value in states[-1].snapshot().items():
+            assert np.asarray(restored[name]).tobytes() == np.asarray(value).tobytes()
+    with h5py.File(tmp_path / "trajectory.h5") as file:
+        np.testing.assert_array_equal(file["control/field"][:], np.eye(3))
+        assert file["control"].attrs["dt"] == 0.1
+
+
+def told(result) -> dict:
+    """The summary of a run as it is written, without what clocks say."""
+    content = json.loads(json.dumps(summary("scene", {}, result, []), default=lambda value: np.asarray(value).tolist()))
+    return {name: value for name, value in content.items() if name not in CLOCKS}
+
+
+def observe(model, state) -> dict:
+    return {"x": state.points().flat[0]}
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+@pytest.mark.parametrize("kind", ["rods", "net", "shell", "contact"])
+def test_resumed_equals_straight_in_every_number(kind, worlds, device, tmp_path):
+    """Of summary and trajectory: in two parts and in three, one of them a single step."""
+    scene, given = (
+        scene_of(kind),
+        {"device": device, "worlds": worlds, "observe": observe, "progress": False, "usd": False},
+    )
+    given["fields"] = ["contacts"] if kind == "contact" else ["velocities"]
+    straight = simulate(scene, out=tmp_path / "straight", **given)
+    for name, ends in {"two": (0.04, 0.08), "three": (0.02, 0.024, 0.08)}.items():
+        simulate(scene, out=tmp_path / name, duration=ends[0], **given)
+        for end in ends[1:]:
+            resumed = simulate(scene, resume=tmp_path / name, duration=end, **given)
+        assert told(resumed) == told(straight)
+        assert resumed.series == straight.series and resumed.times == straight.times
+        assert resumed.wall_time > resumed.compile_time > 0.0
+        with TrajectoryReader(tmp_path / name / "trajectory.h5") as one:
+            with TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as other:
+                assert one.recorded == other.recorded
+                for field in one.recorded:
+                    assert one._file["trajectory"][field][:].tobytes() == other._file["trajectory"][field][:].tobytes()
+                counts = one.run_counts(), other.run_counts()
+        for key in counts[0]:
+            if not key.startswith(("clock/", "search/")):
+                np.testing.assert_array_equal(*(each[key] for each in counts), err_msg=key)
+
+
+class Killed(BaseException):
+    """As if the process had ended."""
+
+
+@pytest.mark.parametrize("kind", ["rods", "contact"])
+def test_a_killed_run_counts_what_was_complete(kind, device, tmp_path, monkeypatch):
+    """Steps after the last block are done again, and counted once."""
+    scene, given = scene_of(kind, duration=0.32), {"device": device, "progress": False, "usd": False}
+    straight = simulate(scene, out=tmp_path / "straight", **given)
+
+    def record(self, state, observed=None, record=Recorder.record):
+        if state.time > 0.29:
+            self._abandon()
+            raise Killed
+        record(self, state, observed)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Recorder, "record", record)
+        simulate(scene, out=tmp_path / "killed", **given)
+    with TrajectoryReader(tmp_path / "killed" / "trajectory.h5") as reader:
+        assert len(reader) == 64
+    assert told(simulate(scene, resume=tmp_path / "killed", **given)) == told(straight)
+
+
+def test_a_failed_step_is_counted_once(device, tmp_path, monkeypatch):
+    """A run that failed, and goes on once the reason is gone, counts as if it had not."""
+    scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
+    straight = simulate(scene, out=tmp_path / "straight", **given)
+
+    def step(self, state, dt, step=ddg.Integrator.step):
+        if state.time > 0.03:
+            step(self, state, dt)
+            raise ddg.SolverError("no more", state=state)
+        return step(self, state, dt)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ddg.Integrator, "step", step)
+        assert simulate(scene, out=tmp_path / "failed", **given).failure
+    assert told(simulate(scene, resume=tmp_path / "failed", **given)) == told(straight)
+
+
+def test_a_file_without_counts_is_told(device, tmp_path):
+    """Of an older version: nothing is invented of what came before."""
+    scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
+    simulate(scene, out=tmp_path, duration=0.04, **given)
+    with transaction(tmp_path / "trajectory.h5") as file:
+        for slot in ("a", "b"):
+            if slot in file["checkpoint"]:
+                del file[f"checkpoint/{slot}/run"]
+                file[f"checkpoint/{slot}"].attrs.pop("crc32")
+    for end in (0.06, 0.08):
+        result = simulate(scene, resume=tmp_path, duration=end, **given)
+        content = told(result)
+    assert content["counted_from"] == pytest.approx(0.06)
+    assert content["energy"]["start"] is None and content["energy"]["end"]
+    assert content["steps"] == 20 and content["outcomes"] == {"converged": 5 * 3}
+
+
+def test_a_finished_run_stays_as_it_is(device, tmp_path):
+    """Its result is had again; no file of it changes."""
+    scene, given = scene_of("contact"), {"device": device, "progress": False}
+    first = simulate(scene, out=tmp_path, **given)
+    before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in tmp_path.iterdir()}
+    again = simulate(scene, resume=tmp_path, **given)
+    assert told(again) == told(first) and again.times == first.times
+    with pytest.raises(
+        InputError, match=r"recorded up to 0.08 s; a duration of 0.04 s would cut it: give a longer one"
+    ):
+        simulate(scene, resume=tmp_path, duration=0.04, **given)
+    assert before == {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt": 0.002}, "has dt = 0.004"),
+        ({"worlds": 2}, "has worlds = 1"),
+        ({"precision": "float32"}, "has precision = float64"),
+        ({"fields": ["velocities"]}, "has fields = none"),
+        ({"fields": ["twist"]}, "has fields = none"),
+        ({"force": True}, "replaces nothing"),
+        ({"out": "elsewhere"}, "goes on in its directory"),
+    ],
+)
+def test_a_run_resumes_with_its_own_settings(options, message, tmp_path):
+    scene, given = scene_of("rods"), {"device": "cpu", "progress": False, "usd": False}
+    simulate(scene, out=tmp_path, duration=0.004, **given)
+    before = (tmp_path / "trajectory.h5").read_bytes()
+    with pytest.raises(InputError, match=message):
+        simulate(scene, resume=tmp_path, **given, **options)
+    assert (tmp_path / "trajectory.h5").read_bytes() == before
+
+
+def test_parameters_that_callbacks_set_are_no_other_model(device, tmp_path):
+    """A resumed run begins with the parameters of its scene, and callbacks set them by the time."""
+    scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
+
+    @scene.callbacks.append
+    def soften(state) -> None:
+        state.model.set_parameter("rod_stretch", "stiffness", 1000.0 * (1.0 - state.time))
+
+    straight = simulate(scene, out=tmp_path / "straight", **given)
+    simulate(scene, out=tmp_path / "parts", duration=0.04, **given)
+    assert told(simulate(scene, resume=tmp_path / "parts", duration=0.08, **given)) == told(straight)
+
+
+def build(kind: str = "rods", change=None, worlds: int = 1):
+    scene = scene_of(kind)
+    if change:
+        change(scene)
+    return scene.build("cpu", worlds=worlds)
+
+
+OTHERS = {
+    "worlds": (lambda: build(worlds=2), "shape"),
+    "another rod": (lambda: build(change=rods), "rods"),
+    "radius": (lambda: build(change=lambda s: s.batches[0].section.__dict__.update(radius=0.03)), "(rods|parameters)"),
+    "stiffness": (lambda: _stiffer(build()), "parameters"),
+    "a net": (lambda: build("net"), "parameters|rods|snapshot"),
+    "contact": (lambda: build(change=lambda s: s.contact()), "contact"),
+    "a shell beside": (lambda: build(change=_add_sheet), "surfaces|shape"),
+}
+
+
+def _stiffer(model):
+    model.set_parameter("rod_stretch", "stiffness", 5.0)
+    return model
+
+
+def _add_sheet(scene) -> None:
+    scene.add_shell(*meshes.rectangle(1, 1), thickness=0.01, material=RUBBER)
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_another_model_cannot_go_on(other, tmp_path):
+    """It is refused when the recorder is opened, and the file stays."""
+    model = build()
+    with Recorder(model, tmp_path, usd=False) as recorder:
+        recorder.record(model.state())
+    before = (tmp_path / "trajectory.h5").read_bytes()
+    make, what = OTHERS[other]
+    with pytest.raises(TrajectoryError, match=what):
+        Recorder(make(), tmp_path, usd=False, resume=True)
+    assert (tmp_path / "trajectory.h5").read_bytes() == before
+
+
+def test_states_are_recorded_in_order(device, tmp_path):
+    """A state not later than the last is refused; of a resumed run only the checkpoint is passed over, if it is that."""
+    model = build()
+    states = stepped(model, 4)
+    with Recorder(model, tmp_path, usd=False) as recorder:
+        recorder.record(states[0])
+        recorder.record(states[2])
+        for state in states[:3]:
+            with pytest.raises(SceneError, match=r"follows one at 0.008 s.*Recorder\(..., time=\"frame\"\)"):
+                recorder.record(state)
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        restored = model.restore(reader.checkpoint())
+    for first in (states[1], _moved(model, restored)):
+        with Recorder(model, tmp_path, usd=False, resume=True) as recorder:
+            with pytest.raises(SceneError, match=r"follows one at|but not the state of its checkpoint"):
+                recorder.record(first)
+    with Recorder(model, tmp_path, usd=False, resume=True) as recorder:
+        recorder.record(restored)
+        with pytest.raises(SceneError, match="follows one at"):
+            recorder.record(restored)
+        recorder.record(states[3])
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        assert reader.time.tolist() == [states[k].time for k in (0, 2, 3)]
+
+
+def _moved(model, state):
+    moved = model.state(np.asarray(state.points()) + 1e-9)
+    moved.time = state.time
+    return moved
+
+
+def test_frames_may_be_numbered(tmp_path):
+    """Designs and equilibria one after the other, whose states have any time; resumed, they count on."""
+    from pxr import Usd
+
+    model = build()
+    states = stepped(model, 3)
+    with Recorder(model, tmp_path, time="frame", block=2) as recorder:
+        for state in (states[2], states[0], states[0]):
+            recorder.record(state, {"design": 1})
+    with Recorder(model, tmp_path, resume=True) as recorder:
+        recorder.record(states[0], {"design": 2})
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        assert (reader.time_is, reader.time.tolist()) == ("frame", [0.0, 1.0, 2.0, 3.0])
+        for frame, k in enumerate((2, 0, 0, 0)):
+            np.testing.assert_array_equal(reader.points[frame], states[k].points())
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 3.0)
+    with pytest.raises(ValueError, match="has time='frame', not 'state'"):
+        Recorder(model, tmp_path, resume=True, time="state")
+
+
+def test_what_is_refused_leaves_the_recording_whole(tmp_path):
+    """After each refusal of `record` the frames before and after it are there, all of them."""
+    model = build()
+    states = stepped(model, 8)
+    bad = [{"a/b": 1.0}, {"": 1.0}, {3: 1.0}, {"a": "1"}, {"a": np.nan}, {"b": 1.0}, {}]
+    with Recorder(model, tmp_path, block=2) as recorder:
+        recorder.record(states[0], {"a": 0.0})
+        for k, observed in enumerate(bad):
+            with pytest.raises(SceneError, match="observed"):
+                recorder.record(states[k + 1], observed)
+            recorder.record(states[k + 1], {"a": k + 1})
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        assert reader.series["a"].tolist() == list(range(8))
+    with Recorder(model, tmp_path, usd=False, resume=True) as recorder:
+        with pytest.raises(SceneError, match=r"observed \['b'\], before \['a'\]"):
+            recorder.record(_later(model, states[-1]), {"b": 1.0})
+
+
+def _later(model, state):
+    return ddg.Integrator(model).step(state, 0.004)
+
+
+def test_a_directory_that_is_held_stays_so(tmp_path):
+    """From before the recorder until after it."""
+    model = build()
+    with RunDirectory(tmp_path / "a") as held:
+        with Recorder(model, held, usd=False) as recorder:
+            recorder.record(model.state())
+        with pytest.raises(FileExistsError, match="is recording a run there"):
+            Recorder(model, tmp_path / "a", usd=False, force=True)
+    Recorder(model, tmp_path / "a", usd=False, force=True).close()
+    with RunDirectory(tmp_path / "b"):
+        pass
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("name", ["run.lock", "trajectory.h5", "scene.usdc", "trajectory.h5.partial", "scene.partial.usdc",
+                                  "scene.room.usdc", "trajectory.h5.journal", "scene.copy.usdc"])  # fmt: skip
+def test_links_are_not_written_through(name, tmp_path):
+    """A link in the directory to a file elsewhere: that file stays, whether the run is recorded or refused."""
+    model, other, folder = build(), tmp_path / "other", tmp_path / "run"
+    other.write_bytes(b"precious" * 100)
+    folder.mkdir()
+    (folder / name).symlink_to(other)
+    for options in ({"force": True}, {"resume": True}):
+        try:
+            with Recorder(model, folder, block=1, **options) as recorder:
+                for state in stepped(model, 3)[2 * ("resume" in options) :]:
+                    recorder.record(state)
+        except (FileExistsError, ValueError) as error:
+            assert "link" in str(error) or "cut short" in str(error) or "later" in str(error) or "follows" in str(error)
+    assert other.read_bytes() == b"precious" * 100
+
+
+def test_a_trajectory_that_is_a_link_is_read_but_not_resumed(tmp_path):
+    model = build()
+    with Recorder(model, tmp_path / "a", usd=False) as recorder:
+        recorder.record(model.state())
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "trajectory.h5").symlink_to(tmp_path / "a" / "trajectory.h5")
+    before = (tmp_path / "a" / "trajectory.h5").read_bytes()
+    with pytest.raises(TrajectoryError, match=r"is a link to .*links are not written through"):
+        Recorder(model, tmp_path / "b", usd=False, resume=True)
+    assert (tmp_path / "a" / "trajectory.h5").read_bytes() == before
+
+
+@pytest.mark.parametrize("dt", [1e8, 1e-9])
+def test_time_codes_of_any_step(dt, tmp_path):
+    """One a frame."""
+    from pxr import Usd
+
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=3 * dt))
+    rods(scene)
+    model = scene.build("cpu")
+    with Recorder(model, tmp_path) as recorder:
+        for frame in range(4):
+            state = model.state()
+            state.time = frame * dt
+            recorder.record(state)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 3.0)
+
+
+def test_places_that_cannot_be_written_to_are_named(tmp_path, monkeypatch):
+    """As they were given, with a remedy that helps: no free space is asked for where there is enough."""
+    model = build()
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(FileExistsError, match=rf"{place}: .*file is a file.*give another one"):
+            Recorder(model, place)
+    with pytest.raises(OSError, match=r"/proc/x: .*give another place") as caught:
+        Recorder(model, "/proc/x")
+    assert "free some space" not in str(caught.value)
+    with pytest.raises(OSError, match="give a shorter name"):
+        Recorder(model, tmp_path / ("a" * 300))
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(OSError, match=r"the working directory was removed: .*change to one that exists"):
+        Recorder(model, Path("out"))
+
+
+def test_steps_of_simulate_are_few_enough(tmp_path):
+    with pytest.raises(InputError, match="take longer steps"):
+        simulate_module.step_count(1e-300, 1.0)
