@@ -271,11 +271,15 @@ def test_a_cache_that_cannot_be_written_to_is_named(fall, monkeypatch, capsys):
     import ddg_warp.run.cli
 
     def read_only(_):
-        raise OSError(30, "Read-only file system", "/root/.cache")
+        raise OSError(30, "Read-only file system", "/somewhere/.cache")
 
+    monkeypatch.setenv("HOME", "/somewhere")
+    monkeypatch.delenv("WARP_CACHE_PATH", raising=False)
     monkeypatch.setattr(ddg_warp.run.cli, "require_device", read_only)
     assert fall("run") == 2
-    assert "/root/.cache: Read-only file system: " in (said := capsys.readouterr().err) and "WARP_CACHE_PATH" in said
+    assert (
+        "/somewhere/.cache: Read-only file system: " in (said := capsys.readouterr().err) and "WARP_CACHE_PATH" in said
+    )
 
 
 @pytest.mark.parametrize("place", ["/proc/x.usda", "file/x.usda", "{}/x.usda".format("a" * 300)])

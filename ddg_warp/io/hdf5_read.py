@@ -176,7 +176,7 @@ def refuse_links(file: h5py.File, path: Path) -> None:
 
     if found := file.visititems_links(elsewhere):
         raise TrajectoryError(
-            f"{path}: {found}: data of other files are not read; put them into this one, or read it with other_files=True if you "
+            f"{path}: {found}: data of other files are not read; put them into this one, or read it with outside=True if you "
             "know where it comes from"
         )
 
@@ -211,7 +211,7 @@ class TrajectoryReader:
 
     Args:
         path: The file.
-        other_files: Whether it may have its data in other files: by external links, external storage or virtual datasets.
+        outside: Whether it may have its data in other files: by external links, external storage or virtual datasets.
 
     Attributes:
         time: Times of the frames [s], shape (F,).
@@ -233,13 +233,13 @@ class TrajectoryReader:
         recorded: Names of the recorded fields.
     """
 
-    def __init__(self, path, *, other_files: bool = False):
+    def __init__(self, path, *, outside: bool = False):
         self.path = existing(path)
         with undamaged(self.path):
             self._file = open_to_read(self.path)
         try:
             with undamaged(self.path):
-                if not arguments.flag("other_files", other_files):
+                if not arguments.flag("outside", outside):
                     refuse_links(self._file, self.path)
                 self._read()
         except BaseException:
@@ -339,23 +339,38 @@ class TrajectoryReader:
         self._file.close()
 
 
-def read_rods(path, frame: int = -1, world: int = 0, *, other_files: bool = False) -> list[CurveSet]:
+def read_rods(path, frame: int = -1, world: int = 0, *, outside: bool = False) -> list[CurveSet]:
     """Rods from an HDF5 file, of either kind.
 
     A trajectory gives one set for each batch of rods, at one frame (by default the last) of one world.
     Any other file has at its root `points`, (R, n, 3) or (P, 3) [m]; with the latter `counts`, (R,); and it may have
     `closed`, one flag or (R,), and `radius`, one value or (P,) [m].
+
+    Args:
+        path: The file.
+        frame, world: Of a trajectory; other files have one of each.
+        outside: Whether the file may have its data in other files; see `TrajectoryReader`.
+
+    Raises:
+        CurveError, TrajectoryError: The file holds no rods, or none of that frame and world.
     """
-    path = existing(path)
+    path, frame, world = existing(path), arguments.index("frame", frame), arguments.index("world", world)
     with undamaged(path), open_to_read(path) as file:
-        if not other_files:
+        if not outside:
             refuse_links(file, path)
         if "points" in file:
+            if frame not in (0, -1) or world not in (0, -1):
+                raise CurveError(
+                    f"{path}: there are no frames or worlds to choose from; leave out frame = {frame}, world = {world}"
+                )
             return [_read_plain(file, path)]
-    with TrajectoryReader(path, other_files=other_files) as reader:
+    with TrajectoryReader(path, outside=outside) as reader:
         if not len(reader):
             raise CurveError(f"{path}: the trajectory has no frames; read a file of a run that wrote a block")
         points = reader.points[frame]
+        worlds = len(points) if points.ndim == 3 else 1
+        if not -worlds <= world < worlds:
+            raise CurveError(f"{path}: there is no world {world}; it has {worlds}, counted from 0")
         return _by_batch(reader.curves, points if points.ndim == 2 else points[world], path)
 
 

@@ -27,7 +27,7 @@ def refused(where: str = "") -> Iterator[None]:
     """Turns what the package says of a bad scene, file or option into an InputError that begins with `where`."""
     try:
         yield
-    except InputError:
+    except (InputError, OSError):
         raise
     except ValueError as error:
         raise InputError(f"{where}{error}") from error

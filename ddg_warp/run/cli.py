@@ -63,12 +63,14 @@ def _of_a_place(error: Exception) -> Exception:
     """The error, or for one of the system the place that it is about and what to do."""
     if not isinstance(error, OSError) or isinstance(error, ValueError) or error.filename is None:
         return error
-    if "warp" in Path(os.fsdecode(error.filename)).parts or ".cache" in Path(os.fsdecode(error.filename)).parts:
+    path = Path(os.fsdecode(error.filename))
+    cache = Path(os.environ.get("WARP_CACHE_PATH") or Path("~/.cache/warp").expanduser())
+    if path in (cache, *cache.parents) or cache in path.parents:
         return InputError(
-            f"{os.fsdecode(error.filename)}: {error.strerror}: kernels are compiled into a directory that can be written to; name one "
-            "by the variable WARP_CACHE_PATH"
+            f"{path}: {error.strerror}: compiled kernels are kept in {cache}, which cannot be written to; name another by the "
+            "variable WARP_CACHE_PATH"
         )
-    return told(os.fsdecode(error.filename), error)
+    return told(path, error)
 
 
 def parser(arguments: list[str]) -> Parser:

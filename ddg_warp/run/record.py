@@ -56,7 +56,7 @@ class Recorder:
 
     Raises:
         ValueError: An option is no such option, or the run to resume is of another model or has not the fields asked for.
-        FileExistsError: DIR holds a run, or another process writes to it.
+        TakenError: DIR holds a run, or another process writes to it; a FileExistsError.
         RecordError: The disk is full, or fails; also from `record` and `close`.
     """
 
@@ -291,7 +291,7 @@ class Recorder:
 
     def _told(self, error: BaseException) -> BaseException:
         """The error, or for one of the disk what is lost, what is kept and what to do."""
-        if not isinstance(error, OSError) or isinstance(error, FileExistsError | RecordError) or error.errno is None:
+        if not isinstance(error, OSError) or isinstance(error, RecordError) or error.errno is None:
             return error
         kept = "the run cannot be recorded any further. "
         kept += (

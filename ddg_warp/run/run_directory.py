@@ -8,7 +8,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import DataError, SceneError
 
 TRAJECTORY, SCENE, SUMMARY, LOCK = "trajectory.h5", "scene.usdc", "summary.json", "run.lock"
 PICTURES = ("picture.png", "path.png", "learned.png")
@@ -17,11 +17,12 @@ PICTURES = ("picture.png", "path.png", "learned.png")
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what a disk may come to while a run writes to it
 
 
-class RecordError(OSError):
+class RecordError(DataError, OSError):
     """A run could not be written to its disk; what was complete is kept."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+
+class TakenError(RecordError, FileExistsError):
+    """A directory cannot be given to a run: there is a run, another process or a file."""
 
 
 def told(path, error: OSError, kept: str = "") -> RecordError:
@@ -72,7 +73,7 @@ class RunDirectory(os.PathLike):
 
     Raises:
         SceneError: It is no path.
-        FileExistsError: Another process, or another recorder of this one, holds the directory, or the path is a file.
+        TakenError: Another process, or another recorder of this one, holds the directory, or the path is a file.
         RecordError: It cannot be made or written to.
     """
 
@@ -85,13 +86,14 @@ class RunDirectory(os.PathLike):
             self._made = not self.path.exists()
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock = lock_directory(self.path)
+        except TakenError:
+            raise
         except (FileExistsError, NotADirectoryError) as error:
-            files = [each for each in (self.path, *self.path.parents) if each.exists() and not each.is_dir()]
-            if not files:
-                raise
-            raise FileExistsError(
-                f"{self.path}: {files[0]} is a file, and a run is recorded in a directory of its own; give another one (--out DIR), "
-                "or move the file away"
+            files = [each for each in (self.path, *self.path.parents) if os.path.lexists(each) and not each.is_dir()]
+            what = "a link that leads nowhere" if files[0].is_symlink() else "a file"
+            raise TakenError(
+                f"{self.path}: {files[0]} is {what}, and a run is recorded in a directory of its own; give another one (--out DIR), "
+                "or move it away"
             ) from error
         except OSError as error:
             raise told(self.path, error, "no run can be recorded there; " * (error.errno not in FULL)) from error
@@ -125,7 +127,7 @@ def lock_directory(directory: Path) -> int:
     """Descriptor of the lock of a directory, held until it is closed: a process that ends, however it does, holds none.
 
     Raises:
-        FileExistsError: Another process, or another recorder of this one, holds it, or its name is taken by something else.
+        TakenError: Another process, or another recorder of this one, holds it, or its name is taken by something else.
     """
     path = directory / LOCK
     while True:
@@ -135,7 +137,7 @@ def lock_directory(directory: Path) -> int:
             if error.errno not in (errno.ELOOP, errno.EISDIR):
                 raise
             what = "a link" if error.errno == errno.ELOOP else "a directory"
-            raise FileExistsError(f"{path} is {what}, and no lock of a run; remove it") from None
+            raise TakenError(f"{path} is {what}, and no lock of a run; remove it") from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if path.exists() and os.path.samestat(os.fstat(lock), os.lstat(path)):
@@ -145,7 +147,7 @@ def lock_directory(directory: Path) -> int:
         except BlockingIOError:
             owner = os.pread(lock, 20, 0).decode(errors="replace") or "unknown"
             os.close(lock)
-            raise FileExistsError(
+            raise TakenError(
                 f"{directory}: process {owner} is recording a run there; wait for its end, or give another directory"
             ) from None
         except OSError:
@@ -156,7 +158,7 @@ def lock_directory(directory: Path) -> int:
 
 
 def refuse_to_replace(directory: Path) -> None:
-    """Raises a FileExistsError where a directory holds frames of a run."""
+    """Raises a TakenError where a directory holds frames of a run."""
     from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 
     path = directory / TRAJECTORY
@@ -169,7 +171,7 @@ def refuse_to_replace(directory: Path) -> None:
     else:
         frames = SCENE if (directory / SCENE).exists() else ""
     if frames:
-        raise FileExistsError(
+        raise TakenError(
             f"{directory} holds {frames}: force (--force) replaces them, another directory (--out DIR) keeps them, "
             "and resume (--resume DIR) goes on with them"
         )

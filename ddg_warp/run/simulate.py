@@ -361,7 +361,7 @@ def step_count(dt: float, duration: float) -> int:
         if not (number and 0.0 < value < float("inf")):
             raise InputError(f"dt = {dt} s and duration = {duration} s must be positive and finite numbers")
     if duration / dt > MOST_STEPS:
-        raise InputError(f"a duration of {duration} s is {duration / dt:.3g} steps of {dt} s; take longer steps")
+        raise InputError(f"a duration of {duration} s is {duration / dt:.3g} steps of dt = {dt} s; take longer steps")
     steps = round(duration / dt)
     if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
         raise InputError(f"a duration of {duration} s is no whole number of steps of {dt} s; change one of them")

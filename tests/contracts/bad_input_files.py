@@ -93,7 +93,7 @@ def run(**options):
     """Run held rods, or what `analysis` says."""
     scene = held_rods()
     scene.analysis = options.pop("analysis", ddg.Dynamics(0.01, 0.02))
-    return simulate(scene, device=DEVICE, progress=False, **options)
+    return simulate(scene, device=DEVICE, **({"progress": False} | options))
 
 
 each("simulate", "dt", [0.0, -1.0, NAN], lambda v: run(dt=v), "dt =", "positive")

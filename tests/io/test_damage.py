@@ -316,11 +316,11 @@ def elsewhere(path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["an external link", "external storage", "a virtual dataset"])
-def test_data_of_other_files_are_not_read(tmp_path, monkeypatch, kind):
+def test_data_of_outside_are_not_read(tmp_path, monkeypatch, kind):
     """Unless it is asked for by name."""
     monkeypatch.chdir(tmp_path)
     elsewhere(tmp_path / "a.h5", kind)
     with pytest.raises(TrajectoryError, match=r"a.h5: .*points.*(other.h5|raw): data of other files are not read"):
         read(tmp_path / "a.h5")
-    (rods,) = read_rods(tmp_path / "a.h5", other_files=True)
+    (rods,) = read_rods(tmp_path / "a.h5", outside=True)
     np.testing.assert_array_equal(rods.points, np.arange(18.0).reshape(6, 3))
