@@ -388,6 +388,17 @@ def test_a_directory_that_is_held_stays_so(tmp_path):
     assert not (tmp_path / "b").exists()
 
 
+def test_force_replaces_all_of_a_run(tmp_path):
+    """Also what the new one does not write, such as the scene of a run that is recorded without."""
+    model = build()
+    for name in ("summary.json", "picture.png", "notes.txt"):
+        (tmp_path / name).write_text("{}")
+    for options, left in (({}, {"scene.usdc"}), ({"usd": False}, set())):
+        with Recorder(model, tmp_path, force=True, **options) as recorder:
+            recorder.record(model.state())
+        assert {path.name for path in tmp_path.iterdir()} == {"trajectory.h5", "trajectory.vtkhdf", "notes.txt"} | left
+
+
 @pytest.mark.parametrize("name", ["run.lock", "trajectory.h5", "scene.usdc", "trajectory.h5.partial", "scene.partial.usdc",
                                   "scene.room.usdc", "trajectory.h5.journal", "scene.copy.usdc"])  # fmt: skip
 def test_links_are_not_written_through(name, tmp_path):

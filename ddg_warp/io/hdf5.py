@@ -58,6 +58,7 @@ from ddg_warp.io.hdf5_write import (
     write_model,
 )
 from ddg_warp.io.journal import recover, transaction
+from ddg_warp.io.observed import checked_observed
 from ddg_warp.io.vtkhdf import write_view
 
 __all__ = ["TrajectoryError", "TrajectoryReader", "TrajectoryWriter", "read_rods"]
@@ -199,7 +200,7 @@ class TrajectoryWriter:
             counts: What the run has counted up to this state, by name.
             time: Time of the frame; by default that of the state [s].
         """
-        observed = dict(observed or {})
+        observed = checked_observed(observed)
         if self._frames and observed.keys() != self._frames[0]["series"].keys():
             raise TrajectoryError(f"observed {sorted(observed)}, before {sorted(self._frames[0]['series'])}")
         frame = {name: np.array(getattr(state, name)()) for name in self._names if "/" not in name}

@@ -102,8 +102,9 @@ def _told(dataset: h5py.Dataset, path: Path) -> TrajectoryError:
     for first in lost:
         bad[first : first + size] = True
     rest = f"{_ranges(~bad)} can be read" if not bad.all() else "no others can be read"
+    what = "pairs" if "/contacts/" in dataset.name and not dataset.name.endswith("/ends") else "frames"
     return TrajectoryError(
-        f"{path}: {dataset.name} is damaged: the checksum of frames {_ranges(bad)} is not that of what was written; {rest}. Take a "
+        f"{path}: {dataset.name} is damaged: the checksum of {what} {_ranges(bad)} is not that of what was written; {rest}. Take a "
         "copy of the file, or record the run anew"
     )
 

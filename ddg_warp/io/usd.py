@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Tf, Usd, UsdGeom, Vt
 
+from ddg_warp import arguments
 from ddg_warp.io import CurveError, Curves, Shapes
 from ddg_warp.io.colors import PALETTE
 from ddg_warp.io.contacts import Contacts, Touching
@@ -65,6 +66,7 @@ class CurvesWriter:
         obstacles: Obstacles | None = None,
         touching: Touching | None = None,
     ):
+        arguments.positive("CurvesWriter: fps", fps, "1/s")
         self.path = Path(path)
         self._partial = self.path.with_name(f"{self.path.stem}.partial{self.path.suffix}")
         self._partial.unlink(missing_ok=True)
@@ -74,6 +76,7 @@ class CurvesWriter:
         self._stage = Usd.Stage.CreateNew(str(self._partial))
         self._describe_stage()
         shapes = curves if isinstance(curves, Shapes) else _drawable(curves)
+        self._rows = shapes.worlds * shapes.point_count
         color_by = ColorBy(*color_by) if color_by else None
         self._prims: list[PointsPrim] = []
         kept = {name: np.tile(np.asarray(values), shapes.worlds) for name, values in (attributes or {}).items()}
@@ -122,7 +125,15 @@ class CurvesWriter:
             triangle_scalars: Values of the triangles of all surfaces by name, each of shape (T,), likewise.
             obstacles: Nodes of obstacles that something moves [m], shape (M, 3), world after world.
             contacts: What touches.
+
+        Raises:
+            CurveError: The time code is that of a frame before, or the points are not as many as the curves have.
         """
+        time, points = arguments.number("CurvesWriter: time", time), np.asarray(points)
+        if points.shape != (self._rows, 3):
+            raise CurveError(
+                f"{self.path}: points have shape {points.shape}, not ({self._rows}, 3); give those of all curves"
+            )
         code = Usd.TimeCode(float(f"{time * self._fps:.12g}"))  # of whole numbers, as frames have
         if self._frames and code.GetValue() <= self._stage.GetEndTimeCode():
             raise CurveError(

@@ -11,8 +11,8 @@ from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directo
 from ddg_warp.errors import SceneError
 from ddg_warp.io import Shapes
 from ddg_warp.io.contacts import Contacts
-from ddg_warp.run.observed import checked_attributes, checked_notes, checked_observed
-from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, RecordError, RunDirectory, refuse_to_replace, told
+from ddg_warp.io.observed import checked_attributes, checked_notes, checked_observed
+from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, VIEW, RecordError, RunDirectory, refuse_to_replace, told
 
 DEFAULT_FPS = 24.0
 LEAST_DT = 1e-300  # s, whose inverse is finite
@@ -50,7 +50,7 @@ class Recorder:
         control: How the run is driven, stored in the trajectory.
         resume: Whether to go on after the last complete block of DIR/trajectory.h5, with the fields that it has; the scene is written
             anew from it.
-        force: Whether to replace a run that DIR holds already, with its summary and pictures.
+        force: Whether to replace a run that DIR holds already: trajectory, scene, summary and pictures.
         counts: Asked with every recorded state: what the run has counted up to it, arrays by name, kept with the checkpoint; see
             `TrajectoryReader.run_counts`.
 
@@ -91,6 +91,10 @@ class Recorder:
             arguments.flag(f"Recorder: {name}", value)
         for name, value in {"velocities": velocities, "directors": directors, "contacts": contacts}.items():
             arguments.flag(f"Recorder: {name}", value)
+        if counts is not None and not callable(counts):
+            raise SceneError(
+                f"Recorder: counts is {counts!r}; give a function that returns arrays by name, or leave it out"
+            )
         if fps is not None:
             arguments.positive("Recorder: fps", fps, "1/s")
         if time is not None:
@@ -134,7 +138,7 @@ class Recorder:
             if resume:
                 self._replay()
             elif force:
-                self._held.clear()
+                self._held.clear(*((TRAJECTORY, VIEW) if hdf5 else ()), *((SCENE,) if usd else ()))
         except BaseException as error:
             self._abandon()
             raise self._told(error) from error

@@ -11,6 +11,7 @@ from pathlib import Path
 from ddg_warp.errors import DataError, SceneError
 
 TRAJECTORY, SCENE, SUMMARY, LOCK = "trajectory.h5", "scene.usdc", "summary.json", "run.lock"
+VIEW = "trajectory.vtkhdf"  # the trajectory by the name that ParaView knows
 PICTURES = ("picture.png", "path.png", "learned.png")
 
 
@@ -110,9 +111,9 @@ class RunDirectory(os.PathLike):
             with suppress(OSError):  # where there is something in it
                 self.path.rmdir()
 
-    def clear(self) -> None:
-        """Removes what an earlier run has left; its frames go when new ones are begun."""
-        for name in (SUMMARY, *PICTURES):
+    def clear(self, *kept: str) -> None:
+        """Removes what an earlier run has left, but for the files that the new one has begun already."""
+        for name in {TRAJECTORY, VIEW, SCENE, SUMMARY, *PICTURES} - {*kept}:
             (self.path / name).unlink(missing_ok=True)
 
     def close(self) -> None:

@@ -15,8 +15,8 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SolverError
+from ddg_warp.io.observed import checked_observed
 from ddg_warp.run.catalog import RUN_SETTINGS, InputError
-from ddg_warp.run.observed import checked_observed
 from ddg_warp.run.progress import progress_bar
 from ddg_warp.scene.descriptions import Dynamics, Statics
 from ddg_warp.scene.scene import Scene

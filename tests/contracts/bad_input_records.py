@@ -566,6 +566,19 @@ each(
 )
 
 
+each(
+    "USD written",
+    "points",
+    [line(4), line(6), line(5)[:, :2], 3.0],
+    lambda v: writer(lambda w: w.write(0.0, v)),
+    "points",
+    "(5, 3)",
+)
+each("USD written", "time", [NAN, "now", None], lambda v: writer(lambda w: w.write(v, line(5))), "time", "finite")
+each("USD written", "fps", [0.0, -1.0, NAN, "film", None], lambda v: writer(lambda w: None, fps=v), "fps", "positive")
+each("recorder", "counts", [3, {}, "all"], lambda v: recorder(counts=v), "counts", "function")
+
+
 # --- simulate ---
 for name in ("force", "usd", "progress"):
     each("simulate", name, ["yes", 1, None], lambda v, n=name: run(**{n: v}), name, "True or False")
