@@ -248,12 +248,14 @@ def test_a_run_resumes_with_its_own_settings(options, message, tmp_path):
 
 
 def test_parameters_that_callbacks_set_are_no_other_model(device, tmp_path):
-    """A resumed run begins with the parameters of its scene, and callbacks set them by the time."""
+    """A resumed run begins with the parameters of its scene and its first state, and callbacks set them by the time."""
     scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
 
-    @scene.callbacks.append
-    def soften(state) -> None:
-        state.model.set_parameter("rod_stretch", "stiffness", 1000.0 * (1.0 - state.time))
+    def soften(model, time: float) -> None:
+        model.set_parameter("rod_stretch", "stiffness", 1000.0 * (1.0 - time))
+
+    scene.initial = lambda model: soften(model, 0.0) or model.state()
+    scene.callbacks.append(lambda state: soften(state.model, state.time))
 
     straight = simulate(scene, out=tmp_path / "straight", **given)
     simulate(scene, out=tmp_path / "parts", duration=0.04, **given)

@@ -150,8 +150,10 @@ class TrajectoryWriter:
             contacts, checkpoint = reader.contacts is not None, reader.checkpoint()
             if other := _other(reader, model):
                 what, which = other
+                also = ", and parameters as they were when its recording began" if what == "parameters" else ""
                 raise TrajectoryError(
-                    f"{path}: the file holds other {what} than the model; resume with its own scene{which and f' ({which} differs)'}"
+                    f"{path}: the file holds other {what} than the model; resume with its own scene{also}"
+                    f"{which and f' ({which} differs)'}"
                 )
         writer = cls.__new__(cls)
         writer._prepare(path, model, block, names, contacts)

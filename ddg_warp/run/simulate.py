@@ -194,15 +194,13 @@ def simulate(
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
     result = Result(scene, model, model.state(), dt=dt)
-    counts: dict[str, np.ndarray] = {}
-    if resume is not None:
-        counts = continue_from(result, Path(resume), duration)
-    elif scene.initial:
+    if scene.initial:
         try:
-            result.state = scene.initial(model)
+            result.state = scene.initial(model)  # which may set parameters, of a resumed run, too
         except SolverError as error:
             result.fail(error, "the first state could not be found: ")
             return result
+    counts = continue_from(result, Path(resume), duration) if resume is not None else {}
     done = max(0, len(result.times) - 1)
     earlier = {name: float(counts.get(f"clock/{name}", 0.0)) for name in ("wall", "compile")}
     counted: Callable[[], dict[str, np.ndarray]] | None = None
