@@ -44,6 +44,7 @@ from ddg_warp.io.hdf5_read import (
     TrajectoryError,
     TrajectoryReader,
     all_arrays,
+    paths_of,
     read_rods,
     seal,
     undamaged,
@@ -117,7 +118,7 @@ class TrajectoryWriter:
             write_model(file.create_group("model"), model)
             for name, values in (attributes or {}).items():
                 overwrite(file.require_group("model/attributes"), name, np.asarray(values))
-            seal(file["model"])
+            seal(file["model"], all_arrays(file["model"]))
             write_control(file.create_group("control"), control or {})
             trajectory = file.create_group("trajectory")
             trajectory.attrs["time"] = time
@@ -238,11 +239,11 @@ class TrajectoryWriter:
             write_view(file, self._shapes)
             checkpoint = file.require_group(f"checkpoint/{slot}")
             checkpoint.attrs["frame"] = len(trajectory["time"])
-            for name in all_arrays(checkpoint).keys() - self._snapshot.keys():
+            for name in paths_of(checkpoint) - self._snapshot.keys():
                 del checkpoint[name]
             for name, value in self._snapshot.items():
                 overwrite(checkpoint, name, value)
-            seal(checkpoint)
+            seal(checkpoint, self._snapshot)
             file["checkpoint"].attrs["current"] = slot
         self._slot = OTHER_SLOT[slot]
         self._frames.clear()

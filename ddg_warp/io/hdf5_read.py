@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields as fields_of
 from pathlib import Path
@@ -123,23 +123,23 @@ def _ranges(chosen: np.ndarray) -> str:
     return ", ".join(f"{first} to {stop - 1}" for first, stop in edges.reshape(-1, 2))
 
 
-def checksum(group: h5py.Group) -> int:
-    """CRC-32 of all datasets below a group: their paths, kinds and values."""
+def checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    """CRC-32 of arrays by name: their names, kinds and values."""
     found = 0
-    for name, value in sorted(all_arrays(group).items()):
+    for name, value in sorted(arrays.items()):
         content = "\0".join(value.ravel()).encode() if value.dtype.kind == "U" else np.ascontiguousarray(value)
         found = zlib.crc32(content, zlib.crc32(f"{name} {value.shape} {value.dtype.kind}".encode(), found))
     return found
 
 
-def seal(group: h5py.Group) -> None:
-    """Stores the checksum of a group with it, for `check_seal`."""
-    group.attrs["crc32"] = checksum(group)
+def seal(group: h5py.Group, arrays: Mapping[str, np.ndarray]) -> None:
+    """Stores the checksum of the datasets below a group, which are these arrays by path, with it, for `check_seal`."""
+    group.attrs["crc32"] = checksum(arrays)
 
 
 def check_seal(group: h5py.Group, path: Path) -> None:
     """Refuses a group whose datasets have changed since they were sealed; those of older files have no seal."""
-    if "crc32" in group.attrs and group.attrs["crc32"] != checksum(group):
+    if "crc32" in group.attrs and group.attrs["crc32"] != checksum(all_arrays(group)):
         raise TrajectoryError(
             f"{path}: {group.name} is damaged: its checksum is not that of what was written; take a copy of the file, or record the "
             "run anew"
@@ -414,6 +414,13 @@ def _array(dataset: h5py.Dataset) -> np.ndarray:
     """A dataset in memory; texts as str."""
     _check_size(dataset)
     return dataset.asstr()[()].astype(str) if h5py.check_string_dtype(dataset.dtype) else dataset[()]
+
+
+def paths_of(group: h5py.Group) -> set[str]:
+    """Every dataset below a group, as its path from there."""
+    paths = set()
+    group.visititems(lambda name, item: paths.update([name] if isinstance(item, h5py.Dataset) else []))
+    return paths
 
 
 def all_arrays(group: h5py.Group) -> dict[str, np.ndarray]:
