@@ -310,13 +310,15 @@ class TrajectoryReader:
         """Which of the two places holds the last checkpoint."""
         if "checkpoint" not in self._file:
             raise TrajectoryError(f"{self.path}: the run ended before its first block was written; start it again")
-        return self._file["checkpoint"].attrs["current"]
+        with undamaged(self.path):
+            return self._file["checkpoint"].attrs["current"]
 
     @property
     def checkpoint_frame(self) -> int:
         """Number of frames up to and with the checkpoint's."""
         slot = self.checkpoint_slot
-        return int(self._file["checkpoint"][slot].attrs["frame"])
+        with undamaged(self.path):
+            return int(self._file["checkpoint"][slot].attrs["frame"])
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """The last complete state, for `model.restore`."""

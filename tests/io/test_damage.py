@@ -136,6 +136,38 @@ def test_damage_inside_is_named(run):
     assert refused > 10
 
 
+def all_of(path: Path) -> dict:
+    """Everything that a reader has of a trajectory, but its provenance, as bytes or text."""
+    with TrajectoryReader(path) as reader:
+        found = {
+            "time": reader.time,
+            "points": reader.points[:],
+            **reader.series,
+            **reader.parameters,
+            **reader.checkpoint(),
+        }
+        found |= {"counts": reader.curves.counts, "radius": reader.curves.radius, "names": reader.curves.names}
+        found |= {"triangles": reader.surfaces.triangles, "run": np.array(sorted(reader.run_counts()))}
+    return {name: str(value.tolist()) for name, value in found.items()}
+
+
+def test_no_flipped_bit_is_read_as_a_number(run):
+    """Anywhere in the file: what is read is what was written, or refused by name."""
+    path, told = run / TRAJECTORY, 0
+    content, written = path.read_bytes(), all_of(path)
+    random = np.random.default_rng(1)
+    for place in random.choice(len(content), 60, replace=False):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << random.integers(8)
+        path.write_bytes(damaged)
+        try:
+            assert all_of(path) == written
+        except (TrajectoryError, CurveError) as error:
+            assert str(path) in str(error)
+            told += 1
+    assert told > 20
+
+
 def test_a_run_without_a_block_is_started_again(tmp_path):
     """Killed before its first block: it cannot be resumed, says so, and is no run that a new one would destroy."""
     model = Model()
