@@ -156,20 +156,14 @@ def simulate(
     began = time.perf_counter()
     if not isinstance(scene, Scene):
         raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
-    arguments.count("worlds", worlds)
-    for name, value in {"force": force, "usd": usd, "progress": progress}.items():
-        arguments.flag(name, value)
-    for name, value in {"observe": observe, "clock": clock}.items():
-        if value is not None and not callable(value):
-            raise InputError(f"{name} is {value!r}; give a function, or leave it out")
-    for name, value in {"provenance": provenance, "options": options}.items():
-        if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
-            raise InputError(f"{name} is {value!r}; give values by name, or leave it out")
-    if not isinstance(fields, list | tuple | set) or not all(isinstance(name, str) for name in fields):
-        raise InputError(f"fields = {fields!r}; give a list of names, such as ['velocities']")
-    for name, value in {"out": out, "resume": resume}.items():
-        if value is not None and not isinstance(value, str | os.PathLike):
-            raise InputError(f"{name} is {value!r}; give the path of a directory")
+    _judge(
+        worlds,
+        fields,
+        flags={"force": force, "usd": usd, "progress": progress},
+        functions={"observe": observe, "clock": clock},
+        mappings={"provenance": provenance, "options": options},
+        paths={"out": out, "resume": resume},
+    )
     analysis = scene.analysis
     dynamic = isinstance(analysis, Dynamics)
     if not dynamic and (dt, duration, resume) != (None, None, None):
@@ -261,6 +255,24 @@ def simulate(
     result.wall_time, result.compile_time = clocks().values()
     result.energies["end"] = energies(model, result.state)
     return result
+
+
+def _judge(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
+    """Raises an error that names an argument of `simulate` which is no such argument."""
+    arguments.count("worlds", worlds)
+    for name, value in flags.items():
+        arguments.flag(name, value)
+    for name, value in functions.items():
+        if value is not None and not callable(value):
+            raise InputError(f"{name} is {value!r}; give a function, or leave it out")
+    for name, value in mappings.items():
+        if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
+            raise InputError(f"{name} is {value!r}; give values by name, or leave it out")
+    if not isinstance(fields, list | tuple | set) or not all(isinstance(name, str) for name in fields):
+        raise InputError(f"fields = {fields!r}; give a list of names, such as ['velocities']")
+    for name, value in paths.items():
+        if value is not None and not isinstance(value, str | os.PathLike):
+            raise InputError(f"{name} is {value!r}; give the path of a directory")
 
 
 def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar, counts: Mapping) -> None:
