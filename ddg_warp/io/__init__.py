@@ -6,10 +6,13 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
+
+from ddg_warp.errors import DataError
 
 
 class CurveError(ValueError):
@@ -196,17 +199,33 @@ def _refuse_unusable(points, counts, closed, radius, where: str) -> None:
         raise CurveError(f"{where}: curve {owner[bad]} has a radius of {radius[bad]} m; give it a positive width")
 
 
+def as_path(what: str, value, error: type[ValueError] = DataError) -> Path:
+    """Return a path given as text or as a path, or raise an `error` that names `what`."""
+    given = os.fspath(value) if isinstance(value, os.PathLike) else value
+    if not isinstance(given, str) or not given or "\0" in given:
+        raise error(f"{what} is {value!r}; give a path, as text or pathlib.Path")
+    return Path(given)
+
+
+def is_file(path: Path) -> bool:
+    """Return True if a path leads to a file."""
+    try:
+        return path.is_file()
+    except OSError:  # a name too long, or a folder that may not be looked into
+        return False
+
+
 def existing(path) -> Path:
     """`path` as a Path, refused where there is no such file."""
-    path = Path(path)
-    if not path.is_file():
+    path = as_path("the file to read", path, MissingFileError)
+    if not is_file(path):
         raise MissingFileError(f"{path}: there is no such file; check the path")
     return path
 
 
 def read(path) -> list[CurveSet]:
     """The curves of a USD, HDF5 or DisMech text file, told apart by the suffix."""
-    suffix = Path(path).suffix.lower()
+    suffix = as_path("the file to read", path, MissingFileError).suffix.lower()
     if suffix in {".usd", ".usda", ".usdc", ".usdz"}:
         from ddg_warp.io.usd import read_curves
 

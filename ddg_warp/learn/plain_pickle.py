@@ -1,81 +1,81 @@
 """Pickles of numbers: NumPy arrays in lists, tuples and dicts, and nothing else.
 
-A pickle is a program; whoever loads one runs it. Here nothing of it runs: the few names that arrays are pickled with, by any NumPy and
-protocol, stand for functions of this file that take note of shape, type and bytes; any other name is refused. Not even NumPy's own
-reconstruction is called, whose types carry flags that a file could set at will.
+A pickle is a program, and `pickle.load` runs it. Here an interpreter reads the instructions that numbers, texts, lists, tuples, dicts
+and arrays of numbers are pickled with, by any NumPy and protocol. Names stand for five functions of this file that note shape, type
+and bytes of an array. Any other name or instruction is refused.
+Memory and time are bounded by the size of the file: a file that refers to one object many times unfolds to at most `UNFOLDED` values a
+byte, and lists are nested at most `DEEPEST` times.
 """
 
 from __future__ import annotations
 
-import pickle
+import pickletools
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from ddg_warp.errors import DataError
+from ddg_warp.io import as_path, is_file
+
 KINDS = "biufc"  # truth values, whole numbers, real and complex ones
+DEEPEST = 64  # lists in lists; arrays have as many axes at most
+UNFOLDED, FREE = 16, 10_000  # values that a file may unfold to: for each of its bytes, and in any case
+SHOWN = 120  # letters of a name or a reason in an error
 
 
-class UnsafePickleError(ValueError):
-    """A pickle asks for more than arrays of numbers; the message names the file, and what it asks for. None of it has run."""
+class UnsafePickleError(DataError):
+    """A pickle asks for more than arrays of numbers; the message names the file and the request. Nothing of it has run."""
 
 
 def load(path):
-    """What a pickle holds: numbers, texts, arrays of numbers, and lists, tuples and dicts of them.
+    """Return the content of a pickle: numbers, texts, arrays of numbers, and lists, tuples and dicts of them.
 
     Raises:
-        UnsafePickleError: It asks for anything else.
-        ValueError: It is no pickle, or is cut short.
+        UnsafePickleError: The file asks for anything else.
+        DataError: There is no such file, it is no pickle, is cut short, or unfolds to far more than its size.
     """
-    path = Path(path)
-    with open(path, "rb") as file:
-        try:
-            return _finished(_Reader(file, path).load())
-        except UnsafePickleError:
-            raise
-        except (
-            pickle.UnpicklingError,
-            EOFError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            LookupError,
-            OverflowError,
-        ) as error:
-            raise ValueError(
-                f"{path} is no pickle of arrays, or is damaged ({type(error).__name__}: {error}); take a copy of it"
-            ) from error
+    path = as_path("plain_pickle.load: path", path)
+    try:
+        if not is_file(path):
+            raise DataError(f"the pickle {path} does not exist; check the path")
+        content = path.read_bytes()
+        reader = _Reader(content, path)
+        return reader.finished(reader.run())
+    except DataError:
+        raise
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        LookupError,
+        OverflowError,
+        MemoryError,
+        RecursionError,
+        OSError,
+    ) as error:
+        raise DataError(
+            f"{path} is no pickle of arrays, or is damaged ({type(error).__name__}: {_short(error)}); take a copy of it"
+        ) from error
 
 
-class _Reader(pickle.Unpickler):
-    def __init__(self, file, path: Path):
-        super().__init__(file)
-        self._path = path
-
-    def find_class(self, module: str, name: str) -> _Stand:
-        module = module.replace("numpy._core", "numpy.core")  # its name from NumPy 2 on
-        if (module, name) not in ALLOWED:
-            raise UnsafePickleError(
-                f"{self._path}: the pickle asks for {module}.{name}, which arrays of numbers do not need; nothing of it has run. "
-                "Load it where you trust it, and save its arrays"
-            )
-        return ALLOWED[module, name]
-
-    def persistent_load(self, identity):
-        raise UnsafePickleError(
-            f"{self._path}: the pickle refers to objects outside of it ({identity!r}); save its arrays alone"
-        )
+def _short(text) -> str:
+    """A text in one line of bounded length."""
+    text = " ".join(str(text).split())
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 class _Type:
-    """A NumPy type of numbers, as far as it is known yet."""
+    """A NumPy type of numbers."""
 
     def __init__(self, code: str, *_):
-        self.type = np.dtype(str(code))
+        if not isinstance(code, str):
+            raise ValueError("the type of an array is no text")
+        self.type = np.dtype(code)
         if self.type.kind not in KINDS:
             raise ValueError(f"arrays of type {code!r} are not of numbers")
 
-    def __setstate__(self, state: tuple) -> None:
+    def set_state(self, state: tuple) -> None:
         _, order, *rest = state
         if rest[:3] != [None, None, None]:
             raise ValueError("arrays of records are not of numbers")
@@ -83,20 +83,22 @@ class _Type:
 
 
 class _Array:
-    """An array, as far as it is known yet."""
+    """An array, empty until its state is set; `value` is a view of bytes of the file."""
 
     def __init__(self, *_):
         self.value = np.zeros(0)
 
-    def __setstate__(self, state: tuple) -> None:
+    def set_state(self, state: tuple) -> None:
         _, shape, kind, by_columns, content = state
         self.value = _made(content, kind, shape, "F" if by_columns else "C").value
 
 
 def _made(content, kind: _Type, shape: tuple, order: str = "C") -> _Array:
     """An array of given bytes."""
+    if not isinstance(kind, _Type):
+        raise ValueError("the type of an array is none")
     made = _Array()
-    made.value = np.frombuffer(content, kind.type).reshape(shape, order=order).copy(order="K")
+    made.value = np.frombuffer(content, kind.type).reshape(shape, order=order)
     return made
 
 
@@ -106,52 +108,209 @@ def _scalar(kind: _Type, content: bytes):
 
 def _bytes(text: str, encoding: str) -> bytes:
     """Bytes, as protocols before 3 write them."""
-    if encoding not in ("latin1", "latin-1"):
-        raise ValueError(f"bytes in {encoding!r}")
+    if not isinstance(text, str) or not isinstance(encoding, str) or encoding not in ("latin1", "latin-1"):
+        raise ValueError("bytes are written in another way than as a text in latin1")
     return text.encode("latin1")
 
 
 def _no_bytes() -> bytes:
-    """Those of an empty array, as protocols before 3 write them."""
+    """Bytes of an empty array, as protocols before 3 write them."""
     return b""
 
 
-def _no_call(*_):
-    raise ValueError("arrays are not made by calling their type")
-
-
-class _Stand:
-    """What stands for a name; a pickle can call it, but, other than of a function, not change its attributes."""
-
-    __slots__ = ("_function",)
-
-    def __init__(self, function: Callable):
-        self._function = function
-
-    def __call__(self, *arguments):
-        return self._function(*arguments)
-
-    def __setstate__(self, state) -> None:
-        raise ValueError("the names that arrays are pickled with are not to be changed")
-
-
-ALLOWED = {
-    ("numpy.core.multiarray", "_reconstruct"): _Stand(_Array),
-    ("numpy.core.multiarray", "scalar"): _Stand(_scalar),
-    ("numpy.core.numeric", "_frombuffer"): _Stand(_made),
-    ("numpy", "ndarray"): _Stand(_no_call),
-    ("numpy", "dtype"): _Stand(_Type),
-    ("_codecs", "encode"): _Stand(_bytes),
-    ("__builtin__", "bytes"): _Stand(_no_bytes),
+ARRAY_TYPE = "numpy.ndarray"  # named as the type of an array, never called
+ALLOWED: dict[str, Callable | str] = {
+    "numpy.core.multiarray._reconstruct": _Array,
+    "numpy.core.multiarray.scalar": _scalar,
+    "numpy.core.numeric._frombuffer": _made,
+    "numpy.ndarray": ARRAY_TYPE,
+    "numpy.dtype": _Type,
+    "_codecs.encode": _bytes,
+    "__builtin__.bytes": _no_bytes,
 }
+VALUES = frozenset(
+    "INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE "
+    "SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8".split()
+)
+CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+EMPTY = {"EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "EMPTY_DICT": dict}
+TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
-def _finished(value):
-    """A value with arrays for what stood for them."""
-    if isinstance(value, _Array):
-        return value.value
-    if isinstance(value, dict):
-        return {_finished(key): _finished(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(_finished(item) for item in value)
-    return value
+class _Name:
+    """A name that arrays are pickled with, and its function."""
+
+    def __init__(self, function):
+        self.function = function
+
+
+class _Reader:
+    """Stack machine of one pickle.
+
+    Args:
+        content: The file.
+        path: Its path, for messages.
+    """
+
+    def __init__(self, content: bytes, path: Path):
+        self._content, self._path = content, path
+        self._limit = FREE + UNFOLDED * len(content)
+        self._copied = 0  # bytes that instructions have copied
+        self._stack: list = []
+        self._marks: list[list] = []
+        self._memo: dict[int, object] = {}
+
+    def run(self):
+        """Return the object that the pickle ends with; arrays in it are `_Array`."""
+        for code, argument, _ in pickletools.genops(self._content):
+            name = code.name
+            if name in VALUES:
+                self._stack.append(argument)
+            elif name in CONSTANTS:
+                self._stack.append(CONSTANTS[name])
+            elif name in EMPTY:
+                self._stack.append(EMPTY[name]())
+            elif name in TUPLES:
+                first = len(self._stack) - TUPLES[name]
+                self._stack[first:] = [tuple(self._stack[max(first, 0) :])]
+            elif name == "STOP":
+                break
+            elif name not in ("PROTO", "FRAME"):
+                self._do(name, argument)
+        (result,) = self._stack
+        return result
+
+    def _do(self, name: str, argument) -> None:
+        stack = self._stack
+        if name == "MARK":
+            self._marks.append(stack)
+            self._stack = []
+        elif name in ("LIST", "TUPLE", "DICT", "APPENDS", "SETITEMS", "POP_MARK"):
+            self._stack = self._marks.pop()
+            self._collect(name, stack)
+        elif name == "APPEND":
+            self._extend([stack.pop()])
+        elif name == "SETITEM":
+            value, key = stack.pop(), stack.pop()
+            self._update([key, value])
+        elif name == "POP":
+            stack.pop()
+        elif name == "DUP":
+            stack.append(stack[-1])
+        elif name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            self._memo[argument] = stack[-1]
+        elif name == "MEMOIZE":
+            self._memo[len(self._memo)] = stack[-1]
+        elif name in ("GET", "BINGET", "LONG_BINGET"):
+            stack.append(self._memo[argument])
+        elif name == "GLOBAL":
+            stack.append(self._named(*argument.split(" ", 1)))
+        elif name == "STACK_GLOBAL":
+            found, module = stack.pop(), stack.pop()
+            stack.append(self._named(module, found))
+        elif name == "REDUCE":
+            arguments, called = stack.pop(), stack.pop()
+            stack.append(self._called(called, arguments))
+        elif name == "BUILD":
+            state, built = stack.pop(), stack[-1]
+            if not isinstance(built, _Array | _Type):
+                raise ValueError("the names that arrays are pickled with are not to be changed")
+            built.set_state(state)
+        elif name in ("PERSID", "BINPERSID"):
+            raise UnsafePickleError(f"{self._path}: the pickle refers to objects outside of it; save its arrays alone")
+        else:
+            raise self._unsafe(f"the instruction {name}")
+
+    def _unsafe(self, asked: str) -> UnsafePickleError:
+        return UnsafePickleError(
+            f"{self._path}: the pickle asks for {asked}, which arrays of numbers do not need; nothing of it has run. "
+            "Load it where you trust it, and save its arrays"
+        )
+
+    def _collect(self, name: str, items: list) -> None:
+        """Use the objects since the last mark."""
+        if name == "LIST":
+            self._stack.append(items)
+        elif name == "TUPLE":
+            self._stack.append(tuple(items))
+        elif name == "DICT":
+            self._stack.append({})
+            self._update(items)
+        elif name == "APPENDS":
+            self._extend(items)
+        elif name == "SETITEMS":
+            self._update(items)
+
+    def _extend(self, items: list) -> None:
+        if not isinstance(self._stack[-1], list):
+            raise ValueError("items are added to what is no list")
+        self._stack[-1].extend(items)
+
+    def _update(self, items: list) -> None:
+        if not isinstance(self._stack[-1], dict):
+            raise ValueError("items are set in what is no dict")
+        for key in items[::2]:  # others take long to hash, or are made to collide
+            if not isinstance(key, str) and not (isinstance(key, int) and abs(key) < 2**32):
+                raise ValueError("the keys of a dict are no texts or whole numbers below 2^32")
+        self._stack[-1].update(zip(items[::2], items[1::2], strict=True))
+
+    def _named(self, module, name) -> _Name:
+        if not isinstance(module, str) or not isinstance(name, str):
+            raise ValueError("a name is no text")
+        asked = f"{module}.{name}".replace("numpy._core", "numpy.core")  # its name from NumPy 2 on
+        if asked not in ALLOWED:
+            raise self._unsafe(_short(asked))
+        return _Name(ALLOWED[asked])
+
+    def _called(self, called, arguments):
+        if not isinstance(called, _Name) or called.function is ARRAY_TYPE:
+            raise ValueError("arrays are not made by calling their type")
+        if not isinstance(arguments, tuple):
+            raise ValueError("arguments of a call are no tuple")
+        if called.function is _bytes and arguments and isinstance(arguments[0], str):
+            self._copied += len(arguments[0])
+            if self._copied > self._limit:
+                raise ValueError(f"its bytes unfold to more than {self._limit}")
+        return called.function(*arguments)
+
+    def finished(self, value):
+        """Return an object with arrays for each `_Array`, after a check of the size that it unfolds to."""
+        count = self._count(value, {}, 0)
+        if count > self._limit:
+            raise DataError(
+                f"{self._path}: the pickle of {len(self._content)} bytes unfolds to {count} values, more than {self._limit}; "
+                "save its arrays, each once"
+            )
+        return _converted(value, {})
+
+    def _count(self, value, known: dict[int, int], depth: int) -> int:
+        """Number of values in an object, with those that it refers to several times counted as often."""
+        if isinstance(value, _Array):
+            return 1 + value.value.size
+        if isinstance(value, _Type | _Name):
+            raise ValueError("it holds a name of NumPy's where a value belongs")
+        if not isinstance(value, list | tuple | dict):
+            return 1
+        if depth >= DEEPEST:
+            raise DataError(
+                f"{self._path}: lists of the pickle hold themselves, or are nested more than {DEEPEST} times; save its arrays"
+            )
+        if id(value) not in known:
+            parts = value.values() if isinstance(value, dict) else value
+            known[id(value)] = 1 + len(value) + sum(self._count(part, known, depth + 1) for part in parts)
+        return known[id(value)]
+
+
+def _converted(value, known: dict[int, object]):
+    """An object with arrays of its own for each `_Array`; what is referred to several times stays one object."""
+    if not isinstance(value, _Array | list | tuple | dict):
+        return value
+    if id(value) not in known:
+        if isinstance(value, _Array):
+            made = value.value.copy(order="K")
+        elif isinstance(value, dict):
+            made = {key: _converted(item, known) for key, item in value.items()}
+        else:
+            made = type(value)(_converted(item, known) for item in value)
+        known[id(value)] = made
+    return known[id(value)]

@@ -135,3 +135,13 @@ def test_damaged_files_are_named(tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"a\.pkl is no pickle"):
             load(path)
+
+
+def test_an_array_that_is_referred_to_twice_is_read_once(tmp_path):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps([ARRAY, {"again": ARRAY, 3: [1.0]}]))
+    first, others = load(path)
+    np.testing.assert_array_equal(first, ARRAY)
+    assert others["again"] is first
+    assert others[3] == [1.0]
+    first[0] = 0.0  # writable, of its own
