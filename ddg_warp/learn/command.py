@@ -1,8 +1,10 @@
 """From the command line: `ddg-warp sweep SCENE`, a scene over ranges of its parameters, and `ddg-warp gradients`, their table."""
 
 import argparse
+import inspect
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 from ddg_warp.run.catalog import SHARED, InputError, load_scene, parameters, refused, scene_name
@@ -18,8 +20,20 @@ FLAGS = (
 )  # a scene's parameter of such a name has a range only
 
 
+class Once(argparse.Action):
+    """Store the value of a flag, and refuse the flag where it is given again."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        given = namespace.__dict__.setdefault("_once", set())
+        if self.dest in given:
+            raise argparse.ArgumentError(self, "is given twice; give it once")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
 def add_flags(command: argparse.ArgumentParser) -> None:
     """Add the flags of `sweep`; those of the scene give values that all samples share."""
+    command.register("action", None, Once)
     command.add_argument("scene", metavar="SCENE", help="a scene of `ddg-warp list`, or a Python file; comes first")
     command.add_argument(
         "--range",
@@ -51,10 +65,15 @@ def sweep_scene(chosen: argparse.Namespace) -> int:
     options = {key: asked[key] for key in OPTIONS if key in asked}
     if "fields" in options:
         options["fields"] = [field for field in chosen.fields.split(",") if field]
+    known = inspect.signature(module.build, eval_str=True).parameters
     ranges = {key: asked[key] for key in parameters(module, {}) if key in asked and key not in (*FLAGS, *SHARED)}
     directory = chosen.out or Path("out/sweep") / name
     with refused():
-        ranges |= dict(_named(text) for text in chosen.range)
+        for text in chosen.range:
+            key, range_ = _named(text, known)
+            if key in ranges or key in options:
+                raise InputError(f"--range {text}: {key} is given twice; give it once")
+            ranges[key] = range_
         try:
             episodes = sweep(
                 chosen.scene,
@@ -79,6 +98,7 @@ def sweep_scene(chosen: argparse.Namespace) -> int:
 
 def add_objects(command: argparse.ArgumentParser) -> None:
     """Add the flags of `gradients`."""
+    command.register("action", None, Once)
     command.add_argument("objects", nargs="*", metavar="OBJECT", help="which, such as 'planar rod' (default: all)")
     command.add_argument(
         "--analysis",
@@ -107,6 +127,8 @@ def gradients_table(chosen: argparse.Namespace) -> int:
         for name in names:
             if name not in known:
                 raise InputError(f"gradients: {what}: there is no {name!r}; there are {', '.join(known)}")
+            if names.count(name) > 1:
+                raise InputError(f"gradients: {what}: {name!r} is named twice; name it once")
     objects, analyses = (names or known for names, known in asked.values())
     rows = list(gradients.table(objects, analyses, chosen.device))
     print(table(gradients.gathered(rows)))
@@ -119,11 +141,13 @@ def gradients_table(chosen: argparse.Namespace) -> int:
     return FAILED if bad else DONE
 
 
-def _named(text: str):
-    """Name and range of a `--range`."""
+def _named(text: str, known: Mapping) -> tuple:
+    """Name and range of a `--range`, of one of the `known` parameters."""
     from ddg_warp.learn.ranges import parsed
 
     name, sign, range_ = text.partition("=")
-    if not sign:
+    name = name.strip().replace("-", "_")
+    if not sign or not name or not range_.strip():
         raise InputError(f"--range {text}: it is NAME=LOW:HIGH, NAME=LOW:HIGH:log, or NAME=A,B,C")
-    return name.replace("-", "_"), parsed(range_)
+    with refused(f"--range {text}: "):
+        return name, parsed(range_, known[name].annotation if name in known else None)

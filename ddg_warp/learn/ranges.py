@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,9 @@ from ddg_warp.errors import SceneError
 
 DESIGNS = ("random", "latin_hypercube", "sobol", "grid")
 GROWING = ("random", "sobol")  # designs whose first samples stay when there are to be more
+MOST = 10_000_000  # samples of a sweep
+KINDS = {int: "a whole number", float: "a number", bool: "True or False", str: "a text"}
+"""Types of parameters, and their names in errors."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +29,16 @@ class Uniform:
     """Numbers between two, all equally likely; on a grid equally spaced, both ends included.
 
     Raises:
-        SceneError: They are not finite, or not in order.
+        SceneError: They are not finite, not in order, or too far apart.
     """
 
     low: float
     high: float
 
     def __post_init__(self):
-        _check_ends(self, self.low, self.high)
+        _check_ends(self)
+        if not math.isfinite(self.high - self.low):
+            raise SceneError(f"Uniform({self.low}, {self.high}): the ends are too far apart; give a smaller range")
 
     def at(self, share: float) -> float:
         """The number below which a share of them lies."""
@@ -44,15 +50,17 @@ class LogUniform:
     """Positive numbers between two, whose logarithms are equally likely; on a grid in a geometric series.
 
     Raises:
-        SceneError: They are not positive and finite, or not in order.
+        SceneError: They are not positive and finite, not in order, or too far apart.
     """
 
     low: float
     high: float
 
     def __post_init__(self):
-        arguments.positive(f"{type(self).__name__}: low", self.low)
-        _check_ends(self, self.low, self.high)
+        arguments.positive("LogUniform: low", self.low)
+        _check_ends(self)
+        if self.high > self.low * 1e300:
+            raise SceneError(f"LogUniform({self.low}, {self.high}): the ends are too far apart; give a smaller range")
 
     def at(self, share: float) -> float:
         """The number below which a share of them lies."""
@@ -64,15 +72,17 @@ class Choice:
     """One of several values, all equally likely, such as `Choice([10, 20, 40])` or `Choice(range(5, 50))`.
 
     Raises:
-        SceneError: There is none.
+        SceneError: There is none, they have no order, or one is no value that files hold.
     """
 
     values: Sequence
 
     def __post_init__(self):
-        if isinstance(self.values, str) or not np.iterable(self.values) or not list(self.values):
+        ordered = np.iterable(self.values) and not isinstance(self.values, str | bytes | Mapping | set | frozenset)
+        values = list(self.values) if ordered else []
+        if not values:
             raise SceneError(f"Choice({self.values!r}): give a list of values, one at least")
-        object.__setattr__(self, "values", [plain_value(value) for value in self.values])
+        object.__setattr__(self, "values", [storable(f"Choice: value {k}", each) for k, each in enumerate(values)])
 
     def at(self, share: float):
         """The value below which a share of them lies, in their order."""
@@ -93,15 +103,23 @@ def draw(ranges: Mapping[str, object], samples: int, design: str = "random", see
         seed: What they are drawn with; a grid has no use for it.
 
     Raises:
-        SceneError: There are no samples, or there is no such design.
+        SceneError: Ranges are no mapping of names, there are no samples or more than `MOST`, or there is no such design.
     """
-    arguments.count("samples", samples)
+    samples = arguments.count("samples", samples)
     arguments.count("seed", seed, 0)
     arguments.choice("design", design, DESIGNS)
-    shared = {name: plain_value(value) for name, value in ranges.items() if not isinstance(value, Range)}
+    check_names(ranges)
+    shared = {
+        name: storable(f"ranges: {name}", value) for name, value in ranges.items() if not isinstance(value, Range)
+    }
     names = sorted(ranges.keys() - shared.keys())
+    levels = [_levels(ranges[name], samples) for name in names] if design == "grid" and samples <= MOST else []
+    number = math.prod(map(len, levels)) if levels else samples
+    if number > MOST:
+        raise SceneError(
+            f"samples = {samples}: these are {number} samples, at most {MOST}; give fewer, or fewer ranges"
+        )
     if design == "grid":
-        levels = [_levels(ranges[name], samples) for name in names]
         return [shared | dict(zip(names, values, strict=True)) for values in itertools.product(*levels)]
     shares = _shares(len(names), samples, design, seed)
     return [shared | {name: ranges[name].at(u) for name, u in zip(names, row, strict=True)} for row in shares]
@@ -112,12 +130,18 @@ def seed_of(seed: int, index: int) -> int:
     return int(np.random.SeedSequence([seed, index], spawn_key=(1,)).generate_state(1)[0])
 
 
-def parsed(text: str) -> Range:
-    """A range from the command line: `1:2`, `1e-3:1e-1:log`, or values `10,20,40`.
+def parsed(text: str, kind: type | None = None) -> Range:
+    """Return a range from the command line: `1:2`, `1e-3:1e-1:log`, or values `10,20,40`.
+
+    Args:
+        text: The range.
+        kind: Type of the parameter, where it is known: of a `str` every value is a text.
 
     Raises:
         SceneError: The ends of a range are no numbers.
     """
+    if kind is str:
+        return Choice([value.strip() for value in text.split(",")])
     if ":" in text:
         low, high, *kind = text.split(":")
         if kind not in ([], ["log"]):
@@ -130,6 +154,64 @@ def parsed(text: str) -> Range:
 def plain_value(value):
     """A value without NumPy, as it is kept in files and given to functions."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def storable(what: str, value):
+    """Return a value without NumPy that JSON holds: a number, text, truth value, None, or lists and dicts of them.
+
+    Raises:
+        SceneError: It is none; names `what`.
+    """
+    value = plain_value(value)
+    if value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    if isinstance(value, list | tuple):
+        return type(value)(storable(f"{what}[{k}]", each) for k, each in enumerate(value))
+    if isinstance(value, Mapping) and all(isinstance(name, str) for name in value):
+        return {name: storable(f"{what}[{name!r}]", each) for name, each in value.items()}
+    raise SceneError(
+        f"{what} is {value!r:.60}; give a finite number, a text, True, False, None, or lists and dicts of them"
+    )
+
+
+def check_names(ranges) -> None:
+    """Refuse ranges that are no mapping of names.
+
+    Raises:
+        SceneError: names what was given.
+    """
+    if not isinstance(ranges, Mapping):
+        raise SceneError(f"ranges = {ranges!r:.60}; give a dict of ranges by the names of parameters")
+    for name in ranges:
+        if not (isinstance(name, str) and name.isidentifier()):
+            raise SceneError(f"ranges: {name!r} is no name of a parameter; give a text such as 'load'")
+
+
+def check_kind(name: str, range_, kind: type) -> None:
+    """Refuse a range, or a value for all samples, that gives a parameter values of another type.
+
+    Args:
+        name: Name of the parameter.
+        range_: Its range or value.
+        kind: Its type; anything but `KINDS` is not checked.
+
+    Raises:
+        SceneError: names parameter and value.
+    """
+    if kind not in KINDS:
+        return
+    if isinstance(range_, Uniform | LogUniform):
+        if kind is int:
+            raise SceneError(
+                f"ranges: {name} is a whole number; give Choice(range(LOW, HIGH + 1)), or a list of values"
+            )
+        if kind is not float:
+            raise SceneError(f"ranges: {name} is {KINDS[kind]}; give a list of values, Choice([...])")
+        return
+    fitting = {int: numbers.Integral, float: numbers.Real}.get(kind, kind)
+    for value in range_.values if isinstance(range_, Choice) else [plain_value(range_)]:
+        if not isinstance(value, fitting) or (isinstance(value, bool) and kind is not bool):
+            raise SceneError(f"ranges: {name} is {KINDS[kind]}, and {value!r} is none; correct the values of {name}")
 
 
 def _shares(columns: int, samples: int, design: str, seed: int) -> list[list[float]]:
@@ -155,10 +237,14 @@ def _levels(values: Range, count: int) -> list:
     return [values.at(share) for share in (np.linspace(0.0, 1.0, count).tolist() if count > 1 else [0.5])]
 
 
-def _check_ends(range_, low, high) -> None:
+def _check_ends(range_) -> None:
+    """Refuse ends that are no finite numbers or not in order, and take them without NumPy."""
     what = type(range_).__name__
-    if not arguments.number(f"{what}: low", low) <= arguments.number(f"{what}: high", high):
+    low, high = (arguments.number(f"{what}: {name}", getattr(range_, name)) for name in ("low", "high"))
+    if low > high:
         raise SceneError(f"{what}({low}, {high}): the low end comes first")
+    for name in ("low", "high"):
+        object.__setattr__(range_, name, plain_value(getattr(range_, name)))
 
 
 def _value(text: str):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -19,11 +20,14 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from ddg_warp import arguments
 from ddg_warp.ask.fields import check_fields
 from ddg_warp.errors import DataError, SceneError, SolverError
+from ddg_warp.io import as_path
 from ddg_warp.learn.episodes import DONE, Episodes, EpisodeWriter
-from ddg_warp.learn.ranges import GROWING, LogUniform, Range, Uniform, draw, seed_of
+from ddg_warp.learn.ranges import GROWING, Range, check_kind, check_names, draw, seed_of
 from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
 from ddg_warp.run.catalog import SHARED, load_scene, parameters, scene_name
 from ddg_warp.run.progress import progress_bar
@@ -32,6 +36,7 @@ from ddg_warp.run.summary import plain, write_json
 
 ABOUT = "sweep.json"
 REFUSED = "refused"  # outcome of parameters of which no scene can be built
+SHARED_TIMES = ("dt", "duration")  # options of `simulate` that a range may give
 OPTIONS = ("device", "precision", "dt", "duration", "fields", "options")  # of `simulate`
 
 
@@ -148,13 +153,18 @@ def sweep(
         The episodes.
 
     Raises:
-        SceneError: A range is none, or the scene has no such parameter.
-        DataError: `out` holds the episodes of another sweep.
+        SceneError: A range is none, gives values of another type than the parameter has, or the scene has no such parameter.
+        DataError: `out` is no folder, holds the episodes of another sweep, or its index or sweep.json is damaged.
         InputError: There is no such scene.
         SweepError: A sample met an error that is no outcome of a solver, or workers were lost.
         ModuleNotFoundError: `ray` is wanted, but not installed.
     """
-    out, options = Path(out), dict(options or {})
+    out, options = as_path("sweep: out", out), {} if options is None else options
+    check_names(ranges)
+    if not isinstance(options, Mapping):
+        raise SceneError(f"options = {options!r}; give a dict with {', '.join(OPTIONS)}")
+    options = dict(options)
+    ray, progress = (arguments.flag(f"sweep: {name}", value) for name, value in (("ray", ray), ("progress", progress)))
     run = Run(_runner(what, ranges, options))
     if workers is not None:
         arguments.count("workers", workers)
@@ -200,25 +210,54 @@ def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun
     if callable(what):
         if options:
             raise SceneError(f"options = {options!r} are of `simulate`, for scenes; a function gives them itself")
-        known = inspect.signature(what).parameters.values()
-        if any(parameter.kind is parameter.VAR_KEYWORD for parameter in known):
-            return FunctionRun(what)
-        names, kinds = {parameter.name for parameter in [*known][1:]}, {}
-    else:
-        what = str(Path(what).resolve()) if what.endswith(".py") else what
-        found = inspect.signature(_loaded(what).build, eval_str=True).parameters
-        names, kinds = {*found, *SHARED}, {name: parameter.annotation for name, parameter in found.items()}
-    for name, range_ in ranges.items():
-        if name not in names:
-            raise SceneError(f"ranges: there is no parameter {name!r}; there are {', '.join(sorted(names))}")
-        if kinds.get(name) is int and isinstance(range_, Uniform | LogUniform):
+        found = dict([*inspect.signature(what).parameters.items()][1:])
+        kinds = {}
+        if not inspect.signature(what).parameters:
             raise SceneError(
-                f"ranges: {name} is a whole number; give Choice(range(LOW, HIGH + 1)), or a list of values"
+                f"{_name_of(what)} takes no directory to record in; write it as run(directory, **parameters)"
             )
+    else:
+        what = _scene(what)
+        found = inspect.signature(_loaded(what).build, eval_str=True).parameters
+        kinds = {name: parameter.annotation for name, parameter in found.items()} | dict.fromkeys(SHARED_TIMES, float)
+    names = {*found, *(() if callable(what) else SHARED)}
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values()):
+        for name in ranges:
+            if name not in names:
+                raise SceneError(
+                    f"ranges: there is no parameter {name!r}; there are {', '.join(sorted(names)) or 'none'}"
+                )
+    for name, range_ in ranges.items():
+        check_kind(name, range_, kinds.get(name))
+    for name, parameter in found.items():
+        several = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+        if parameter.default is parameter.empty and not several and name not in ranges and name != "seed":
+            raise SceneError(f"ranges: {name} has neither a range nor a default; give it either")
+    _check_options(options, ranges)
+    return FunctionRun(what) if callable(what) else SceneRun(what, options)
+
+
+def _scene(what) -> str:
+    """A scene by its name or the absolute path of its file."""
+    if not isinstance(what, str | os.PathLike):
+        raise SceneError(f"sweep: {what!r} is no scene; give the name of a scene, the path of its file, or a function")
+    what = os.fspath(what)
+    return str(Path(what).resolve()) if what.endswith(".py") else what
+
+
+def _check_options(options: Mapping, ranges: Mapping) -> None:
+    """Refuse options that `simulate` does not have, or that a range gives, too."""
     if unknown := options.keys() - set(OPTIONS):
-        raise SceneError(f"options: {', '.join(sorted(unknown))}: there are {', '.join(OPTIONS)}")
-    check_fields([name for name in options.get("fields", ()) if name not in ("velocities", "directors", "contacts")])
-    return FunctionRun(what) if callable(what) else SceneRun(what, dict(options))
+        raise SceneError(f"options: {', '.join(sorted(map(str, unknown)))}: there are {', '.join(OPTIONS)}")
+    for name in SHARED_TIMES:
+        if name in options and name in ranges:
+            raise SceneError(f"{name} is given by options and by ranges; give it once")
+        if options.get(name) is not None:
+            arguments.positive(f"options: {name}", options[name], "s")
+    fields = options.get("fields", ())
+    if isinstance(fields, str) or not np.iterable(fields) or not all(isinstance(name, str) for name in fields):
+        raise SceneError(f"options: fields = {fields!r}; give a list of names")
+    check_fields([name for name in fields if name not in ("velocities", "directors", "contacts")])
 
 
 @cache
@@ -229,7 +268,7 @@ def _loaded(scene: str):
 
 def _name_of(what: str | Callable) -> str:
     """What is swept, as the folder remembers it."""
-    if isinstance(what, str):
+    if not callable(what):
         return scene_name(what)
     return f"{what.__module__}.{getattr(what, '__qualname__', type(what).__name__)}"
 
@@ -252,7 +291,13 @@ def _refuse_other(path: Path, about: dict, episodes: int) -> int:
         if episodes:
             raise DataError(f"{path.parent} holds {episodes} episodes of no sweep; take another folder")
         return 0
-    old = json.loads(path.read_text())
+    try:
+        old = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(old, dict) or "samples" not in old:
+            raise ValueError("it does not describe a sweep")
+        arguments.count("samples", old["samples"])
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path} is damaged ({error}); take a copy of it, or another folder") from error
     for name, value in about.items():
         if old.get(name) != value and not (name == "samples" and about["design"] in GROWING):
             found = f"{path.parent} holds a sweep with {name} = {old.get(name)}, not {value}"

@@ -82,3 +82,15 @@ def test_ranges_of_the_command_line():
 def test_mistakes_are_named(make, said):
     with pytest.raises(SceneError, match=said):
         make()
+
+
+def test_values_of_a_choice_come_from_any_sequence_in_order():
+    for values in (range(3), np.arange(3), (k for k in range(3)), (np.int64(0), 1, 2)):
+        choice = Choice(values)
+        assert choice.values == [0, 1, 2]
+        assert all(type(value) is int for value in choice.values)
+
+
+def test_values_of_a_text_stay_texts():
+    assert parsed("1,2", str).values == ["1", "2"]
+    assert parsed("1:2", str).values == ["1:2"]
