@@ -27,8 +27,10 @@ except ModuleNotFoundError as error:
 
 from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError
+from ddg_warp.io import as_path, is_file
 from ddg_warp.io.hdf5_read import TrajectoryReader
-from ddg_warp.learn.episodes import INDEX, Episodes
+from ddg_warp.learn.episodes import INDEX, Episodes, inside
+from ddg_warp.learn.splits import SPLITS
 from ddg_warp.run.run_directory import TRAJECTORY
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -71,6 +73,7 @@ class Recordings(torch.utils.data.Dataset):
         failed: Whether to read also episodes that ended early.
         short: What becomes of a file with fewer frames than a window spans: "refuse" it, or "skip" it; `skipped` has their paths.
         dtype: "float32" or "float64", in which everything is recorded.
+        outside: Whether files may lie outside of the folders given, where an index or links lead.
 
     Attributes:
         sources: The files that are read, a list of `Source`.
@@ -94,18 +97,29 @@ class Recordings(torch.utils.data.Dataset):
         failed: bool = False,
         short: str = "refuse",
         dtype: str = "float64",
+        outside: bool = False,
     ):
         self.window, self.stride, self.every = (
             arguments.count(f"Recordings: {name}", value)
             for name, value in (("window", window), ("stride", stride), ("every", every))
         )
-        if isinstance(fields, str):
-            raise SceneError(f"Recordings: fields = {fields!r}; give a list of names")
-        self.fields = tuple(dict.fromkeys(fields))
+        names = [] if isinstance(fields, str | bytes) or not np.iterable(fields) else [*fields]
+        if not names or not all(isinstance(name, str) for name in names):
+            raise SceneError(f"Recordings: fields = {fields!r}; give a list of names, one at least")
+        self.fields = tuple(dict.fromkeys(names))
+        arguments.flag("Recordings: failed", failed)
+        arguments.flag("Recordings: outside", outside)
+        if split is not None:
+            arguments.choice("Recordings: split", split, SPLITS)
         self._dtype = arguments.choice("Recordings: dtype", dtype, DTYPES)
         arguments.choice("Recordings: short", short, ("refuse", "skip"))
-        several = not isinstance(paths, str | os.PathLike)
-        found = [source for path in (paths if several else [paths]) for source in _sources(Path(path), split, failed)]
+        several = np.iterable(paths) and not isinstance(paths, str | bytes | os.PathLike)
+        given = [as_path("Recordings: paths", path) for path in (paths if several else [paths])]
+        if not given:
+            raise DataError(
+                "Recordings: paths are empty; give a folder of episodes, a directory of a run, or a trajectory.h5"
+            )
+        found = [source for path in given for source in _sources(path, split, failed, outside)]
         span = (self.window - 1) * self.every + 1
         self.skipped = [source.path for source in found if source.frames < span]
         if self.skipped and short == "refuse":
@@ -136,6 +150,12 @@ class Recordings(torch.utils.data.Dataset):
         return self._ends[-1]
 
     def __getitem__(self, index: int) -> dict:
+        """Return a window.
+
+        Raises:
+            SceneError: `index` is no whole number.
+            IndexError: There is no such window.
+        """
         place, world, start = self.place(index)
         source, reader = self.sources[place], self._reader(place)
         frames = slice(start, start + (self.window - 1) * self.every + 1, self.every)
@@ -149,8 +169,10 @@ class Recordings(torch.utils.data.Dataset):
         """Of an item the place of its file in `sources`, its world and its first frame.
 
         Raises:
+            SceneError: `index` is no whole number.
             IndexError: There is no such item.
         """
+        index = arguments.index("Recordings: item", index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"item {index}: there are {len(self)} windows")
         index %= len(self)
@@ -176,13 +198,20 @@ class Recordings(torch.utils.data.Dataset):
         if place not in self._readers:
             path = self.sources[place].path
             reader = self._readers[place] = TrajectoryReader(path)
-            self._check_fields(reader, path)
+            self._check_fields(reader, self.sources[place])
         self._readers.move_to_end(place)
         if len(self._readers) > OPEN_FILES:
             self._readers.popitem(last=False)[1].close()
         return self._readers[place]
 
-    def _check_fields(self, reader: TrajectoryReader, path: Path) -> None:
+    def _check_fields(self, reader: TrajectoryReader, source: Source) -> None:
+        """Refuse a file that lacks fields, or has other frames or worlds than an index says."""
+        path, worlds = source.path, reader.points.shape[1] if reader.points.ndim == 4 else 1
+        if len(reader) < source.frames or worlds != source.worlds:
+            raise DataError(
+                f"{path} has {len(reader)} frames of {worlds} worlds, its index says {source.frames} of {source.worlds}; take a copy "
+                "of file and index, or record the run anew"
+            )
         recorded = {name for name in VECTORS if getattr(reader, name) is not None}
         recorded |= reader.fields.keys() | reader.series.keys()
         for name in self.fields:
@@ -207,10 +236,10 @@ class Recordings(torch.utils.data.Dataset):
         )  # as loaders hand on, whatever the default is
 
 
-def _sources(path: Path, split: str | None, failed: bool) -> list[Source]:
+def _sources(path: Path, split: str | None, failed: bool, outside: bool) -> list[Source]:
     """The files of a path: of the episodes in a folder, or that of one run."""
-    if (path / INDEX).is_file():
-        episodes = Episodes(path)
+    if is_file(path / INDEX):
+        episodes = Episodes(path, outside=outside)
         return [
             Source(episodes.path(episode), episode.frames, episode.worlds, episode.parameters)
             for episode in episodes.select(split, failed)
@@ -219,10 +248,12 @@ def _sources(path: Path, split: str | None, failed: bool) -> list[Source]:
         raise DataError(
             f"{path} is no folder of episodes and has no split {split!r}; leave split out, or write it by EpisodeWriter"
         )
-    path = path / TRAJECTORY if path.is_dir() else path
-    if not path.is_file():
-        raise DataError(f"{path} does not exist; give a folder of episodes, a directory of a run, or a trajectory.h5")
-    with TrajectoryReader(path) as reader:
+    file = path / TRAJECTORY if os.path.isdir(path) else path
+    if not is_file(file):
+        raise DataError(f"{file} does not exist; give a folder of episodes, a directory of a run, or a trajectory.h5")
+    if file is not path:
+        inside(path, file, outside)
+    with TrajectoryReader(file) as reader:
         worlds = reader.points.shape[1] if reader.points.ndim == 4 else 1
         parameters = reader.provenance.get("parameters", {})
-        return [Source(path, len(reader), worlds, parameters if isinstance(parameters, dict) else {})]
+        return [Source(file, len(reader), worlds, parameters if isinstance(parameters, dict) else {})]

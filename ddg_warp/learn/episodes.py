@@ -22,14 +22,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ddg_warp import arguments
-from ddg_warp.errors import DataError, SolverError
+from ddg_warp.errors import DataError, SceneError, SolverError
+from ddg_warp.io import as_path, is_file
+from ddg_warp.learn.ranges import storable
 from ddg_warp.learn.splits import FRACTIONS, SPLITS, checked_fractions, split_of
 from ddg_warp.run.run_directory import LOCK, TRAJECTORY, lock_directory
 from ddg_warp.run.summary import write_json
 
 INDEX, SCRATCH = "index.json", ".partial"
 DONE = "converged"  # outcome of an episode that ran to its end
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 SHARE = 0.05  # of the time of a writer that saving the index may take
 
 
@@ -70,20 +72,29 @@ class Episode:
 class Episodes:
     """The episodes of a folder, as its index has them, in the order of their names.
 
+    Args:
+        directory: The folder.
+        outside: Whether files of episodes may lie outside of the folder, where its index or a link leads.
+
     Raises:
         DataError: The folder has no index, or it is damaged.
     """
 
-    def __init__(self, directory):
-        self.directory = Path(directory)
+    def __init__(self, directory, *, outside: bool = False):
+        self.directory = as_path("Episodes: directory", directory)
+        self._outside = arguments.flag("Episodes: outside", outside)
         path = self.directory / INDEX
-        if not path.is_file():
+        if not is_file(path):
             raise DataError(f"{self.directory} holds no episodes: {path} is missing; `EpisodeWriter` writes it")
         try:
-            content = json.loads(path.read_text())
-            self.fractions, self.seed = tuple(content["fractions"]), content["seed"]
-            self._episodes = {entry["name"]: Episode(**entry) for entry in content["episodes"]}
-        except (ValueError, KeyError, TypeError) as error:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            self.fractions = checked_fractions(content["fractions"])
+            self.seed = arguments.count("seed", content["seed"], 0)
+            entries = [_checked(Episode(**entry)) for entry in content["episodes"]]
+            self._episodes = {entry.name: entry for entry in entries}
+            if len(self._episodes) < len(entries):
+                raise ValueError("two episodes have one name")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DataError(f"{path} is damaged ({error}); take a copy of it, or write the episodes anew") from error
 
     def __len__(self) -> int:
@@ -93,11 +104,11 @@ class Episodes:
         return iter(self._episodes.values())
 
     def __contains__(self, name: str) -> bool:
-        return name in self._episodes
+        return isinstance(name, str) and name in self._episodes
 
     def __getitem__(self, name: str) -> Episode:
-        if name not in self._episodes:
-            raise DataError(f"{self.directory} has no episode {name!r}; iterate over it to see what it has")
+        if name not in self:
+            raise DataError(f"{self.directory} has no episode {name!r}; give a name, which iteration over it shows")
         return self._episodes[name]
 
     def select(self, split: str | None = None, failed: bool = False) -> list[Episode]:
@@ -109,12 +120,21 @@ class Episodes:
         """
         if split is not None:
             arguments.choice("split", split, SPLITS)
+        arguments.flag("failed", failed)
         chosen = (episode for episode in self if split in (None, episode.split))
         return [episode for episode in chosen if episode.frames and (failed or not episode.failed)]
 
     def path(self, episode: Episode) -> Path:
-        """The file of an episode."""
-        return self.directory / episode.file
+        """Return the file of an episode.
+
+        Raises:
+            DataError: It is none, has no file, or its file lies outside of the folder.
+        """
+        if not isinstance(episode, Episode):
+            raise DataError(f"{self.directory}: {episode!r} is no episode; give one of those that it holds")
+        if not episode.file:
+            raise DataError(f"{self.directory}: nothing was recorded of episode {episode.name!r}; select others")
+        return inside(self.directory, self.directory / episode.file, self._outside)
 
 
 class EpisodeWriter:
@@ -130,15 +150,22 @@ class EpisodeWriter:
         seed: What splits are drawn with; by default that of the folder, or 0.
 
     Raises:
-        DataError: The fractions are no shares of one, or the folder has others.
+        DataError: The fractions are no shares of one, the folder has others, or it is no folder that can be made.
         FileExistsError: Another process writes to the folder.
     """
 
     def __init__(self, directory, *, fractions: tuple[float, float, float] | None = None, seed: int | None = None):
-        self.directory = Path(directory)
+        self.directory = as_path("EpisodeWriter: directory", directory)
         given = {} if fractions is None else {"fractions": checked_fractions(fractions)}
         given |= {} if seed is None else {"seed": arguments.count("EpisodeWriter: seed", seed, 0)}
-        self.directory.mkdir(parents=True, exist_ok=True)
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise DataError(
+                f"{error.filename or self.directory} is a file, no folder; choose another folder"
+            ) from error
+        except OSError as error:
+            raise DataError(f"{self.directory} cannot be made ({error.strerror}); choose another folder") from error
         self._lock = lock_directory(self.directory)
         try:
             old = Episodes(self.directory) if (self.directory / INDEX).exists() else None
@@ -168,7 +195,7 @@ class EpisodeWriter:
         return len(self._episodes)
 
     def __contains__(self, name: str) -> bool:
-        return name in self._episodes
+        return isinstance(name, str) and name in self._episodes
 
     @contextmanager
     def episode(self, name: str, *, parameters: Mapping | None = None, seed: int | None = None) -> Iterator[Path]:
@@ -181,7 +208,7 @@ class EpisodeWriter:
             parameters: What it is made of, by name: numbers, texts, lists of them.
             seed: What its random numbers are made with.
         """
-        entry = {"parameters": parameters, "seed": seed}
+        entry = _described(name, parameters, seed)
         directory, began = self.scratch(name), time.perf_counter()
         trajectory = directory / TRAJECTORY
         try:
@@ -222,9 +249,19 @@ class EpisodeWriter:
             parameters, seed, outcome, failure, seconds: See `Episode`.
 
         Raises:
-            DataError: There is an episode of that name, or one that converged has no frames.
+            DataError: There is an episode of that name, one that converged has no frames, or the index cannot hold what is given.
+            SceneError: An option is no such option.
         """
         self._check_new(name)
+        made = _described(name, parameters, seed)
+        made["seconds"] = arguments.number(f"episode {name!r}: seconds", seconds, "a time [s]", lambda v: v >= 0.0)
+        for what, text in (("outcome", outcome), ("failure", failure)):
+            if not isinstance(text, str) or (what == "outcome" and not text):
+                raise SceneError(f"episode {name!r}: {what} = {text!r}; give a text")
+        if trajectory is not None:
+            trajectory = as_path(f"episode {name!r}: trajectory", trajectory)
+            if trajectory.is_symlink():
+                raise DataError(f"episode {name!r}: {trajectory} is a link, which the folder would keep; give the file")
         frames, worlds = _size(trajectory)
         if not (frames or outcome != DONE):
             raise DataError(
@@ -234,7 +271,6 @@ class EpisodeWriter:
         if file:
             _move(Path(trajectory), self.directory / file)
         split = split_of(name, self.fractions, self.seed)
-        made = {"seed": seed, "parameters": dict(parameters or {}), "seconds": seconds}
         episode = Episode(name, split, outcome, failure, **made, frames=frames, worlds=worlds, file=file)
         self._episodes[name] = episode
         # An index of very many episodes is not written anew for each of them; what a kill then costs is run again.
@@ -254,7 +290,8 @@ class EpisodeWriter:
         if self._lock is None:
             raise DataError(f"the writer of {self.directory} is closed: open another, which goes on with the folder")
         if not (isinstance(name, str) and NAME.fullmatch(name)):
-            raise DataError(f"episode {name!r}: a name is made of letters, digits, and . _ - after the first")
+            told = "a name is made of letters, digits, and . _ - after the first, 200 at most"
+            raise DataError(f"episode {name!r:.60}: {told}")
         if name in self._episodes:
             raise DataError(f"{self.directory} has an episode {name!r} already; choose another name")
 
@@ -270,6 +307,49 @@ class EpisodeWriter:
         (self.directory / LOCK).unlink(missing_ok=True)
         os.close(self._lock)
         self._lock = None
+
+
+def inside(folder: Path, path: Path, outside: bool) -> Path:
+    """Return a path, refused where it leads out of a folder.
+
+    Args:
+        folder: The folder.
+        path: A path below it.
+        outside: Whether the path may lead out of the folder.
+
+    Raises:
+        DataError: It leads out of the folder, by its parts or by a link, and may not.
+    """
+    if not outside and not path.resolve().is_relative_to(folder.resolve()):
+        raise DataError(
+            f"{path} leads out of {folder}, to {path.resolve()}; allow it by outside=True where you trust it"
+        )
+    return path
+
+
+def _described(name: str, parameters: Mapping | None, seed: int | None) -> dict:
+    """Parameters and seed of an episode, as the index holds them."""
+    if parameters is not None and not isinstance(parameters, Mapping):
+        raise SceneError(f"episode {name!r}: parameters = {parameters!r:.60}; give a dict of values by name")
+    if seed is not None:
+        seed = arguments.count(f"episode {name!r}: seed", seed, 0)
+    return {"parameters": storable(f"episode {name!r}: parameters", dict(parameters or {})), "seed": seed}
+
+
+def _checked(episode: Episode) -> Episode:
+    """An episode of an index whose values are of the types that they have."""
+    name, file = episode.name, episode.file
+    if not (isinstance(name, str) and NAME.fullmatch(name)):
+        raise ValueError(f"name {name!r:.60}")
+    arguments.choice(f"episode {name!r}: split", episode.split, SPLITS)
+    arguments.count(f"episode {name!r}: frames", episode.frames, 0)
+    arguments.count(f"episode {name!r}: worlds", episode.worlds)
+    texts = (episode.outcome, episode.failure, file)
+    if not all(isinstance(text, str) for text in texts) or not isinstance(episode.parameters, dict):
+        raise ValueError(f"episode {name!r}: outcome, failure and file are texts, parameters a dict")
+    if "\0" in file or bool(file) != bool(episode.frames):
+        raise ValueError(f"episode {name!r}: {episode.frames} frames in the file {file!r:.60}")
+    return episode
 
 
 def _size(trajectory) -> tuple[int, int]:

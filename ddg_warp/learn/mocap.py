@@ -14,6 +14,7 @@ Files are pickles, and are read as arrays of numbers only (`ddg_warp.learn.plain
 
 from __future__ import annotations
 
+import numbers
 import os
 import re
 from dataclasses import dataclass, replace
@@ -24,7 +25,9 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError
 from ddg_warp.geometry.polyline import cross, directors, length, unit
+from ddg_warp.io import as_path, is_file
 from ddg_warp.learn import plain_pickle
+from ddg_warp.learn.episodes import inside
 
 VARIABLE = "DDG_WARP_RECORDINGS"
 RATE = 100.0  # frames per second
@@ -105,7 +108,7 @@ class Recording:
         """
         from scipy.interpolate import make_interp_spline
 
-        if degree not in (1, 3):
+        if isinstance(degree, bool) or degree not in (1, 3):
             raise SceneError(f"resampled: degree = {degree!r}; it is 1 or 3")
         times = np.atleast_1d(arguments.floats(times))
         inside = times.ndim == 1 and times.size and times[0] >= self.times[0] and times[-1] <= self.times[-1]
@@ -131,7 +134,7 @@ class Recording:
         Raises:
             SceneError: `longest` is not positive.
         """
-        arguments.positive("filled: longest", longest, "s")
+        longest = arguments.positive("filled: longest", longest, "s")
         markers = self.markers.copy()
         for place in np.ndindex(markers.shape[1:]):
             seen = np.flatnonzero(np.isfinite(self.markers[(slice(None), *place)]))
@@ -149,27 +152,40 @@ class Recording:
         return replace(self, markers=markers)
 
     def between(self, first: int, last: int) -> Recording:
-        """The frames from `first` up to, but without, `last`; times go on from 0."""
+        """The frames from `first` up to, but without, `last`; times go on from 0.
+
+        Args:
+            first, last: Whole numbers; negative ones count from the end.
+
+        Raises:
+            SceneError: They are no whole numbers.
+            DataError: There are no such frames.
+        """
+        first, last = (arguments.index(f"between: {name}", k) for name, k in (("first", first), ("last", last)))
         times = self.times[first:last]
         if not len(times):
             raise DataError(f"{self.name}: there are no frames from {first} to {last}; there are {len(self.times)}")
         return replace(self, times=times - times[0], markers=self.markers[first:last])
 
 
-def recordings(folder: str = "", *, root=None) -> list[Path]:
+def recordings(folder: str = "", *, root=None, outside: bool = False) -> list[Path]:
     """The pickles below a folder of recordings, in the order of the numbers in their names.
 
     Args:
         folder: Where below the root to look, such as "data_set/DLO1/train".
         root: The clone; by default the folder that the environment variable DDG_WARP_RECORDINGS names.
+        outside: Whether recordings may lie outside of the clone, where parts of a path or links lead.
 
     Raises:
-        DataError: There is no such folder, or no recording in it.
+        DataError: There is no such folder, no recording in it, or one lies outside of the clone.
     """
-    path = _root(root) / folder
+    root, outside = _root(root), arguments.flag("recordings: outside", outside)
+    path = inside(root, root / as_path("recordings: folder", folder or "."), outside)
     found = [each for each in path.rglob("*") if each.suffix in (".pkl", ".pickle")]
     if not found:
         raise DataError(f"{path} holds no recordings (*.pkl); name a folder of them, of a clone that is complete")
+    for each in found:
+        inside(root, each, outside)
     return sorted(
         found, key=lambda each: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(each))]
     )
@@ -184,6 +200,7 @@ def read(
     rate: float = RATE,
     up: str = "z",
     held: tuple[int, ...] = HELD,
+    outside: bool = False,
 ) -> Recording:
     """A recording.
 
@@ -191,29 +208,33 @@ def read(
         path: The file, as `recordings` gives it, or as seen from the root.
         root: See `recordings`.
         axes: What the axes of its array are: frames, coordinates and markers, by their first letters.
-        markers: How many there are, of a file that has frames and markers on one axis, frame after frame (axes "cfm" as (3, F M)).
+        markers: How many there are. A file with axes "cfm" may have frames and markers on one axis, frame after frame: (3, F M).
         rate: Frames per second.
         up: The axis of the file that points up, "x", "y" or "z"; the recording has z up.
         held: The markers of both grips, from the first of the cable to the last; empty where nothing is held.
+        outside: Whether a path as seen from the root may lead out of it, by its parts or by links.
 
     Raises:
         SceneError: An option is no such option.
         DataError: The file does not exist, or holds no markers over time.
         UnsafePickleError: The file asks for more than arrays of numbers.
     """
-    path = Path(path)
-    path = path if path.is_absolute() else _root(root) / path
-    if not path.is_file():
+    path, outside = as_path("read: path", path), arguments.flag("read: outside", outside)
+    if not path.is_absolute():
+        root = _root(root)
+        path = inside(root, root / path, outside)
+    if not is_file(path):
         raise DataError(f"the recording {path} does not exist; `recordings()` lists what there is")
-    if sorted(str(axes)) != ["c", "f", "m"]:
+    if not isinstance(axes, str) or sorted(axes) != ["c", "f", "m"]:
         raise SceneError(
             f"read: axes = {axes!r}; they are the letters f, c, m of frames, coordinates, markers, in their order"
         )
     arguments.choice("read: up", up, UP)
-    arguments.positive("read: rate", rate, "1/s")
+    rate = arguments.positive("read: rate", rate, "1/s")
+    if markers is not None:
+        markers = arguments.count("read: markers", markers)
     values = _array(plain_pickle.load(path), path)
     if markers is not None and values.ndim == 2 and axes == "cfm":
-        arguments.count("read: markers", markers)
         if values.shape[1] % markers:
             raise DataError(f"{path} has an array {values.shape}, not of {markers} markers a frame; correct markers")
         values = values.reshape(len(values), -1, markers)
@@ -222,6 +243,8 @@ def read(
             f"{path} has an array {values.shape}, with three coordinates nowhere in axes = {axes!r}; give its axes"
         )
     values = values.transpose([axes.index(letter) for letter in "fmc"])[..., UP[up]]
+    if markers not in (None, values.shape[1]):
+        raise DataError(f"{path} has {values.shape[1]} markers by axes = {axes!r}, not {markers}; correct either")
     if np.isinf(values).any():
         frame, marker = np.argwhere(np.isinf(values).any(axis=2))[0]
         raise DataError(f"{path}: frame {frame}: marker {marker} is at infinity; correct the file, or leave it out")
@@ -237,16 +260,17 @@ def _root(root) -> Path:
         raise DataError(
             f"where are the recordings? Give root, or set {VARIABLE} to your clone of them; none come with ddg_warp"
         )
-    if not Path(given).is_dir():
-        raise DataError(f"the folder of recordings {given} does not exist; clone them, and give root or set {VARIABLE}")
-    return Path(given)
+    root = as_path("the folder of recordings", given)
+    if not root.is_dir():
+        raise DataError(f"the folder of recordings {root} does not exist; clone them, and give root or set {VARIABLE}")
+    return root
 
 
 def _array(content, path: Path) -> np.ndarray:
     """What a file holds as one array of real numbers."""
     try:
         values = np.asarray(content)
-    except ValueError:  # frames of different shapes
+    except (ValueError, OverflowError):  # frames of different shapes
         values = np.zeros(0, object)
     if values.dtype.kind not in "iuf":
         raise DataError(
@@ -256,9 +280,20 @@ def _array(content, path: Path) -> np.ndarray:
 
 
 def _checked_held(held, count: int, path: Path) -> tuple[int, ...]:
-    """Four markers of those that there are, or none."""
-    held = tuple(held)
-    fits = all(isinstance(marker, int) and -count <= marker < count for marker in held)
-    if held and not (fits and len({marker % count for marker in held}) == len(held) == 4):
-        raise DataError(f"{path} has {count} markers; held = {held} must be four of them, two of each grip, or none")
-    return tuple(marker % count for marker in held)
+    """Four markers of those that there are, or none.
+
+    Raises:
+        DataError: Something else, or a marker that there is not.
+    """
+    given = held
+    held = tuple(held) if np.iterable(held) and not isinstance(held, str | bytes | dict | set) else (None,)
+    fits = all(
+        isinstance(marker, numbers.Integral) and not isinstance(marker, bool) and -count <= marker < count
+        for marker in held
+    )
+    if held and not (fits and len({int(marker) % count for marker in held}) == len(held) == 4):
+        raise DataError(
+            f"{path} has {count} markers; held = {given!r} is not four of them, two of each grip; give four whole numbers, or "
+            "() where nothing is held"
+        )
+    return tuple(int(marker) % count for marker in held)

@@ -12,7 +12,12 @@ FRACTIONS = (0.8, 0.1, 0.1)
 
 
 def split_of(name: str, fractions: tuple[float, float, float] = FRACTIONS, seed: int = 0) -> str:
-    """The split of an episode: of its name and the seed alone, so that it does not depend on the other episodes."""
+    """The split of an episode: of its name and the seed alone, so that it does not depend on the other episodes.
+
+    Raises:
+        DataError: The fractions are no shares of one.
+    """
+    fractions = checked_fractions(fractions)
     digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
     place = int.from_bytes(digest[:8], "big") / 2.0**64
     for split, share in zip(SPLITS, fractions, strict=True):

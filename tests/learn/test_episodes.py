@@ -192,3 +192,25 @@ def test_a_killed_writer_leaves_complete_episodes(tmp_path):
         with writer.episode(name) as directory:  # a file of that name, not in the index yet, is replaced
             record(directory)
     json.loads((tmp_path / "index.json").read_text())
+
+
+def test_a_file_lies_outside_where_it_is_allowed(tmp_path):
+    folder = tmp_path / "data"
+    filled(folder)
+    (folder / "run_1.h5").rename(tmp_path / "away.h5")
+    (folder / "run_1.h5").symlink_to(tmp_path / "away.h5")
+    with pytest.raises(DataError, match=r"run_1\.h5 leads out of .*outside=True"):
+        Episodes(folder).path(Episodes(folder)["run_1"])
+    allowed = Episodes(folder, outside=True)
+    with TrajectoryReader(allowed.path(allowed["run_1"])) as reader:
+        assert len(reader) == 3
+
+
+def test_what_is_refused_leaves_the_index_as_it_was(tmp_path):
+    with EpisodeWriter(tmp_path) as writer:
+        writer.add("good", parameters={"load": np.float32(0.5), "sizes": np.arange(2)}, outcome="no_room")
+        for mistake in ({"parameters": {"load": object()}}, {"seed": -1}, {"seconds": "long"}, {"outcome": 3}):
+            with pytest.raises(SceneError, match="episode 'bad'"):
+                writer.add("bad", **{"outcome": "no_room"} | mistake)
+    episodes = Episodes(tmp_path)
+    assert [(episode.name, episode.parameters) for episode in episodes] == [("good", {"load": 0.5, "sizes": [0, 1]})]

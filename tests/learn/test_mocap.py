@@ -215,3 +215,24 @@ def test_a_recording_starts_a_rod(clone):
     scene.clamp(rod, edges=[0, MARKERS - 2])
     assert scene.build(device="cpu").state().points()[0] == pytest.approx(first.position[0])
     assert last.position[0] == pytest.approx(recording.markers[0, -1])
+
+
+def test_indices_of_numpy_are_taken(clone):
+    held = tuple(np.array([0, 1, -2, -1]))
+    recording = read("data_set/DLO1/train/1.pkl", held=held, markers=MARKERS)
+    assert recording.held == (0, 1, 11, 12)
+    assert all(type(marker) is int for marker in recording.held)
+    assert len(recording.between(np.int64(1), np.int32(-1)).times) == FRAMES - 2
+
+
+def test_links_lead_outside_where_it_is_allowed(clone, tmp_path_factory):
+    away = tmp_path_factory.mktemp("away")
+    (clone / "data_set" / "DLO1" / "eval" / "7.pkl").rename(away / "7.pkl")
+    (clone / "data_set" / "DLO1" / "eval" / "7.pkl").symlink_to(away / "7.pkl")
+    with pytest.raises(DataError, match="outside=True"):
+        recordings("data_set/DLO1/eval")
+    assert [path.name for path in recordings("data_set/DLO1/eval", outside=True)] == ["7.pkl"]
+    assert read("data_set/DLO1/eval/7.pkl", outside=True).complete
+    (clone / "data_set" / "DLO1" / "train" / "3.pkl").symlink_to("2.pkl")  # within the clone
+    assert [path.name for path in recordings("data_set/DLO1/train")] == ["1.pkl", "2.pkl", "3.pkl", "10.pkl"]
+    assert read("data_set/DLO1/train/3.pkl").complete
