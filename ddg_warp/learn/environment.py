@@ -129,6 +129,11 @@ class Environment:
         substeps: int = 1,
         parameters: dict | None = None,
     ):
+        if not isinstance(simulator, Simulator):
+            raise SceneError(f"Environment: {simulator!r} is no simulator; give a Simulator")
+        for name, function in {"observe": observe, "reward": reward, "terminated": terminated, "draw": draw}.items():
+            if not callable(function) and not (function is None and name in ("terminated", "draw")):
+                raise SceneError(f"Environment: {name} is {function!r}; give a function")
         self.simulator, self.worlds = simulator, arguments.count("worlds", worlds)
         self.steps, self.substeps = arguments.count("steps", steps), arguments.count("substeps", substeps)
         self.parameters, self._draw = parameters, draw
@@ -139,7 +144,13 @@ class Environment:
             raise SceneError(
                 "Environment: a Motion goes on with time, which worlds share; hold what it moves by a Grip"
             )
-        entries = [own for one in (rates if isinstance(rates, Sequence) else [rates]) for own in one.entries()]
+        given = [rates] if isinstance(rates, GripRates) or not np.iterable(rates) else list(rates)
+        for one in given:
+            if not isinstance(one, GripRates):
+                raise SceneError(f"Environment: rates hold {one!r}; give a GripRates, or a list of them")
+        entries = [own for one in given for own in one.entries()]
+        if not entries:
+            raise SceneError("Environment: rates are empty; give one GripRates at least")
         self.names = [name for *_, name in entries]
         self._check(entries)
         self.bounds = torch.tensor([bound for _, _, bound, _ in entries], dtype=self.dtype, device=self.device)
@@ -150,20 +161,40 @@ class Environment:
         self.observations, self.observation_dtype = self.observe(first).shape[1], self.observe(first).dtype
 
     def generators(self, seed: int) -> list[np.random.Generator]:
-        """A generator for each world, of independent streams."""
+        """A generator for each world, of independent streams.
+
+        Raises:
+            SceneError: the seed is no whole number that is not negative.
+        """
+        seed = arguments.count("generators: seed", seed, 0)
         return [np.random.default_rng(own) for own in np.random.SeedSequence(seed).spawn(self.worlds)]
 
     def begin(
         self, generators: list, now: EpisodeState | None = None, mask: torch.Tensor | None = None
     ) -> EpisodeState:
-        """Episodes that begin, in all worlds or those of a mask (B,); the others are as they are `now`."""
+        """Episodes that begin, in all worlds or those of a mask (B,); the others are as they are `now`.
+
+        Raises:
+            SceneError: there is not one generator a world, the mask is no mask of the worlds, or a function gives what has another
+                shape, other than before or from one world to the next.
+        """
+        self._check_generators(generators)
+        if now is None and mask is not None:
+            raise SceneError("begin: a mask goes with the episodes that go on; give now, or leave the mask out")
+        if now is not None:
+            self._check_state("begin", now)
+            mask = self._mask(mask)
         chosen = range(self.worlds) if now is None else torch.nonzero(mask).flatten().tolist()
         goals = (
             torch.zeros((self.worlds, 0), dtype=self.dtype, device=self.device) if now is None else now.goals.clone()
         )
         if self._draw is not None and len(chosen):
-            drawn = np.array([self._drawn(generators[world]) for world in chosen])
-            values = torch.as_tensor(drawn, dtype=self.dtype, device=self.device)
+            drawn = [self._drawn(generators[world]) for world in chosen]
+            sizes = {len(own) for own in drawn} | ({goals.shape[1]} if now is not None else set())
+            if len(sizes) > 1:
+                told = " and ".join(map(str, sorted(sizes)))
+                raise SceneError(f"Environment: draw gives {told} numbers; give as many for each world and episode")
+            values = torch.as_tensor(np.array(drawn), dtype=self.dtype, device=self.device)
             goals = values if now is None else goals.index_put((torch.tensor(chosen, device=self.device),), values)
         world = self._start(goals) if callable(self._start) else self._start
         if not isinstance(world, WorldState) or world.engine is not self.simulator.engine(self.worlds):
@@ -186,6 +217,7 @@ class Environment:
         Raises:
             SceneError: actions have another shape, are not finite, or exceed their bounds.
         """
+        self._check_state("step", now)
         actions = self._actions(actions)
         rates = torch.zeros((self.worlds, 6 * len(self.model.grips)), dtype=self.dtype, device=self.device)
         rates = rates.index_copy(1, self._places, actions).reshape(self.worlds, -1, 6)
@@ -225,10 +257,35 @@ class Environment:
             raise SceneError(f"Environment: {name} gives {_shape(found)}; give a tensor ({self.worlds},)")
         return found
 
+    def _check_generators(self, generators) -> None:
+        """Refuse what is not one generator of NumPy's for each world."""
+        several = isinstance(generators, list | tuple)
+        if not several or len(generators) != self.worlds or not all(hasattr(own, "random") for own in generators):
+            shown = f"{len(generators)} values" if several else repr(generators)
+            raise SceneError(
+                f"begin: generators are {shown}; give a list of {self.worlds}, one a world, as environment.generators(seed) does"
+            )
+
+    def _check_state(self, call: str, now) -> None:
+        """Refuse what is no state of episodes of these worlds."""
+        if not isinstance(now, EpisodeState) or len(now.steps) != self.worlds:
+            shown = f"of {len(now.steps)} worlds" if isinstance(now, EpisodeState) else repr(now)
+            raise SceneError(
+                f"{call}: now is {shown}; give an EpisodeState of {self.worlds} worlds, as begin and step do"
+            )
+
+    def _mask(self, mask) -> torch.Tensor:
+        """A mask of the worlds (B,)."""
+        found = tensor_of(mask)
+        if found is None or found.dtype != torch.bool or tuple(found.shape) != (self.worlds,):
+            raise SceneError(f"begin: mask is {mask!r}; give bools ({self.worlds},), one a world")
+        return found.to(self.device)
+
     def _drawn(self, generator) -> np.ndarray:
-        values = arguments.floats(self._draw(generator))
+        given = self._draw(generator)
+        values = arguments.floats(given)
         if values.ndim != 1 or not np.isfinite(values).all():
-            raise SceneError(f"Environment: draw gives {_shape(values)}; give finite numbers (n,)")
+            raise SceneError(f"Environment: draw gives {given!r:.60}; give finite numbers (n,)")
         return values
 
     def _check(self, entries: list) -> None:
@@ -244,8 +301,10 @@ class Environment:
         Controls(poses).checked(self.model)
 
     def _actions(self, actions) -> torch.Tensor:
-        actions = torch.as_tensor(actions).to(device=self.device, dtype=self.dtype)
-        shape = (self.worlds, len(self.names))
+        given, actions = actions, tensor_of(actions)
+        if actions is None or actions.dtype in (torch.bool, torch.complex64, torch.complex128):
+            raise SceneError(f"actions are {given!r:.60}, no numbers; give a tensor or an array of them")
+        actions, shape = actions.to(device=self.device, dtype=self.dtype), (self.worlds, len(self.names))
         if tuple(actions.shape) != shape:
             raise SceneError(f"actions have shape {tuple(actions.shape)}; they are {shape}: {', '.join(self.names)}")
         over = ~(actions.abs() <= self.bounds * (1.0 + 1e-6))  # by rounding to float32
@@ -283,6 +342,24 @@ def _selected(mask: torch.Tensor, new: WorldState, old: WorldState) -> WorldStat
         values.append(torch.where(along(mask, field, b), a, b))
     own = (torch.where(mask, a, b) for a, b in ((new.codes, old.codes), (new.differentiable, old.differentiable)))
     return WorldState(tuple(values), old.time, old.engine, *own)
+
+
+def check_environment(what: str, environment) -> None:
+    """Refuse what is no environment, by the name of the class that is to wrap it.
+
+    Raises:
+        SceneError: names class and value.
+    """
+    if not isinstance(environment, Environment):
+        raise SceneError(f"{what}: {environment!r} is no environment; give an Environment")
+
+
+def tensor_of(values) -> torch.Tensor | None:
+    """Return values as a tensor, or None where they are no array of numbers or bools."""
+    try:
+        return torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError):
+        return None
 
 
 def _shape(found) -> str:

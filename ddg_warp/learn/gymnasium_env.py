@@ -19,8 +19,9 @@ except ModuleNotFoundError as error:
         "vector environments need gymnasium: `pip install 'ddg-warp[gym]'`", name=error.name
     ) from error
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.learn.environment import Environment
+from ddg_warp.learn.environment import Environment, check_environment
 
 
 class VectorEnvironment(VectorEnv):
@@ -37,6 +38,7 @@ class VectorEnvironment(VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 - as of gymnasium
 
     def __init__(self, environment: Environment):
+        check_environment("VectorEnvironment", environment)
         self.environment, self.num_envs = environment, environment.worlds
         bounds = environment.bounds.cpu().numpy().astype(np.float32)
         seen = torch.zeros(0, dtype=environment.observation_dtype).numpy().dtype
@@ -50,10 +52,12 @@ class VectorEnvironment(VectorEnv):
         """First observations of new episodes in all worlds, of streams that go on where no seed is given.
 
         Raises:
-            SceneError: there are no options.
+            SceneError: there are options, or the seed is no whole number.
         """
         if options:
             raise SceneError(f"reset: options are {options}; there are none")
+        if seed is not None:
+            seed = arguments.count("reset: seed", seed, 0)
         super().reset(seed=seed)
         if seed is not None or self._generators is None:
             self._generators = self.environment.generators(self.np_random_seed)
@@ -71,7 +75,7 @@ class VectorEnvironment(VectorEnv):
             raise SceneError("step: no episode has begun; call reset first")
         own = self.environment
         with torch.no_grad():
-            now = own.step(self._now, np.asarray(actions))
+            now = own.step(self._now, actions)
             observations, rewards, ended = own.observe(now), own.reward(now), own.ended(now)
             over, infos = ended[0] | ended[1], {}
             if over.any():

@@ -19,6 +19,7 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("functions of JAX need jax: `pip install 'ddg-warp[jax]'`", name=error.name) from error
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 
@@ -35,6 +36,9 @@ def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callab
     Raises:
         SceneError: the function gives something of another shape, when it is called.
     """
+    if not callable(function):
+        raise SceneError(f"from_torch: {function!r} is no function; give one of torch tensors")
+    shape = tuple(arguments.count("from_torch: shape", size, 0) for size in (shape if np.iterable(shape) else [shape]))
     kind = jax.dtypes.canonicalize_dtype(dtype or float)
     result = jax.ShapeDtypeStruct(shape, kind)
 
@@ -51,10 +55,10 @@ def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callab
 
     def found(inputs: list) -> torch.Tensor:
         output = function(*inputs)
-        if not isinstance(output, torch.Tensor) or tuple(output.shape) != tuple(shape):
+        if not isinstance(output, torch.Tensor) or tuple(output.shape) != shape:
             given = tuple(output.shape) if isinstance(output, torch.Tensor) else repr(output)
             raise SceneError(
-                f"from_torch: the function gives {given}; give a tensor of shape {tuple(shape)}, or say another shape"
+                f"from_torch: the function gives {given}; give a tensor of shape {shape}, or say another shape"
             )
         return output
 

@@ -1,6 +1,10 @@
 """Parameters as modules: positive ones are learned as logarithms."""
 
+from collections.abc import Mapping
+
 import torch
+
+from ddg_warp.errors import SceneError
 
 
 class PositiveParameters(torch.nn.Module):
@@ -8,18 +12,39 @@ class PositiveParameters(torch.nn.Module):
 
     Args:
         values: first values by name, tensors that broadcast to (B, E).
+
+    Raises:
+        SceneError: they are no dict of positive finite real numbers by names; names the parameter.
     """
 
     def __init__(self, values: dict[str, torch.Tensor]):
         super().__init__()
+        if not isinstance(values, Mapping):
+            raise SceneError(f"PositiveParameters: values are {values!r:.60}; give a dict of tensors by name")
         self._names = list(values)
         self.logarithms = torch.nn.ParameterList(
-            torch.nn.Parameter(torch.log(torch.as_tensor(v))) for v in values.values()
+            torch.nn.Parameter(torch.log(_positive(name, value))) for name, value in values.items()
         )
 
     def forward(self) -> dict[str, torch.Tensor]:
         """Their values."""
         return {name: value.exp() for name, value in zip(self._names, self.logarithms, strict=True)}
+
+
+def _positive(name, value) -> torch.Tensor:
+    """Positive finite numbers of floating point."""
+    try:
+        found = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError):
+        found = torch.zeros(0, dtype=torch.bool)
+    found = found.to(torch.get_default_dtype()) if found.dtype in (torch.int32, torch.int64) else found
+    if not isinstance(name, str) or not found.is_floating_point() or not found.numel():
+        raise SceneError(
+            f"PositiveParameters: {name!r} is {value!r:.60}; give names of parameters, and numbers for each"
+        )
+    if not (torch.isfinite(found) & (found > 0.0)).all():
+        raise SceneError(f"PositiveParameters: {name!r} is not positive and finite; give positive numbers")
+    return found.detach()
 
 
 def parameter_key(name: str) -> str:

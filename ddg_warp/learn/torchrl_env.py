@@ -17,7 +17,8 @@ except ModuleNotFoundError as error:
         "environments of TorchRL need torchrl: `pip install 'ddg-warp[torchrl]'`", name=error.name
     ) from error
 
-from ddg_warp.learn.environment import Environment
+from ddg_warp import arguments
+from ddg_warp.learn.environment import Environment, check_environment
 
 ENDS = ("done", "terminated", "truncated")
 
@@ -33,6 +34,8 @@ class TorchRLEnvironment(EnvBase):
     """
 
     def __init__(self, environment: Environment, differentiable: bool = False):
+        check_environment("TorchRLEnvironment", environment)
+        differentiable = arguments.flag("TorchRLEnvironment: differentiable", differentiable)
         worlds, where = environment.worlds, {"device": torch.device(environment.device)}
         super().__init__(**where, batch_size=[worlds])
         self.environment, self.differentiable = environment, differentiable

@@ -69,6 +69,16 @@ def test_gymnasium_finds_nothing_wrong():
     assert not [text for text in left if not any(words in text for words in expected)]
 
 
+@pytest.mark.parametrize("seed", [[1, 2], (0,), -1, 0.5, "0", True], ids=repr)
+def test_seeds_of_gymnasium_are_whole_numbers(seed):
+    envs = vector()
+    with pytest.raises(SceneError, match="reset: seed"):
+        envs.reset(seed=seed)
+    envs.reset(seed=np.int64(3))
+    with pytest.raises(SceneError, match="actions are 'left'"):
+        envs.step("left")
+
+
 def test_episodes_of_gymnasium_end_and_begin_in_the_same_step():
     envs = vector(terminated=lambda now: (now.steps >= 2) & (torch.arange(WORLDS) == 1))
     from gymnasium.vector import AutoresetMode
@@ -168,3 +178,14 @@ def test_rollouts_of_torchrl_have_gradients():
     assert rollout["next", "truncated"][..., 0].sum(1).tolist() == [1] * WORLDS
     assert (rollout["observation"][:, 4, 3:] == 0.0).all()  # new episodes, at rest
     assert (rollout["observation"][:, 4, :3] != rollout["observation"][:, 0, :3]).all()
+
+
+@pytest.mark.parametrize(
+    ("module", "wrapper"), [("gymnasium_env", "VectorEnvironment"), ("torchrl_env", "TorchRLEnvironment")]
+)
+def test_what_is_no_environment_is_refused(module, wrapper):
+    pytest.importorskip({"gymnasium_env": "gymnasium", "torchrl_env": "torchrl"}[module])
+    made = getattr(importlib.import_module(f"ddg_warp.learn.{module}"), wrapper)
+    for other in (None, 3, gripped()):
+        with pytest.raises(SceneError, match=f"{wrapper}: .* is no environment"):
+            made(other)

@@ -1,0 +1,1 @@
+"""Bad inputs to readers of files that others wrote: curves, meshes, recordings."""
