@@ -71,6 +71,24 @@ def test_chain_of_springs_has_no_angles_and_no_frames(device):
     assert state.points()[-1, 2] < 0.0  # it falls
 
 
+def test_rods_of_two_nodes_are_springs_and_say_so(device):
+    """They neither bend nor twist, whatever is asked for; a ring of two nodes is none."""
+    scene = ddg.Scene()
+    given = {"section": ddg.Circle(0.01), "material": ddg.Material(1e6), "name": "hair"}
+    strands = np.array([[[0.0, y, 0.0], [0.1, y, 0.0]] for y in (0.0, 1.0)])
+    with pytest.warns(ddg.SceneWarning, match="'hair' have 2 nodes each, and no vertex"):
+        scene.add_rods(strands, **given)
+    scene.fix(0, [0])
+    model = scene.build(device=device)
+    assert [term.name for group in model.groups for term in group.kind.terms] == ["rod_stretch"]
+    state = ddg.Integrator(model).step(model.state(), 0.01)
+    z = state.points()[:, 2]
+    assert z[0] == 0.0 and (z[1:] < 0.0).all()
+    with pytest.raises(ddg.SceneError, match=r"rod 2 .* has 2 nodes; it needs at least 3"):
+        scene.add_rods(strands, closed=True, **given)
+        scene.build(device=device)
+
+
 @pytest.mark.parametrize(
     ("options", "block"),
     [({}, 4), ({"twist": False}, 3), ({"bend": False}, 3), ({"dimension": 2}, 2), ({"dimension": 2, "bend": False}, 2)],

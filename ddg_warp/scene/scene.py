@@ -1,5 +1,6 @@
 """The description of a simulation: rods, supports, loads. NumPy only; nothing here knows a device."""
 
+import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from copy import copy, deepcopy
@@ -8,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Law, Load, RodBatch, Statics, Support, Trace, laws_of
 from ddg_warp.scene.grip import Grip
@@ -127,7 +128,7 @@ class Scene(Structures):
             director: first director of the first edge (3,) or (R, 3), carried along without twist, or of all edges
                 (R, edges, 3); made perpendicular to the tangents. By default one is chosen.
             twist: False leaves twist out: 3 dofs a node, for isotropic rods that are straight at rest.
-            bend: False leaves bending and twist out: a chain of springs.
+            bend: False leaves bending and twist out: a chain of springs, as rods of two nodes are in any case (`SceneWarning`).
             name: shown in reports and output.
             laws: a `Law` for terms by name, such as "rod_bend_twist", instead of the quadratic one with the section's stiffness.
             curvature: what it is where edges meet at the angle phi, l the mean of their lengths: "tangent", 2 tan(phi/2) / l, or
@@ -145,7 +146,8 @@ class Scene(Structures):
             director = None if director is None else np.array(director, float)
         except (TypeError, ValueError):
             raise SceneError(
-                f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3)"
+                f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3), and rods "
+                "of other numbers of nodes go into a call of their own"
             ) from None
         if points.ndim == 2:
             points = points[None]
@@ -162,6 +164,14 @@ class Scene(Structures):
             raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
         if arguments.choice(f"rods '{name}': curvature", curvature, ("tangent", "angle")) == "angle" and not bend:
             raise SceneError(f"rods '{name}': curvature is 'angle' and bend is False; without bending leave it out")
+        if bend and not closed and points.shape[1] == 2:
+            warnings.warn(
+                f"rods '{name}' have 2 nodes each, and no vertex at which they could bend or twist: they are springs, as with "
+                "bend=False; give 3 nodes at least where they are to bend",
+                SceneWarning,
+                stacklevel=3,
+            )
+            bend = False
         planar = self.dimension == 2
         points.setflags(write=False)
         batch = RodBatch(

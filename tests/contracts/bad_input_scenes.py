@@ -64,7 +64,7 @@ ROD = {
     "nan point": ({"points": line(n3=(NAN, 0.0, 0.0))}, "rod 1", "'odd'", "node 3", "non-finite"),
     "infinite point": ({"points": line(n4=(INF, 0.0, 0.0))}, "rod 1", "node 4", "non-finite"),
     "one point": ({"points": np.zeros(3)}, "rod 1", "1 nodes", "at least 3"),
-    "too few nodes": ({"points": line(2)}, "rod 1", "2 nodes", "at least 3"),
+    "too few nodes": ({"points": line(2), "closed": True}, "rod 1", "2 nodes", "at least 3"),
     "too few nodes of a chain": ({"points": line(1), "bend": False}, "rod 1", "1 nodes", "at least 2"),
     "too few nodes of a ring": ({"points": line(2), "bend": False, "closed": True}, "rod 1", "2 nodes", "at least 3"),
     "folded": ({"points": line(n4=(0.6, 0.0, 0.0))}, "rod 1", "edges 2 and 2 + 1", "fold back", "move a node"),
