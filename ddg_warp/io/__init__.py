@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import DataError
 
 
@@ -126,7 +127,8 @@ class CurveSet:
         points: Positions [m], shape (P, 3), float64; the rods one after the other.
         counts: Points of each rod, shape (R,), int; their sum is P.
         closed: Whether a rod's last point is joined to its first, shape (R,), bool.
-        radius: Radius at each point [m], shape (P,), float64; None where the file gives none.
+        radius: Radius at each point [m], shape (P,), float64; None where the file gives none. It may be 0 at the tips of open rods: an
+            edge has the mean of its ends.
         path: Where the curves stood in the file: a USD prim path, an HDF5 dataset, a section.
         attributes: Further values of each rod by name, shape (R,), such as the ids and groups of a groom; a `Recorder` keeps them.
     """
@@ -164,17 +166,33 @@ def checked_curves(points, counts, closed, radius, path: str, source: str) -> Cu
         path: Where in the file the curves stand.
         source: File name, for messages.
     """
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-    counts = np.asarray(counts, dtype=int).reshape(-1)
     where = f"{source}, {path}"
+    points, counts = arguments.floats(points), arguments.floats(counts).reshape(-1)
+    if (points.ndim < 2 and points.size) or (points.ndim and points.shape[-1] != 3 and points.size):
+        raise CurveError(
+            f"{where}: the points have shape {points.shape} or are no numbers; give (P, 3), three numbers each"
+        )
+    if not (counts == np.round(counts)).all():
+        raise CurveError(f"{where}: the curves' vertex counts are no whole numbers; give each curve's number of points")
+    points, counts = points.reshape(-1, 3), counts.astype(int)
     if counts.sum() != len(points):
         raise CurveError(
             f"{where}: the curves' vertex counts sum to {counts.sum()}, but there are {len(points)} points; "
             "write the counts and the points of the same frame"
         )
-    closed = np.broadcast_to(np.asarray(closed, dtype=bool), counts.shape).copy()
+    closed = np.asarray(closed)
+    if closed.dtype.kind not in "biu" or closed.shape not in ((), counts.shape):
+        raise CurveError(
+            f"{where}: `closed` has shape {closed.shape}; give one flag, or one for each of {len(counts)} curves"
+        )
+    closed = np.broadcast_to(closed.astype(bool), counts.shape).copy()
     if radius is not None:
-        radius = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(points),)).copy()
+        radius = arguments.floats(radius)
+        if radius.shape not in ((), (1,), (len(points),)):
+            raise CurveError(
+                f"{where}: there are {radius.size} radii for {len(points)} points; give one, or one a point"
+            )
+        radius = np.broadcast_to(radius, (len(points),)).copy()
     _refuse_unusable(points, counts, closed, radius, where)
     return CurveSet(points, counts, closed, radius, path)
 
@@ -194,9 +212,17 @@ def _refuse_unusable(points, counts, closed, radius, where: str) -> None:
     if not finite.all():
         curve = owner[np.argmin(finite)]
         raise CurveError(f"{where}: curve {curve} has a point that is not finite; re-export it or delete it")
-    if radius is not None and not (positive := np.isfinite(radius) & (radius > 0.0)).all():
-        bad = np.argmin(positive)
-        raise CurveError(f"{where}: curve {owner[bad]} has a radius of {radius[bad]} m; give it a positive width")
+    if radius is not None:
+        positive = np.isfinite(radius) & (radius > 0.0)
+        last = np.cumsum(counts) - 1
+        tips = np.zeros(len(radius), bool)
+        tips[np.concatenate([last, last - counts + 1])] = np.tile(~closed, 2)
+        tips &= np.repeat(np.logical_or.reduceat(positive, last - counts + 1), counts) & (radius == 0.0)
+        for bad in np.flatnonzero(~(positive | tips))[:1]:
+            raise CurveError(
+                f"{where}: curve {owner[bad]} has a radius of {radius[bad]} m; give it a positive width, which may taper to 0 at the "
+                "ends of an open curve alone"
+            )
 
 
 def as_path(what: str, value, error: type[ValueError] = DataError) -> Path:
@@ -205,6 +231,12 @@ def as_path(what: str, value, error: type[ValueError] = DataError) -> Path:
     if not isinstance(given, str) or not given or "\0" in given:
         raise error(f"{what} is {value!r}; give a path, as text or pathlib.Path")
     return Path(given)
+
+
+def shown(words: list[str], most: int = 60) -> str:
+    """Return words of a file for a message: in one line, without letters that cannot be printed, the first of many."""
+    text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(words))
+    return text if len(text) <= most else f"{text[:most]}..."
 
 
 def is_file(path: Path) -> bool:

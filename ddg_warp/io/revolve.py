@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.io import Curves, Shapes, Surfaces
 
 
@@ -15,13 +16,14 @@ class Revolution:
     Args:
         curves: Open curves, such as a trajectory's.
         points: Their points at some time [m], shape (P, 3); points on the axis are poles.
-        sides: Corners of each ring.
+        sides: Corners of each ring, three at least.
 
     Attributes:
         shapes: The surfaces as what a writer of USD takes.
     """
 
     def __init__(self, curves: Curves, points: np.ndarray, sides: int):
+        sides = arguments.count("revolution: sides", sides, 3)
         self._angle = 2.0 * np.pi * np.arange(sides) / sides
         starts = np.concatenate([[0], np.cumsum(curves.counts)])
         triangles = [self._strips(np.arange(a, b), points) for a, b in pairwise(starts)]

@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
-from ddg_warp.io import existing
+from ddg_warp.io import CurveError, MissingFileError, existing
+from ddg_warp.io.usd_read import opened
 
 EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32
 
 
-def validate(path) -> list[str]:
+def validate(path, outside: bool = False) -> list[str]:
     """What is wrong with a USD file, a sentence each; empty where all is well.
 
     USD's own validators run where the installed USD has them. Beside them, for every BasisCurves and Mesh at every
-    time sample: counts match the points, all is finite, widths are positive, normals are unit vectors or 0 where there are
-    any, and the extent contains the points. Of Points as many widths as points, positive, and finite values.
+    time sample: counts match the points, all is finite, widths are positive but for tips of 0, normals are unit vectors or 0 where
+    there are any, and the extent contains the points. Of Points as many widths as points, positive, and finite values.
+
+    Args:
+        path: The file.
+        outside: Whether layers, references and payloads out of the folder of the file may be opened.
     """
-    path = existing(path)
     try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        return [f"{path}: cannot be opened: {error}"]
+        with opened(existing(path), CurveError, outside) as stage:
+            return _problems_of(stage, path)
+    except MissingFileError:
+        raise
+    except CurveError as error:
+        return [str(error)]
+
+
+def _problems_of(stage: Usd.Stage, path) -> list[str]:
+    """Those of a whole stage."""
     problems = _from_validators(stage)
     shapes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves) or prim.IsA(UsdGeom.Mesh)]
     if not shapes:
@@ -51,7 +62,8 @@ def _problems(prim: Usd.Prim) -> list[str]:
         curves = UsdGeom.BasisCurves(prim)
         count = int(np.sum(curves.GetCurveVertexCountsAttr().Get(times[0]) or [0]))
         widths = np.array(curves.GetWidthsAttr().Get(times[0]) or [np.nan])
-        problems = [] if (widths > 0.0).all() else ["the widths are missing or not positive"]
+        good = (widths >= 0.0).all() and widths.any()
+        problems = [] if good else ["the widths are missing or not positive"]
         if len(widths) not in {1, len(curves.GetCurveVertexCountsAttr().Get(times[0]) or []), count}:
             problems.append(f"there are {len(widths)} widths for {count} points")
     for time in times:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.colors import on_scale
@@ -20,11 +22,20 @@ HEADER = 64  # bytes at most that a value takes in a file beside its numbers
 
 @dataclass(frozen=True)
 class ColorBy:
-    """A scalar that decides the color, and its values at the two ends of the scale."""
+    """A scalar that decides the color, and its values at the two ends of the scale.
+
+    Raises:
+        SceneError: The ends are no finite numbers, or not in order.
+    """
 
     name: str
     low: float
     high: float
+
+    def __post_init__(self):
+        low, high = (arguments.number(f"color_by: {end} end", getattr(self, end)) for end in ("low", "high"))
+        if not isinstance(self.name, str) or low >= high:
+            raise SceneError(f"color_by = {(self.name, low, high)}; give a name, and a low end below the high end")
 
 
 @dataclass(frozen=True)

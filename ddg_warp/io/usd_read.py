@@ -1,50 +1,69 @@
 """Curves and meshes from USD files, in metres with z up: transforms, metersPerUnit and upAxis are applied.
 
-Every BasisCurves prim becomes a `CurveSet`; of a file with several meshes one is chosen by its path.
-Attributes are taken at the default time, or at their first sample where they have no default. Widths are diameters;
-under a transform that scales, they scale by the cube root of its volume change. A cubic curve is replaced by the
-polyline through its knots: its vertices (Catmull-Rom), every third vertex (Bezier), or (p0 + 4 p1 + p2)/6 (B-spline);
-resample it more finely before if that is too coarse.
+Every BasisCurves prim becomes a `CurveSet`; of a file with several meshes one is chosen by its path. Other curves (NURBS) are told, and
+instances of a PointInstancer refused. Attributes are taken at the default time, or at their first sample where they have no default.
+Widths are diameters; under a transform that scales, they scale by the cube root of its volume change. A cubic curve becomes the
+polyline through points on it, see `read_curves`.
+Layers, references and payloads are followed within the folder of a file, and out of it only where that is allowed.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom
 
-from ddg_warp.io import CurveError, CurveSet, MeshError, checked_curves, existing
+from ddg_warp import arguments
+from ddg_warp.errors import SceneWarning
+from ddg_warp.io import CurveError, CurveSet, MeshError, checked_curves, cubic, existing
 from ddg_warp.io.mesh_read import triangulated
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-BEZIER_STEP = 3
-MESHES_LISTED = 5
+LISTED = 5  # prims in a message
+SHORT = 0.01  # of its length by which the polyline of a cubic curve may fall short of it
+FINER = 4  # times as many points that a length is compared with
+INSTANCES = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 DRAWN = ("displayColor", "displayOpacity", "widths", "normals", "radius")
 
 
-def read_curves(path, prim: str | None = None) -> list[CurveSet]:
-    """The curves of a USD file, one set for each BasisCurves prim, in metres with z up.
+def read_curves(path, prim: str | None = None, samples: int = 1, outside: bool = False) -> list[CurveSet]:
+    """Return the curves of a USD file, one set for each BasisCurves prim, in metres with z up.
+
+    Warns (`SceneWarning`) of curves that are no BasisCurves, of files that it refers to and that are missing, and of cubic curves whose
+    polyline is more than 1 % too short.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path of the prim to read, with all below it; by default the whole file.
+        samples: Points of each segment of a cubic curve. 1 gives its knots: vertices (Catmull-Rom), every third vertex (Bezier), or
+            (p0 + 4 p1 + p2) / 6 (B-spline). With more points between them lengths converge with the square of their number.
+        outside: Whether layers, references and payloads out of the folder of the file may be opened.
+
+    Raises:
+        CurveError: The file has no curves to read, or one that no rod can be built from; names prim and curve.
     """
-    path = existing(path)
-    with _opened(path, CurveError) as stage:
-        curves = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
+    path, samples = existing(path), arguments.count("read_curves: samples", samples)
+    with opened(path, CurveError, outside) as stage:
+        curves, others = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
+        others = [each for each in others if each.IsA(UsdGeom.Curves)]
         if not curves:
+            there = f"; it holds {_listed(others)}" if others else ""
             raise CurveError(
-                f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}; export curves, not meshes"
+                f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}{there}; export curves as BasisCurves, not "
+                "meshes or NURBS"
             )
-        return [_read_prim(each, path) for each in curves]
+        if others:
+            _warn(f"{path}: {_listed(others)} {'is' if len(others) == 1 else 'are'} not read; export BasisCurves")
+        return [_read_prim(each, path, samples) for each in curves]
 
 
-def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, str]:
-    """The mesh of a USD file, in metres with z up: (points (P, 3), triangles (T, 3), name of the prim).
+def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the mesh of a USD file, in metres with z up: (points (P, 3), triangles (T, 3), name of the prim).
 
     Polygons are cut as `triangulated` does; holes are left out. A subdivision surface is taken as its control mesh. Triangles run
     counter-clockwise as seen from outside, also where the file says leftHanded or a transform mirrors.
@@ -52,22 +71,29 @@ def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarra
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path of the Mesh prim, or of one above it; needed where the file has several meshes.
+        outside: Whether layers, references and payloads out of the folder of the file may be opened.
+
+    Raises:
+        MeshError: The file has no mesh to read, or a bad one; names prim and face.
     """
     path = existing(path)
-    with _opened(path, MeshError) as stage:
-        meshes = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
+    with opened(path, MeshError, outside) as stage:
+        meshes, others = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
         if len(meshes) != 1:
-            listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:MESHES_LISTED]) or "none"
-            raise MeshError(f"{path}: there are {len(meshes)} meshes to read ({listed}); give prim= the path of one")
+            there = f"; it holds {_listed(others)}" if others and not meshes else ""
+            listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:LISTED]) or "none"
+            raise MeshError(
+                f"{path}: there are {len(meshes)} meshes to read ({listed}){there}; give prim= the path of one"
+            )
         (mesh,) = meshes
         where = f"{path}, {mesh.GetPath()}"
         points, time = _points(mesh, where, MeshError)
-        counts = np.array(_value(mesh.GetFaceVertexCountsAttr(), time) or [], dtype=int)
-        indices = np.array(_value(mesh.GetFaceVertexIndicesAttr(), time) or [], dtype=int)
-        holes = np.array(_value(mesh.GetHoleIndicesAttr(), time) or [], dtype=int)
+        counts = _whole(mesh.GetFaceVertexCountsAttr(), time)
+        indices = _whole(mesh.GetFaceVertexIndicesAttr(), time)
+        holes = _whole(mesh.GetHoleIndicesAttr(), time)
         triangles, face = triangulated(points, counts, indices, where)
         triangles = triangles[~np.isin(face, holes)]
-        to_world, _ = _placement(mesh, time)
+        to_world, _ = _placement(mesh, time, where, MeshError)
         left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
             triangles = triangles[:, [0, 2, 1]]
@@ -75,22 +101,92 @@ def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarra
 
 
 @contextmanager
-def _opened(path: Path, error: type[ValueError]) -> Iterator[Usd.Stage]:
-    """The stage of a file, whose prims live no longer than it; what USD says of a damaged one becomes an `error`."""
+def opened(path: Path, error: type[ValueError], outside: bool) -> Iterator[Usd.Stage]:
+    """Open the stage of a file, whose prims live no longer than it; what USD says of a damaged one becomes an `error`.
+
+    Args:
+        path: The file.
+        error: Class of what is raised.
+        outside: Whether layers out of the folder of the file may be opened.
+    """
+    arguments.flag("outside", outside)
     try:
-        yield Usd.Stage.Open(str(path))
+        layers = _layers(path, error, outside)
+        stage = Usd.Stage.Open(layers[0])
+        for layer in stage.GetUsedLayers():  # which variables in asset paths may have chosen
+            _refuse_outside(path, layer.realPath, error, outside)
+        yield stage
     except Tf.ErrorException as reason:
         said = " ".join(str(reason).split()).rpartition(" : ")[2].strip("'")
         raise error(f"{path}: this is no USD file, or it is cut short or damaged ({said}); export it again") from reason
+    except (CurveError, MeshError):
+        raise
+    except (TypeError, ValueError, OverflowError) as reason:
+        raise error(f"{path}: values are of another kind than USD gives them ({reason}); export it again") from reason
 
 
-def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]) -> list:
-    """All prims of a kind in a file, or below the prim at a path."""
+def _layers(path: Path, error: type[ValueError], outside: bool) -> list[Sdf.Layer]:
+    """All layers that a file is composed of, itself first; each is looked at before those that it names are opened."""
+    layers, seen = [Sdf.Layer.FindOrOpen(str(path))], set()
+    for layer in layers:
+        for asset in layer.GetCompositionAssetDependencies():
+            name = layer.ComputeAbsolutePath(Sdf.Layer.SplitIdentifier(asset)[0])
+            found = Ar.GetResolver().Resolve(name).GetPathString()
+            if not found:
+                _warn(f"{path}: @{asset}@, to which the file refers, is missing; put it there, or flatten the stage")
+            elif found not in seen:
+                _refuse_outside(path, found, error, outside)
+                seen.add(found)
+                layers.append(Sdf.Layer.FindOrOpen(found))
+    return layers
+
+
+def _refuse_outside(path: Path, found: str, error: type[ValueError], outside: bool) -> None:
+    """Refuse a layer out of the folder of a file, unless that is allowed."""
+    if outside or not found:
+        return
+    if Ar.IsPackageRelativePath(found):
+        found = Ar.SplitPackageRelativePathOuter(found)[0]
+    folders = (path.parent.resolve(), path.resolve().parent)
+    if not any(Path(found).resolve().is_relative_to(folder) for folder in folders):
+        raise error(
+            f"{path}: the file refers to {found}, out of its folder; flatten the stage, or allow it by outside=True where you trust it"
+        )
+
+
+def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]) -> tuple[list, list]:
+    """(prims of a kind in a file, or below the prim at a path; prims of other kinds that have a shape)."""
+    if prim is not None and not (isinstance(prim, str) and Sdf.Path.IsValidPathString(prim)[0]):
+        raise error(f"{path}: prim = {prim!r} is no path of a prim; give one such as '/World/Hair'")
     root = stage.GetPrimAtPath(prim) if prim else stage.GetPseudoRoot()
     if not root:
         raise error(f"{path}: there is no prim {prim}; `usdtree {path}` lists them")
-    within = Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
-    return [kind(each) for each in within if each.IsA(kind)]
+    within = list(Usd.PrimRange(root, INSTANCES))
+    for instancer in (UsdGeom.PointInstancer(each) for each in within if each.IsA(UsdGeom.PointInstancer)):
+        for target in instancer.GetPrototypesRel().GetTargets():
+            prototype = stage.GetPrimAtPath(target)
+            for each in Usd.PrimRange(prototype, Usd.PrimAllPrimsPredicate) if prototype else ():
+                if each.IsA(kind):
+                    raise error(
+                        f"{path}: {instancer.GetPath()} is a PointInstancer, whose instances of {each.GetPath()} are not read; make "
+                        f"them prims of their own, or read the prototype alone by prim='{target}'"
+                    )
+    for each in [stage.GetPrimAtPath(prefix) for prefix in root.GetPath().GetPrefixes()] + within:
+        if each.HasAuthoredMetadata("clips"):
+            raise error(f"{path}: {each.GetPath()} takes values from other files (clips); flatten the stage")
+    found = [each for each in within if each.IsA(kind)]
+    others = [each for each in within if each.IsA(UsdGeom.Gprim) and not each.IsA(kind)]
+    return [kind(each) for each in found], others
+
+
+def _listed(prims: list[Usd.Prim]) -> str:
+    """Prims by path and type, the first of many."""
+    shown = [f"{each.GetPath()} ({each.GetTypeName()})" for each in prims[:LISTED]]
+    return ", ".join(shown + (["..."] if len(prims) > LISTED else []))
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, SceneWarning, stacklevel=5)
 
 
 def _points(shape: UsdGeom.PointBased, where: str, error: type[ValueError]) -> tuple[np.ndarray, Usd.TimeCode]:
@@ -100,23 +196,26 @@ def _points(shape: UsdGeom.PointBased, where: str, error: type[ValueError]) -> t
         raise error(f"{where}: there are no points; export the prim with its points")
     # EarliestTime means the first sample of an attribute, and its default where it has no samples.
     time = Usd.TimeCode.EarliestTime() if attribute.Get() is not None else Usd.TimeCode(attribute.GetTimeSamples()[0])
-    return np.array(_value(attribute, time), dtype=np.float64).reshape(-1, 3), time
+    points = np.array(_value(attribute, time), dtype=np.float64)
+    if points.size and (points.ndim != 2 or points.shape[1] != 3):
+        raise error(f"{where}: the points have shape {points.shape}; export them as point3f[]")
+    return points.reshape(-1, 3), time
 
 
-def _read_prim(curves: UsdGeom.BasisCurves, path: Path) -> CurveSet:
+def _read_prim(curves: UsdGeom.BasisCurves, path: Path, samples: int) -> CurveSet:
     name = str(curves.GetPath())
-    points, time = _points(curves, f"{path}, {name}", CurveError)
-    counts = np.array(_value(curves.GetCurveVertexCountsAttr(), time) or [], dtype=int)
+    where = f"{path}, {name}"
+    points, time = _points(curves, where, CurveError)
+    counts = _whole(curves.GetCurveVertexCountsAttr(), time)
     closed = curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic
     checked_curves(points, counts, closed, None, name, str(path))
-    knots = _knots(curves, counts, closed, f"{path}, {name}")
-    knot_counts = np.array([len(each) for each in knots])
-    widths = _widths(curves, time, knots, knot_counts, f"{path}, {name}")
-    to_world, scale = _placement(curves, time)
-    points = np.concatenate([_blend(each, points) for each in knots]) @ to_world[:3, :3] + to_world[3, :3]
+    to_world, scale = _placement(curves, time, where, CurveError)
+    sampled = _sampled(curves, counts, points, samples, where)
+    widths = _widths(curves, time, sampled, len(points), where)
+    points = sampled.blend(points) @ to_world[:3, :3] + to_world[3, :3]
     radius = None if widths is None else 0.5 * scale * widths
     return replace(
-        checked_curves(points, knot_counts, closed, radius, name, str(path)),
+        checked_curves(points, sampled.counts, closed, radius, name, str(path)),
         attributes=_attributes(curves, time, len(counts)),
     )
 
@@ -142,56 +241,81 @@ def _value(attribute: Usd.Attribute, time: Usd.TimeCode):
     return attribute.Get(time) if default is None else default
 
 
-def _placement(shape: UsdGeom.PointBased, time: Usd.TimeCode) -> tuple[np.ndarray, float]:
+def _whole(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
+    """Whole numbers of an attribute; empty where it has no value.
+
+    Raises:
+        ValueError: It has others.
+    """
+    values = np.array(_value(attribute, time) or np.zeros(0, int))
+    if values.dtype.kind not in "iu" or values.ndim != 1:
+        raise ValueError(f"{attribute.GetPath()} is {attribute.GetTypeName()}, not int[]")
+    return values.astype(int)
+
+
+def _placement(
+    shape: UsdGeom.PointBased, time: Usd.TimeCode, where: str, error: type[ValueError]
+) -> tuple[np.ndarray, float]:
     """(matrix for row vectors to metres with z up, shape (4, 4); its mean scale)."""
     stage = shape.GetPrim().GetStage()
-    matrix = np.array(shape.ComputeLocalToWorldTransform(time)) * UsdGeom.GetStageMetersPerUnit(stage)
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
+    unit, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
+    if not 0.0 < unit < np.inf:
+        raise error(f"{where}: metersPerUnit of the file is {unit}; set it to the length of its unit [m], such as 0.01")
+    matrix = np.array(shape.ComputeLocalToWorldTransform(time)) * unit
+    volume = abs(np.linalg.det(matrix[:3, :3])) if np.isfinite(matrix).all() else np.nan
+    if not 0.0 < volume < np.inf:
+        raise error(f"{where}: its transforms scale volumes by {volume}; correct those that scale, or metersPerUnit")
+    if up == UsdGeom.Tokens.y:
         matrix[:, :3] = matrix[:, :3] @ Y_UP_TO_Z_UP.T
-    return matrix, abs(np.linalg.det(matrix[:3, :3])) ** (1.0 / 3.0)
+    return matrix, volume ** (1.0 / 3.0)
 
 
-def _knots(curves: UsdGeom.BasisCurves, counts: np.ndarray, closed: bool, where: str) -> list[np.ndarray]:
-    """For each curve the vertices that its knots are blended from, shape (knots, 3), see `_blend`."""
-    starts = np.cumsum(counts) - counts
-    if curves.GetTypeAttr().Get() == UsdGeom.Tokens.linear:
-        return [
-            np.repeat(first + np.arange(count), 3).reshape(-1, 3) for first, count in zip(starts, counts, strict=True)
-        ]
-    basis, wrap = curves.GetBasisAttr().Get(), curves.GetWrapAttr().Get()
-    local = [_cubic_knots(basis, wrap, count) for count in counts]
-    for curve, knots in enumerate(local):
-        if len(knots) < 2 + closed:
+def _sampled(
+    curves: UsdGeom.BasisCurves, counts: np.ndarray, points: np.ndarray, samples: int, where: str
+) -> cubic.Sampled:
+    """Points of each curve, as weights of its vertices; warns of polylines that are too short."""
+    kind, basis, wrap = (each.Get() for each in (curves.GetTypeAttr(), curves.GetBasisAttr(), curves.GetWrapAttr()))
+    if kind == UsdGeom.Tokens.linear:
+        return cubic.linear(counts)
+    if kind != UsdGeom.Tokens.cubic or basis not in cubic.BASES:
+        raise CurveError(
+            f"{where}: the curves are of type {kind!r} and basis {basis!r}; export linear ones, or cubic ones of a basis of "
+            f"{', '.join(cubic.BASES)}"
+        )
+    for count in np.unique(counts):
+        if not cubic.segments(basis, wrap, int(count)):
+            allowed = [str(n) for n in range(2, 16) if cubic.segments(basis, wrap, n)][:3]
             raise CurveError(
-                f"{where}: curve {curve} is a cubic {basis} of {counts[curve]} vertices, too few; resample it"
+                f"{where}: curve {np.argmax(counts == count)} is a cubic {basis} ({wrap}) of {count} vertices; such curves have "
+                f"{', '.join(allowed)}, ...: resample it"
             )
-    return [first + knots for first, knots in zip(starts, local, strict=True)]
+    found = cubic.sampled(basis, wrap, counts, samples)
+    finer = cubic.sampled(basis, wrap, counts, FINER * samples)
+    closed = wrap == UsdGeom.Tokens.periodic
+    with np.errstate(all="ignore"):
+        short = 1.0 - _lengths(found, points, closed) / _lengths(finer, points, closed)
+    short = np.nan_to_num(short)
+    if (worst := short.max()) > SHORT:
+        _warn(
+            f"{where}: the polyline of curve {np.argmax(short)} is {100.0 * worst:.2g} % shorter than its cubic {basis}; read more "
+            f"points on it by read_curves(path, samples={int(np.ceil(samples * np.sqrt(worst / SHORT)))})"
+        )
+    return found
 
 
-def _cubic_knots(basis: str, wrap: str, count: int) -> np.ndarray:
-    """Vertices before, at and after each knot of a cubic curve, shape (knots, 3); three times the same to keep it."""
-    vertex = np.arange(count)
-    if basis == UsdGeom.Tokens.bezier:
-        return np.repeat(vertex[::BEZIER_STEP], 3).reshape(-1, 3)
-    neighbours = np.stack([vertex - 1, vertex, vertex + 1], axis=1)
-    if basis == UsdGeom.Tokens.catmullRom:
-        neighbours = np.repeat(vertex, 3).reshape(-1, 3)
-    if wrap == UsdGeom.Tokens.periodic:
-        return neighbours % count
-    if wrap == UsdGeom.Tokens.pinned:  # the curve begins and ends at its first and last vertex
-        neighbours[[0, -1]] = [[0], [count - 1]]
-        return neighbours
-    return neighbours[1:-1]
+def _lengths(curves: cubic.Sampled, points: np.ndarray, closed: bool) -> np.ndarray:
+    """Lengths of the polylines through points on curves, shape (R,)."""
+    at, first = curves.blend(points), np.cumsum(curves.counts) - curves.counts
+    steps = np.linalg.norm(np.roll(at, -1, axis=0) - at, axis=1)
+    last = first + curves.counts - 1
+    steps[last] = np.linalg.norm(at[first] - at[last], axis=1) if closed else 0.0
+    return np.add.reduceat(steps, first)
 
 
-def _blend(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values at the knots of a curve; the weights of a B-spline leave three equal vertices as they are."""
-    before, at, after = (values[knots[:, k]] for k in range(3))
-    return (before + 4.0 * at + after) / 6.0
-
-
-def _widths(curves, time, knots: list[np.ndarray], knot_counts: np.ndarray, where: str) -> np.ndarray | None:
-    """Width at each knot, in the prim's units, shape (knots of all curves,); None where the prim has no widths."""
+def _widths(
+    curves: UsdGeom.BasisCurves, time: Usd.TimeCode, sampled: cubic.Sampled, vertex_count: int, where: str
+) -> np.ndarray | None:
+    """Width at each point of all curves, in the prim's units, shape (P,); None where the prim has no widths."""
     primvar = UsdGeom.PrimvarsAPI(curves).GetPrimvar("widths")  # takes precedence over the attribute
     if primvar.HasValue():
         value, kind = primvar.ComputeFlattened(time), primvar.GetInterpolation()
@@ -201,13 +325,13 @@ def _widths(curves, time, knots: list[np.ndarray], knot_counts: np.ndarray, wher
         return None
     widths = np.array(value, dtype=np.float64)
     if kind == UsdGeom.Tokens.constant or len(widths) == 1:
-        return np.full(knot_counts.sum(), widths[0])
-    vertex_count = sum(_value(curves.GetCurveVertexCountsAttr(), time))
-    expected = {UsdGeom.Tokens.uniform: len(knots), UsdGeom.Tokens.varying: knot_counts.sum()}.get(kind, vertex_count)
+        return np.full(sampled.counts.sum(), widths[0])
+    each = {UsdGeom.Tokens.uniform: len(sampled.counts), UsdGeom.Tokens.varying: sampled.knot_counts.sum()}
+    expected = each.get(kind, vertex_count)
     if len(widths) != expected:
         raise CurveError(
             f"{where}: there are {len(widths)} widths, but `{kind}` interpolation takes {expected}; fix either"
         )
     if kind == UsdGeom.Tokens.uniform:
-        return np.repeat(widths, knot_counts)
-    return widths if kind == UsdGeom.Tokens.varying else np.concatenate([_blend(each, widths) for each in knots])
+        return np.repeat(widths, sampled.counts)
+    return sampled.between_knots(widths) if kind == UsdGeom.Tokens.varying else sampled.blend(widths)

@@ -7,6 +7,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, Vt
 from stand_in import curves, rest_points
 
+from ddg_warp.errors import SceneWarning
 from ddg_warp.io import CurveError, MissingFileError, read
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd import CurvesWriter, read_curves, validate
@@ -115,6 +116,59 @@ def test_cubic_curves_become_polylines_through_knots(tmp_path, basis, wrap, x):
     assert found.radius.shape == (len(x),)
 
 
+CIRCLE = 4.0 / 3.0 * np.tan(np.pi / 8)  # of a Bezier quarter circle, within 3e-4
+QUARTER = [(1, 0, 0), (1, CIRCLE, 0), (CIRCLE, 1, 0), (0, 1, 0)]
+TURNS = 2.0 * np.pi * np.arange(8) / 8
+AROUND = [(np.cos(a), np.sin(a), 0.0) for a in TURNS]
+
+
+@pytest.mark.parametrize(
+    ("basis", "wrap", "points", "length"),
+    [
+        ("bezier", "nonperiodic", QUARTER, 0.5 * np.pi),
+        ("catmullRom", "periodic", AROUND, 6.255947),
+        ("bspline", "periodic", AROUND, 5.666319),
+    ],
+)
+def test_lengths_of_cubic_curves_converge(tmp_path, basis, wrap, points, length):
+    """With the square of the number of points; lengths of splines are those that SciPy has of them."""
+    stage, prim = stage_with_curves(tmp_path / "a.usda", points, [len(points)], "cubic", wrap)
+    prim.CreateBasisAttr(basis)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.Save()
+    path = stage.GetRootLayer().realPath
+
+    def measured(samples: int) -> float:
+        (found,) = read_curves(path, samples=samples)
+        around = np.concatenate([found.points, found.points[:1]]) if wrap == "periodic" else found.points
+        return np.linalg.norm(np.diff(around, axis=0), axis=1).sum()
+
+    exact = measured(500)
+    assert exact == pytest.approx(length, rel=5e-4)
+    errors = [exact - measured(samples) for samples in (8, 16)]
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.02)
+    with pytest.warns(
+        SceneWarning, match=rf"/Curves: the polyline of curve 0 .* shorter than its cubic {basis}; .*samples="
+    ):
+        measured(1)
+
+
+def test_samples_lie_between_knots_with_their_widths(tmp_path):
+    stage, prim = stage_with_curves(tmp_path / "a.usda", [(3 * k, 0, 0) for k in range(6)], [6], "cubic", "pinned")
+    prim.CreateBasisAttr("bspline")
+    prim.CreateWidthsAttr([2.0, 4.0, 6.0, 8.0, 10.0, 12.0])
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.Save()
+    for kind in ("vertex", "varying"):
+        prim.SetWidthsInterpolation(kind)
+        stage.Save()
+        (found,) = read_curves(stage.GetRootLayer().realPath, samples=3)
+        assert found.counts.tolist() == [16]
+        along = [abs(x) for x in found.points @ [1.0, 0.0, 0.0]]
+        np.testing.assert_allclose(along, np.arange(16.0), atol=1e-6)  # the phantom points keep a straight line even
+        np.testing.assert_allclose(found.radius, np.linspace(1.0, 6.0, 16), rtol=1e-6)
+
+
 def test_bezier_knots_and_varying_widths(tmp_path):
     stage, prim = stage_with_curves(tmp_path / "a.usda", [(k, 0, 0) for k in range(7)], [7], "cubic")
     prim.CreateBasisAttr("bezier")
@@ -158,9 +212,31 @@ def test_bad_widths_are_named(tmp_path):
     prim.CreateWidthsAttr([1.0, 2.0, 3.0])
     with pytest.raises(CurveError, match="/Curves: there are 3 widths, but `vertex` interpolation takes 5"):
         only(stage)
-    prim.GetWidthsAttr().Set([1.0, 1.0, 1.0, 0.0, 1.0])
-    with pytest.raises(CurveError, match=r"curve 1 has a radius of 0\.0 m"):
+    for widths, curve in (
+        ([1.0, 0.0, 1.0, 1.0, 1.0], 0),
+        ([1.0, 1.0, 1.0, 0.0, 0.0], 1),
+        ([1.0, 1.0, 1.0, 1.0, -1.0], 1),
+    ):
+        prim.GetWidthsAttr().Set(widths)
+        with pytest.raises(CurveError, match=rf"curve {curve} has a radius of -?0\.\d+ m.* taper to 0 at the ends"):
+            only(stage)
+    prim.CreateWrapAttr("periodic")
+    prim.GetCurveVertexCountsAttr().Set([5])
+    prim.GetWidthsAttr().Set([1.0, 1.0, 1.0, 1.0, 0.0])
+    with pytest.raises(CurveError, match=r"curve 0 has a radius of 0\.0 m"):
         only(stage)
+
+
+def test_widths_taper_to_0_at_tips(tmp_path):
+    """As those of most grooms do; a linear taper gives edges the mean of their ends."""
+    stage, prim = stage_with_curves(tmp_path / "a.usda")
+    prim.CreateWidthsAttr([0.0, 2.0, 0.0, 2.0, 0.0])
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    found = only(stage)
+    np.testing.assert_array_equal(found.radius, [0.0, 1.0, 0.0, 1.0, 0.0])
+    with CurvesWriter(tmp_path / "b.usda", found) as writer:
+        writer.write(0.0, found.points)
+    assert validate(tmp_path / "b.usda") == []
 
 
 def frames(count=3):
@@ -300,3 +376,82 @@ def test_the_groom():
     np.testing.assert_allclose(np.linalg.norm(strands[:, 0] - [0, 0, 1.6], axis=1), 0.1, atol=1e-3)  # on the head, z up
     assert strands[:, 0, 2].min() > 1.6
     assert validate(GROOM) == []
+
+
+def groom(name: str, more: str = "") -> str:
+    """A prim of one strand, as text."""
+    return f"""def BasisCurves "{name}" {more}
+{{
+    uniform token type = "linear"
+    int[] curveVertexCounts = [3]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (2, 0, 0)]
+}}
+"""
+
+
+HEAD = """#usda 1.0
+(
+    metersPerUnit = 1
+    upAxis = "Z"
+    {}
+)
+"""
+
+
+@pytest.mark.parametrize(
+    ("head", "body"),
+    [
+        ("subLayers = [@../away/hair.usda@]", ""),
+        ("", 'def "a" (references = @../away/hair.usda@</hair>)\n{\n}\n'),
+        ("", 'def "a" (payload = @../away/hair.usda@</hair>)\n{\n}\n'),
+        ("", 'def "a" (references = @./link.usda@</hair>)\n{\n}\n'),
+        ("", 'def "a" (references = @./between.usda@</b>)\n{\n}\n'),
+        ("", 'def "a" (references = @../away/hair.usda:SDF_FORMAT_ARGS:a=b@</hair>)\n{\n}\n'),
+    ],
+    ids=["sublayer", "reference", "payload", "link", "reference of a reference", "arguments"],
+)
+def test_files_out_of_the_folder_are_opened_where_it_is_allowed(tmp_path, head, body):
+    here, away = tmp_path / "here", tmp_path / "away"
+    here.mkdir(), away.mkdir()
+    (away / "hair.usda").write_text(HEAD.format("") + groom("hair"))
+    (here / "link.usda").symlink_to(away / "hair.usda")
+    (here / "between.usda").write_text(HEAD.format("") + 'def "b" (references = @../away/hair.usda@</hair>)\n{\n}\n')
+    (here / "a.usda").write_text(HEAD.format(head) + body)
+    with pytest.raises(CurveError, match=r"a\.usda: the file refers to .*\.usda, out of its folder; .*outside=True"):
+        read_curves(here / "a.usda")
+    (problem,) = validate(here / "a.usda")
+    assert "out of its folder" in problem
+    (found,) = read_curves(here / "a.usda", outside=True)
+    assert found.counts.tolist() == [3]
+
+
+def test_files_in_the_folder_are_opened_and_missing_ones_told(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "hair.usda").write_text(HEAD.format("") + groom("hair"))
+    text = 'def "a" (references = @parts/hair.usda@</hair>)\n{\n}\ndef "b" (references = @parts/none.usda@)\n{\n}\n'
+    (tmp_path / "a.usda").write_text(HEAD.format("") + text)
+    with pytest.warns(SceneWarning, match=r"@parts/none\.usda@.* is missing"):
+        (found,) = read_curves(tmp_path / "a.usda")
+    assert found.path == "/a"
+
+
+def test_other_curves_are_told(tmp_path):
+    nurbs = groom("nurbs").replace("BasisCurves", "NurbsCurves").replace('    uniform token type = "linear"\n', "")
+    (tmp_path / "a.usda").write_text(HEAD.format("") + nurbs + groom("hair"))
+    with pytest.warns(SceneWarning, match=r"/nurbs \(NurbsCurves\) is not read"):
+        (found,) = read_curves(tmp_path / "a.usda")
+    assert found.path == "/hair"
+    (tmp_path / "b.usda").write_text(HEAD.format("") + nurbs)
+    with pytest.raises(CurveError, match=r"no BasisCurves; it holds /nurbs \(NurbsCurves\)"):
+        read_curves(tmp_path / "b.usda")
+
+
+def test_prototypes_of_instancers_are_read_by_their_path(tmp_path):
+    instancer = 'def PointInstancer "p"\n{\nint[] protoIndices = [0, 0]\npoint3f[] positions = [(0, 0, 0), (5, 0, 0)]\n'
+    (tmp_path / "a.usda").write_text(
+        HEAD.format("") + instancer + "rel prototypes = </p/hair>\n" + groom("hair") + "}\n"
+    )
+    with pytest.raises(CurveError, match="/p is a PointInstancer, whose instances of /p/hair are not read"):
+        read_curves(tmp_path / "a.usda")
+    (found,) = read_curves(tmp_path / "a.usda", "/p/hair")
+    assert found.path == "/p/hair"

@@ -1,0 +1,104 @@
+"""Points of cubic curves of USD: B-splines, Catmull-Rom splines and Bezier curves, as weights of their vertices.
+
+Source: UsdGeomBasisCurves, openusd.org (segments by basis and wrap; phantom points of pinned curves).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BASES = {
+    "bezier": np.array([[1, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], float),
+    "bspline": np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0,
+    "catmullRom": np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]) / 2.0,
+}
+"""Weights of the four vertices of a segment, by the powers of the parameter from 0 to 1."""
+PERIODIC, PINNED = "periodic", "pinned"
+BEZIER_STEP = 3
+REACH = 6  # vertices that a point can depend on: four, and one more at a pinned end each
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Points of a curve, or of several curves one after the other.
+
+    Attributes:
+        vertices, weights: vertices that each point is blended from, and their weights, shape (P, 6) or (P, 1).
+        knots, shares: knots before and after each point, shape (P, 2), and the share of the second, shape (P,).
+        counts: Points of each curve, shape (R,).
+        knot_counts: Knots of each curve, shape (R,).
+    """
+
+    vertices: np.ndarray
+    weights: np.ndarray
+    knots: np.ndarray
+    shares: np.ndarray
+    counts: np.ndarray
+    knot_counts: np.ndarray
+
+    def blend(self, values: np.ndarray) -> np.ndarray:
+        """Return values at the points, shape (P, ...), from values at the vertices."""
+        return np.einsum("pk,pk...->p...", self.weights, values[self.vertices])
+
+    def between_knots(self, values: np.ndarray) -> np.ndarray:
+        """Return values at the points, shape (P,), linear between values at the knots."""
+        return (1.0 - self.shares) * values[self.knots[:, 0]] + self.shares * values[self.knots[:, 1]]
+
+
+def segments(basis: str, wrap: str, count: int) -> int:
+    """Return the number of segments of a curve of so many vertices; 0 where its basis does not take so many."""
+    if basis == "bezier":
+        whole, rest = divmod(count - (wrap != PERIODIC), BEZIER_STEP)
+        return whole if not rest else 0
+    number = {PERIODIC: count, PINNED: count - 1}.get(wrap, count - 3)
+    return max(number, 0) if wrap != PERIODIC or count >= 3 else 0
+
+
+def linear(counts: np.ndarray) -> Sampled:
+    """Return the vertices of polylines as they are."""
+    every = np.arange(counts.sum())
+    return Sampled(every[:, None], np.ones((len(every), 1)), np.stack([every, every], 1), 0.0 * every, counts, counts)
+
+
+def sampled(basis: str, wrap: str, counts: np.ndarray, samples: int) -> Sampled:
+    """Return points of curves: the knots and, between two of them, `samples` - 1 points at equal parameters.
+
+    Args:
+        basis: One of `BASES`.
+        wrap: "nonperiodic", "periodic" or "pinned".
+        counts: Vertices of each curve, shape (R,), all with segments.
+        samples: Points of a segment.
+    """
+    local = {count: _local(basis, wrap, int(count), samples) for count in np.unique(counts)}
+    each = [local[count] for count in counts]
+    points, knots = (np.array([len(one[k]) for one in each]) for k in (0, 4))
+    before, first = np.repeat(np.cumsum(counts) - counts, points), np.repeat(np.cumsum(knots) - knots, points)
+    vertices, weights, between, shares = (np.concatenate([one[k] for one in each]) for k in range(4))
+    return Sampled(vertices + before[:, None], weights, between + first[:, None], shares, points, knots)
+
+
+def _local(basis: str, wrap: str, count: int, samples: int) -> tuple:
+    """(vertices, weights, knots, shares of the points; knots) of one curve, see `Sampled`."""
+    number, closed = segments(basis, wrap, count), wrap == PERIODIC
+    segment = np.repeat(np.arange(number), samples)
+    share = np.tile(np.arange(samples) / samples, number)
+    if not closed:
+        segment, share = np.append(segment, number - 1), np.append(share, 1.0)
+    step, ahead = (BEZIER_STEP, 0) if basis == "bezier" else (1, 0 if wrap not in (PERIODIC, PINNED) else 1)
+    vertices = np.zeros((len(segment), REACH), int)
+    weights = np.zeros((len(segment), REACH))
+    vertices[:, :4] = step * segment[:, None] - ahead + np.arange(4)
+    weights[:, :4] = share[:, None] ** np.arange(4) @ BASES[basis]
+    if closed:
+        vertices %= count
+    # A point beyond a pinned end continues the line through the last two vertices: 2 p_0 - p_1.
+    for k, beyond, end, inner in ((4, -1, 0, 1), (5, count, count - 1, count - 2)):
+        out = vertices == beyond
+        weights[:, k] = -(weights * out).sum(1)
+        vertices[:, k] = inner
+        weights[out] *= 2.0
+        vertices[out] = end
+    knots = np.arange(number + (not closed))
+    return vertices, weights, np.stack([segment, (segment + 1) % len(knots)], 1), share, knots
