@@ -198,6 +198,23 @@ def torus(n_around: int, n_tube: int, major: float, minor: float, pattern: str =
     return points, _grid(n_around, n_tube, pattern, wrap_x=True, wrap_y=True)
 
 
+def drop_unused(points, triangles) -> Mesh:
+    """Return a mesh without the vertices that no triangle uses; the others keep their order.
+
+    Raises:
+        SceneError: points or triangles are no mesh.
+    """
+    points, triangles = np.asarray(points), np.asarray(triangles)
+    if points.ndim != 2 or triangles.ndim != 2 or triangles.dtype.kind not in "iu":
+        raise SceneError("drop_unused: give points (P, 3) and triangles (T, 3) of whole numbers")
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise SceneError(
+            f"drop_unused: triangles name vertices that do not exist, there are {len(points)}; correct them"
+        )
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return points[used], renumbered.reshape(triangles.shape)
+
+
 def weld(points, triangles, tolerance: float) -> Mesh:
     """The mesh with vertices that lie within a tolerance [m] of each other made one, and triangles that shrink by it left out.
 

@@ -189,7 +189,9 @@ class Surface:
                 "merge or move a vertex"
             )
         for vertex in np.flatnonzero(np.bincount(triangles.ravel(), minlength=count) == 0)[:1]:
-            raise SceneError(f"{self._name}: vertex {vertex} is used by no triangle; remove it")
+            raise SceneError(
+                f"{self._name}: vertex {vertex} is used by no triangle; remove it, as meshes.drop_unused(points, triangles) does"
+            )
         return triangles
 
     def _refuse_edges(self, edge_of: np.ndarray, forwards: np.ndarray) -> None:

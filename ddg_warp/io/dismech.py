@@ -9,17 +9,18 @@
 The MATLAB and Python programs count nodes from 1. A file in which an edge names node 0 is taken to count from 0.
 The C++ program has no sections: its files hold one node a line, separated by blanks, in order along a single rod.
 Sections that those programs derive from the edges (`*elStretchRod`, ...) are skipped. Separators are commas or
-blanks; what follows a `#` or `%` is a comment.
+blanks; what follows a `#` or `%` is a comment. Comments may be in any encoding.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ddg_warp.io import CurveError, CurveSet, checked_curves, existing
+from ddg_warp.io import CurveError, CurveSet, checked_curves, existing, shown
 
 COLUMNS = {"nodes": (3, float), "edges": (2, int), "triangles": (3, int)}
 ALIASES = {"rodnodes": "nodes", "rodedges": "edges", "shelltriangles": "triangles"}
+BEYOND = 2**31  # a node that no file has
 DERIVED_PREFIX = "el"
 
 
@@ -50,7 +51,7 @@ def _sections(path) -> dict[str, list[tuple]]:
     sections: dict[str, list[tuple]] = {name: [] for name in COLUMNS}
     sections["headers"] = []
     current = "nodes"
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         text = line.partition("#")[0].partition("%")[0].strip()
         if text.startswith("*"):
             current = _section(text, f"{path}:{number}")
@@ -64,7 +65,9 @@ def _section(header: str, where: str) -> str:
     name = header[1:].strip().lower()
     name = ALIASES.get(name, name)
     if name not in COLUMNS and not name.startswith(DERIVED_PREFIX):
-        raise CurveError(f"{where}: unknown section `{header}`; known are *Nodes, *Edges, *rodNodes, *rodEdges")
+        raise CurveError(
+            f"{where}: unknown section `{shown([header])}`; known are *Nodes, *Edges, *rodNodes, *rodEdges"
+        )
     return name
 
 
@@ -76,8 +79,10 @@ def _row(text: str, section: str, where: str) -> tuple:
         row = ()
     if len(row) != width:
         raise CurveError(
-            f"{where}: `{text}` is not a line of *{section}: {width} {number.__name__} values are expected"
+            f"{where}: `{shown([text])}` is not a line of *{section}: {width} {number.__name__} values are expected"
         )
+    if number is int and max(map(abs, row)) > BEYOND:
+        raise CurveError(f"{where}: `{shown([text])}` names a node that no file has; correct the line")
     return row
 
 

@@ -7,44 +7,60 @@ Source: B1. Object Files, Advanced Visualizer manual, Wavefront Technologies (st
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from ddg_warp import arguments
+from ddg_warp.errors import SceneWarning
 from ddg_warp.geometry import polygons
-from ddg_warp.io import MeshError, existing
+from ddg_warp.io import MeshError, existing, shown
 
+BEYOND = 2**31  # a vertex that no file has, for any larger number
 USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
 
 
-def read_mesh(path, prim: str | None = None, weld: float | None = None) -> tuple[np.ndarray, np.ndarray, str]:
-    """The mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
+def read_mesh(
+    path, prim: str | None = None, weld: float | None = None, outside: bool = False
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
 
-    Polygons that are not convex are cut by ears in their plane, others into fans from their first corner. `Surface` checks
-    what comes back.
+    Polygons that are not convex are cut by ears in their plane, others into fans from their first corner. Vertices that no face uses
+    are dropped, with a `SceneWarning`. `Surface` checks what comes back.
 
     Args:
         path: A .obj, .usd, .usda, .usdc or .usdz file.
         prim: For USD, path of the Mesh prim, or of one above it; needed where the file has several meshes.
         weld: Vertices within this distance [m] of each other become one, as seams of exported files need; None keeps all.
+        outside: For USD, whether layers, references and payloads out of the folder of the file may be opened. An OBJ file is read
+            alone: files that it names (mtllib) are never opened.
 
     Raises:
         MeshError: the file cannot be read; names the file, the line or prim, and the remedy.
+        SceneError: `weld` is no positive length.
     """
-    points, triangles, name = _read(existing(path), prim)
-    if weld is None:
-        return points, triangles, name
     from ddg_warp.geometry import meshes
 
-    return *meshes.weld(points, triangles, weld), name
+    path = existing(path)
+    points, triangles, name = _read(path, prim, arguments.flag("read_mesh: outside", outside))
+    used, told = meshes.drop_unused(points, triangles), len(points)
+    if len(used[0]) < told:
+        first = np.argmin(np.isin(np.arange(told), triangles))
+        warnings.warn(
+            f"{path}: {told - len(used[0])} of {told} vertices are dropped, the first of them {first}: no face uses them",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return *(used if weld is None else meshes.weld(*used, weld)), name
 
 
-def _read(path: Path, prim: str | None) -> tuple[np.ndarray, np.ndarray, str]:
+def _read(path: Path, prim: str | None, outside: bool) -> tuple[np.ndarray, np.ndarray, str]:
     if path.suffix.lower() in USD_SUFFIXES:
         from ddg_warp.io.usd_read import read_mesh_prim
 
-        return read_mesh_prim(path, prim)
+        return read_mesh_prim(path, prim, outside)
     if path.suffix.lower() == ".obj":
         if prim is not None:
             raise MeshError(f"{path}: prim = {prim!r}, but an OBJ file has no prims; leave it out")
@@ -116,14 +132,14 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     for number, (keyword, *words) in _statements(path):
         try:
             if keyword == "v":
-                x, y, z = map(float, words[:3])
+                x, y, z = (float(word) for word in words[:3])
                 points.append([x, y, z])
             elif keyword == "f":
                 corners = [int(word.partition("/")[0]) for word in words]
                 if 0 in corners:
                     raise MeshError(f"{path}:{number}: the face names vertex 0; an OBJ file counts from 1, correct it")
                 # what is negative counts back from the last vertex so far
-                indices += [k - 1 if k > 0 else max(len(points) + k, -1) for k in corners]
+                indices += [min(k - 1, BEYOND) if k > 0 else max(len(points) + k, -1) for k in corners]
                 counts.append(len(corners))
                 lines.append(number)
             elif keyword in {"o", "g"} and not name:
@@ -132,7 +148,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
             raise
         except ValueError:
             wanted = "three numbers" if keyword == "v" else "vertices as v, v/vt, v//vn or v/vt/vn"
-            text = " ".join([keyword, *words])
+            text = shown([keyword, *words])
             raise MeshError(f"{path}:{number}: '{text}' cannot be read; write {wanted} after {keyword}") from None
     vertices = np.array(points, dtype=np.float64).reshape(-1, 3)
     triangles, _ = triangulated(vertices, np.array(counts, int), np.array(indices, int), str(path), lines)

@@ -68,6 +68,12 @@ def test_bad_files_are_named(tmp_path, text, message):
         rods(tmp_path, text)
 
 
+def test_comments_in_any_encoding(tmp_path):
+    path = tmp_path / "rods.txt"
+    path.write_bytes(("% Länge 1 m, Höhe µ\n" + NODES + "*Edges\n1,2\n2,3\n3,4\n").encode("latin-1"))
+    assert list(read_rods(path).counts) == [4]
+
+
 def test_missing_file(tmp_path):
     with pytest.raises(MissingFileError, match="no such file"):
         read_rods(tmp_path / "none.txt")

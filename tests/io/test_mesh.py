@@ -7,6 +7,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, Vt
 from stand_in import Model, State, curves, rest_points, step, surfaces
 
+from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import meshes
 from ddg_warp.geometry.operators import face_areas, vertex_normals
 from ddg_warp.geometry.surface import Surface
@@ -92,6 +93,36 @@ def test_bad_obj_files_are_named(tmp_path, text, message):
         read_mesh(tmp_path / "a.obj")
 
 
+def test_vertices_of_no_face_are_dropped_with_a_word(tmp_path):
+    (tmp_path / "a.obj").write_text(
+        "v 9 9 9\n" + PYRAMID.replace("# a pyr", "v 8 8 8\n#") + "v 5 5 5\nf 3 4 7\nf 4 5 7\n"
+    )
+    with pytest.warns(
+        SceneWarning, match=r"a\.obj: 4 of 8 vertices are dropped, the first of them 0: no face uses them"
+    ):
+        points, triangles, _ = read_mesh(tmp_path / "a.obj")
+    assert points.tolist() == [[0, 0, 0], [2, 0, 0], [2, 2, 0], [1, 1, 3]]
+    assert triangles.tolist() == [[0, 1, 3], [1, 2, 3]]
+    assert len(Surface(points, triangles).points) == 4
+
+
+def test_the_refusal_of_unused_vertices_names_what_drops_them():
+    points, triangles = meshes.rectangle(1, 1)
+    more = np.concatenate([[[9.0, 9.0, 9.0]], points])
+    with pytest.raises(
+        SceneError, match=r"vertex 0 is used by no triangle; .*meshes\.drop_unused\(points, triangles\)"
+    ):
+        Surface(more, triangles + 1)
+    kept, renumbered = meshes.drop_unused(more, triangles + 1)
+    np.testing.assert_array_equal(kept, points)
+    np.testing.assert_array_equal(renumbered, triangles)
+
+
+def test_libraries_of_materials_are_never_opened(tmp_path):
+    (tmp_path / "a.obj").write_text("mtllib /dev/full ../../nowhere.mtl\n" + PYRAMID + FACES["v"])
+    assert len(read_mesh(tmp_path / "a.obj")[0]) == 5
+
+
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(MissingFileError, match="no such file"):
         read_mesh(tmp_path / "none.obj")
@@ -159,8 +190,9 @@ def test_usd_polygons_holes_and_first_sample(tmp_path):
     mesh.GetPointsAttr().Clear()
     for time in (7.0, 9.0):
         mesh.GetPointsAttr().Set([Gf.Vec3f(k % 4, k // 4, time) for k in range(8)], time)
-    points, triangles, _ = saved(stage)
-    assert triangles.tolist() == [[0, 1, 5], [0, 5, 4], [2, 3, 7]]
+    with pytest.warns(SceneWarning, match="1 of 8 vertices are dropped, the first of them 6"):
+        points, triangles, _ = saved(stage)
+    assert triangles.tolist() == [[0, 1, 5], [0, 5, 4], [2, 3, 6]]
     assert (points[:, 2] == 7.0).all()
 
 
