@@ -255,16 +255,30 @@ def existing(path) -> Path:
     return path
 
 
-def read(path) -> list[CurveSet]:
-    """The curves of a USD, HDF5 or DisMech text file, told apart by the suffix."""
+def read(path, outside: bool = False) -> list[CurveSet]:
+    """Return the curves of a USD, HDF5 or DisMech text file, told apart by the suffix.
+
+    Args:
+        path: The file.
+        outside: Whether other files that a USD or HDF5 file takes data from may be opened: layers, references and payloads out of its
+            folder, external links and virtual datasets.
+
+    Raises:
+        CurveError: The file holds no usable curves.
+        DataError: An HDF5 file takes data from another file, and may not.
+    """
+    outside = arguments.flag("read: outside", outside)
     suffix = as_path("the file to read", path, MissingFileError).suffix.lower()
     if suffix in {".usd", ".usda", ".usdc", ".usdz"}:
         from ddg_warp.io.usd import read_curves
 
-        return read_curves(path)
+        return read_curves(path, outside=outside)
     if suffix in {".h5", ".hdf5"}:
         from ddg_warp.io.hdf5 import read_rods
+        from ddg_warp.io.links import refuse_links
 
+        if not outside:
+            refuse_links(existing(path))
         return read_rods(path)
     if suffix == ".txt":
         from ddg_warp.io.dismech import read_rods as read_text

@@ -29,6 +29,7 @@ from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io import as_path, is_file
 from ddg_warp.io.hdf5_read import TrajectoryReader
+from ddg_warp.io.links import refuse_links
 from ddg_warp.learn.episodes import INDEX, Episodes, inside
 from ddg_warp.learn.splits import SPLITS
 from ddg_warp.run.run_directory import TRAJECTORY
@@ -73,7 +74,7 @@ class Recordings(torch.utils.data.Dataset):
         failed: Whether to read also episodes that ended early.
         short: What becomes of a file with fewer frames than a window spans: "refuse" it, or "skip" it; `skipped` has their paths.
         dtype: "float32" or "float64", in which everything is recorded.
-        outside: Whether files may lie outside of the folders given, where an index or links lead.
+        outside: Whether files may lie outside of the folders given, where an index or links lead, and take data from others.
 
     Attributes:
         sources: The files that are read, a list of `Source`.
@@ -112,6 +113,7 @@ class Recordings(torch.utils.data.Dataset):
         if split is not None:
             arguments.choice("Recordings: split", split, SPLITS)
         self._dtype = arguments.choice("Recordings: dtype", dtype, DTYPES)
+        self._outside = outside
         arguments.choice("Recordings: short", short, ("refuse", "skip"))
         several = np.iterable(paths) and not isinstance(paths, str | bytes | os.PathLike)
         given = [as_path("Recordings: paths", path) for path in (paths if several else [paths])]
@@ -197,6 +199,8 @@ class Recordings(torch.utils.data.Dataset):
             self._readers, self._owner = OrderedDict(), os.getpid()
         if place not in self._readers:
             path = self.sources[place].path
+            if not self._outside:
+                refuse_links(path)
             reader = self._readers[place] = TrajectoryReader(path)
             self._check_fields(reader, self.sources[place])
         self._readers.move_to_end(place)
@@ -253,6 +257,8 @@ def _sources(path: Path, split: str | None, failed: bool, outside: bool) -> list
         raise DataError(f"{file} does not exist; give a folder of episodes, a directory of a run, or a trajectory.h5")
     if file is not path:
         inside(path, file, outside)
+    if not outside:
+        refuse_links(file)
     with TrajectoryReader(file) as reader:
         worlds = reader.points.shape[1] if reader.points.ndim == 4 else 1
         parameters = reader.provenance.get("parameters", {})

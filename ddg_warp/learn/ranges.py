@@ -198,7 +198,7 @@ def check_kind(name: str, range_, kind: type) -> None:
     Raises:
         SceneError: names parameter and value.
     """
-    if kind not in KINDS:
+    if not isinstance(kind, type) or kind not in KINDS:
         return
     if isinstance(range_, Uniform | LogUniform):
         if kind is int:

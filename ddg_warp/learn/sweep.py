@@ -27,7 +27,7 @@ from ddg_warp.ask.fields import check_fields
 from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io import as_path
 from ddg_warp.learn.episodes import DONE, Episodes, EpisodeWriter
-from ddg_warp.learn.ranges import GROWING, Range, check_kind, check_names, draw, seed_of
+from ddg_warp.learn.ranges import GROWING, KINDS, Range, check_kind, check_names, draw, seed_of
 from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
 from ddg_warp.run.catalog import SHARED, load_scene, parameters, scene_name
 from ddg_warp.run.progress import progress_bar
@@ -36,7 +36,7 @@ from ddg_warp.run.summary import plain, write_json
 
 ABOUT = "sweep.json"
 REFUSED = "refused"  # outcome of parameters of which no scene can be built
-SHARED_TIMES = ("dt", "duration")  # options of `simulate` that a range may give
+NAMED = {kind.__name__: kind for kind in KINDS}  # types of parameters, as modules with postponed annotations have them
 OPTIONS = ("device", "precision", "dt", "duration", "fields", "options")  # of `simulate`
 
 
@@ -210,16 +210,15 @@ def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun
     if callable(what):
         if options:
             raise SceneError(f"options = {options!r} are of `simulate`, for scenes; a function gives them itself")
-        found = dict([*inspect.signature(what).parameters.items()][1:])
-        kinds = {}
-        if not inspect.signature(what).parameters:
+        known = [*inspect.signature(what).parameters.items()]
+        found = dict(known[1:])
+        if not known:
             raise SceneError(
                 f"{_name_of(what)} takes no directory to record in; write it as run(directory, **parameters)"
             )
     else:
         what = _scene(what)
         found = inspect.signature(_loaded(what).build, eval_str=True).parameters
-        kinds = {name: parameter.annotation for name, parameter in found.items()} | dict.fromkeys(SHARED_TIMES, float)
     names = {*found, *(() if callable(what) else SHARED)}
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values()):
         for name in ranges:
@@ -228,7 +227,9 @@ def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun
                     f"ranges: there is no parameter {name!r}; there are {', '.join(sorted(names)) or 'none'}"
                 )
     for name, range_ in ranges.items():
-        check_kind(name, range_, kinds.get(name))
+        kind = getattr(found.get(name), "annotation", None)
+        kind = NAMED.get(kind) if isinstance(kind, str) else kind
+        check_kind(name, range_, float if name in SHARED and not callable(what) else kind)
     for name, parameter in found.items():
         several = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
         if parameter.default is parameter.empty and not several and name not in ranges and name != "seed":
@@ -249,7 +250,7 @@ def _check_options(options: Mapping, ranges: Mapping) -> None:
     """Refuse options that `simulate` does not have, or that a range gives, too."""
     if unknown := options.keys() - set(OPTIONS):
         raise SceneError(f"options: {', '.join(sorted(map(str, unknown)))}: there are {', '.join(OPTIONS)}")
-    for name in SHARED_TIMES:
+    for name in SHARED:
         if name in options and name in ranges:
             raise SceneError(f"{name} is given by options and by ranges; give it once")
         if options.get(name) is not None:

@@ -246,6 +246,22 @@ each("sweeps", "what", [3, None, b"cable", ["cable"], 1.5], swept, "sweep", "nam
 each("sweeps", "ranges", [None, 3, [("load", 1.0)], "load=1:2"], lambda v: swept(ranges=v), "ranges", "dict")
 each("sweeps", "samples", [0, 2.5, "3", True, None], lambda v: swept(samples=v), "samples")
 each("sweeps", "seed", [-1, 0.5, None, "0"], lambda v: swept(seed=v), "seed")
+each(
+    "sweeps",
+    "whole number of a function",
+    [5.5, "x", True, Uniform(1, 5)],
+    lambda v: swept(ranges={"load": 1.0, "n": v}),
+    "ranges: n",
+    "whole number",
+)
+each(
+    "sweeps",
+    "number of a function",
+    ["x", True, Choice([0.5, "1"])],
+    lambda v: swept(ranges={"load": v}),
+    "ranges: load",
+    "number",
+)
 each("sweeps", "workers", [0, 1.5, "2", True], lambda v: swept(workers=v), "workers")
 each("sweeps", "gpus", [-1.0, "1", NAN, True, None], lambda v: swept(gpus=v), "gpus")
 each("sweeps", "out", [None, 3, b"out", "", "a\0b"], lambda v: swept(out=v), "out", "pathlib.Path")

@@ -3,12 +3,14 @@
 import pickle
 from importlib import import_module
 
+import h5py
 import numpy as np
 import pytest
 from test_episodes import filled, record
 
 import ddg_warp as ddg
 from ddg_warp.errors import DataError, SceneError
+from ddg_warp.io import read
 from ddg_warp.io.hdf5 import TrajectoryReader
 from ddg_warp.learn.episodes import EpisodeWriter
 from ddg_warp.run.simulate import simulate
@@ -206,3 +208,50 @@ def test_missing_files_are_named(tmp_path):
     filled(tmp_path, 1, fractions=(1.0, 0.0, 0.0))
     with pytest.raises(DataError, match="of the split 'test'"):
         Recordings(tmp_path, window=2, split="test")
+
+
+@pytest.mark.parametrize("index", [slice(2), None, 0.0, "0", [0], True, slice(None)], ids=repr)
+def test_items_are_chosen_by_whole_numbers(run, index):
+    data = Recordings(run, window=2)
+    with pytest.raises(SceneError, match="Recordings: item"):
+        data[index]
+    assert data[np.int64(-1)]["time"][-1] == data[len(data) - 1]["time"][-1]
+
+
+def test_files_that_an_index_does_not_fit_are_named(tmp_path):
+    episodes = filled(tmp_path)
+    index = tmp_path / "index.json"
+    index.write_text(index.read_text().replace('"frames": 3', '"frames": 5', 1))
+    with pytest.raises(DataError, match=r"run_0\.h5 has 3 frames of 1 worlds, its index says 5 of 1"):
+        Recordings(episodes.directory, window=4, short="skip")
+
+
+@pytest.mark.parametrize("how", ["link", "storage", "virtual"])
+def test_data_of_other_files_is_read_where_it_is_allowed(tmp_path, how):
+    """By external links, external storage and virtual datasets."""
+    record(tmp_path)
+    path, other = tmp_path / "trajectory.h5", tmp_path / "other.h5"
+    with h5py.File(path, "r+") as file, h5py.File(other, "w") as away:
+        points = file["trajectory/points"][:]
+        del file["trajectory/points"]
+        away["points"] = points
+        if how == "link":
+            file["trajectory/points"] = h5py.ExternalLink("other.h5", "/points")
+        elif how == "storage":
+            points.tofile(tmp_path / "raw")
+            file.create_dataset(
+                "trajectory/points", points.shape, float, external=[(str(tmp_path / "raw"), 0, h5py.h5f.UNLIMITED)]
+            )
+        else:
+            layout = h5py.VirtualLayout(points.shape, float)
+            layout[:] = h5py.VirtualSource(str(other), "points", points.shape)
+            file.create_virtual_dataset("trajectory/points", layout)
+    for reading in (lambda: Recordings(path, window=2), lambda: read(path)):
+        with pytest.raises(
+            DataError, match=r"trajectory\.h5: /trajectory/points is kept in another file, .*outside=True"
+        ):
+            reading()
+    with EpisodeWriter(tmp_path / "folder") as writer, pytest.raises(DataError, match="kept in another file"):
+        writer.add("a", path)
+    np.testing.assert_array_equal(Recordings(path, window=3, outside=True)[0]["points"], points)
+    assert len(read(path, outside=True)) == 1

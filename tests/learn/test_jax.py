@@ -121,3 +121,20 @@ def test_arrays_of_states_pass_without_a_copy(name, device):
         state = integrator.step(state, DT)
     assert torch.equal(held, before)
     assert not torch.equal(torch.from_dlpack(state.arrays()[key]), before)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((None, (2,)), "None is no function"),
+        ((abs, (-1,)), "shape"),
+        ((abs, "ab"), "shape"),
+        ((abs, (1.5,)), "shape"),
+        ((abs, None), "shape"),
+    ],
+)
+def test_what_is_no_function_or_shape_is_refused(jax, given, said):
+    from ddg_warp.learn.jax import from_torch
+
+    with pytest.raises(SceneError, match=f"from_torch: .*{said}"):
+        from_torch(*given)
