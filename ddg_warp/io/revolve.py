@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.io import Curves, Shapes, Surfaces
+from ddg_warp.io import CurveError, Curves, Shapes, Surfaces
 
 
 class Revolution:
@@ -23,6 +23,10 @@ class Revolution:
     """
 
     def __init__(self, curves: Curves, points: np.ndarray, sides: int):
+        if not isinstance(points, np.ndarray) or points.shape != (len(curves.radius), 3):
+            raise CurveError(
+                f"revolution: points are no array ({len(curves.radius)}, 3) of the points of its curves; give those"
+            )
         sides = arguments.count("revolution: sides", sides, 3)
         self._angle = 2.0 * np.pi * np.arange(sides) / sides
         starts = np.concatenate([[0], np.cumsum(curves.counts)])

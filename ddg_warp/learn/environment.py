@@ -39,11 +39,11 @@ class GripRates:
         arguments.count("GripRates: grip", self.grip, 0)
         arguments.positive("GripRates: speed", self.speed, "m/s")
         arguments.positive("GripRates: spin", self.spin, "rad/s")
-        if not self.axes and not self.about:
+        if isinstance(self.axes, str) and isinstance(self.about, str) and not self.axes + self.about:
             raise SceneError("GripRates: nothing moves; give axes='xyz' to move along, or about='z' to turn about")
         for name in ("axes", "about"):
             letters = getattr(self, name)
-            if letters:
+            if not isinstance(letters, str) or letters:
                 arguments.components(f"GripRates: {name}", letters)
 
     def entries(self) -> list[tuple[int, int, float, str]]:
@@ -236,6 +236,7 @@ class Environment:
 
     def observe(self, now: EpisodeState) -> torch.Tensor:
         """Observations (B, n)."""
+        self._check_state("observe", now)
         found = self._observe(now)
         if not isinstance(found, torch.Tensor) or found.ndim != 2 or len(found) != self.worlds:
             raise SceneError(f"Environment: observe gives {_shape(found)}; give a tensor ({self.worlds}, n)")
@@ -243,10 +244,12 @@ class Environment:
 
     def reward(self, now: EpisodeState) -> torch.Tensor:
         """Rewards (B,)."""
+        self._check_state("reward", now)
         return self._one_each("reward", self._reward(now))
 
     def ended(self, now: EpisodeState) -> tuple[torch.Tensor, torch.Tensor]:
         """Episodes that are terminated, and those that are truncated (B,)."""
+        self._check_state("ended", now)
         terminated = now.failed
         if self._terminated is not None:
             terminated = terminated | self._one_each("terminated", self._terminated(now)).bool()

@@ -108,7 +108,7 @@ class Recording:
         """
         from scipy.interpolate import make_interp_spline
 
-        if isinstance(degree, bool) or degree not in (1, 3):
+        if isinstance(degree, bool) or not isinstance(degree, numbers.Integral) or degree not in (1, 3):
             raise SceneError(f"resampled: degree = {degree!r}; it is 1 or 3")
         times = np.atleast_1d(arguments.floats(times))
         inside = times.ndim == 1 and times.size and times[0] >= self.times[0] and times[-1] <= self.times[-1]
@@ -180,7 +180,9 @@ def recordings(folder: str = "", *, root=None, outside: bool = False) -> list[Pa
         DataError: There is no such folder, no recording in it, or one lies outside of the clone.
     """
     root, outside = _root(root), arguments.flag("recordings: outside", outside)
-    path = inside(root, root / as_path("recordings: folder", folder or "."), outside)
+    path = inside(
+        root, root / as_path("recordings: folder", "." if isinstance(folder, str) and not folder else folder), outside
+    )
     found = [each for each in path.rglob("*") if each.suffix in (".pkl", ".pickle")]
     if not found:
         raise DataError(f"{path} holds no recordings (*.pkl); name a folder of them, of a clone that is complete")
@@ -212,7 +214,7 @@ def read(
         rate: Frames per second.
         up: The axis of the file that points up, "x", "y" or "z"; the recording has z up.
         held: The markers of both grips, from the first of the cable to the last; empty where nothing is held.
-        outside: Whether a path as seen from the root may lead out of it, by its parts or by links.
+        outside: Whether a path as seen from the root, or one given with it, may lead out of it, by its parts or by links.
 
     Raises:
         SceneError: An option is no such option.
@@ -220,7 +222,7 @@ def read(
         UnsafePickleError: The file asks for more than arrays of numbers.
     """
     path, outside = as_path("read: path", path), arguments.flag("read: outside", outside)
-    if not path.is_absolute():
+    if root is not None or not path.is_absolute():
         root = _root(root)
         path = inside(root, root / path, outside)
     if not is_file(path):
@@ -256,7 +258,7 @@ def read(
 def _root(root) -> Path:
     """The folder of recordings."""
     given = root if root is not None else os.environ.get(VARIABLE)
-    if not given:
+    if given is None or (isinstance(given, str) and not given):
         raise DataError(
             f"where are the recordings? Give root, or set {VARIABLE} to your clone of them; none come with ddg_warp"
         )

@@ -126,7 +126,12 @@ def draw(ranges: Mapping[str, object], samples: int, design: str = "random", see
 
 
 def seed_of(seed: int, index: int) -> int:
-    """A seed of 32 bits for the random numbers inside of a sample, independent of those that the sample itself was drawn with."""
+    """A seed of 32 bits for the random numbers inside of a sample, independent of those that the sample itself was drawn with.
+
+    Raises:
+        SceneError: They are no whole numbers that are not negative.
+    """
+    seed, index = arguments.count("seed_of: seed", seed, 0), arguments.count("seed_of: index", index, 0)
     return int(np.random.SeedSequence([seed, index], spawn_key=(1,)).generate_state(1)[0])
 
 
@@ -138,8 +143,10 @@ def parsed(text: str, kind: type | None = None) -> Range:
         kind: Type of the parameter, where it is known: of a `str` every value is a text.
 
     Raises:
-        SceneError: The ends of a range are no numbers.
+        SceneError: The text is none, or the ends of a range are no numbers.
     """
+    if not isinstance(text, str):
+        raise SceneError(f"range {text!r}: give a text, LOW:HIGH, or LOW:HIGH:log, or values A,B,C")
     if kind is str:
         return Choice([value.strip() for value in text.split(",")])
     if ":" in text:

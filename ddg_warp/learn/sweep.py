@@ -188,7 +188,7 @@ def sweep(
         )
         with (
             progress_bar(len(values), len(values) - len(todo), progress, "sample", "") as bar,
-            closing(_finished(run, samples_to_run, workers, ray, gpus)) as finished,
+            closing(_finished(run, samples_to_run, workers and min(workers, len(todo)), ray, gpus)) as finished,
         ):
             for sample, ended in finished:
                 kept = {"parameters": plain(sample.parameters), "seed": sample.seed}
@@ -210,7 +210,12 @@ def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun
     if callable(what):
         if options:
             raise SceneError(f"options = {options!r} are of `simulate`, for scenes; a function gives them itself")
-        known = [*inspect.signature(what).parameters.items()]
+        try:
+            known = [*inspect.signature(what).parameters.items()]
+        except ValueError:
+            raise SceneError(
+                f"sweep: {what!r} tells no parameters; write a function run(directory, **parameters)"
+            ) from None
         found = dict(known[1:])
         if not known:
             raise SceneError(

@@ -17,7 +17,7 @@ import ddg_warp as ddg
 from ddg_warp.learn import plain_pickle
 from ddg_warp.learn.episodes import Episode, Episodes, EpisodeWriter
 from ddg_warp.learn.mocap import Recording, read, recordings
-from ddg_warp.learn.ranges import Choice, LogUniform, Uniform, draw, parsed
+from ddg_warp.learn.ranges import Choice, LogUniform, Uniform, draw, parsed, seed_of
 from ddg_warp.learn.splits import split_of
 from ddg_warp.learn.sweep import sweep
 from ddg_warp.run.catalog import InputError
@@ -169,6 +169,9 @@ each(
     "no name of a parameter",
 )
 each("ranges", "samples", [0, -1, 2.5, "3", True, None, 10**12], lambda v: draw({"n": Uniform(0.0, 1.0)}, v), "samples")
+each("ranges", "seed of a sample", [-1, 0.5, None, "0", [1]], lambda v: seed_of(v, 0), "seed_of: seed")
+each("ranges", "index of a sample", [-1, 0.5, None, "0", [1]], lambda v: seed_of(0, v), "seed_of: index")
+each("ranges", "parsed", [None, 3, b"1:2", ["1:2"], Uniform(0.0, 1.0)], parsed, "give a text")
 each("ranges", "seed", [-1, 0.5, "0", None], lambda v: draw({"n": Uniform(0.0, 1.0)}, 2, seed=v), "seed")
 each("ranges", "design", ["Sobol", None, 3, ["grid"]], lambda v: draw({"n": Uniform(0.0, 1.0)}, 2, v), "design")
 each(
@@ -784,6 +787,14 @@ if find_spec("torch"):
         "mask",
     )
     each("environments", "now", [3, "now", [None]], lambda v: begun(None, v, torch.ones(2, dtype=torch.bool)), "now")
+    for call in ("observe", "reward", "ended"):
+        each(
+            "environments",
+            f"state to {call}",
+            [None, 3, "now"],
+            lambda v, call=call: getattr(good()[0], call)(v),
+            f"{call}: now",
+        )
     each("environments", "state", [None, 3, "now"], lambda v: good()[0].step(v, torch.zeros(2, 1)), "now")
     each(
         "environments",
@@ -804,7 +815,7 @@ if find_spec("torch"):
         "actions",
     )
     each("environments", "grip", [-1, 0.5, "0", True, None], lambda v: GripRates(v, axes="x"), "grip")
-    each("environments", "axes", ["w", 3, ["x"], b"x"], lambda v: GripRates(axes=v), "axes")
+    each("environments", "axes", ["w", 3, ["x"], b"x", None], lambda v: GripRates(axes=v), "axes")
     each("environments", "speed", [0.0, -1.0, NAN, "fast", None, True], lambda v: GripRates(axes="x", speed=v), "speed")
     each("positive parameters", "values", [None, 3, [1.0], "a"], PositiveParameters, "PositiveParameters", "dict")
     each(
