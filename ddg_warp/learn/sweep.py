@@ -27,7 +27,7 @@ from ddg_warp.ask.fields import check_fields
 from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io import as_path
 from ddg_warp.learn.episodes import DONE, Episodes, EpisodeWriter
-from ddg_warp.learn.ranges import GROWING, KINDS, Range, check_kind, check_names, draw, seed_of
+from ddg_warp.learn.ranges import GROWING, KINDS, MOST, Range, check_kind, check_names, draw, seed_of
 from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
 from ddg_warp.run.catalog import SHARED, load_scene, parameters, scene_name
 from ddg_warp.run.progress import progress_bar
@@ -188,7 +188,7 @@ def sweep(
         )
         with (
             progress_bar(len(values), len(values) - len(todo), progress, "sample", "") as bar,
-            closing(_finished(run, samples_to_run, workers and min(workers, len(todo)), ray, gpus)) as finished,
+            closing(_finished(run, samples_to_run, workers, ray, gpus)) as finished,
         ):
             for sample, ended in finished:
                 kept = {"parameters": plain(sample.parameters), "seed": sample.seed}
@@ -202,7 +202,7 @@ def _finished(run: Run, samples: Iterator[Sample], workers: int | None, ray: boo
     """(sample, how it ended) of all samples, as they are finished."""
     if ray:
         return on_ray(run, samples, workers, gpus)
-    return in_processes(run, samples, workers) if workers and workers > 1 else in_turn(run, samples)
+    return in_processes(run, samples, min(workers, MOST)) if workers and workers > 1 else in_turn(run, samples)
 
 
 def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun | FunctionRun:
