@@ -96,6 +96,7 @@ def test_first_sample_without_a_default(tmp_path):
     np.testing.assert_allclose(only(stage).points[0], [1.07, 0, 0], rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:.*shorter than its cubic:ddg_warp.errors.SceneWarning")
 @pytest.mark.parametrize(
     ("basis", "wrap", "x"),
     [

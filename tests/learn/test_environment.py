@@ -171,7 +171,7 @@ REFUSED = [
     ({"rates": GripRates(1, axes="x")}, r"grip 1: velocity x \[m/s\]: the model has 1 grips"),
     ({"rates": [GripRates(axes="x"), GripRates(axes="xy")]}, r"velocity x \[m/s\] is given twice"),
     ({"observe": lambda now: now.poses}, r"observe gives shape \(3, 1, 6\); give a tensor \(3, n\)"),
-    ({"draw": lambda random: [np.nan]}, r"draw gives shape \(1,\); give finite numbers"),
+    ({"draw": lambda random: [np.nan]}, r"draw gives .*; give finite numbers"),
     ({"start": lambda goals: goals}, "start is no WorldState of 3 worlds"),
     ({"steps": 0}, "steps = 0"),
 ]
