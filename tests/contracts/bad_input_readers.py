@@ -419,7 +419,7 @@ each(
 each(
     "plain HDF5",
     "closed",
-    [[True, False], [[True]], 0.5, "no"],
+    [[True, False], [[True]], 0.5],
     lambda v: plain(points=LINE, counts=[4], closed=v),
     "a.h5",
     "closed",
@@ -427,7 +427,7 @@ each(
 each(
     "plain HDF5",
     "radius",
-    [[0.1, 0.1], 0.0, -0.1, NAN, [0.1, 0.0, 0.1, 0.1], "thick"],
+    [[0.1, 0.1], 0.0, -0.1, NAN, [0.1, 0.0, 0.1, 0.1]],
     lambda v: plain(points=LINE, counts=[4], radius=v),
     "a.h5",
     "radi",
@@ -445,6 +445,13 @@ each(
     [[[0, 0]] * 6, [0] * 6, None, "line", [[0, 0, 0], [1]]],
     lambda v: checked_curves(v, [4], False, None, "p", "f"),
     "f, p",
+)
+each(
+    "plain HDF5",
+    "text as",
+    ["closed", "radius", "counts"],
+    lambda v: plain(points=LINE, **{"counts": [4], v: "no"}),
+    "a.h5",
 )
 
 # --- drawing ---
