@@ -1,5 +1,6 @@
 """Environment: episodes of a model's worlds, whose grips are moved by actions. `gymnasium_env` and `torchrl_env` hand it to others."""
 
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -164,9 +165,10 @@ class Environment:
         """A generator for each world, of independent streams.
 
         Raises:
-            SceneError: the seed is no whole number that is not negative.
+            SceneError: the seed is no whole number that is not negative; it may be as large as NumPy's own, of 128 bits.
         """
-        seed = arguments.count("generators: seed", seed, 0)
+        if not isinstance(seed, numbers.Integral) or isinstance(seed, bool) or seed < 0:
+            raise SceneError(f"generators: seed = {seed!r}; it is a whole number of at least 0")
         return [np.random.default_rng(own) for own in np.random.SeedSequence(seed).spawn(self.worlds)]
 
     def begin(

@@ -146,8 +146,7 @@ class Scene(Structures):
             director = None if director is None else np.array(director, float)
         except (TypeError, ValueError):
             raise SceneError(
-                f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3), and rods "
-                "of other numbers of nodes go into a call of their own"
+                f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3)"
             ) from None
         if points.ndim == 2:
             points = points[None]

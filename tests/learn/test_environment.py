@@ -211,3 +211,10 @@ def test_scenes_that_do_not_fit_are_refused():
     scene.clamp(rods[1], motion=ddg.Motion(translation=lambda t: (t, 0.0, 0.0)))
     with pytest.raises(SceneError, match="a Motion goes on with time"):
         environment(Simulator(built(scene), DT))
+
+
+def test_seeds_are_as_large_as_those_of_numpy():
+    own = environment()
+    seed = np.random.SeedSequence().entropy | 1 << 127
+    one, other = (own.generators(seed)[2].random() for _ in range(2))
+    assert one == other != own.generators(seed - 1)[2].random()
