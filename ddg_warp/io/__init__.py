@@ -265,7 +265,7 @@ def read(path, outside: bool = False) -> list[CurveSet]:
 
     Raises:
         CurveError: The file holds no usable curves.
-        DataError: An HDF5 file takes data from another file, and may not.
+        TrajectoryError: An HDF5 file is damaged, or takes data from another file, and may not.
     """
     outside = arguments.flag("read: outside", outside)
     suffix = as_path("the file to read", path, MissingFileError).suffix.lower()
@@ -275,11 +275,8 @@ def read(path, outside: bool = False) -> list[CurveSet]:
         return read_curves(path, outside=outside)
     if suffix in {".h5", ".hdf5"}:
         from ddg_warp.io.hdf5 import read_rods
-        from ddg_warp.io.links import refuse_links
 
-        if not outside:
-            refuse_links(existing(path))
-        return read_rods(path)
+        return read_rods(path, outside=outside)
     if suffix == ".txt":
         from ddg_warp.io.dismech import read_rods as read_text
 

@@ -29,7 +29,6 @@ from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io import as_path, is_file
 from ddg_warp.io.hdf5_read import TrajectoryReader
-from ddg_warp.io.links import refuse_links
 from ddg_warp.learn.episodes import INDEX, Episodes, inside
 from ddg_warp.learn.splits import SPLITS
 from ddg_warp.run.run_directory import TRAJECTORY
@@ -199,9 +198,7 @@ class Recordings(torch.utils.data.Dataset):
             self._readers, self._owner = OrderedDict(), os.getpid()
         if place not in self._readers:
             path = self.sources[place].path
-            if not self._outside:
-                refuse_links(path)
-            reader = self._readers[place] = TrajectoryReader(path)
+            reader = self._readers[place] = TrajectoryReader(path, outside=self._outside)
             self._check_fields(reader, self.sources[place])
         self._readers.move_to_end(place)
         if len(self._readers) > OPEN_FILES:
@@ -257,9 +254,7 @@ def _sources(path: Path, split: str | None, failed: bool, outside: bool) -> list
         raise DataError(f"{file} does not exist; give a folder of episodes, a directory of a run, or a trajectory.h5")
     if file is not path:
         inside(path, file, outside)
-    if not outside:
-        refuse_links(file)
-    with TrajectoryReader(file) as reader:
+    with TrajectoryReader(file, outside=outside) as reader:
         worlds = reader.points.shape[1] if reader.points.ndim == 4 else 1
         parameters = reader.provenance.get("parameters", {})
         return [Source(file, len(reader), worlds, parameters if isinstance(parameters, dict) else {})]

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError, SolverError
-from ddg_warp.io import as_path, existing, is_file
+from ddg_warp.io import as_path, is_file
 from ddg_warp.learn.ranges import storable
 from ddg_warp.learn.splits import FRACTIONS, SPLITS, checked_fractions, split_of
 from ddg_warp.run.run_directory import LOCK, TRAJECTORY, lock_directory
@@ -355,11 +355,9 @@ def _checked(episode: Episode) -> Episode:
 def _size(trajectory) -> tuple[int, int]:
     """Frames and worlds of a recorded file; none where there is no file."""
     from ddg_warp.io.hdf5_read import TrajectoryReader
-    from ddg_warp.io.links import refuse_links
 
     if trajectory is None or not Path(trajectory).exists():
         return 0, 1
-    refuse_links(existing(trajectory))
     with TrajectoryReader(trajectory) as reader:
         return len(reader), reader.points.shape[1] if reader.points.ndim == 4 else 1
 

@@ -11,7 +11,7 @@ from test_episodes import filled, record
 import ddg_warp as ddg
 from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io import read
-from ddg_warp.io.hdf5 import TrajectoryReader
+from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.learn.episodes import EpisodeWriter
 from ddg_warp.run.simulate import simulate
 
@@ -247,11 +247,9 @@ def test_data_of_other_files_is_read_where_it_is_allowed(tmp_path, how):
             layout[:] = h5py.VirtualSource(str(other), "points", points.shape)
             file.create_virtual_dataset("trajectory/points", layout)
     for reading in (lambda: Recordings(path, window=2), lambda: read(path)):
-        with pytest.raises(
-            DataError, match=r"trajectory\.h5: /trajectory/points is kept in another file, .*outside=True"
-        ):
+        with pytest.raises(TrajectoryError, match=r"trajectory\.h5: .*trajectory/points .*outside=True"):
             reading()
-    with EpisodeWriter(tmp_path / "folder") as writer, pytest.raises(DataError, match="kept in another file"):
+    with EpisodeWriter(tmp_path / "folder") as writer, pytest.raises(TrajectoryError, match="data of other files"):
         writer.add("a", path)
     np.testing.assert_array_equal(Recordings(path, window=3, outside=True)[0]["points"], points)
     assert len(read(path, outside=True)) == 1
