@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 
@@ -116,8 +117,8 @@ def built(scene: ddg.Scene, *changes: Callable[[ddg.Scene], object]):
 
 def counts() -> Counter:
     """Number of cases by group, of all modules."""
-    for name in ():
-        import_module(f"bad_input_{name}")
+    for path in sorted(Path(__file__).parent.glob("bad_input_*.py")):
+        import_module(path.stem)
     return Counter(case.group for case in import_module("bad_inputs").CASES)
 
 
