@@ -1,41 +1,121 @@
 """What callers hand in: numbers, vectors, choices, selections, functions of time; each as it is used, or a refusal that names it."""
 
+import difflib
+import inspect
 import numbers
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from functools import wraps
 
 import numpy as np
 
 from ddg_warp.errors import SceneError, SolverError
 
 NAN = np.nan
+LEAST, MOST = 1e-75, 1e75  # magnitudes of numbers other than zero, whose fourth powers neither underflow nor overflow
+SHOWN = 200  # characters of a value in a refusal
+
+
+def array(what: str, value, rule: str = "give numbers") -> np.ndarray:
+    """An array of real numbers, not yet judged; or a refusal that names `what` and says why it is none."""
+    if getattr(value, "requires_grad", False):
+        raise SceneError(f"{what} requires a gradient, which is lost here; {rule}, such as its .detach()")
+    try:
+        found = np.asarray(value)
+        if found.dtype.kind == "O" and all(map(_is_number, found.ravel().tolist())):
+            found = found.astype(float)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as reason:
+        raise SceneError(f"{what} is no array of numbers: {reason}; {rule}") from None
+    if found.dtype.kind not in "fiu":
+        raise SceneError(f"{what} is {shown(value)}, no array of numbers; {rule}")
+    return found.astype(float, copy=False)
 
 
 def floats(value, otherwise=NAN) -> np.ndarray:
-    """An array of numbers; of what is none, such as text, `otherwise`."""
+    """An array of real numbers; of what is none, such as text, bools or complex numbers, `otherwise`."""
     try:
-        value = np.asarray(value)
-        return np.asarray(otherwise if value.dtype.kind in "US" else value, float)
-    except (TypeError, ValueError):
+        return array("", value)
+    except SceneError:
         return np.asarray(otherwise)
+
+
+def sized(what: str, values: np.ndarray, least: float = LEAST, most: float = MOST) -> None:
+    """Refuse numbers whose products overflow, or of which the largest is so small that its products underflow.
+
+    Entries that are small beside the largest one are left alone: next to it they are zero.
+    """
+    size = np.abs(values, out=np.zeros(np.shape(values)), where=np.isfinite(values))
+    largest = size.max(initial=0.0)
+    if largest == 0.0 or least <= largest <= most:
+        return
+    at = np.unravel_index(int(np.argmax(size)), size.shape)
+    entry = f": entry {at[0] if len(at) == 1 else tuple(map(int, at))}" if at else ""
+    fails = "overflow" if largest > most else "underflow"
+    raise SceneError(
+        f"{what}{entry} is {np.asarray(values)[at]:g}, whose products {fails}; magnitudes are from {least:g} to {most:g}: give it in "
+        "other units, with all else of the scene"
+    )
+
+
+def shown(value) -> str:
+    """A value as refusals show it."""
+    try:
+        text = repr(value)
+    except Exception:  # of whoever wrote it, or an integer of too many digits
+        text = f"a value of type {type(value).__name__}"
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
+def _is_number(value) -> bool:
+    return hasattr(value, "__float__") and not isinstance(value, str | bytes | bool | np.bool_ | complex)
 
 
 def vector(what: str, value) -> tuple[float, float, float]:
     """Three finite numbers, or a refusal that names `what`."""
     result = floats(value)
     if result.shape != (3,) or not np.isfinite(result).all():
-        raise SceneError(f"{what} is {value!r}; give three finite numbers")
+        raise SceneError(f"{what} is {shown(value)}; give three finite numbers")
+    sized(what, result)
     return tuple(result.tolist())
+
+
+def direction(what: str, value) -> np.ndarray:
+    """A unit vector (3,) along three numbers, however large or small; or a refusal that names `what`."""
+    result = floats(value)
+    if result.shape != (3,) or not np.isfinite(result).all():
+        raise SceneError(f"{what} is {shown(value)}; give three finite numbers")
+    if not result.any():
+        raise SceneError(f"{what} is zero, and no direction; give three numbers that are not all zero")
+    return unit(result)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Unit vectors along vectors (..., d) other than zero, whose squares may overflow or underflow."""
+    largest = np.abs(vectors).max(axis=-1, keepdims=True)
+    scaled = vectors / np.where(largest > 0.0, largest, 1.0)
+    return scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+
+
+def triangles(what: str, values) -> np.ndarray:
+    """Corners of triangles (T, 3) as whole numbers, not yet judged; or a refusal that names `what`."""
+    try:
+        found = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):
+        found = np.zeros(0, object)
+    if found.ndim != 2 or found.shape[1] != 3 or not len(found):
+        raise SceneError(f"{what} have shape {found.shape}; give three vertices each, (T, 3), one at least")
+    if found.dtype.kind not in "iu":
+        raise SceneError(f"{what} are of type {found.dtype}; give whole numbers")
+    return found.astype(np.int64)
 
 
 def number(what: str, value, rule: str = "one finite number", holds: Callable = np.isfinite) -> float:
     """One finite number for which a `rule` holds, or a refusal that names `what`."""
-    try:
-        result = float(value) if np.ndim(value) == 0 and not isinstance(value, str | bool | np.bool_) else np.nan
-    except (TypeError, ValueError):
-        result = np.nan
-    if not (np.isfinite(result) and holds(result)):
-        raise SceneError(f"{what} is {value!r}; give {rule}")
-    return result
+    result = floats(value)
+    if not (result.ndim == 0 and np.isfinite(result) and holds(float(result))):
+        raise SceneError(f"{what} is {shown(value)}; give {rule}")
+    sized(what, result)
+    return float(result)
 
 
 def part(what: str, value) -> float:
@@ -48,17 +128,27 @@ def positive(what: str, value, unit: str = "") -> float:
     return number(what, value, f"one positive number{unit and f' [{unit}]'}", lambda v: v > 0.0)
 
 
-def count(what: str, value, least: int = 1) -> int:
-    """One whole number of at least `least`, or a refusal that names `what`."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
-        raise SceneError(f"{what} = {value!r}; it is a whole number of at least {least}")
+def count(what: str, value, least: int = 1, most: int = 2**62) -> int:
+    """One whole number from `least` to `most`, or a refusal that names `what`."""
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not whole or value < least:
+        raise SceneError(f"{what} = {shown(value)}; it is a whole number of at least {least}")
+    if value > most:
+        raise SceneError(f"{what} = {shown(value)}; it is a whole number of at most {most}")
     return int(value)
+
+
+def text(what: str, value) -> str:
+    """A text that is not empty, or a refusal that names `what`."""
+    if not isinstance(value, str) or not value:
+        raise SceneError(f"{what} is {shown(value)}; give a text")
+    return value
 
 
 def flag(what: str, value) -> bool:
     """True or False, or a refusal that names `what`."""
     if not isinstance(value, bool | np.bool_):
-        raise SceneError(f"{what} = {value!r}; it is True or False")
+        raise SceneError(f"{what} = {shown(value)}; it is True or False")
     return bool(value)
 
 
@@ -66,32 +156,82 @@ def choice(what: str, value, allowed) -> str:
     """One of several names, or a refusal that names `what`."""
     if not isinstance(value, str) or value not in allowed:
         *first, last = map(repr, allowed)
-        raise SceneError(f"{what} is {value!r}; it is {', '.join(first)} or {last}")
+        raise SceneError(f"{what} is {shown(value)}; it is {', '.join(first)} or {last}")
     return value
+
+
+def options(call: str, kind: type, given: dict, beside: Iterable[str] = ()):
+    """Options of a call, a dataclass `kind` made of what is `given`; or a refusal of an unknown one that names the call.
+
+    Args:
+        beside: names of arguments that the call takes, too.
+    """
+    known = [each.name for each in fields(kind)]
+    for name in given:
+        if name not in known:
+            raise SceneError(f"{call} takes no {name!r}{meant(name, [*beside, *known])}")
+    return kind(**given)
+
+
+def names(call: Callable) -> list[str]:
+    """Names of the arguments that a call lists."""
+    listed = inspect.signature(call).parameters.values()
+    return [each.name for each in listed if each.kind is not each.VAR_KEYWORD]
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """The end of a refusal of a name that is unknown: the nearest of those that are known, and all of them."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name, known, 1)
+    return f"; {f'did you mean {near[0]!r}? ' if near else ''}There {'is' if len(known) == 1 else 'are'} {', '.join(known)}"
+
+
+def sealed(kind: type) -> type:
+    """A class whose objects, once they are made, refuse attributes that they do not have; to decorate it with."""
+    make = kind.__init__
+
+    def init(self, *given, **named):
+        make(self, *given, **named)
+        self.__dict__["_sealed"] = True
+
+    def set_attribute(self, name, value):
+        if "_sealed" in self.__dict__ and not hasattr(self, name):
+            known = (each for each in (*vars(self), *dir(type(self))) if not each.startswith("_"))
+            raise SceneError(f"{kind.__name__} has no attribute {name!r}{meant(name, set(known))}")
+        object.__setattr__(self, name, value)
+
+    kind.__init__, kind.__setattr__ = wraps(make)(init), set_attribute
+    return kind
 
 
 def components(what: str, value, letters: str = "xyz") -> str:
     """Axes by their letters, or a refusal that names `what`."""
     if not isinstance(value, str) or not value or set(value) - set(letters):
-        raise SceneError(f"{what}: components {value!r}; they are letters of {letters!r}, one at least")
+        raise SceneError(f"{what}: components {shown(value)}; they are letters of {letters!r}, one at least")
     return value
 
 
-def broadcast(what: str, values, shape: tuple) -> np.ndarray:
-    """Finite numbers of a shape, a copy; or a refusal that names `what`."""
+def broadcast(what: str, values, shape: tuple, own: int = 0) -> np.ndarray:
+    """Finite numbers of a shape, a copy; or a refusal that names `what`. The last `own` axes have to be there, as of vectors."""
+    values = array(what, values, f"give finite numbers that broadcast to {shape}")
+    inner = shape[len(shape) - own :]
     try:
-        values = np.broadcast_to(floats(values), shape).copy()
+        full = np.broadcast_to(values, shape).copy() if values.shape[len(values.shape) - own :] == inner else None
     except ValueError:
-        values = np.full(1, np.nan)
-    if not np.isfinite(values).all():
-        raise SceneError(f"{what}: give finite numbers that broadcast to {shape}")
+        full = None
+    if full is None or not np.isfinite(full).all():
+        given = f"they have shape {values.shape}" if full is None else "not all are finite"
+        inside = f", {inner} at least" if own else ""
+        raise SceneError(f"{what}: {given}; give finite numbers that broadcast to {shape}{inside}")
+    values = full
+    sized(what, values)
     return values
 
 
 def index(what: str, value) -> int:
     """One whole number, or a refusal that names `what`."""
     if np.iterable(value) or isinstance(value, slice):
-        raise SceneError(f"{what} is {value!r}; give one whole number")
+        raise SceneError(f"{what} is {shown(value)}; give one whole number")
     return int(indices(what, value)[0])
 
 
@@ -115,7 +255,7 @@ def indices(what: str, values, size: int | None = None) -> np.ndarray:
         values = np.arange(size)[values]
     try:
         values = np.atleast_1d(values if isinstance(values, np.ndarray) or not np.iterable(values) else list(values))
-    except ValueError:
+    except (TypeError, ValueError, RuntimeError):
         values = np.zeros((0, 0))
     truths = values.dtype == bool
     mixed = not truths and isinstance(given, list | tuple) and any(isinstance(v, bool | np.bool_) for v in given)
@@ -127,12 +267,15 @@ def indices(what: str, values, size: int | None = None) -> np.ndarray:
             f"{what}: a mask of {values.size} bools, but {there}; give a mask of that size, or whole numbers"
         )
     if not truths and (mixed or values.ndim != 1 or values.dtype.kind not in "iu"):
-        shown = [given] if np.ndim(given) == 0 else given
-        raise SceneError(f"{what} {shown} are no indices; give whole numbers, or a mask of bools")
+        several = [given] if not np.iterable(given) or isinstance(given, str | bytes) else given
+        raise SceneError(f"{what} {shown(several)} are no indices; give whole numbers, or a mask of bools")
     if truths and not values.any():
         raise SceneError(
             f"{what}: nothing is chosen, the mask is False everywhere; choose one at least, or leave the call out"
         )
+    far = values[values > np.iinfo(np.int64).max] if values.dtype.kind == "u" else ()
+    for value in far[:1]:
+        raise SceneError(f"{what}: {value} does not exist; indices count from 0")
     return np.flatnonzero(values) if truths else values.astype(int)
 
 
@@ -148,7 +291,7 @@ def once(what: str, values: np.ndarray) -> np.ndarray:
 def amplitude(what: str, function) -> Callable[[float], float] | None:
     """A function of time, or None; tried at t = 0."""
     if function is not None and not callable(function):
-        raise SceneError(f"{what}: amplitude is {function!r}; give a function of the time, or None")
+        raise SceneError(f"{what}: amplitude is {shown(function)}; give a function of the time, or None")
     if function is not None:
         value_at("amplitude", function, 0.0, error=SceneError)
     return function
@@ -166,12 +309,16 @@ def value_at(what: str, function, t: float, columns: int = 0, error=SolverError)
     except Exception as reason:
         text = f"{_written(what, function)} fails at t = {t:g}: {type(reason).__name__}: {reason}"
         raise _refusal(error, f"{text}; make it defined from t = 0 on") from reason
-    value = np.zeros((0, 0, 0)) if given is None else floats(given, np.zeros((0, 0, 0)))
+    given = float(given) if isinstance(given, bool | np.bool_) else given  # as of t < 1
+    value = floats(given, np.zeros((0, 0, 0)))
     fits = value.ndim in (1, 2) and value.shape[-1] == columns if columns else value.ndim == 0
     if not fits:
-        raise _refusal(error, f"{_written(what, function)} is {given!r} at t = {t:g}; it is {shapes}")
-    if not np.isfinite(value).all():
-        raise _refusal(error, f"{_written(what, function)} is not finite at t = {t:g}: {given!r}; correct the function")
+        raise _refusal(error, f"{_written(what, function)} is {shown(given)} at t = {t:g}; it is {shapes}")
+    if not (np.abs(value) <= MOST).all():
+        fails = "too large" if np.isfinite(value).all() else "not finite"
+        raise _refusal(
+            error, f"{_written(what, function)} is {fails} at t = {t:g}: {shown(given)}; correct the function"
+        )
     return value
 
 

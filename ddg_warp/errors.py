@@ -1,7 +1,5 @@
 """Errors that a user of ddg_warp can meet; every message names the object, its index and the remedy."""
 
-import numbers
-
 
 class SceneError(ValueError):
     """A scene cannot be built as described."""
@@ -38,18 +36,14 @@ class SolverError(RuntimeError):
 
 
 def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
-    """Refuse an option that is no positive finite number, or no whole number of at least one.
+    """Refuse an option of a frozen dataclass that is no positive number, or no whole number of at least one.
 
     Raises:
         SceneError: names the option.
     """
+    from ddg_warp import arguments
+
     for name in positive:
-        value = getattr(options, name)
-        real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-        if not (real and 0.0 < value < float("inf")):
-            raise SceneError(f"{name} = {value!r}; it is a positive number")
+        object.__setattr__(options, name, arguments.positive(name, getattr(options, name)))
     for name in counts:
-        value = getattr(options, name)
-        whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-        if not (whole and value >= 1):
-            raise SceneError(f"{name} = {value!r}; it is a whole number of at least 1")
+        arguments.count(name, getattr(options, name), 1, 2**31 - 1)

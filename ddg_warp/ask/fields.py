@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from ddg_warp import arguments
+from ddg_warp.model import validate
 from ddg_warp.threads import launches
 
 POINT_FIELDS = {
@@ -29,8 +31,9 @@ def check_fields(names: Sequence[str]) -> tuple[str, ...]:
         ValueError: names what there is.
     """
     known = (*POINT_FIELDS, *CELL_FIELDS)
-    if isinstance(names, str) or not set(names) <= set(known):
-        raise ValueError(f"fields = {names!r}; it is a list of names out of {', '.join(known)}")
+    listed = isinstance(names, list | tuple | set | dict)
+    if not listed or not all(isinstance(name, str) and name in known for name in names):
+        raise ValueError(f"fields = {arguments.shown(names)}; it is a list of names out of {', '.join(known)}")
     return tuple(dict.fromkeys(names))
 
 
@@ -41,6 +44,7 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     Values of edges are means at their nodes. Ends of rods and nodes at rigid joints, which have no vertex of their own, have the
     values of the vertex beside them.
     """
+    _check("point_fields", model, state, names, POINT_FIELDS)
     sums = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
     counts = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
     energies = [np.full((model.worlds, model.points_count), np.nan) for _ in range(2)]
@@ -73,12 +77,21 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
 @launches
 def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Fields of CELL_FIELDS by name, each (worlds, triangles) in the order of `model.surfaces`."""
+    _check("cell_fields", model, state, names, CELL_FIELDS)
     if not names:
         return {}
     from ddg_warp.ask.inquiry import triangle_fields
 
     found = triangle_fields(model, state)
     return {name: found[name.removeprefix("shell_")] for name in names}
+
+
+def _check(call: str, model, state, names, known) -> None:
+    """Refuse what is no model, no state of it, or a name of no field."""
+    validate.check_model(call, model)
+    validate.check_state(call, model, state)
+    for name in check_fields(names):
+        arguments.choice(call, name, known)
 
 
 def _curvatures(term, strains: np.ndarray) -> dict[str, np.ndarray]:

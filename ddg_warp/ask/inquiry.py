@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arguments, arrays
 from ddg_warp.ask import end_moments
 from ddg_warp.compile.storage import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
+from ddg_warp.model import validate
 from ddg_warp.solve.drag import ChainDrag, NetDrag
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
@@ -32,6 +33,7 @@ class Reaction:
 @launches
 def energies(model, state) -> dict:
     """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
+    _check("energies", model, state)
     tangent = Tangent(model)
     result, kinetic, potential = tangent.energy(state), np.zeros(model.worlds), np.zeros(model.worlds)
     for part in tangent.parts:
@@ -56,6 +58,9 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
         point: what moments are about (3,); by default the first node that a support holds.
         factor: the load parameter in statics.
     """
+    _check("reactions", model, state)
+    point = None if point is None else np.array(arguments.vector("reactions: point", point))
+    factor = arguments.number("reactions: factor", factor)
     tangent = Tangent(model)
     q = tangent.dofs(state)
     gradient = tangent.gradient(state) - tangent.friction(state)
@@ -73,7 +78,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
             parts = [part for part in tangent.parts if i < len(part.host.held)]
             found = [_taken(part, Tangent.of(part, q), Tangent.of(part, force), i, world) for part in parts]
             here, push, twist = (np.concatenate(values) for values in zip(*found, strict=True))
-            about = np.concatenate([here, np.zeros((1, 3))])[0] if point is None else np.asarray(point, float)
+            about = np.concatenate([here, np.zeros((1, 3))])[0] if point is None else point
             moment = (np.cross(here - about, push) + twist).sum(0) + turns[world, i]
             worlds.append((push.sum(0), moment, about))
         result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
@@ -104,6 +109,7 @@ def drag(model, state) -> Drag:
     Rods without mass move as in the last step: by implicit Euler at its end; by the midpoint rule, whose velocities are means over a
     step, half a step after that, as in the last two steps. A first state has the velocities that it is given.
     """
+    _check("drag", model, state)
     forces, moments, power, blocks, turns = [], [], np.zeros(model.worlds), None, None
     for group, data in zip(model.groups, state.groups, strict=True):
         v, omega = (arrays.download(array).astype(float) for array in (data.v, data.omega))
@@ -132,6 +138,12 @@ def drag(model, state) -> Drag:
         blocks = force / np.maximum(1, np.bincount(places, minlength=force.shape[1]))[:, None]
     force, moment = model.order.nodes(forces, blocks), model.order.edges(moments, turns)
     return Drag(force, moment, power if model.worlds > 1 else float(power[0]))
+
+
+def _check(call: str, model, state) -> None:
+    """Refuse what is no model, or no state of it."""
+    validate.check_model(call, model)
+    validate.check_state(call, model, state)
 
 
 def _each_world(values: np.ndarray) -> np.ndarray:
@@ -204,6 +216,7 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
     (11, 22, 12), forces of edges ("axisymmetric_stretch"), moments of inner nodes ("axisymmetric_bend") and of both ends
     ("axisymmetric_rim"). What a rod or shell has not is None.
     """
+    _check("stresses", model, state)
     result: dict[str, list] = {}
     for group, data in zip(model.groups, state.groups, strict=True):
         values = group_strains(model, group, data)[1]
@@ -248,6 +261,7 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
     "strain": Green's strain, its largest principal value in magnitude. "curvature" [1/m]: the same of the change of curvature, of
     shells with mid-edge normals. "energy" [J/m^2]: elastic energy of membrane and mid-edge bending per rest area.
     """
+    _check("triangle_fields", model, state)
     net, surfaces = model.net, model.surfaces
     if surfaces is None:
         raise ValueError("the model has no surfaces to color")
@@ -317,6 +331,9 @@ def _resultants(slope: np.ndarray, metric) -> np.ndarray:
 
 def writhe(points: np.ndarray) -> float:
     """Writhe of a closed polygon (n, 3): the exact Gauss integral over pairs of edges (Klenin and Langowski 2000, method 1a)."""
+    points = arguments.array("writhe: points", points, "give (n, 3)")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
+        raise ValueError(f"writhe: points have shape {points.shape}; give three finite points at least, (n, 3)")
     a, b = points, np.roll(points, -1, axis=0)
     i, j = np.triu_indices(len(points), 2)
     apart = (i > 0) | (
@@ -345,7 +362,8 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
     Raises:
         ValueError: there is no such rod, or it has no twist.
     """
-    if not 0 <= rod < model.scene.rod_count:
+    _check("total_twist", model, state)
+    if not 0 <= arguments.index("total_twist: rod", rod) < model.scene.rod_count:
         raise ValueError(f"total_twist: rod {rod} does not exist; the scene has {model.scene.rod_count} rods")
     turns, found = np.zeros(model.worlds), False
     for group, data in zip(model.groups, state.groups, strict=True):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.compile.elements import ElementSet
 from ddg_warp.compile.loads import Load
 from ddg_warp.errors import SceneError
@@ -142,15 +143,14 @@ def meridian(shell, index: int, supports, nodes: np.ndarray) -> NetMeridian:
 
 
 def _explicit(shell, n: int):
-    try:
-        metric, curvature = (np.asarray(values, float) for values in shell.rest)
-        metric, curvature = np.broadcast_to(metric, (n - 1, 2)), np.broadcast_to(curvature, (n, 2))
-    except (TypeError, ValueError):
-        metric, curvature = np.full((n - 1, 2), np.nan), np.zeros((n, 2))
-    if not (np.isfinite(metric) & (metric > 0.0)).all() or not np.isfinite(curvature).all():
-        raise SceneError(
-            f"axisymmetric shell '{shell.name}': rest is two arrays, a positive metric {(n - 1, 2)} and curvature {(n, 2)}"
-        )
+    rule = (
+        f"axisymmetric shell '{shell.name}': rest is two arrays, a positive metric {(n - 1, 2)} and curvature {(n, 2)}"
+    )
+    if not isinstance(shell.rest, list | tuple) or len(shell.rest) != 2:
+        raise SceneError(f"{rule}; it is {arguments.shown(shell.rest)}")
+    metric, curvature = (arguments.broadcast(rule, v, (k, 2)) for v, k in zip(shell.rest, (n - 1, n), strict=True))
+    if not (metric > 0.0).all():
+        raise SceneError(rule)
     return metric, curvature
 
 
@@ -198,6 +198,8 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
     viscosity = {"viscosity": material.viscosity} if material.viscosity > 0.0 else {}
     stretch = material.young * shell.thickness / (1.0 - nu**2)
     bend = stretch * shell.thickness**2 / 12.0
+    for name, values in (("membrane stiffness", stretch), ("bending stiffness", bend)):
+        arguments.sized(f"shell of revolution: {name}", values)
 
     def law(area, stiffness, poisson, metric, rest):
         zero = np.zeros(len(area))

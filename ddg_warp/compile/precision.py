@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp.errors import SceneError, SolverError
+from ddg_warp import arguments
+from ddg_warp.errors import SolverError
 from ddg_warp.kernels.turns import TURNED
 
 
@@ -38,9 +39,7 @@ def choose(name: str | None, device) -> Precision:
     """
     if name is None:
         name = "mixed" if device.is_cuda else "float64"
-    if name not in PRECISIONS:
-        raise SceneError(f"precision {name!r}: it is one of {', '.join(PRECISIONS)}")
-    return PRECISIONS[name]
+    return PRECISIONS[arguments.choice("precision", name, PRECISIONS)]
 
 
 FLOAT32_LIMIT = (

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.compile.elements import ElementSet
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.shell_forms import (
@@ -129,7 +130,10 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
         if viscosity is None
         else _by_triangle("viscosity", viscosity, count, lambda v: v >= 0.0, "not negative"),
     }
-    return Plate(abar, bbar, angle, **material)
+    made = Plate(abar, bbar, angle, **material)
+    for name in ("membrane_stiffness", "bending_stiffness"):
+        arguments.sized(f"shell '{surface.name}': {name.replace('_', ' ')}", getattr(made, name))
+    return made
 
 
 def _refuse_folds(surface, angle: np.ndarray) -> None:

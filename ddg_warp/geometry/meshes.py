@@ -226,7 +226,11 @@ def weld(points, triangles, tolerance: float) -> Mesh:
     from scipy.spatial import cKDTree
 
     arguments.positive("weld: tolerance", tolerance, "m")
-    points, triangles = np.asarray(points, float), np.asarray(triangles)
+    points, triangles = arguments.array("weld: points", points), arguments.triangles("weld: triangles", triangles)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise SceneError(f"weld: points have shape {points.shape}; give finite numbers (P, 3)")
+    for t in np.flatnonzero(((triangles < 0) | (triangles >= len(points))).any(1))[:1]:
+        raise SceneError(f"weld: triangle {t} has the vertices {triangles[t].tolist()}, but there are {len(points)}")
     pairs = cKDTree(points).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     count, group = connected_components(graph, directed=False)

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.polyline import cross, length
 
@@ -150,26 +151,16 @@ class Surface:
         return f"surface '{self.name}'"
 
     def _checked_points(self, points) -> np.ndarray:
-        try:
-            points = np.array(points, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise SceneError(f"{self._name}: the points are no array of numbers; give (P, 3)") from None
+        points = arguments.array(f"{self._name}: points", points, "give (P, 3)").copy()
         if points.ndim != 2 or points.shape[1] != 3:
             raise SceneError(f"{self._name}: points have shape {points.shape}; give (P, 3)")
         for vertex in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
             raise SceneError(f"{self._name}: vertex {vertex} is at a non-finite position; check the points")
+        arguments.sized(f"{self._name}: points", points)
         return points
 
     def _checked_triangles(self, triangles) -> np.ndarray:
-        try:
-            triangles = np.asarray(triangles)
-        except ValueError:
-            raise SceneError(f"{self._name}: the triangles are not of three vertices each; give (T, 3)") from None
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
-            raise SceneError(f"{self._name}: triangles have shape {triangles.shape}; give (T, 3), one at least")
-        if triangles.dtype.kind not in "iu":
-            raise SceneError(f"{self._name}: triangles are of type {triangles.dtype}; give whole numbers")
-        triangles, count = triangles.astype(np.int64), len(self.points)
+        triangles, count = arguments.triangles(f"{self._name}: triangles", triangles), len(self.points)
         for t in np.flatnonzero(((triangles < 0) | (triangles >= count)).any(axis=1))[:1]:
             raise SceneError(
                 f"{self._name}: triangle {t} has the vertices {triangles[t].tolist()}, but there are {count}; "

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 
@@ -59,17 +60,15 @@ def checked(controls: Controls | None, model, call: str = "step") -> dict[str, n
         return {}
     if not isinstance(controls, Controls):
         raise SceneError(
-            f"{call}: controls are {controls!r}; give Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
+            f"{call}: controls are {arguments.shown(controls)}; give "
+            "Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
         )
     return controls.checked(model)
 
 
 def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
     """The one place where arrays of others become ours."""
-    try:
-        values = np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise SceneError(f"Controls: {name} are no array of numbers: {values!r}") from None
+    values = arguments.array(f"Controls: {name}", values)
     if values.shape not in (shape, (worlds, *shape)):
         raise SceneError(
             f"Controls: {name} have shape {values.shape}; they are {shape}, or {(worlds, *shape)} for each of the worlds"

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arguments, arrays
 from ddg_warp.compile import memory
 from ddg_warp.compile.chains import compile_chains
 from ddg_warp.compile.conditions import scene_motions
@@ -309,7 +309,7 @@ class Model:
             ValueError: a shape does not fit, or a value is not finite.
         """
         state = self.empty_state()
-        state.spun = spins is not None and bool(np.any(spins))
+        state.spun = spins is not None and bool(arguments.floats(spins).any())
         for group, data in zip(self.groups, state.groups, strict=True):
             x = np.concatenate([group.host.x] * self.worlds, axis=1)
             if points is not None:
@@ -443,7 +443,7 @@ class Model:
 def _device(name):
     """A Warp device by its name; by default CUDA if there is one."""
     try:
-        return wp.get_device(name or ("cuda:0" if wp.is_cuda_available() else "cpu"))
+        return wp.get_device(("cuda:0" if wp.is_cuda_available() else "cpu") if name is None else name)
     except (ValueError, RuntimeError, TypeError, AttributeError):
         known = ", ".join(device.alias for device in wp.get_devices())
         raise SceneError(f"device is {name!r}; there is {known}") from None

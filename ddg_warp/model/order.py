@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from ddg_warp import arguments
 from ddg_warp.compile import axisymmetric
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.obstacles import Obstacles
@@ -216,10 +217,9 @@ class Order:
 
 
 def _numbers(what: str, values) -> np.ndarray:
-    try:
-        return np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} are no array of numbers: {values!r}") from None
+    values = arguments.array(what, values)
+    arguments.sized(what, values, least=0.0)  # velocities that have died away may be as small as they are
+    return values
 
 
 def _node_radius(batch) -> np.ndarray:

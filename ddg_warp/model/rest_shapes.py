@@ -5,6 +5,7 @@ first two edges, a1 = x1 - x0 and a2 = x2 - x0. They need not be those of any su
 (Efrati, Sharon, Kupferman 2009). `Model.set_rest` puts them into a model; `Scene.add_shell(rest=(abar, bbar))` starts with them.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.geometry import shell_forms
-from ddg_warp.geometry.surface import DEGENERATE
+from ddg_warp.geometry.surface import DEGENERATE, Surface
+from ddg_warp.model import validate
 
 
 def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
@@ -35,7 +37,8 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
         ValueError: the direction is normal to a triangle.
     """
     (u1, u2), (v1, v2) = np.moveaxis(edges_along(points, triangles, direction), 0, -1)
-    first, second = np.asarray(first, float), np.asarray(second, float)
+    count = (len(np.asarray(triangles)),)
+    first, second = (arguments.broadcast(name, v, count) for name, v in (("first", first), ("second", second)))
     return np.stack(
         [first * u * v + second * p * q for u, v, p, q in ((u1, u1, v1, v1), (u1, u2, v1, v2), (u2, u2, v2, v2))], -1
     )
@@ -49,11 +52,12 @@ def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
     Raises:
         ValueError: the direction is normal to a triangle.
     """
-    corners = np.asarray(points, float)[np.asarray(triangles)]
+    surface = Surface(points, triangles)
+    corners = surface.points[surface.triangles]
     a1, a2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(a1, a2)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    direction = np.broadcast_to(np.asarray(direction, float), a1.shape)
+    direction = arguments.broadcast("direction", direction, a1.shape, own=1)
     along = direction - normal * _dot(direction, normal)[:, None]
     length = np.linalg.norm(along, axis=1)
     for t in np.flatnonzero(~(length > 1e-9 * np.linalg.norm(direction, axis=1)))[:1]:
@@ -69,6 +73,7 @@ def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0
     Arguments as of `principal_form`; a stretch of 1.1 is a growth by a tenth in length.
     """
     second = first if second is None else second
+    first, second = (arguments.array(name, values) for name, values in (("first", first), ("second", second)))
     return principal_form(points, triangles, np.square(first), np.square(second), direction)
 
 
@@ -86,12 +91,14 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
     """
     for name, value in (("h1", h1), ("h2", h2), ("young1", young1), ("young2", young2)):
         arguments.positive(f"bilayer_curvature: {name}", value)
+    arguments.number("bilayer_curvature: mismatch", mismatch)
     m, n, h = h1 / h2, young1 / young2, h1 + h2
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
 
 def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
     """See `Model.set_rest`; `plate` are values of its `Plate` by name, as they are stored."""
+    validate.check_model("set_rest", model)
     if model.net is None or not 0 <= arguments.index("set_rest: shell", shell) < len(model.net.host.shells):
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
@@ -141,9 +148,12 @@ def set_rest_strains(model, strains: dict) -> None:
         ValueError: no rod on its own has such a rest strain, or rods of the net have it too; values do not fit or are not finite.
             Nothing is changed then.
     """
+    validate.check_model("set_rest_strains", model)
     own = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
     shared = {part.term.name for part in model.net.sets} if model.net is not None else set()
     known, found = sorted(name for name in own if name.partition(".")[0] not in shared), []
+    if not isinstance(strains, Mapping):
+        raise ValueError(f"set_rest_strains: strains are {arguments.shown(strains)}; give values by name, of {known}")
     for name, values in strains.items():
         if name not in known:
             why = "rods that are joined, glued or magnetised have it too" if name in own else f"there is {known}"
@@ -167,12 +177,10 @@ def _refuse_without_area(name: str, metric: np.ndarray) -> None:
 
 
 def _shaped(name: str, values, shape: tuple) -> np.ndarray:
-    try:
-        values = np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is {values!r}; give finite numbers of shape {shape}") from None
+    values = arguments.array(name, values, f"give finite numbers of shape {shape}")
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{name} has shape {values.shape}; give finite numbers of shape {shape}")
+    arguments.sized(name, values)
     return values
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import drag
 
@@ -19,7 +20,9 @@ def check_state(call: str, model, state) -> None:
     from ddg_warp.model.state import State
 
     if not isinstance(state, State):
-        raise SceneError(f"{call}: the state is {state!r}; give one of this model, such as model.state()")
+        raise SceneError(
+            f"{call}: the state is {arguments.shown(state)}; give one of this model, such as model.state()"
+        )
     if state.model is not model:
         raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")
 

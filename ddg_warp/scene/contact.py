@@ -103,14 +103,16 @@ class Contacts:
         if self.touching is not None:
             raise SceneError("contact: this scene has contact already; use contact_between for what differs")
         call = "contact: "
-        for name, value in (("range", range), ("stiffness", stiffness)):
-            if value is not None:
-                arguments.positive(call + name, value, "m" if name == "range" else "N/m")
+        range = None if range is None else arguments.positive(f"{call}range", range, "m")
+        stiffness = None if stiffness is None else arguments.positive(f"{call}stiffness", stiffness, "N/m")
         if apart is not None:
-            arguments.number(f"{call}apart", apart, "an arc length, zero or more [m]", lambda v: v >= 0.0)
+            apart = arguments.number(f"{call}apart", apart, "an arc length, zero or more [m]", lambda v: v >= 0.0)
         if radius is not None and not isinstance(radius, Mapping):
-            raise SceneError(f"{call}radius is {radius!r}; give a dictionary from names of objects to radii [m]")
+            raise SceneError(
+                f"{call}radius is {arguments.shown(radius)}; give a dictionary from names of objects to radii [m]"
+            )
         for name, value in (radius or {}).items():
+            arguments.text(f"{call}a name in radius", name)
             arguments.positive(f"{call}radius of {name!r}", value, "m")
         self.touching = Contact(
             arguments.choice(f"{call}law", law, LAWS),
@@ -149,10 +151,11 @@ class Contacts:
         Raises:
             SceneError: an argument that is none of these; at `build`, three coefficients between what is no rod and an obstacle.
         """
+        for which, name in (("one", one), ("other", other)):
+            arguments.text(f"contact_between: {which}", name)
         call = f"contact_between {one!r} and {other!r}: "
-        for name, value in (("stiffness", stiffness), ("range", range)):
-            if value is not None:
-                arguments.positive(call + name, value)
+        stiffness = None if stiffness is None else arguments.positive(f"{call}stiffness", stiffness, "N/m")
+        range = None if range is None else arguments.positive(f"{call}range", range, "m")
         if np.iterable(friction) and not isinstance(friction, str):
             friction = arguments.vector(f"{call}friction forwards, backwards and across", friction)
             for way, value in zip(WAYS, friction, strict=True):
@@ -189,8 +192,7 @@ class Contacts:
         Raises:
             SceneError: no such shape, or a motion that does not fit.
         """
-        if not isinstance(name, str) or not name:
-            raise SceneError(f"add_obstacle: name is {name!r}; give a text")
+        arguments.text("add_obstacle: name", name)
         if not isinstance(shape, Plane | Sphere | Capsule | Mesh):
             raise SceneError(f"add_obstacle '{name}': shape is {shape!r}; give Plane, Sphere, Capsule, Box or Mesh")
         if motion is not None and not isinstance(motion, Motion | Grip):
@@ -225,6 +227,12 @@ def check_contact(scene) -> None:
         raise SceneError(
             f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything"
         )
+    if not any(np.any(between.friction) for between in (scene.touching, *scene.betweens) if between.friction):
+        for name in ("friction_law", "velocity", "lags"):
+            if getattr(scene.touching, name) != getattr(Contact, name):
+                raise SceneError(
+                    f"contact: {name} is of friction, and there is none; give friction, or leave {name} out"
+                )
     bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
     moving, obstacles = touching_names(scene), {obstacle.name for obstacle in scene.obstacles}
     names = moving | obstacles
@@ -266,10 +274,10 @@ def touching_names(scene) -> set[str]:
 
 def _names(what: str, values) -> tuple[str, ...]:
     """Names without repetition, from one or several."""
-    values = [values] if isinstance(values, str) else values
-    if not np.iterable(values) or not len(values := tuple(dict.fromkeys(values))):
-        raise SceneError(f"{what} is {values!r}; give a name or a list of names of rods and shells")
-    return values
+    names = [values] if isinstance(values, str) else list(values) if np.iterable(values) else []
+    if not names or not all(isinstance(name, str) for name in names):
+        raise SceneError(f"{what} is {arguments.shown(values)}; give a name or a list of names of rods and shells")
+    return tuple(dict.fromkeys(names))
 
 
 def _friction(what: str, value: float, more: str = "") -> float:

@@ -76,7 +76,7 @@ class Trace:
             raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
         if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
             raise SceneError(
-                f"Trace: watch is {self.watch!r}; give displacements by name, {{'tip': Displacement.of(row, axis)}}"
+                f"Trace: watch is {arguments.shown(self.watch)}; give displacements by name, {{'tip': Displacement.of(row, axis)}}"
             )
 
 
@@ -96,6 +96,12 @@ class Law:
     values: dict
 
     def __init__(self, density, **values):
+        for name, given in values.items():
+            for number in given if isinstance(given, list | tuple) else [given]:
+                found = arguments.array(
+                    f"Law: {name}", number, "give a number, an array, or a list with one for each strain"
+                )
+                arguments.sized(f"Law: {name}", found)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "values", deepcopy(values))
 

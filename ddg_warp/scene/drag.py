@@ -177,7 +177,10 @@ def _numbers(what: str, values, unit: str, rule: str = "not negative", holds=np.
     """A number, or numbers along rods (n,) or (rods, n), for which a rule holds against zero; or a refusal that names `what`."""
     found = arguments.floats(values) if not isinstance(values, bool) else np.array(np.nan)
     if found.ndim > 2 or not found.size or not (np.isfinite(found).all() and holds(found, 0.0).all()):
-        raise SceneError(f"{what} is {values!r}; give a number, or numbers along the rod, finite and {rule} [{unit}]")
+        raise SceneError(
+            f"{what} is {arguments.shown(values)}; give a number, or numbers along the rod, finite and {rule} [{unit}]"
+        )
+    arguments.sized(what, found)
     return found.copy() if found.ndim else float(found)
 
 

@@ -135,7 +135,7 @@ class Magnets:
         value = value if callable(value) else np.array(arguments.vector("magnetic_field: value", value))
         if not callable(gradient):
             gradient = np.zeros((3, 3)) if gradient is None else gradient
-            gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3))
+            gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3), own=2)
         given = MagneticField(value, gradient, origin, self.dimension == 2)
         given.at(0.0, 1.0, SceneError)
         self.applied_field = given

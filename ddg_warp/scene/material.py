@@ -1,5 +1,6 @@
 """Materials and cross-sections of rods: what turns Young's modulus and a radius into EA, EI1, EI2, GJ and inertia."""
 
+from copy import deepcopy
 from dataclasses import dataclass
 from math import pi
 
@@ -70,20 +71,50 @@ class Stiffness:
         return self if self.EI2 is not None else Stiffness(**{**self.__dict__, "EI2": self.EI1})
 
 
+def stiffness_of(what: str, section, material: Material | None) -> Stiffness:
+    """Return the stiffness of a section of a material.
+
+    Raises:
+        SceneError: there is no such section, it lacks a material or has no use for one, or the numbers of both do not go together.
+    """
+    if isinstance(section, type) or not hasattr(section, "stiffness"):
+        raise SceneError(
+            f"{what}: section {arguments.shown(section)} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
+        )
+    if isinstance(section, Stiffness) and material is not None:
+        raise SceneError(f"{what}: a Stiffness is given outright, and takes nothing of a material; leave material out")
+    if not isinstance(material, Material) and not isinstance(section, Stiffness):
+        raise SceneError(f"{what}: a {type(section).__name__} needs a material; give material=Material(...)")
+    try:
+        with np.errstate(all="ignore"):  # what overflows is refused at `build`
+            return deepcopy(section.stiffness(material))
+    except ValueError as reason:
+        raise SceneError(
+            f"{what}: numbers of the section and of the material do not go together: {reason}; give numbers that broadcast "
+            "to (rods, edges)"
+        ) from None
+
+
 def _require(what: str, value, rule: str, holds) -> None:
     """Refuse what is no finite number, or numbers, that fulfil a rule."""
-    try:
-        numbers = np.asarray(value, float)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if not (np.isfinite(numbers).all() and np.all(holds(numbers))):
-        raise SceneError(f"{what} = {value!r}; {rule}")
+    numbers = arguments.array(what, value, rule)
+    if not (numbers.size and np.isfinite(numbers).all() and np.all(holds(numbers))):
+        raise SceneError(f"{what} = {arguments.shown(value)}; {rule}")
+    arguments.sized(what, numbers)
 
 
 def _require_sizes(section, *names: str) -> None:
-    for what in names or section.__dict__:
-        value = section.__dict__[what]
-        _require(f"{type(section).__name__}: {what}", value, "it is positive [m]", lambda v: v > 0.0)
+    kind, names = type(section).__name__, names or tuple(vars(section))
+    for what in names:
+        _require(f"{kind}: {what}", getattr(section, what), "it is positive [m]", lambda v: v > 0.0)
+    shapes = [np.shape(getattr(section, what)) for what in names]
+    try:
+        np.broadcast_shapes(*shapes)
+    except ValueError:
+        shown = " and ".join(map(str, shapes))
+        raise SceneError(
+            f"{kind}: {' and '.join(names)} have shapes {shown}; give numbers that broadcast to (rods, edges)"
+        ) from None
 
 
 def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
@@ -171,7 +202,7 @@ class Ribbon:
 
     def __post_init__(self):
         _require_sizes(self, "width", "thickness")
-        if not np.all(np.asarray(self.thickness) < self.width):
+        if not np.all(np.asarray(self.thickness) < np.asarray(self.width)):
             raise SceneError(f"Ribbon: thickness = {self.thickness!r}; it is less than the width, {self.width!r}")
         arguments.choice("Ribbon: law", self.law, ("audoly_neukirch", "sano_wada", "sadowsky"))
 

@@ -93,10 +93,11 @@ class Meridians:
         Raises:
             SceneError: what is given is no meridian; the message names shell and node.
         """
-        try:
-            points, thickness = np.array(points, float), np.array(thickness, float)
-        except (TypeError, ValueError):
-            raise SceneError(f"axisymmetric shell '{name}': points or thickness are no numbers") from None
+        what = f"axisymmetric shell '{arguments.text('add_axisymmetric_shell: name', name)}'"
+        points = arguments.array(f"{what}: points", points, "give (n, 2), radius and height").copy()
+        thickness = arguments.array(f"{what}: thickness", thickness, "give one number, or one an edge").copy()
+        for part, values in (("points", points), ("thickness", thickness)):
+            arguments.sized(f"{what}: {part}", values)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
             raise SceneError(
                 f"axisymmetric shell '{name}': points have shape {points.shape}; give (n, 2), n at least 3: radius, height"
@@ -128,7 +129,7 @@ class Meridians:
             tangent: direction (2,) of the meridian there, the way it runs; by default that of the points, extrapolated.
         """
         if tangent is not None:
-            tangent = arguments.broadcast("clamp_ring: tangent (2,)", tangent, (2,))
+            tangent = arguments.broadcast("clamp_ring: tangent (2,)", tangent, (2,), own=1)
             if not tangent.any():
                 raise SceneError(f"clamp_ring: tangent is {tangent!r}; give a direction (2,), not zero")
         node = self._end(shell, end)
@@ -153,7 +154,7 @@ class Meridians:
         radius = self.axisymmetric_shells[shell].points[nodes, 0]
         if not radius.all():
             raise SceneError(f"add_ring_force: shell {shell} has a pole there; use add_pole_force")
-        force = arguments.broadcast("add_ring_force: force", force, (len(nodes), 2))
+        force = arguments.broadcast("add_ring_force: force", force, (len(nodes), 2), own=1)
         amplitude = arguments.amplitude("add_ring_force", amplitude)
         self.ring_loads.append(RingLoad(shell, nodes, 2.0 * np.pi * radius[:, None] * force, amplitude))
 

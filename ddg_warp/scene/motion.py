@@ -50,12 +50,8 @@ class Motion:
             function = getattr(self, name)
             if not callable(function):
                 raise SceneError(f"Motion: {name} is {function!r}; give a function of the time, such as lambda t: ...")
-        for name in ("axis", "pivot"):
-            arguments.vector(f"Motion: {name}", getattr(self, name))
-        length = np.linalg.norm(self.axis)
-        if not length > 0.0:
-            raise SceneError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
-        object.__setattr__(self, "unit", np.asarray(self.axis, float) / length)
+        object.__setattr__(self, "pivot", arguments.vector("Motion: pivot", self.pivot))
+        object.__setattr__(self, "unit", arguments.direction("Motion: axis", self.axis))
         shift = arguments.value_at("Motion: translation", self.translation, 0.0, 3, error=SceneError)
         arguments.value_at("Motion: angle", self.angle, 0.0, error=SceneError)
         object.__setattr__(self, "count", len(shift) if shift.ndim == 2 else None)

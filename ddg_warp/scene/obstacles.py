@@ -24,10 +24,7 @@ class Plane:
 
     def __post_init__(self):
         point = np.array(arguments.vector("Plane: point", self.point))
-        normal = np.array(arguments.vector("Plane: normal", self.normal))
-        if not normal.any():
-            raise SceneError("Plane: the normal is zero; give the direction out of the half-space")
-        normal /= np.linalg.norm(normal)
+        normal = arguments.direction("Plane: normal", self.normal)
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         # a motion moves the plane by three points of it
@@ -92,16 +89,11 @@ class Mesh:
     kind = MESH
 
     def __post_init__(self):
-        try:
-            points, cells = np.array(self.points, float), np.array(self.cells)
-        except (TypeError, ValueError):
-            raise SceneError("Mesh: points or triangles are no arrays of numbers") from None
+        points = arguments.array("Mesh: points", self.points, "give (points, 3) [m]").copy()
+        cells = arguments.triangles("Mesh: triangles", self.cells)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise SceneError(f"Mesh: points have shape {points.shape}; they are finite, (points, 3) [m]")
-        if cells.ndim != 2 or cells.shape[1] != 3 or cells.dtype.kind not in "iu" or not len(cells):
-            raise SceneError(
-                f"Mesh: triangles have shape {cells.shape} of {cells.dtype}; they are whole numbers (T, 3)"
-            )
+        arguments.sized("Mesh: points", points)
         for triangle in np.flatnonzero(((cells < 0) | (cells >= len(points))).any(1))[:1]:
             raise SceneError(
                 f"Mesh: triangle {triangle} has corners {cells[triangle]}; vertices are 0 to {len(points) - 1}"
@@ -120,13 +112,9 @@ def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
     center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():
         raise SceneError(f"Box: half = {half}; half lengths are positive [m]")
-    try:
-        turn = np.eye(3) if rotation is None else np.array(rotation, float)
-        turns = turn.shape == (3, 3) and np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0.0
-    except (TypeError, ValueError):
-        turns = False
-    if not turns:
-        raise SceneError(f"Box: rotation = {rotation!r} is no rotation matrix (3, 3)")
+    turn = np.eye(3) if rotation is None else arguments.broadcast("Box: rotation", rotation, (3, 3), own=2)
+    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0.0):
+        raise SceneError(f"Box: rotation = {arguments.shown(rotation)} is no rotation matrix (3, 3)")
     cells = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
     return Mesh(center + (CORNERS * half) @ turn.T, cells, radius)
 

@@ -22,9 +22,16 @@ class Displacement:
     terms: tuple[tuple[int, str, float], ...]
 
     def __post_init__(self):
-        for term in self.terms if np.iterable(self.terms) else [self.terms]:
+        terms = self.terms if isinstance(self.terms, tuple | list) else [self.terms]
+        if not terms:
+            raise SceneError(
+                "Displacement: there are no terms; give (row of the points, axis, weight) each, one at least"
+            )
+        for term in terms:
             if not isinstance(term, tuple | list) or len(term) != 3:
-                raise SceneError(f"Displacement: {term!r} is no term; give (row of the points, axis, weight) each")
+                raise SceneError(
+                    f"Displacement: {arguments.shown(term)} is no term; give (row of the points, axis, weight) each"
+                )
             arguments.index("Displacement: point", term[0])
             arguments.choice("Displacement: axis", term[1], ("x", "y", "z"))
             arguments.number("Displacement: weight", term[2])
@@ -167,9 +174,17 @@ class Stop:
         arguments.count("Stop: steps", self.steps)
         if self.limit_points is not None:
             arguments.count("Stop: limit_points", self.limit_points)
-        bounds = {"load": self.load, "displacement": self.displacement and self.displacement[1:]}
+        bounds = {"load": self.load}
+        if self.displacement is not None:
+            given = self.displacement
+            if not (isinstance(given, tuple | list) and len(given) == 3 and isinstance(given[0], str)):
+                shown = arguments.shown(given)
+                raise SceneError(
+                    f"Stop: displacement is {shown}; give (name of what is watched, lowest, highest value)"
+                )
+            bounds["displacement"] = given[1:]
         for name, bound in bounds.items():
-            if bound is None:
-                continue
-            if np.shape(bound) != (2,) or not np.asarray(bound, float)[0] < np.asarray(bound, float)[1]:
-                raise SceneError(f"Stop: {name} is {getattr(self, name)!r}; its lowest value comes before a higher one")
+            found = arguments.floats(bound)
+            if found.shape != (2,) or not found[0] < found[1]:
+                shown = arguments.shown(getattr(self, name))
+                raise SceneError(f"Stop: {name} is {shown}; its lowest value comes before a higher one")

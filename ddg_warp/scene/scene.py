@@ -13,7 +13,7 @@ from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Law, Load, RodBatch, Statics, Support, Trace, laws_of
 from ddg_warp.scene.grip import Grip
-from ddg_warp.scene.material import Material, Stiffness
+from ddg_warp.scene.material import Material, Stiffness, stiffness_of
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.structures import Structures
 
@@ -52,6 +52,14 @@ class Scene(Structures):
 
     def __post_init__(self):
         validate.check_settings(self)
+
+    def __setattr__(self, name: str, value) -> None:
+        self._need_attribute(name)
+        super().__setattr__(name, value)
+
+    def _need_attribute(self, name: str) -> None:
+        if name not in self.__dataclass_fields__:
+            raise SceneError(f"Scene has no attribute {name!r}{arguments.meant(name, self.__dataclass_fields__)}")
 
     def __repr__(self) -> str:
         joined = f", {len(self.joints)} joints, {len(self.attachments)} attachments" if self.joints else ""
@@ -141,26 +149,19 @@ class Scene(Structures):
         Raises:
             SceneError: what is given cannot be a rod; the message names rod and node.
         """
-        try:
-            points = np.array(points, float)
-            director = None if director is None else np.array(director, float)
-        except (TypeError, ValueError):
-            raise SceneError(
-                f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3)"
-            ) from None
+        arguments.text("add_rods: name", name)
+        points = arguments.array(f"rods '{name}': points", points, "give (rods, nodes, 3)").copy()
+        if director is not None:
+            director = arguments.array(f"rods '{name}': director", director, "give (3,), (rods, 3) or (rods, edges, 3)")
+            director = director.copy()
         if points.ndim == 2:
             points = points[None]
         if points.ndim != 3 or points.shape[2] != 3:
             raise SceneError(f"rods '{name}': points have shape {points.shape}; give (rods, nodes, 3)")
+        arguments.sized(f"rods '{name}': points", points)
         flags = {"closed": closed, "twist": twist, "bend": bend}
         closed, twist, bend = (arguments.flag(f"rods '{name}': {what}", value) for what, value in flags.items())
-        stiffness = getattr(section, "stiffness", None)
-        if stiffness is None:
-            raise SceneError(
-                f"rods '{name}': section {section!r} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
-            )
-        if not isinstance(material, Material) and not isinstance(section, Stiffness):
-            raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
+        stiffness = stiffness_of(f"rods '{name}'", section, material)
         if arguments.choice(f"rods '{name}': curvature", curvature, ("tangent", "angle")) == "angle" and not bend:
             raise SceneError(f"rods '{name}': curvature is 'angle' and bend is False; without bending leave it out")
         if bend and not closed and points.shape[1] == 2:
@@ -175,7 +176,7 @@ class Scene(Structures):
         points.setflags(write=False)
         batch = RodBatch(
             points,
-            deepcopy(stiffness(material)),
+            stiffness,
             closed,
             deepcopy(natural),
             director,
@@ -328,13 +329,18 @@ class Scene(Structures):
 
         validate.check_scene(self)
         worlds = arguments.count("worlds", worlds)
+        allow_rounding = arguments.flag("build: allow_rounding", allow_rounding)
         return Model(self.copy(), device=device, precision=precision, worlds=worlds, allow_rounding=allow_rounding)
 
     def copy(self, **changes) -> "Scene":
         """The scene as it is now, with attributes changed; lists and entries are its own, their arrays are shared."""
+        for name in changes:
+            self._need_attribute(name)
         other, own = copy(self), vars(self).items()
         other.__dict__.update({name: list(map(copy, value)) for name, value in own if isinstance(value, list)})
         other.__dict__.update(changes)
+        if changes:
+            validate.check_settings(other)
         return other
 
     def _rods(self, rods) -> np.ndarray:

@@ -76,9 +76,9 @@ class Structures(Meridians, Magnets, Contacts):
         Raises:
             SceneError: what is given is no surface; the message names shell and triangle.
         """
-        surface = Surface(points, triangles, name)
+        surface = Surface(points, triangles, arguments.text("add_shell: name", name))
         if not isinstance(material, Material):
-            raise SceneError(f"shell '{name}': material is {material!r}; give material=Material(...)")
+            raise SceneError(f"shell '{name}': material is {arguments.shown(material)}; give material=Material(...)")
         if np.any(np.abs(material.poisson) >= 1.0):
             raise SceneError(f"shell '{name}': Poisson's ratio {material.poisson}; that of a shell is between -1 and 1")
         arguments.choice(f"shell '{name}': bending", bending, MODELS)
@@ -87,12 +87,9 @@ class Structures(Meridians, Magnets, Contacts):
             arguments.choice(f"shell '{name}': rest", rest, ("shape", "flat"))
         else:
             rest = _forms(f"shell '{name}': rest", rest, len(surface.triangles))
-        try:
-            thickness = np.array(thickness, float)
-        except (TypeError, ValueError):
-            raise SceneError(
-                f"shell '{name}': thickness is {thickness!r}; give one number, or one a triangle [m]"
-            ) from None
+        what = f"shell '{name}': thickness"
+        thickness = arguments.array(what, thickness, "give one number, or one a triangle [m]").copy()
+        arguments.sized(what, thickness)
         _warn_of_pieces(surface)
         self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name))
         return len(self.shells) - 1
@@ -132,10 +129,7 @@ class Structures(Meridians, Magnets, Contacts):
         if isinstance(axis, str):
             normal = np.eye(3)["xyz".index(arguments.choice("symmetry: axis", axis, ("x", "y", "z")))]
         else:
-            normal = np.array(arguments.vector("symmetry: axis, 'x', 'y' or 'z' or the plane's normal,", axis))
-            if not normal.any():
-                raise SceneError("symmetry: the normal is zero; give three numbers that are not, or 'x', 'y' or 'z'")
-            normal /= np.linalg.norm(normal)
+            normal = arguments.direction("symmetry: axis, 'x', 'y' or 'z' or the plane's normal,", axis)
             # to rounding, an axis of space is one
             axis = "xyz"[np.argmax(np.abs(normal))] if np.sort(np.abs(normal))[1] < 1e-15 else ""
             normal = np.round(normal) if axis else normal
@@ -159,7 +153,7 @@ class Structures(Meridians, Magnets, Contacts):
     def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
         vertices = arguments.once("add_vertex_force: vertices", self._vertices(shell, vertices))
-        force = arguments.broadcast("add_vertex_force: force", force, (len(vertices), 3))
+        force = arguments.broadcast("add_vertex_force: force", force, (len(vertices), 3), own=1)
         amplitude = arguments.amplitude("add_vertex_force", amplitude)
         self.shell_loads.append(ShellLoad(shell, vertices, force, amplitude))
 
@@ -327,14 +321,12 @@ class Structures(Meridians, Magnets, Contacts):
 def _forms(what: str, rest, triangles: int) -> tuple[np.ndarray, np.ndarray]:
     """Rest forms (abar, bbar), copies."""
     if not isinstance(rest, list | tuple) or len(rest) != 2:
-        raise SceneError(f"{what} is {rest!r}; it is 'shape', 'flat' or two arrays (abar, bbar)")
-    try:
-        forms = tuple(np.array(values, float) for values in rest)
-    except (TypeError, ValueError):
-        forms = (np.zeros(0),)
+        raise SceneError(f"{what} is {arguments.shown(rest)}; it is 'shape', 'flat' or two arrays (abar, bbar)")
+    forms = tuple(arguments.array(what, values).copy() for values in rest)
     for values in forms:
         if values.shape != (triangles, 3) or not np.isfinite(values).all():
             raise SceneError(f"{what} has shape {values.shape}; both arrays are finite and of shape {(triangles, 3)}")
+        arguments.sized(what, values)
     return forms
 
 

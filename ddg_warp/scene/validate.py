@@ -1,5 +1,6 @@
 """What a scene must fulfil before anything is built: every refusal names the object, its index and the remedy."""
 
+import numbers
 import warnings
 
 import numpy as np
@@ -24,8 +25,8 @@ def check_settings(scene) -> None:
         SceneError: the first thing found wrong.
     """
     arguments.vector("gravity", scene.gravity)
-    if scene.dimension not in (2, 3):
-        raise SceneError(f"dimension = {scene.dimension!r}; a scene is of dimension 2 or 3")
+    if not (isinstance(scene.dimension, numbers.Integral) and scene.dimension in (2, 3)):
+        raise SceneError(f"dimension = {arguments.shown(scene.dimension)}; a scene is of dimension 2 or 3")
     arguments.number(
         "mass_damping", scene.mass_damping, "one number, finite and not negative [1/s]", lambda v: v >= 0.0
     )
@@ -112,14 +113,17 @@ def check_motion(call: str, motion, planar: bool) -> None:
 def directions(what: str, value, rods: np.ndarray) -> np.ndarray:
     """Unit vectors (rods, 3) from a direction (3,), or one a rod."""
     try:
-        result = np.broadcast_to(np.asarray(value, float), (len(rods), 3))
-    except (TypeError, ValueError):
-        raise SceneError(f"{what} is {value!r}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods") from None
-    length = np.linalg.norm(result, axis=1, keepdims=True)
-    bad = np.flatnonzero(~(np.isfinite(length[:, 0]) & (length[:, 0] > 0.0)))
+        result = arguments.array(what, value)
+        result = np.broadcast_to(result[..., :3], (len(rods), result.shape[-1]))
+    except (IndexError, ValueError):
+        result = np.zeros((0, 0))
+    if result.shape[1] != 3:
+        shown = arguments.shown(value)
+        raise SceneError(f"{what} is {shown}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
+    bad = np.flatnonzero(~(np.isfinite(result).all(1) & result.any(1)))
     if bad.size:
         raise SceneError(f"{what} of rod {rods[bad[0]]} is {result[bad[0]]}; give a finite vector that is not zero")
-    return result / length
+    return arguments.unit(result)
 
 
 def check_batch(batch, dimension: int) -> None:
@@ -141,15 +145,16 @@ def check_batch(batch, dimension: int) -> None:
         if what == "radius" and section.radius is None:
             continue
         try:
-            value = np.asarray(getattr(section, what), float)
+            value = arguments.array(what, getattr(section, what))
             np.broadcast_to(value, (batch.rods, batch.edges))
-        except (TypeError, ValueError):
+        except ValueError:
             raise SceneError(
-                f"rod {batch.first} {name}: {what} = {getattr(section, what)!r}; give a number, or numbers that broadcast "
-                f"to the {batch.rods} rods and {batch.edges} edges"
+                f"rod {batch.first} {name}: {what} = {arguments.shown(getattr(section, what))}; give a "
+                f"number, or numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
             ) from None
         if not np.all(np.isfinite(value)) or np.any(value < 0.0):
             raise SceneError(f"rod {batch.first} {name}: {what} = {value}; it must be finite and not negative")
+        arguments.sized(f"rod {batch.first} {name}: {what}", value)
     needed = ["EA"] + (["EI1", "EI2"] if batch.bend else []) + (["GJ"] if batch.twist else [])
     for what in needed:
         if np.any(np.asarray(getattr(section, what)) == 0.0):
@@ -191,18 +196,22 @@ def _check_natural(batch, dimension: int) -> None:
         return
     parts = 1 if dimension == 2 else 3
     where = f"rod {batch.first} ('{batch.name}')"
-    if isinstance(natural, str) or not np.iterable(natural) or len(natural) != parts:
-        raise SceneError(f"{where}: natural is {natural!r}; give 'shape', 'straight' or {parts} arrays [1/m]")
+    several = isinstance(natural, list | tuple) or getattr(natural, "ndim", 0)
+    if not several or len(natural) != parts:
+        shown = arguments.shown(natural)
+        raise SceneError(f"{where}: natural is {shown}; give 'shape', 'straight' or {parts} arrays [1/m]")
     for value in natural:
         try:
-            value = np.broadcast_to(np.asarray(value, float), (batch.rods, vertices))
-        except (TypeError, ValueError):
+            value = np.broadcast_to(arguments.array(f"{where}: natural", value), (batch.rods, vertices))
+        except ValueError:
             raise SceneError(
-                f"{where}: natural holds {value!r}; give numbers that broadcast to the {batch.rods} rods and {vertices} vertices"
+                f"{where}: natural holds {arguments.shown(value)}; give numbers that broadcast to the {batch.rods} rods "
+                f"and {vertices} vertices"
             ) from None
         _refuse(
             ~np.isfinite(value), batch, "natural curvature or twist is not finite at vertex {k}; give finite numbers"
         )
+        arguments.sized(f"{where}: natural", value)
 
 
 def _check_director(batch, dimension: int) -> None:

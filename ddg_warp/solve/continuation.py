@@ -14,6 +14,7 @@ passed over as a corner. The load may be stationary there; which eigenvalues cha
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 
 import numpy as np
 from scipy.optimize import brentq
@@ -47,10 +48,14 @@ class Continuation:
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement] | None = None, **options):
+        if watch is not None and not isinstance(watch, Mapping):
+            raise SceneError(f"Continuation: watch is {arguments.shown(watch)}; give displacements by name")
         for name, displacement in (watch or {}).items():
+            arguments.text("Continuation: a name in watch", name)
             if not isinstance(displacement, Displacement):
                 raise SceneError(f"watch[{name!r}] is {displacement!r}; give Displacement.of(row, axis)")
-        self.model, self.options = model, ContinuationOptions(**options)
+        self.model = model
+        self.options = arguments.options("Continuation", ContinuationOptions, options, arguments.names(Continuation))
         self.corrector = Corrector(model, watch or {}, self.options)
         self.tangent, self.watched = self.corrector.tangent, self.corrector.watched
 
@@ -74,8 +79,10 @@ class Continuation:
             SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as its
                 `path`.
         """
-        if direction not in (1, -1):
-            raise SceneError(f"direction = {direction!r}; it is 1, with the load growing at first, or -1")
+        if not (isinstance(direction, Real) and direction in (1, -1)):
+            raise SceneError(
+                f"direction = {arguments.shown(direction)}; it is 1, with the load growing at first, or -1"
+            )
         first = self._start(state, start)
         stop = self._stop(stop)
         if direction * first.direction[-1] < 0.0:
@@ -91,7 +98,7 @@ class Continuation:
     def _stop(self, stop: Stop | None) -> Stop:
         """Where a path ends, checked."""
         if stop is not None and not isinstance(stop, Stop):
-            raise SceneError(f"stop is {stop!r}; give Stop(...)")
+            raise SceneError(f"stop is {arguments.shown(stop)}; give Stop(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
             raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
         return stop or Stop()
@@ -101,7 +108,9 @@ class Continuation:
 
         See `NetEquilibrium.contact_statistics`.
         """
-        for point in points:
+        for point in points if isinstance(points, Sequence) else [points]:
+            if not isinstance(point, Point):
+                raise SceneError(f"statistics: {arguments.shown(point)} is no point; give a list of those of a path")
             self.corrector.equilibrium.count(point.state, 0.0)
         return self.corrector.equilibrium.statistics()
 
@@ -119,9 +128,12 @@ class Continuation:
             ValueError: the point is no bifurcation.
         """
         if not isinstance(bifurcation, Point):
-            raise ValueError(f"switch: {bifurcation!r} is no point of a path; give one of path.bifurcations")
-        if side not in (1, -1):
-            raise SceneError(f"side = {side!r}; it is 1 or -1, the sense of the mode")
+            raise ValueError(
+                f"switch: {arguments.shown(bifurcation)} is no point of a path; give one of path.bifurcations"
+            )
+        if not (isinstance(side, Real) and side in (1, -1)):
+            raise SceneError(f"side = {arguments.shown(side)}; it is 1 or -1, the sense of the mode")
+        step = self.options.step if step is None else arguments.positive("switch: step", step)
         if bifurcation.kind != BIFURCATION:
             raise ValueError(f"the point is a {bifurcation.kind}; a path branches at a bifurcation")
         across = np.append(bifurcation.mode, 0.0)
@@ -131,7 +143,7 @@ class Continuation:
             along = self.corrector.dot(across, bifurcation.direction)
         across -= bifurcation.direction * along
         across *= side / self.corrector.norm(across)
-        distance = step or self.options.step
+        distance = step
         for _ in range(12):
             try:
                 point = self.corrector.correct(bifurcation, distance * across, self.corrector.metric * across)
@@ -166,12 +178,14 @@ class Continuation:
             SolverError: `no_start`, `singular_start`, or `displacement_turns_back`: the displacement cannot go on along the path
                 without a jump to another part of it; carries the path so far as its `path`.
         """
-        if displacement not in self.watched:
-            raise SceneError(
-                f"no displacement {displacement!r} is watched; give watch={{{displacement!r}: Displacement...}}"
-            )
+        if not isinstance(displacement, str) or displacement not in self.watched:
+            shown = arguments.shown(displacement)
+            raise SceneError(f"no displacement {shown} is watched; give watch={{{shown}: Displacement...}}")
         row = np.append(self.watched[displacement], 0.0)
-        values = arguments.broadcast("control: values", values, np.shape(values) or (1,))
+        values = np.atleast_1d(arguments.array("control: values", values, "give finite numbers"))
+        if values.ndim != 1 or not values.size or not np.isfinite(values).all():
+            raise SceneError(f"control: values have shape {values.shape}; give finite numbers (values,), one at least")
+        arguments.count("control: max_cuts", max_cuts, 0)
         here, path = self._start(state, start), Path()
         for value in values:
             reached, cuts = here.values[displacement], 0

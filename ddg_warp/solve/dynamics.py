@@ -109,7 +109,7 @@ class Integrator:
         if check_every is not None:
             arguments.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
-        self.options = NewtonOptions(**options)
+        self.options = arguments.options("Integrator", NewtonOptions, options, arguments.names(Integrator))
         if self.options.outliers and not model.scene.touching:
             raise SceneError(
                 f"outliers = {self.options.outliers!r} is of scenes with contact, whose bodies wait for each other; this one has none"
@@ -173,6 +173,7 @@ class Integrator:
 
     def resists(self, state: State) -> bool:
         """Whether spins resist turns of their axes in a step from a state; see `gyroscopic`."""
+        validate.check_state("resists", self.model, state)
         return state.spun if self.gyroscopic is None else self.gyroscopic
 
     def _spin(self, wanted: bool) -> None:
@@ -224,6 +225,7 @@ class Integrator:
         Raises:
             SolverError: a rod has been given up, and failures are not flagged.
         """
+        validate.check_state("check", self.model, state)
         self._steps_since_check = 0
         for part in self._parts if self.failures == "raise" else ():
             part.raise_failures(state)

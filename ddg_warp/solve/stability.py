@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import linalg, sparse
@@ -82,6 +83,9 @@ def spectrum(
     validate.check_state("spectrum", model, state)
     arguments.count("spectrum: count", count)
     arguments.choice("spectrum: metric", metric, ("mass", "unit"))
+    if tangent is not None and not isinstance(tangent, Tangent):
+        raise SceneError(f"spectrum: tangent is {arguments.shown(tangent)}; give Tangent(model), or leave it out")
+    load = None if load is None else arguments.number("spectrum: load", load)
     lost_in_rounding(model, state=state)
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
@@ -272,12 +276,27 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
     Raises:
         ValueError: the lowest eigenvalue has the same sign at both ends.
     """
-
+    if not callable(equilibrium_at):
+        shown = arguments.shown(equilibrium_at)
+        raise SceneError(
+            f"critical: equilibrium_at is {shown}; give a function of the parameter that returns (model, state)"
+        )
+    low, high = arguments.number("critical: low", low), arguments.number("critical: high", high)
+    tolerance = arguments.positive("critical: tolerance", tolerance)
+    if low == high:
+        raise SceneError(
+            f"critical: low and high are both {low:g}; give two parameters between which stability is lost"
+        )
     rigid = np.inf
 
+    @cache
     def lowest(parameter: float) -> float:
         nonlocal rigid
-        model, state = equilibrium_at(parameter)
+        found = equilibrium_at(parameter)
+        if not isinstance(found, tuple | list) or len(found) != 2:
+            shown = arguments.shown(found)
+            raise SceneError(f"critical: equilibrium_at gives {shown} at {parameter:g}; give (model, state)")
+        model, state = found
         found = spectrum(model, state, 1, "unit")
         rigid = min(rigid, found.rigid)
         if found.rigid > rigid:
@@ -286,6 +305,11 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
             found = spectrum(model, state, 1 + found.rigid, "unit")
         return float(found.elastic[0].real)
 
+    if lowest(low) * lowest(high) > 0.0:
+        raise ValueError(
+            f"critical: the lowest eigenvalue is {lowest(low):.3g} at {low:g} and {lowest(high):.3g} at {high:g}; give two "
+            "parameters between which its sign changes"
+        )
     return float(brentq(lowest, low, high, xtol=tolerance * abs(high - low)))
 
 

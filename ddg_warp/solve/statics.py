@@ -77,10 +77,8 @@ class StaticsOptions:
 
     def __post_init__(self):
         check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
-        if self.mode not in ("minimise", "follow"):
-            raise SceneError(f"statics mode {self.mode!r}: it is 'minimise' or 'follow'")
-        if self.solver not in SOLVERS:
-            raise SceneError(f"statics solver {self.solver!r}: it is one of {', '.join(SOLVERS)}")
+        arguments.choice("statics: mode", self.mode, ("minimise", "follow"))
+        arguments.choice("statics: solver", self.solver, SOLVERS)
         if self.solver == "pcg" and self.mode == "follow":
             raise SceneError(
                 "statics mode 'follow' passes limit points by the inertia of the tangent, which solver 'pcg' does not know; "
@@ -133,7 +131,8 @@ def solve(
     validate.check_model("statics", model)
     if state is not None:
         validate.check_state("statics", model, state)
-    equilibrium = Equilibrium(model, StaticsOptions(**options))
+    options = arguments.options("statics.solve", StaticsOptions, options, arguments.names(solve))
+    equilibrium = Equilibrium(model, options)
     return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)
 
 
@@ -215,6 +214,8 @@ class Equilibrium:
         for name, value in (("start", start), ("end", end)):
             arguments.number(f"statics: {name}", value)
         load_steps = arguments.count("load_steps", load_steps)
+        if way is not None and not isinstance(way, list):
+            raise SceneError(f"statics: way is {arguments.shown(way)}; give a list, to which equilibria are added")
         if self._rubs and start == end:
             raise SceneError(
                 f"contact: friction acts against what slides along an increment of the load parameter, and from {start:g} to {end:g} "
@@ -259,6 +260,8 @@ class Equilibrium:
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
                 shapes.to((at - start) / (end - start))
+                if error.outcome == "lost_in_rounding" and (advice := jump_between(self.model, at, target)):
+                    raise self._explained(error, state, target, f"; {advice}") from None
                 if error.outcome in (arguments.PRESCRIBED, "lost_in_rounding"):
                     raise
                 if not balanced:  # as with another rest shape: no part of the increment is small enough

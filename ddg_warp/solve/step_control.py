@@ -17,6 +17,7 @@ from ddg_warp.solve.motion import poses_between
 from ddg_warp.threads import launches, stays_here
 
 HALVINGS = 4
+MOST_HALVINGS = 40  # beyond which a step is lost in the rounding of the time
 ROOM = 0.8  # of the error, that the estimate of a step twice as long has to leave
 
 
@@ -59,7 +60,7 @@ class StepControl:
             raise SceneError(f"StepControl estimates the error of 'implicit_euler', not of {integrator.scheme!r}")
         self.integrator, self.model = integrator, integrator.model
         self.error = arguments.positive("StepControl: error", error, "m/s")
-        self.halvings = arguments.count("StepControl: halvings (0 for steps of one length)", halvings, 0)
+        self.halvings = arguments.count("StepControl: halvings (0 for steps of one length)", halvings, 0, MOST_HALVINGS)
         self.level, self.estimate, self.lengths = self.halvings, math.inf, Counter()
         self._changes, self._version = integrator.watch_changes(), None
 

@@ -127,7 +127,10 @@ class Worlds:
         Raises:
             SceneError: it is no array of bools, one a world.
         """
-        values = np.asarray(mask)
+        try:
+            values = np.asarray(mask)
+        except (TypeError, ValueError, RuntimeError):
+            values = np.zeros(0)
         if values.dtype != bool or values.shape != (self.model.worlds,):
             raise SceneError(
                 f"reset: the mask is {values.dtype} of shape {values.shape}; give bools ({self.model.worlds},), True for worlds that "

@@ -65,7 +65,7 @@ each("contact", "radius", [0.1, [1.0]], lambda v: touching(radius=v), "contact: 
 each("contact", "radius of a name", [0.0, -1.0, NAN, INF, "thick", [1.0, 2.0]], lambda v: touching(radius={"odd": v}),
      "contact: radius of 'odd'", "positive", "[m]")
 each("contact", "objects", [[], 3, ()], lambda v: touching(objects=v), "contact: objects", "names")
-each("contact", "names of objects", ["none", [0], ["rod", "none"]], lambda v: built(touching(objects=v)),
+each("contact", "names of objects", ["none", ["rod", "none"]], lambda v: built(touching(objects=v)),
      "contact: objects names", "'odd', 'rod'")
 refuse("contact", {
     "twice": (lambda: touching().contact(), "has contact already", "contact_between"),
@@ -73,7 +73,7 @@ refuse("contact", {
     "radius of what can not touch": (lambda: built(touching(objects="rod", radius={"odd": 0.1})), "radius names 'odd'", "is 'rod'"),
     "between a name that is not there": (lambda: between("rod", "none", ignore=True), "names 'none'", "'floor', 'odd', 'rod'"),
     "friction by direction of a shell": (lambda: _shell_over_floor((0.1, 0.2, 0.3)), "'shell' and 'floor'", "rods on an obstacle"),
-    "between numbers": (lambda: between(0, 1, ignore=True), "contact_between names 0"),
+    "between numbers": (lambda: between(0, 1, ignore=True), "contact_between: one is 0", "text"),
     "between obstacles": (lambda: between("floor", "floor", friction=0.1), "'floor' and 'floor'", "obstacles never touch"),
     "between, and nothing": (lambda: between("rod", "floor"), "'rod' and 'floor'", "nothing is different", "ignore=True"),
     "between, ignored and rough": (lambda: between("rod", "odd", ignore=True, friction=0.1), "'rod' and 'odd'", "no friction"),
@@ -118,7 +118,7 @@ each("obstacles", "rotation", [np.eye(2), 2.0 * np.eye(3), np.diag([1.0, 1.0, -1
 each("obstacles", "half a thickness", [-1.0, NAN, INF, "thick"], lambda v: ddg.Mesh(*meshes.sphere(0), v),
      "Mesh: radius", "zero or more")
 refuse("obstacles", {
-    "a normal of zero": (lambda: ddg.Plane(normal=(0.0, 0.0, 0.0)), "Plane", "normal is zero"),
+    "a normal of zero": (lambda: ddg.Plane(normal=(0.0, 0.0, 0.0)), "Plane", "normal is zero", "not all zero"),
     "a capsule of one point": (lambda: ddg.Capsule((1.0,) * 3, (1.0,) * 3, 0.1), "Capsule", "one point", "Sphere"),
     "a mesh of nothing": (lambda: ddg.Mesh(None, None), "Mesh", "(points, 3)"),
     "a mesh of no triangles": (lambda: ddg.Mesh(FLAT, np.zeros((0, 3), int)), "Mesh", "(T, 3)"),

@@ -57,7 +57,7 @@ refuse("statics", {
         lambda: _still(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (t if t < 0.5 else NAN, 0.0, 0.0))), load_steps=4),
         *("translation", "not finite", "t = 0.5")),
     "motion that jumps": (
-        lambda: _still(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (0.0, 0.0, 0.0 if t < 0.3 else 1e200))), max_cuts=3),
+        lambda: _still(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (0.0, 0.0, 0.0 if t < 0.3 else 1e20))), max_cuts=3),
         *("jumps at t = 0.3", "continuous", "load parameter")),
     "amplitude of three later": (lambda: _still(_pushed(lambda t: t if t < 0.5 else (t, t, t))), "amplitude", "one number", "t = 1"),
     "sheet, motion that ends": (

@@ -123,7 +123,7 @@ refuse("step", {
 
 
 def _jump(t):
-    return (0.0, 0.0, 0.0 if t < 0.005 else 1e200)
+    return (0.0, 0.0, 0.0 if t < 0.005 else 1e20)
 
 
 def _stepped(scene):

@@ -70,10 +70,11 @@ def _radius(batch, row: int, rod: int) -> float:
     Raises:
         SceneError: its section has none.
     """
-    if batch.section.radius is None:
+    radius = batch.section.radius
+    if radius is None or not np.all(np.asarray(radius) > 0.0):
         raise SceneError(
-            f"contact: rod {rod} ('{batch.name}') touches by a radius, and its section has none; give Stiffness(radius=...), or "
-            f"contact(radius={{{batch.name!r}: ...}})"
+            f"contact: rod {rod} ('{batch.name}') touches by a radius, and that of its section is {radius}; give "
+            f"Stiffness(radius=...), positive, or contact(radius={{{batch.name!r}: ...}})"
         )
     return float(np.max(_of_rod(batch, "radius", row)))
 

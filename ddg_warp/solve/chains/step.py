@@ -185,10 +185,10 @@ def _newton(model, group, integrator, means) -> ChainNewton:
     last = (means.linear, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
         return ProjectiveNewton(*given, *last)
-    if linear in DIRECT and group.kind.closed:
+    if linear in tuple(DIRECT) and group.kind.closed:
         raise SceneError(
             f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
         )
-    if linear in DIRECT:
+    if linear in tuple(DIRECT):
         return DIRECT[linear](*given, *last, split=means.split)
     return PcgNewton(*given, linear, *last)
