@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp.compile.ghosts import Ghosts, end_director, ghost_node
 from ddg_warp.compile.half_cells import HalfCells
+from ddg_warp.compile.laws import check_law
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.chain import ChainKind
@@ -103,6 +104,9 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
             raise SceneError(
                 f"rod {batch.first} ('{batch.name}'): it has no term {term!r} to give a law; it has {', '.join(names)}"
             )
+    for term, law in batch.laws.items():
+        where = f"rod {batch.first} ('{batch.name}'), {term}"
+        check_law(where, law, len(REGISTRY[term].measure.strains))
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
     keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
     terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)

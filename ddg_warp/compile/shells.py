@@ -132,7 +132,7 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
     }
     made = Plate(abar, bbar, angle, **material)
     for name in ("membrane_stiffness", "bending_stiffness"):
-        arguments.sized(f"shell '{surface.name}': {name.replace('_', ' ')}", getattr(made, name))
+        arguments.sized(name.replace("_", " "), getattr(made, name))
     return made
 
 

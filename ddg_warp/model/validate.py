@@ -6,6 +6,8 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import drag
 
+CARRIED = 1e-40  # least magnitude of which float32, below its normal numbers, keeps four digits
+
 
 def check_model(call: str, model) -> None:
     """Refuse what is no model, where one is asked for."""
@@ -25,6 +27,23 @@ def check_state(call: str, model, state) -> None:
         )
     if state.model is not model:
         raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")
+
+
+def refuse_underflow(model) -> None:
+    """Refuse stiffnesses, and squared areas of triangles, that float32 does not carry, unless rounding is allowed."""
+    if model.precision != "float32" or model.allow_rounding:
+        return
+    given = {name: values for name, values in model.parameters().items() if "/stiffness" in name}
+    for i, shell in enumerate(model.net.host.shells if model.net is not None else ()):
+        given[f"shell {i}, squared area of a triangle"] = shell.plate.area**2
+    for name, values in given.items():
+        size = np.abs(values[np.nonzero(values)])
+        if size.size and not (CARRIED <= size.min() and size.max() <= np.finfo(np.float32).max):
+            worst = size.min() if size.min() < CARRIED else size.max()
+            raise SceneError(
+                f"precision 'float32': {name} is {worst:.3g}, and float32 goes from {CARRIED:g} to {np.finfo(np.float32).max:.3g}; "
+                "take 'mixed' or 'float64', or other units"
+            )
 
 
 def refuse_curved_membranes(model) -> None:

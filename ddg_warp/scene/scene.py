@@ -326,11 +326,15 @@ class Scene(Structures):
             SceneError: see `ddg_warp.scene.validate`.
         """
         from ddg_warp.model.model import Model
+        from ddg_warp.model.validate import refuse_underflow
 
         validate.check_scene(self)
         worlds = arguments.count("worlds", worlds)
         allow_rounding = arguments.flag("build: allow_rounding", allow_rounding)
-        return Model(self.copy(), device=device, precision=precision, worlds=worlds, allow_rounding=allow_rounding)
+        options = {"device": device, "precision": precision, "worlds": worlds, "allow_rounding": allow_rounding}
+        model = Model(self.copy(), **options)
+        refuse_underflow(model)
+        return model
 
     def copy(self, **changes) -> "Scene":
         """The scene as it is now, with attributes changed; lists and entries are its own, their arrays are shared."""

@@ -320,8 +320,15 @@ class Equilibrium:
         """
         tangent, self.stiffness = self.tangent, None
         if not tangent.free.any():
-            state = state.copy()
+            begun, state = state, state.copy()
             tangent.move_supports(state, before, at)
+            if self.share(begun, state) < 1.0:
+                raise SolverError(
+                    f"no equilibrium at load parameter {at:g}: in_the_way, motions drive what they hold into each other, and "
+                    "nothing is free to yield; change these motions, or let them pass by contact_between(..., ignore=True)",
+                    state=begun,
+                    outcome="in_the_way",
+                )
             none = np.zeros(tangent.size)
             state.stable = True if self.model.worlds == 1 else np.full(self.model.worlds, True, object)
             return self.found(state, none, none, at, np.ones(tangent.islands, bool))

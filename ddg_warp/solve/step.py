@@ -246,4 +246,6 @@ class PartStep:
         """What to do about a step that failed and has no other reason."""
         jump = jump_between(self.model, state.time - self.integrator._dt_host, state.time)
         grips = "move grips less in a step, " if self.model.grips else ""
+        if not jump and self.model.precision != "float64" and self.islands.reason.numpy().max() == outcome.NON_FINITE:
+            return f"take precision 'float64', or units in which numbers stay far from the ends of float32; or {grips}a smaller dt"
         return jump or f"{grips}take a smaller dt, a looser rtol, or check its loads and supports"

@@ -12,6 +12,10 @@ HALF = 0.5  # of the smallest radius, the range of contact by default
 # Of forces that close the gap by some part of the range, by default: weights of a node; the share of EI / r^2, bending to ten radii;
 # the strain of what a node carries of a membrane; and that of a rod, which counts where its bending stiffness is next to none.
 WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
+BEYOND, RESOLVED = (
+    100.0,
+    1e-13,
+)  # range of contact over the size of the scene at most, and over its coordinates at least
 INERTIA = 10.0  # of the mass of a node over the square of the step, the least stiffness of a step that had no room
 
 
@@ -106,9 +110,26 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
                 table[g, h] = table[h, g] = value
         if between.ignore:
             ignored.append((g, h))
+    _refuse_ranges(scene, within, names)
     inertia = np.where(np.isnan(stiffness), inertia, 0.0)
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
     return Touching(law, bodies, names.tolist(), group, *_by_way(rough), stiffness, within, inertia, ignored)
+
+
+def _refuse_ranges(scene, within: np.ndarray, names) -> None:
+    """Refuse a range (groups, groups) far beyond what touches, or one that coordinates do not resolve."""
+    points = np.concatenate([o.points.reshape(-1, 3) for o in (*scene.batches, *scene.shells)])
+    size, far = np.ptp(points, axis=0).max(), np.abs(points).max()
+    for g, h in np.argwhere((within > BEYOND * size) | (within < RESOLVED * far))[:1]:
+        wrong = (
+            f"far beyond the size of the scene, {size:.3g} m"
+            if within[g, h] > size
+            else f"lost in positions of {far:.3g} m"
+        )
+        raise SceneError(
+            f"contact: the range between {str(names[g])!r} and {str(names[h])!r} is {within[g, h]:.3g} m, {wrong}; it is by "
+            "default half of the smallest radius or half thickness: give range=..., of about that size"
+        )
 
 
 def _of_both(values: np.ndarray, group: np.ndarray, moving: np.ndarray) -> np.ndarray:

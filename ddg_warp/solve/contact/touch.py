@@ -140,16 +140,21 @@ class Touch:
 
     def closest(self, x: wp.array) -> tuple[float, str]:
         """Smallest gap of all candidates [m], and which pair has it; infinite where nothing is near."""
+        gap, pair, _ = self.closest_nodes(x)
+        return gap, pair
+
+    def closest_nodes(self, x: wp.array) -> tuple[float, str, tuple]:
+        """Return the smallest gap of all candidates [m], the pair that has it, and the nodes of both; see `closest`."""
         self.at(x)
         found = self.pairs(x)
         if not len(found["gap"]):
-            return np.inf, ""
+            return np.inf, "", ()
         k = int(np.argmin(np.where(np.isfinite(found["gap"]), found["gap"], np.inf)))
-        one, other = (
-            self.shapes.describe(*map(int, of)) for of in zip(found["sizes"][k], found["things"][k], strict=True)
-        )
+        things = [tuple(map(int, of)) for of in zip(found["sizes"][k], found["things"][k], strict=True)]
+        one, other = (self.shapes.describe(*thing) for thing in things)
         world = f" in world {found['world'][k]}" if self.net.worlds > 1 else ""
-        return float(found["gap"][k]), f"{one} and {other}{world}"
+        nodes = tuple(self.shapes.things(size)[0][index] for size, index in things)
+        return float(found["gap"][k]), f"{one} and {other}{world}", nodes
 
 
 def _of_first(part, pairs) -> np.ndarray:

@@ -15,6 +15,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import touch as kernels
+from ddg_warp.scene.obstacles import Obstacle
 from ddg_warp.solve.chains.newton import EARLY
 from ddg_warp.solve.contact.tally import Tally
 from ddg_warp.solve.contact.touch import Touch
@@ -47,7 +48,7 @@ class NetContact:
     """
 
     def __init__(self, newton, model):
-        self.newton, self.net = newton, newton.net
+        self.newton, self.net, self._scene = newton, newton.net, model.scene
         net, host, real, linear, device = newton.net, newton.net.host, newton.real, newton.linear, newton.device
         if host.frames:
             raise SceneError(
@@ -326,16 +327,19 @@ class NetContact:
             wp.copy(own, found)
 
     def check(self, x: wp.array) -> None:
-        """Refuse to start from positions in which surfaces overlap. Reads from the device.
+        """Refuse to start from positions in which surfaces overlap, or are too close for a barrier. Reads from the device.
 
         Raises:
             SceneError: names the pair and by how much.
         """
         gap, pair = self.touch.closest(x)
-        least = 0.0 if self.touch.keep else -self.touch.search.reach
+        least = self._least if self.touch.keep else -self.touch.search.reach
         if gap <= least:
+            meet = f"overlap by {-gap:.3g} m" if gap < 0.0 else "touch"
+            if gap > 0.0:
+                meet = f"are {gap:.3g} m apart, too close for a barrier, which needs {least:.3g} m,"
             raise SceneError(
-                f"contact: {pair} overlap by {-gap:.3g} m at the start; move them apart, as model.pushed_apart(state) does, give "
+                f"contact: {pair} {meet} at the start; move them apart, as model.pushed_apart(state) does, give "
                 "them a smaller radius, or let them pass by contact_between(..., ignore=True)"
             )
 
@@ -349,6 +353,28 @@ class NetContact:
             return ""
         return (
             f"the smallest gap, {gap:.3g} m, is between {pair}; {self._widen(gap) if reason == outcome.NO_ROOM else ''}"
+        )
+
+    def driven(self, x: wp.array) -> str:
+        """What to do about two things that overlap at positions x, both held and one moved, so that nothing yields; empty for others.
+
+        Reads from the device.
+        """
+        gap, pair, nodes = self.touch.closest_nodes(x)
+        host, scene = self.net.host, self._scene
+        if gap > max(self._least, 0.0) or not all(host.fixed[of].all() for of in nodes):
+            return ""
+        supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
+        moved = {
+            f"obstacle '{support.name}'" if isinstance(support, Obstacle) else f"support {number} ({support.call})"
+            for number, (support, held) in enumerate(zip(supports, host.held, strict=True))
+            if support.motion is not None and any(np.isin(of, held.places).any() for of in nodes)
+        }
+        if not moved:
+            return ""
+        return (
+            f"{pair} are both held, and the motion of {' and of '.join(sorted(moved))} drives them into each other: change "
+            "that motion, free what holds one of them, or let them pass by contact_between(..., ignore=True), "
         )
 
     def _widen(self, gap: float) -> str:
