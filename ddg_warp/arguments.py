@@ -183,11 +183,12 @@ def meant(name: str, known: Iterable[str]) -> str:
     """The end of a refusal of a name that is unknown: the nearest of those that are known, and all of them."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, 1)
-    return f"; {f'did you mean {near[0]!r}? ' if near else ''}There {'is' if len(known) == 1 else 'are'} {', '.join(known)}"
+    there = f"here {'is' if len(known) == 1 else 'are'} {', '.join(known)}"
+    return f"; did you mean {near[0]!r}? T{there}" if near else f"; t{there}"
 
 
 def sealed(kind: type) -> type:
-    """A class whose objects, once they are made, refuse attributes that they do not have; to decorate it with."""
+    """A class whose objects, once they are made, refuse public attributes that they do not have; a decorator."""
     make = kind.__init__
 
     def init(self, *given, **named):
@@ -195,7 +196,7 @@ def sealed(kind: type) -> type:
         self.__dict__["_sealed"] = True
 
     def set_attribute(self, name, value):
-        if "_sealed" in self.__dict__ and not hasattr(self, name):
+        if "_sealed" in self.__dict__ and not name.startswith("_") and not hasattr(self, name):
             known = (each for each in (*vars(self), *dir(type(self))) if not each.startswith("_"))
             raise SceneError(f"{kind.__name__} has no attribute {name!r}{meant(name, set(known))}")
         object.__setattr__(self, name, value)

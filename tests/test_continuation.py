@@ -379,7 +379,7 @@ def test_mistakes(device):
     ):
         with pytest.raises(ddg.SceneError, match=message):
             Continuation(continuation.model, {"d": Displacement.of(row, axis)})
-    with pytest.raises(ddg.SceneError, match="step = 0"):
+    with pytest.raises(ddg.SceneError, match="step is 0"):
         Continuation(continuation.model, step=0)
     with pytest.raises(ddg.SceneError, match="one world; the model has 2"):
         Continuation(continuation.model.scene.build(device, "float64", worlds=2))

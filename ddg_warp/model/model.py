@@ -25,6 +25,7 @@ from ddg_warp.scene.grip import Grip
 from ddg_warp.threads import launches, one_at_a_time
 
 
+@arguments.sealed
 @launches
 class Model:
     """A built scene; see `Scene.build`.

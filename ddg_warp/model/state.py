@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arguments, arrays
 from ddg_warp.geometry import polyline
 from ddg_warp.threads import launches
 
@@ -73,6 +73,7 @@ class Sliding:
         return wp.array(q.numpy() - self.increment * self.velocity.numpy(), dtype=q.dtype, device=q.device)
 
 
+@arguments.sealed
 @launches
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.

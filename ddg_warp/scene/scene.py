@@ -100,8 +100,9 @@ class Scene(Structures):
         curvature: str = "tangent",
     ) -> int:
         """Add one rod with points (n, 3); arguments as in `add_rods`, without R: a director (3,) or (edges, 3). Returns its index."""
-        if np.ndim(director) == 2 and len(director) > 1:
-            director = [director]
+        if director is not None:
+            director = arguments.array(f"rods '{name}': director", director, "give (3,) or (edges, 3)")
+            director = director[None] if director.ndim == 2 and len(director) > 1 else director
         options = {"closed": closed, "natural": natural, "twist": twist, "bend": bend, "name": name}
         options |= {"laws": laws, "curvature": curvature}
         return self.add_rods([points], section=section, material=material, director=director, **options)[0]

@@ -33,6 +33,7 @@ LEAP = 4.0  # distance of two points over the length between them at which they 
 BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
 
 
+@arguments.sealed
 @stays_here
 @launches
 class Continuation:

@@ -29,6 +29,7 @@ SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
 
+@arguments.sealed
 @stays_here
 @launches
 class Integrator:

@@ -21,6 +21,7 @@ MOST_HALVINGS = 40  # beyond which a step is lost in the rounding of the time
 ROOM = 0.8  # of the error, that the estimate of a step twice as long has to leave
 
 
+@arguments.sealed
 @stays_here
 @launches
 class StepControl:

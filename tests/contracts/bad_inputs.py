@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import traceback
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 
 DEVICE = "cpu"  # refusals come from the host
@@ -115,6 +118,26 @@ def built(scene: ddg.Scene, *changes: Callable[[ddg.Scene], object]):
     return scene.build(DEVICE, "float64")
 
 
+def is_bare(error: Exception) -> bool:
+    """Return True of an error of Python's, NumPy's or another library's, which names no object."""
+    raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+    packaged = type(error).__module__.startswith("ddg_warp") or Path(ddg.__file__).parent in raised_in.parents
+    return not (isinstance(error, ValueError | SolverError) and packaged)
+
+
+def verdict(case: Case) -> str:
+    """Return what became of a case: "refused", "silent", "bare", or "unclear" where words are missing."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            case.action()
+    except Exception as error:
+        if is_bare(error):
+            return "bare"
+        return "refused" if all(word in str(error) for word in case.words) else "unclear"
+    return "silent"
+
+
 def counts() -> Counter:
     """Number of cases by group, of all modules."""
     for path in sorted(Path(__file__).parent.glob("bad_input_*.py")):
@@ -123,6 +146,12 @@ def counts() -> Counter:
 
 
 if __name__ == "__main__":
-    found = counts()
+    found, cases = counts(), import_module("bad_inputs").CASES
     print("\n".join(f"{number:4}  {group}" for group, number in found.items()))
     print(f"{sum(found.values()):4}  in all")
+    verdicts = {str(case): verdict(case) for case in cases}
+    for name, said in verdicts.items():
+        if said != "refused":
+            print(f"{said}: {name}")
+    times = Counter(verdicts.values())
+    print(", ".join(f"{times[said]} {said}" for said in ("refused", "silent", "bare", "unclear")))

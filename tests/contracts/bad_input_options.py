@@ -1,0 +1,95 @@
+"""Options that no call takes, attributes that nothing has, and what would have no effect."""
+
+# fmt: off
+from dataclasses import replace
+from functools import cache
+
+import warp as wp
+from bad_inputs import RUBBER, STIFFNESS, built, each, integrator, line, model, refuse, rods
+
+import ddg_warp as ddg
+from ddg_warp.kernels.densities.quadratic import quadratic
+from ddg_warp.solve import continuation, statics
+
+# --- unknown options ---
+refuse("options: unknown", {
+    "Integrator": (lambda: ddg.Integrator(model(), foo=1), "Integrator takes no 'foo'", "rtol", "scheme"),
+    "Integrator, nearly rtol": (lambda: ddg.Integrator(model(), rtoll=1e-6), "Integrator takes no 'rtoll'", "did you mean 'rtol'"),
+    "Integrator, nearly scheme": (lambda: ddg.Integrator(model(), sheme="implicit_euler"), "did you mean 'scheme'"),
+    "Integrator, nearly max_iterations": (lambda: ddg.Integrator(model(), max_iteration=3), "did you mean 'max_iterations'"),
+    "statics": (lambda: statics.solve(model(), foo=1), "statics.solve takes no 'foo'", "load_steps", "rotation_cap"),
+    "statics, nearly load_steps": (lambda: statics.solve(model(), load_step=2), "did you mean 'load_steps'"),
+    "statics, nearly mode": (lambda: statics.solve(model(), modes="follow"), "did you mean 'mode'"),
+    "Continuation": (lambda: continuation.Continuation(model(), foo=1), "Continuation takes no 'foo'", "watch", "max_step"),
+    "Continuation, nearly max_step": (lambda: continuation.Continuation(model(), maxstep=1.0), "did you mean 'max_step'"),
+})
+
+# --- unknown attributes ---
+
+
+def assigned(made, name: str):
+    """Set an attribute."""
+    setattr(made, name, 1.0)
+
+
+refuse("options: attributes", {
+    "scene.gravty": (lambda: assigned(rods(), "gravty"), "Scene has no attribute 'gravty'", "did you mean 'gravity'"),
+    "scene.mass_dampin": (lambda: assigned(rods(), "mass_dampin"), "did you mean 'mass_damping'"),
+    "scene.foo": (lambda: assigned(rods(), "foo"), "Scene has no attribute 'foo'", "gravity", "callbacks"),
+    "scene.copy(gravty)": (lambda: rods().copy(gravty=(0, 0, 0)), "Scene has no attribute 'gravty'", "did you mean 'gravity'"),
+    "state.tme": (lambda: assigned(model().state(), "tme"), "State has no attribute 'tme'", "did you mean 'time'"),
+    "state.velocity": (lambda: assigned(model().state(), "velocity"), "State has no attribute 'velocity'", "did you mean 'velocities'"),
+    "integrator.retry_limt": (lambda: assigned(integrator(), "retry_limt"), "did you mean 'retry_limit'"),
+    "model.gravity": (lambda: assigned(model(), "gravty"), "Model has no attribute 'gravty'"),
+    "continuation.optoins": (lambda: assigned(continuation.Continuation(model()), "optoins"), "did you mean 'options'"),
+})
+
+# --- no effect ---
+
+
+def smooth(**options) -> ddg.Scene:
+    """Two rods apart in contact without friction."""
+    scene = rods(line() + [0.0, 0.5, 0.0])
+    scene.contact(**options)
+    return scene
+
+
+each("options: no effect", "lags", [2, 3], lambda v: built(smooth(lags=v)), "contact: lags", "friction")
+each("options: no effect", "velocity", [1e-2], lambda v: built(smooth(velocity=v, friction=0.0)), "contact: velocity", "friction")
+each("options: no effect", "friction_law", ["polynomial"], lambda v: built(smooth(friction_law=v)), "contact: friction_law", "friction")
+refuse("options: no effect", {
+    "a material beside a Stiffness": (lambda: rods(section=STIFFNESS, material=RUBBER), "rods 'odd'", "leave material out"),
+    "lags, and friction that contact_between takes away": (
+        lambda: built(smooth(lags=2), lambda s: s.contact_between("rod", "odd", friction=0.0)), "contact: lags", "friction"),
+})
+
+
+# --- laws ---
+def wrong(part: int):
+    """The quadratic law with twice one of its derivatives, or its energy."""
+
+    @cache
+    def laws(real, n):
+        functions, values = list(quadratic.laws(real, n)), wp.types.vector(2 * n, real)
+        strains, right = wp.types.vector(n, real), functions[part]
+
+        @wp.func
+        def twice(e: strains, p: values):
+            return real(2.0) * right(e, p)
+
+        functions[part] = twice
+        return tuple(functions)
+
+    return replace(quadratic, name="mine", laws=laws)
+
+
+def bent(part: int):
+    """Build a rod with such a law."""
+    return built(rods(laws={"rod_bend_twist": ddg.Law(wrong(part), stiffness=[1.0, 1.0, 1.0])}))
+
+
+refuse("options: laws", {
+    "slope": (lambda: bent(1), "rod 1 ('odd')", "rod_bend_twist", "slope of the law 'mine'", "derivative of its energy"),
+    "energy": (lambda: bent(0), "rod 1 ('odd')", "slope of the law 'mine'", "derivative of its energy"),
+    "curvature": (lambda: bent(2), "rod 1 ('odd')", "curvature of the law 'mine'", "derivative of its slope"),
+})
