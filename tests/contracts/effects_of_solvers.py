@@ -1,0 +1,310 @@
+"""Arguments of integrators, equilibria, paths, questions and states; see `effects`."""
+
+from functools import cache
+
+import numpy as np
+from effects import ARC, CALLS, DEVICE, DT, MAGNET, RUBBER, SHEET, Call, Change, at_state, line
+
+import ddg_warp as ddg
+from ddg_warp.ask import inquiry
+from ddg_warp.solve import continuation, stability, statics
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.corrector import ContinuationOptions
+from ddg_warp.solve.statics import StaticsOptions
+from ddg_warp.solve.step_control import StepControl
+
+
+@cache
+def model(kind: str = "arc", worlds: int = 1):
+    """A small model, built once."""
+    scene = ddg.Scene(mass_damping=0.1)
+    if kind == "sheet":
+        scene.add_shell(**SHEET, thickness=0.05, material=RUBBER, bending="hinge")
+        scene.clamp_boundary(0, [0, 1, 2])
+    elif kind == "dof sheet":
+        scene.add_shell(**SHEET, thickness=0.05, material=RUBBER)
+        scene.clamp_boundary(0, [0, 1, 2])
+    elif kind == "ring":  # which PCG solves
+        angle = 2.0 * np.pi * np.arange(8) / 8
+        scene.add_rod(
+            np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]),
+            closed=True,
+            section=ddg.Circle(0.05),
+            material=RUBBER,
+        )
+    elif kind == "column":
+        scene = ddg.Scene(gravity=(0.0, 0.0, -1.0), dimension=2)
+        scene.add_rod(line()[:, [2, 1, 0]], section=ddg.Circle(0.01), material=RUBBER)
+        scene.clamp(0)
+        scene.add_force(0, -1, (0.0, 0.0, -0.5))
+    elif kind == "arch":
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
+        x = np.linspace(-0.5, 0.5, 9)
+        scene.add_rod(np.column_stack([x, 0.0 * x, 0.1 * np.cos(np.pi * x)]), section=ddg.Circle(0.01), material=RUBBER)
+        scene.fix(0, [0, -1])
+        scene.add_force(0, 4, (0.0, 0.0, -1.0))
+    elif kind == "held":
+        scene.add_rod(ARC, section=MAGNET)
+        scene.clamp(0, motion=ddg.Grip())
+        scene.magnetize(0, 1e5)
+        scene.magnetic_field((0.0, 0.0, 0.0))
+    elif kind == "touching":
+        scene.add_rod(line(), section=ddg.Circle(0.01), material=RUBBER, name="low")
+        scene.add_rod(line(6, 0.021), section=ddg.Circle(0.01), material=RUBBER, name="high")
+        scene.clamp([0])
+        scene.contact(range=5e-3)
+    elif kind == "couple":
+        scene.add_rod(ARC, section=ddg.Circle(0.02), material=RUBBER)
+        scene.clamp(0)
+        scene.add_couple(0, -1, (0.0, 0.1, 0.1))
+    elif kind == "falling":
+        scene.add_rod(line(), section=ddg.Circle(0.02), material=RUBBER)
+        scene.fix(0, [0])
+    else:
+        scene.add_rod(ARC, section=ddg.Rectangle(0.03, 0.02), material=RUBBER)
+        scene.clamp(0)
+        scene.add_force(0, -1, (0.0, 1.0, 1.0))
+    return scene.build(DEVICE, "float64", worlds=worlds)
+
+
+# --- integrators ---
+ODD = ARC + 0.3 * np.random.default_rng(0).standard_normal(ARC.shape) * (np.arange(6) > 1)[:, None]  # far from rest
+
+
+def integrated(kind: str = "arc", dt: float = 0.05, steps: int = 2, spins: float = 0.0, points=None, **options) -> list:
+    """What some steps show: the state, the counts, and after how many steps they end."""
+    made = model(kind)
+    integrator = ddg.Integrator(made, **options)
+    state = made.state(points, spins=np.full(made.order.edges_count, spins) if spins else None)
+    done, ended = 0, ""
+    for _ in range(steps):
+        try:
+            state = integrator.step(state, dt)
+        except ddg.SolverError as error:
+            ended = error.outcome
+            break
+        done += 1
+    return [*at_state(state), integrator.statistics(), done, ended, integrator.outcomes().tolist()]
+
+
+FAILS = {"max_iterations": 1, "retry_limit": 1, "rtol": 1e-12}
+CALLS["Integrator"] = Call(ddg.Integrator, integrated, {}, {
+    "scheme": "implicit_midpoint", "solver": "projective", "linear": "chain", "retry_limit": Change(0, {"max_iterations": 2}, 20),
+    "energy_bound": Change(1e-9, {"scheme": "implicit_midpoint"}), "check_every": Change(2, FAILS), "failures": Change("flag", FAILS),
+    "gyroscopic": Change(False, {"kind": "falling", "spins": 500.0}), "rtol": 1e-2, "floor_factor": Change(1e9, {"rtol": 1e-14}),
+    "max_iterations": 1, "max_halvings": Change(1, {"points": ODD, "dt": 1.0, "rotation_cap": 20.0, "retry_limit": 1}),
+    "rotation_cap": 1e-2,
+    "linear_rtol": Change(1e-1, {"kind": "ring"}), "psd": "project", "outliers": Change(0.1, refused=True)},
+    subjects=("model",), kinds=(NewtonOptions,))  # fmt: skip
+
+
+def controlled(**given) -> list:
+    """What a step under controls shows of a magnetised rod that is gripped."""
+    made = model("held")
+    return at_state(ddg.Integrator(made).step(made.state(), DT, ddg.Controls(**given)))
+
+
+CALLS["Controls"] = Call(ddg.Controls, controlled, {}, {
+    "poses": [[0.1, 0, 0, 0, 0.1, 0]], "forces": np.full((6, 3), 0.1), "moments": np.full(5, 0.1), "gravity": (1, 0, 0),
+    "field": (0, 0.1, 0)})  # fmt: skip
+
+
+def advanced(**given) -> list:
+    """What steps of their own length show."""
+    made = model("falling")
+    steps = StepControl(ddg.Integrator(made), **given)
+    state = steps.advance(made.state(), 0.1)
+    return [*at_state(state), sorted(steps.lengths.items()), steps.estimate]
+
+
+CALLS["StepControl"] = Call(
+    StepControl, advanced, {"error": 0.2, "halvings": 3}, {"error": 10.0, "halvings": 2}, ("integrator",)
+)
+
+
+# --- states and questions ---
+def begun(kind: str = "arc", **given) -> list:
+    """What a first state shows, and a step from it."""
+    made = model(kind)
+    state = made.state(**given)
+    return [*at_state(state), at_state(ddg.Integrator(made).step(state, DT))]
+
+
+CALLS["model.state"] = Call(ddg.Model.state, begun, {}, {
+    "points": ARC + [0, 0.1, 0] * ARC, "velocities": np.full((6, 3), 0.1), "spins": np.full(5, 0.1),
+    "angles": np.linspace(0, 1, 5)})  # fmt: skip
+
+
+def reacting(**given) -> list:
+    """Reactions."""
+    return [(found.force, found.moment, found.point) for found in inquiry.reactions(model(), model().state(), **given)]
+
+
+CALLS["reactions"] = Call(inquiry.reactions, reacting, {}, {"point": (1, 0, 0), "factor": 2.0}, ("model", "state"))
+
+
+def pushed(**given) -> list:
+    """What is pushed apart."""
+    state, far = model("touching").pushed_apart(model("touching").state(), **given)
+    return [state.points(), far]
+
+
+CALLS["pushed_apart"] = Call(ddg.Model.pushed_apart, pushed, {}, {"gap": 2e-3}, ("state",))
+
+
+def with_rest(kind: str = "dof sheet", **given) -> list:
+    """What a sheet of another rest shape shows, in a model of its own."""
+    made = model(kind).scene.build(DEVICE, "float64")
+    made.set_rest(0, **given)
+    return at_state(ddg.Integrator(made).step(made.state(), DT))
+
+
+STRETCHED = SHEET["points"] * 1.05
+METRIC = np.tile([0.3, 0.0, 0.3], (8, 1))
+CALLS["set_rest"] = Call(ddg.Model.set_rest, with_rest, {"points": SHEET["points"]}, {
+    "points": STRETCHED, "metric": METRIC, "curvature": np.full((8, 3), 0.1),
+    "angle": Change(np.full(16, 0.1), {"kind": "sheet"})}, ("shell",))  # fmt: skip
+
+
+def with_parameter(**given) -> list:
+    """What a rod shows with another parameter, in a model of its own."""
+    made = model().scene.build(DEVICE, "float64")
+    made.set_parameter(**given)
+    return at_state(ddg.Integrator(made).step(made.state(), DT))
+
+
+CALLS["set_parameter"] = Call(ddg.Model.set_parameter, with_parameter, {
+    "term": "rod_bend_twist", "parameter": "stiffness_1", "values": 0.2}, {
+    "term": Change("rod_stretch", {"parameter": "measure"}, "rod_bend_twist"), "parameter": "stiffness_2", "values": 0.3})  # fmt: skip
+
+
+# --- equilibria ---
+def solved(kind: str = "arc", way=None, controls=None, cuts: bool = False, **given) -> list:
+    """What an equilibrium shows, with how it was found."""
+    made, ways = model(kind), []
+    if way is not None:
+        given["way"] = ways
+    if given.get("state") == "moved":
+        given["state"] = made.state(points=made.state().points() * [1.0, 1.0, -1.0])
+    if given.get("rest"):
+        made = made.scene.build(DEVICE, "float64")
+    options = {name: given.pop(name) for name in [each.name for each in _fields()] if name in given}
+    solver = statics.Equilibrium(made, StaticsOptions(**options))
+    state = given.pop("state", None) or made.state()
+    found = solver.load(state, controls=controls, **given)
+    return [
+        *at_state(found),
+        str(found.outcome),
+        str(found.stable),
+        solver.iterations,
+        len(ways),
+        solver.pcg_iterations,
+    ]
+
+
+def _fields():
+    from dataclasses import fields
+
+    return fields(StaticsOptions)
+
+
+PUSH = ddg.Controls(forces=np.full((6, 3), 0.1))
+CALLS["statics.solve"] = Call(statics.solve, solved, {}, {
+    "state": Change("moved", {"kind": "arch", "end": 0.01}), "controls": PUSH, "load_steps": 2,
+    "start": Change(0.5, {"load_steps": 2}), "end": 0.5, "way": [],
+    "rest": Change({0: {"angle": np.full(16, 0.1)}}, {"kind": "sheet"}), "rtol": 1e-2, "floor_factor": Change(1e12, {"rtol": 1e-30}),
+    "max_iterations": Change(2, {"max_cuts": 1}, refused=True), "rotation_cap": 0.1, "mode": Change("follow", {"kind": "column"}),
+    "max_cuts": Change(1, {"max_iterations": 3}, 10, refused=True), "solver": Change("pcg", refused=True)},
+    subjects=("model",), kinds=(StaticsOptions,))  # fmt: skip
+
+
+def spectrum(kind: str = "arc", **given) -> list:
+    """Eigenvalues of a column that a force which follows nothing presses."""
+    made = model(kind)
+    found = stability.spectrum(made, made.state(), **given)
+    return [found.eigenvalues, found.negative]
+
+
+CALLS["spectrum"] = Call(stability.spectrum, spectrum, {}, {
+    "count": 2, "metric": "unit", "load": Change(2.0, {"kind": "couple"})}, ("model", "state", "tangent"))  # fmt: skip
+
+
+@cache
+def at_load(load: float):
+    """The column at a load parameter."""
+    return model("column"), statics.solve(model("column"), end=load, mode="follow")
+
+
+def buckling(free: float = 0.0, loaded: float = 0.1, count: int = 1) -> list:
+    """Buckling factors between two loads."""
+    return [stability.buckling(model("column"), at_load(free)[1], at_load(loaded)[1], count)]
+
+
+CALLS["buckling"] = Call(stability.buckling, buckling, {}, {"free": 0.01, "loaded": 0.2, "count": 2}, ("model",))
+CALLS["critical"] = Call(stability.critical, stability.critical, {
+    "equilibrium_at": at_load, "low": 0.0, "high": 1.0, "tolerance": 1e-2}, {
+    "equilibrium_at": lambda load: at_load(2.0 * load), "low": 0.05, "high": 1.2, "tolerance": 1e-6})  # fmt: skip
+
+
+# --- paths ---
+def traced(kind: str = "arch", tip: int = 4, trace=None, **given) -> list:
+    """What a path shows."""
+    made = model(kind)
+    watch = given.pop("watch", {"tip": ddg.Displacement.of(tip, "z")})
+    followed = continuation.Continuation(made, watch, **given)
+    path = followed.trace(**({"stop": ddg.Stop(steps=3)} | (trace or {})))
+    return [path.load, path.arclength, path.negative, path.kinds, [list(point.values.items()) for point in path.points], path.outcome,
+            [point.iterations for point in path.points]]  # fmt: skip
+
+
+CALLS["Continuation"] = Call(continuation.Continuation, traced, {}, {
+    "watch": {"side": ddg.Displacement.of(3, "x")}, "step": 0.01, "max_step": 0.021, "min_step": Change(0.5, refused=True),
+    "load_scale": 0.3, "iterations": 2, "max_iterations": Change(1, {"min_step": 1e-2}, refused=True), "rotation_cap": 1e-2,
+    "tolerance": Change(0.1, {"trace": {"stop": ddg.Stop(steps=40, limit_points=1)}, "max_step": 0.3}), "rtol": 1e-2,
+    "floor_factor": Change(1e12, {"rtol": 1e-30})}, ("model",), (ContinuationOptions,))  # fmt: skip
+
+
+def follow(**given) -> list:
+    """What a path shows by the arguments of `trace`."""
+    made = model("arch")
+    if given.get("state"):
+        given["state"] = made.state(points=made.state().points() * [1.0, 1.0, -1.0])
+    return traced(trace=given)
+
+
+CALLS["trace"] = Call(continuation.Continuation.trace, follow, {"stop": ddg.Stop(steps=3)}, {
+    "state": True, "start": 0.01, "direction": -1, "stop": ddg.Stop(steps=2)})  # fmt: skip
+CALLS["Stop at limit points"] = Call(ddg.Stop, lambda **given: traced(trace={"stop": ddg.Stop(**given)}, max_step=0.3), {"steps": 30}, {
+    "limit_points": 1})  # fmt: skip
+
+
+def driven(displacement="tip", values=(-0.01,), state=None, start=0.0, max_cuts=10) -> list:
+    """What a path under control shows."""
+    made = model("arch")
+    watch = {"tip": ddg.Displacement.of(4, "z"), "side": ddg.Displacement.of(3, "z")}
+    begin = made.state(points=made.state().points() * [1.0, 1.0, -1.0]) if state else None
+    found = continuation.Continuation(made, watch).control(displacement, values, begin, start=start, max_cuts=max_cuts)
+    return [found.load, found.points[-1].state.points(), [point.iterations for point in found.points]]
+
+
+CALLS["control"] = Call(continuation.Continuation.control, driven, {}, {
+    "displacement": "side", "values": (-0.02,), "state": Change(True, {"values": (-0.21,), "max_cuts": 0}), "start": 0.01,
+    "max_cuts": Change(0, {"values": (-0.25,)}, refused=True)})  # fmt: skip
+
+
+@cache
+def branched():
+    """A path of the column through its first bifurcation."""
+    followed = continuation.Continuation(model("column"), max_step=0.3)
+    return followed, followed.trace(stop=ddg.Stop(load=(-1.0, 1.0))).bifurcations[0]
+
+
+def switched(**given) -> list:
+    """What a branch shows."""
+    followed, fork = branched()
+    path = followed.switch(fork, **({"stop": ddg.Stop(steps=2)} | given))
+    return [path.load, path.points[-1].state.points()]
+
+
+CALLS["switch"] = Call(continuation.Continuation.switch, switched, {}, {
+    "side": -1, "step": 0.05, "stop": ddg.Stop(steps=1)}, ("bifurcation",))  # fmt: skip
