@@ -39,20 +39,27 @@ def floats(value, otherwise=NAN) -> np.ndarray:
         return np.asarray(otherwise)
 
 
-def sized(what: str, values: np.ndarray, least: float = LEAST, most: float = MOST) -> None:
+def sized(what: str, values: np.ndarray, *axes: str, least: float = LEAST) -> None:
     """Refuse numbers whose products overflow, or of which the largest is so small that its products underflow.
 
     Entries that are small beside the largest one are left alone: next to it they are zero.
+
+    Args:
+        axes: what the last axes but that of components count, such as "rod", "node".
+        least: magnitude of the largest entry; 0 for any.
     """
     size = np.abs(values, out=np.zeros(np.shape(values)), where=np.isfinite(values))
     largest = size.max(initial=0.0)
-    if largest == 0.0 or least <= largest <= most:
+    if largest == 0.0 or least <= largest <= MOST:
         return
     at = np.unravel_index(int(np.argmax(size)), size.shape)
     entry = f": entry {at[0] if len(at) == 1 else tuple(map(int, at))}" if at else ""
-    fails = "overflow" if largest > most else "underflow"
+    if axes:
+        entry = ", ".join(f"{axis} {place}" for axis, place in zip(axes, at[-1 - len(axes) : -1], strict=True))
+        entry = f": a coordinate of {entry}"
+    fails = "overflow" if largest > MOST else "underflow"
     raise SceneError(
-        f"{what}{entry} is {np.asarray(values)[at]:g}, whose products {fails}; magnitudes are from {least:g} to {most:g}: give it in "
+        f"{what}{entry} is {np.asarray(values)[at]:g}, whose products {fails}; magnitudes are from {LEAST:g} to {MOST:g}: give it in "
         "other units, with all else of the scene"
     )
 

@@ -156,7 +156,7 @@ class Surface:
             raise SceneError(f"{self._name}: points have shape {points.shape}; give (P, 3)")
         for vertex in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
             raise SceneError(f"{self._name}: vertex {vertex} is at a non-finite position; check the points")
-        arguments.sized(f"{self._name}: points", points)
+        arguments.sized(f"{self._name}: points", points, "vertex")
         return points
 
     def _checked_triangles(self, triangles) -> np.ndarray:

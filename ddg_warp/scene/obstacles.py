@@ -93,7 +93,7 @@ class Mesh:
         cells = arguments.triangles("Mesh: triangles", self.cells)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise SceneError(f"Mesh: points have shape {points.shape}; they are finite, (points, 3) [m]")
-        arguments.sized("Mesh: points", points)
+        arguments.sized("Mesh: points", points, "vertex")
         for triangle in np.flatnonzero(((cells < 0) | (cells >= len(points))).any(1))[:1]:
             raise SceneError(
                 f"Mesh: triangle {triangle} has corners {cells[triangle]}; vertices are 0 to {len(points) - 1}"

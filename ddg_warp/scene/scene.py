@@ -159,7 +159,7 @@ class Scene(Structures):
             points = points[None]
         if points.ndim != 3 or points.shape[2] != 3:
             raise SceneError(f"rods '{name}': points have shape {points.shape}; give (rods, nodes, 3)")
-        arguments.sized(f"rods '{name}': points", points)
+        arguments.sized(f"rods '{name}': points", points, "rod", "node")
         flags = {"closed": closed, "twist": twist, "bend": bend}
         closed, twist, bend = (arguments.flag(f"rods '{name}': {what}", value) for what, value in flags.items())
         stiffness = stiffness_of(f"rods '{name}'", section, material)

@@ -275,6 +275,9 @@ class Equilibrium:
                 elif cuts > self.options.max_cuts:
                     advice = jump_between(self.model, at, target)
                     told = f" (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)"
+                    if error.outcome != "in_the_way" and (blocked := self._blocked(state, at, target)):
+                        told = f"{error}{told}; {blocked}"
+                        raise SolverError(told, state=state, outcome=error.outcome) from None
                     raise self._explained(error, state, target, f"{told}{advice and '; ' + advice}") from None
         state.time = end
         return state
@@ -295,6 +298,12 @@ class Equilibrium:
         """Refuse to begin where surfaces overlap; by a penalty equilibria may."""
         if self.model.touch and self.model.touch.keep:
             self.net.newton.contact.check(state.net.q)
+
+    def _blocked(self, state: State, start: float, end: float) -> str:
+        """What to do about two held things that motions drive into each other between two load parameters; empty without any."""
+        if not self.model.touch:
+            return ""
+        return self.net.newton.contact.blocked(self.tangent, state, start, end).rstrip(", ")
 
     def share(self, before: State, after: State) -> float:
         """The part of the straight way between two states in which nothing passes through anything."""
@@ -323,9 +332,12 @@ class Equilibrium:
             begun, state = state, state.copy()
             tangent.move_supports(state, before, at)
             if self.share(begun, state) < 1.0:
+                told = self._blocked(begun, before, at) or (
+                    "motions drive what they hold through each other: change these motions, or let them pass by "
+                    "contact_between(..., ignore=True)"
+                )
                 raise SolverError(
-                    f"no equilibrium at load parameter {at:g}: in_the_way, motions drive what they hold into each other, and "
-                    "nothing is free to yield; change these motions, or let them pass by contact_between(..., ignore=True)",
+                    f"no equilibrium at load parameter {at:g}: in_the_way, {told}",
                     state=begun,
                     outcome="in_the_way",
                 )

@@ -168,7 +168,8 @@ refuse("sizes: contact", {
     "held through held": (lambda: stepped(driven(), 2), "both held", "motion of support 2 (clamp)", "change that motion"),
     "held through held, penalty": (lambda: stepped(driven(law="penalty"), 4), "both held", "motion of support 2 (clamp)"),
     "a plane through what is held": (lambda: stepped(driven("plane"), 2), "both held", "motion of obstacle 'floor'"),
-    "held through held in an equilibrium": (lambda: statics.solve(built(driven()), max_cuts=1), "in_the_way", "change these motions"),
+    "held through held in an equilibrium": (lambda: statics.solve(built(driven()), max_cuts=1),
+                                            "in_the_way", "both held", "support 2 (clamp)"),
 })
 
 

@@ -29,7 +29,6 @@ RUNS, TREES = 1, 2  # what is made anew before some steps
 # Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
 # step in which they touch nothing. So many looks trees of runs serve, which are refitted by these alone.
 RENEWAL = 8
-LOOKS = 8  # times in a step that failed at which motions are looked at
 
 
 class NetStep(PartStep):
@@ -368,19 +367,6 @@ class NetStep(PartStep):
         found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
         return next(filter(None, found), "") or self._tightest(state, world)
 
-    def _blocked(self, state) -> str:
-        """Two things, both held, that motions drive into each other in the step after a state; empty where none are seen.
-
-        The state has the time of the end of the step. Looks at `LOOKS` times in between.
-        """
-        dt, tangent = self.integrator._dt_host, Tangent(self.model)
-        for part in np.arange(1, LOOKS + 1) / LOOKS if self.model.motions else ():
-            there = state.copy()
-            tangent.move_supports(there, state.time - dt, state.time - dt + part * dt)
-            if told := self.newton.contact.driven(there.net.q):
-                return told
-        return ""
-
     def _tightest(self, state, world: int) -> str:
         """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart; and advice.
 
@@ -389,6 +375,8 @@ class NetStep(PartStep):
         if not self.newton.contact:
             return self.advice(state)
         reason = int(self.islands.reason.numpy()[world])
-        told = self._blocked(state) or self.newton.contact.tightest(state.net.q, reason)
+        begin = state.time - self.integrator._dt_host
+        told = self.newton.contact.blocked(Tangent(self.model), state, begin, state.time)
+        told = told or self.newton.contact.tightest(state.net.q, reason)
         helped = told.endswith(", ")
         return told + ("or check its loads and supports" if helped else self.advice(state))
