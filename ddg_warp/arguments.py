@@ -194,6 +194,33 @@ def meant(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}? T{there}" if near else f"; t{there}"
 
 
+def called(kind: type) -> type:
+    """A class that refuses arguments which do not fit its public methods, or itself, by a `SceneError`; a decorator."""
+    for name, function in list(vars(kind).items()):
+        if inspect.isfunction(function) and (name == "__init__" or not name.startswith("_")):
+            setattr(kind, name, _fitting(kind.__name__ if name == "__init__" else name, function))
+    return kind
+
+
+def _fitting(call: str, function: Callable) -> Callable:
+    signature = inspect.signature(function)
+    known = [name for name in names(function) if name != "self"]
+    takes_any = any(each.kind is each.VAR_KEYWORD for each in signature.parameters.values())
+
+    @wraps(function)
+    def fitted(*given, **named):
+        for name in named if not takes_any else ():
+            if name not in known:
+                raise SceneError(f"{call} takes no {name!r}{meant(name, known)}")
+        try:
+            signature.bind(*given, **named)
+        except TypeError as reason:
+            raise SceneError(f"{call}: {reason}; it takes {', '.join(known)}") from None
+        return function(*given, **named)
+
+    return fitted
+
+
 def sealed(kind: type) -> type:
     """A class whose objects, once they are made, refuse public attributes that they do not have; a decorator."""
     make = kind.__init__

@@ -126,7 +126,7 @@ def warn_of_rounding(model, analysis) -> None:
     s = getattr(analysis, "dt", np.inf) * (0.5 if getattr(analysis, "scheme", "") == "implicit_midpoint" else 1.0)
     error, where = rounding(model, s) if model.precision == "float32" else (0.0, "")
     if error > FLOAT32_LIMIT:
-        warnings.warn(_message(error, where, s, "float32 is doubtful here"), stacklevel=5)
+        warnings.warn(_message(error, where, s, "float32 is doubtful here"), stacklevel=6)
 
 
 def lost_in_rounding(model, s: float = np.inf, state=None) -> bool:

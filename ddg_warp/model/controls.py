@@ -9,6 +9,7 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 
+@arguments.called
 @dataclass(frozen=True, eq=False)
 class Controls:
     """What acts during one step, constant over it: `integrator.step(state, dt, controls)`. What is not given is as the scene has it.

@@ -46,6 +46,7 @@ class Between:
     range: float | None
 
 
+@arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Contacts:
     """The part of a scene that is about contact."""

@@ -17,6 +17,7 @@ from ddg_warp.scene.path import Displacement, Stop
 RUN = 2**16  # nodes
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Dynamics:
     """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
@@ -43,6 +44,7 @@ class Dynamics:
             arguments.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Statics:
     """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
@@ -53,6 +55,7 @@ class Statics:
         arguments.count("Statics: load_steps", self.load_steps)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Trace:
     """Follow the path of equilibria from load parameter 0 by arc length, through limit points.

@@ -45,6 +45,7 @@ class Resistance:
         return [self.tangential, self.normal, self.rotational, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
+@arguments.called
 @dataclass(frozen=True, eq=False)
 class Viscous:
     """Drag of a viscous fluid on a slender rod, without inertia of the fluid, walls and neighbours.
@@ -109,6 +110,7 @@ class Viscous:
         ]
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Granular:
     """Drag of a granular medium, by the direction of the velocity and not by its size: see `kernels.drag` (Maladen et al. 2009).

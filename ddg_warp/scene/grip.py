@@ -7,6 +7,7 @@ import numpy as np
 from ddg_warp import arguments
 
 
+@arguments.called
 @dataclass(frozen=True, eq=False)
 class Grip:
     """A rigid motion of supports that every step is told: `integrator.step(state, dt, Controls(poses=...))`; see `Controls`.

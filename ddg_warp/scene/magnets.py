@@ -67,6 +67,7 @@ class Dipoles:
     cutoff: float
 
 
+@arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Magnets:
     """The part of a scene that is magnetic."""

@@ -12,6 +12,7 @@ from ddg_warp.errors import SceneError
 DRAWN = 1e-3  # radius of rods that are drawn and have none [m]
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Material:
     """Isotropic linear elastic material.
@@ -40,6 +41,7 @@ class Material:
         return self.young / (2.0 * (1.0 + self.poisson))
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Stiffness:
     """Stiffness and inertia of a section, given outright.
@@ -131,6 +133,7 @@ def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
     )
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Circle:
     """Solid circular section of `radius` [m]; a number, or an array that broadcasts to (rods, edges)."""
@@ -146,6 +149,7 @@ class Circle:
         return _elastic(material, pi * np.asarray(self.radius) ** 2, i, i, 2.0 * i)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Ellipse:
     """Solid elliptic section with semi-axes a, b [m] along the first and second director."""
@@ -163,6 +167,7 @@ class Ellipse:
         return _elastic(material, pi * a * b, pi * a**3 * b / 4.0, pi * a * b**3 / 4.0, torsion)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Rectangle:
     """Solid rectangular section, `width` along the first and `height` along the second director [m]."""
@@ -183,6 +188,7 @@ class Rectangle:
         return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, torsion)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Ribbon:
     """Thin flat section whose cross-section bends along with bending and twist, as that of a strip of plate does.

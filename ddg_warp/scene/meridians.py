@@ -61,6 +61,7 @@ class RingPressure:
     amplitude: Callable[[float], float] | None = None
 
 
+@arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Meridians:
     """The part of a scene that turns about the z axis: every energy, force and mass is that of the whole revolution."""

@@ -20,6 +20,7 @@ def _unturned(t: float) -> float:
     return 0.0
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Motion:
     """A rigid motion of supports: rotation about an axis through `pivot`, then translation.

@@ -12,6 +12,7 @@ from ddg_warp.scene.motion import Motion
 PLANE, BALL, CAPSULE, MESH = "plane", "ball", "capsule", "mesh"
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Plane:
     """A half-space: everything behind the plane through `point` whose `normal` points outwards."""
@@ -31,6 +32,7 @@ class Plane:
         object.__setattr__(self, "points", np.stack([point, point + first, point + np.cross(normal, first)]))
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Sphere:
     """A ball of a `radius` [m] about its `center` [m]."""
@@ -50,6 +52,7 @@ class Sphere:
         return np.array([self.center], float)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Capsule:
     """All that is within a `radius` [m] of the line from `start` to `end` [m]."""
@@ -73,6 +76,7 @@ class Capsule:
         return np.array([self.start, self.end], float)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Mesh:
     """A surface of triangles that nothing passes, from either side; open or closed.

@@ -11,6 +11,7 @@ from ddg_warp.errors import SceneError
 REGULAR, LIMIT_POINT, BIFURCATION = "regular", "limit point", "bifurcation"
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Displacement:
     """A displacement from rest [m]: that of a point along an axis, or a weighted sum of several.
@@ -154,6 +155,7 @@ class Path:
         return self.of_kind(BIFURCATION)
 
 
+@arguments.called
 @dataclass(frozen=True)
 class Stop:
     """Where a path ends; what comes first counts, and the last point lies exactly on a bound that it met.

@@ -18,6 +18,7 @@ from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.structures import Structures
 
 
+@arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Scene(Structures):
     """Rods and shells with supports and loads, ready to be built for a device.

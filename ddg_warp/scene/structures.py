@@ -31,6 +31,7 @@ from ddg_warp.scene.motion import Motion
 COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may be apart, over the largest coordinate
 
 
+@arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Structures(Meridians, Magnets, Contacts):
     """The part of a scene that is a net: whatever is not a rod of its own."""
@@ -342,5 +343,5 @@ def _warn_of_pieces(surface: Surface) -> None:
             f"shell '{surface.name}' falls into {pieces} pieces, though {shared} of its vertices lie on others: weld them with "
             "read_mesh(path, weld=1e-6) or meshes.weld(points, triangles, 1e-6)",
             SceneWarning,
-            stacklevel=3,
+            stacklevel=4,
         )

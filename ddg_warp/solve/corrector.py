@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.model import validate
 from ddg_warp.model.state import State
@@ -23,6 +24,7 @@ from ddg_warp.solve.direct import Factorisation, SingularError
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
+@arguments.called
 @dataclass(frozen=True)
 class ContinuationOptions:
     """How a path is followed.

@@ -49,6 +49,7 @@ LOST = 1e-3  # of the loads, which supports and obstacles may miss for rounding
 FIRST_TURN = 0.1  # rad, by which a search leaves a saddle
 
 
+@arguments.called
 @dataclass(frozen=True)
 class StaticsOptions:
     """How an equilibrium is searched.

@@ -10,6 +10,7 @@ from bad_inputs import RUBBER, STIFFNESS, built, each, integrator, line, model, 
 import ddg_warp as ddg
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.solve import continuation, statics
+from ddg_warp.solve.chains.newton import NewtonOptions
 
 # --- unknown options ---
 refuse("options: unknown", {
@@ -22,6 +23,33 @@ refuse("options: unknown", {
     "statics, nearly mode": (lambda: statics.solve(model(), modes="follow"), "did you mean 'mode'"),
     "Continuation": (lambda: continuation.Continuation(model(), foo=1), "Continuation takes no 'foo'", "watch", "max_step"),
     "Continuation, nearly max_step": (lambda: continuation.Continuation(model(), maxstep=1.0), "did you mean 'max_step'"),
+})
+
+SHEET = {"points": line(), "triangles": [[0, 1, 2]]}
+refuse("options: unknown", {
+    "add_rod, nearly section": (lambda: rods().add_rod(line(), sectoin=STIFFNESS), "add_rod takes no 'sectoin'", "'section'?"),
+    "add_rod without a section": (lambda: rods().add_rod(line()), "add_rod", "missing", "'section'"),
+    "add_rod without points": (lambda: rods().add_rod(section=STIFFNESS), "add_rod", "missing", "'points'"),
+    "add_rod of too much": (lambda: rods().add_rod(line(), STIFFNESS), "add_rod", "too many positional"),
+    "add_shell, nearly thickness": (lambda: rods().add_shell(**SHEET, thicknes=0.1, material=RUBBER), "did you mean 'thickness'"),
+    "contact, nearly friction": (lambda: rods().contact(fricton=0.1), "contact takes no 'fricton'", "did you mean 'friction'"),
+    "clamp, nearly motion": (lambda: rods().clamp(0, motoin=None), "clamp takes no 'motoin'", "did you mean 'motion'"),
+    "magnetize, nearly edges": (lambda: rods().magnetize(0, 1.0, edge=[0]), "magnetize takes no 'edge'", "did you mean 'edges'"),
+    "hold_ring without a shell": (lambda: rods().hold_ring(nodes=[0]), "hold_ring", "missing", "'shell'"),
+    "build, nearly worlds": (lambda: rods().build(world=2), "build takes no 'world'", "did you mean 'worlds'"),
+    "Scene, nearly gravity": (lambda: ddg.Scene(gravty=(0, 0, 0)), "Scene takes no 'gravty'", "did you mean 'gravity'"),
+    "Material, nearly young": (lambda: ddg.Material(yuong=1e6), "Material takes no 'yuong'", "did you mean 'young'"),
+    "Material without young": (ddg.Material, "Material", "missing", "'young'"),
+    "Circle of two": (lambda: ddg.Circle(0.1, 0.2), "Circle", "too many positional"),
+    "Motion, nearly angle": (lambda: ddg.Motion(angel=lambda t: t), "did you mean 'angle'"),
+    "Sphere without a radius": (lambda: ddg.Sphere((0, 0, 0)), "Sphere", "missing", "'radius'"),
+    "Trace": (lambda: ddg.Trace(foo=1), "Trace takes no 'foo'", "load_scale"),
+    "Dynamics, nearly duration": (lambda: ddg.Dynamics(durations=1.0), "did you mean 'duration'"),
+    "Stop, nearly limit_points": (lambda: ddg.Stop(limit_point=1), "did you mean 'limit_points'"),
+    "Viscous, nearly scale": (lambda: ddg.Viscous(1.0, scales=1.0), "did you mean 'scale'"),
+    "Controls, nearly forces": (lambda: ddg.Controls(force=[]), "did you mean 'forces'"),
+    "NewtonOptions": (lambda: NewtonOptions(foo=1), "NewtonOptions takes no 'foo'", "rtol"),
+    "StaticsOptions": (lambda: statics.StaticsOptions(foo=1), "StaticsOptions takes no 'foo'", "rotation_cap"),
 })
 
 # --- unknown attributes ---

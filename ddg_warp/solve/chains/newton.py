@@ -18,6 +18,7 @@ FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_ne
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
+@arguments.called
 @dataclass(frozen=True)
 class NewtonOptions:
     """How a Newton solve searches and when it stops.
