@@ -9,6 +9,33 @@ from ddg_warp.model.recipe import Recipe
 from ddg_warp.solve import statics
 
 WORLDS, DT = 2, 2e-3
+FAST = (
+    "rod",
+    "rod without twist",
+    "planar rod",
+    "closed rod",
+    "rod with drag",
+    "ribbon",
+    "rods joined rigidly",
+    "shell, hinge",
+    "rod on a shell",
+    "rods in contact",
+)
+EQUILIBRIA = [
+    "rod",
+    "rods joined rigidly",
+    "shell, hinge",
+    pytest.param("shell, curved membrane", marks=pytest.mark.slow),
+    "shell of revolution",
+]
+EVERY_KIND = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in FAST else pytest.mark.slow)
+        for name in OBJECTS
+        if "curved membrane" not in name  # which is for equilibria alone
+    ],
+)
 
 
 def built(name: str, device, worlds: int = WORLDS):
@@ -52,7 +79,7 @@ def set_back(model, name: str) -> None:
     Recipe(built(name, model.device), WORLDS).put(model)
 
 
-@pytest.mark.parametrize("name", [name for name in OBJECTS if "curved membrane" not in name])
+@EVERY_KIND
 def test_a_parameter_that_is_set_is_that_of_a_new_model(device, name):
     """Set between two steps, in new memory and in place, and put back: in an integrator that has stepped as in a new one."""
     model = built(name, device)
@@ -72,7 +99,7 @@ def test_a_parameter_that_is_set_is_that_of_a_new_model(device, name):
     assert moved, "no parameter had any effect"
 
 
-@pytest.mark.parametrize("name", [name for name in OBJECTS if "curved membrane" not in name])
+@EVERY_KIND
 def test_a_tensor_is_what_set_parameter_sets(device, name):
     """Every parameter, handed to a step as a tensor or set in the model, by the simulator of that; without it the model's is back."""
     torch = pytest.importorskip("torch")
@@ -97,9 +124,7 @@ def test_a_tensor_is_what_set_parameter_sets(device, name):
                 assert torch.equal(c, d), f"{parameter}: {field.name} is not back"
 
 
-@pytest.mark.parametrize(
-    "name", ["rod", "rods joined rigidly", "shell, hinge", "shell, curved membrane", "shell of revolution"]
-)
+@pytest.mark.parametrize("name", EQUILIBRIA)
 def test_equilibria_follow_the_model(device, name):
     """By a solver that is kept, as by a new one."""
     model = built(name, device)
