@@ -227,7 +227,8 @@ def sealed(kind: type) -> type:
 
     def init(self, *given, **named):
         make(self, *given, **named)
-        self.__dict__["_sealed"] = True
+        if type(self) is kind:  # others may go on to add theirs
+            self.__dict__["_sealed"] = True
 
     def set_attribute(self, name, value):
         if "_sealed" in self.__dict__ and not name.startswith("_") and not hasattr(self, name):

@@ -112,14 +112,11 @@ def check_motion(call: str, motion, planar: bool) -> None:
 
 def directions(what: str, value, rods: np.ndarray) -> np.ndarray:
     """Unit vectors (rods, 3) from a direction (3,), or one a rod."""
-    try:
-        result = arguments.array(what, value)
-        result = np.broadcast_to(result[..., :3], (len(rods), result.shape[-1]))
-    except (IndexError, ValueError):
-        result = np.zeros((0, 0))
-    if result.shape[1] != 3:
+    result = arguments.array(what, value, f"give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
+    if result.shape not in ((3,), (1, 3), (len(rods), 3)):
         shown = arguments.shown(value)
         raise SceneError(f"{what} is {shown}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
+    result = np.broadcast_to(result, (len(rods), 3))
     bad = np.flatnonzero(~(np.isfinite(result).all(1) & result.any(1)))
     if bad.size:
         raise SceneError(f"{what} of rod {rods[bad[0]]} is {result[bad[0]]}; give a finite vector that is not zero")
