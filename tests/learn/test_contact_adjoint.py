@@ -190,7 +190,7 @@ def test_pairs_that_do_not_fit_are_made_room_for(lags):
 
 
 def test_without_friction_there_is_nothing_to_lag():
-    model = built(scene_of("rod on plane", lags=2))
+    model = built(scene_of("rod on plane"))
     _, tape = Adjoint(ddg.Integrator(model)).step(touching(model), DT)
     assert tape.parts[-1].lagged == []
 
