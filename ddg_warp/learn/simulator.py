@@ -12,14 +12,18 @@ from ddg_warp import arguments
 from ddg_warp.errors import GradientWarning, SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.learn.adjoint import refuse_gyroscopic
-from ddg_warp.learn.engine import Engine
+from ddg_warp.learn.engine import LOAD, Engine
 from ddg_warp.learn.layout import Layout, copies, tensors
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, require_acting, shapes
-from ddg_warp.solve.dynamics import SCHEMES
+from ddg_warp.solve import statics
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.dynamics import SCHEMES, Integrator
 from ddg_warp.threads import alone
+
+SETTLED = {"failures", "check_every", "energy_bound"}  # of the arguments of `Integrator`, by the engine
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,11 @@ class Simulator(torch.nn.Module):
         validate.check_model("Simulator", model)
         arguments.choice("scheme", scheme, SCHEMES)
         self.dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
+        for name in SETTLED & options.keys():
+            raise SceneError(f"Simulator: {name} is settled, as worlds that fail are told by outcomes(); leave it out")
+        others = set(arguments.names(Integrator)) - SETTLED - {"model", "scheme"}
+        given = {name: value for name, value in options.items() if name not in others}
+        arguments.options("Simulator", NewtonOptions, given, others)
         self.model, self.scheme, self.options = model, scheme, options
         self._engines: dict[int, Engine] = {}
         self._last: Engine | torch.Tensor | None = None  # what tells the outcomes of the last step
@@ -185,6 +194,9 @@ class Simulator(torch.nn.Module):
             SceneError: shapes do not fit, or surfaces overlap that touch; under transforms of torch steps tell.
         """
         moved = {"positions": positions, "velocities": velocities}
+        for name, values in moved.items():
+            if not (values is None or isinstance(values, torch.Tensor) or np.isfinite(arguments.floats(values)).all()):
+                raise SceneError(f"initial_state: {name} are {arguments.shown(values)}; give finite numbers")
         moved = {name: self._tensor(name, values) for name, values in moved.items() if values is not None}
         given = [len(values) for values in moved.values() if values.ndim == 3]
         worlds = given[0] if given else self.model.worlds
@@ -341,12 +353,16 @@ class Simulator(torch.nn.Module):
             SolverError: there is none, in one of the worlds.
             SceneError: the state has a history of gradients, which would end here; a name or shape does not fit.
         """
+        given = {name: value for name, value in options.items() if name not in LOAD}
+        arguments.options("Simulator.equilibrium", statics.StaticsOptions, given, LOAD)
         if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
             raise SceneError(
                 "equilibrium: no gradient goes to the state where the search begins, which places what is held, yet; give "
                 "state.detach()"
             )
-        state = state or self.initial_state(batch)
+        if state is not None and batch is not None and arguments.count("batch", batch) != self._own(state).model.worlds:
+            raise SceneError(f"equilibrium: batch = {batch} of a state of {len(state.codes)} worlds; leave batch out")
+        state = state if state is not None else self.initial_state(batch)
         engine, end = self._own(state), arguments.number("end", options.get("end", 1.0))
         full, controls = self._full(engine, parameters), self._controls(engine, controls)
         call = self._call(engine, end, full, controls)
@@ -366,7 +382,8 @@ class Simulator(torch.nn.Module):
 
     def parameter(self, name: str, batch: int | None = None) -> torch.Tensor:
         """The values that the model has of a parameter (B, E)."""
-        return self.engine(batch or self.model.worlds).tables.value(name)
+        worlds = self.model.worlds if batch is None else arguments.count("batch", batch)
+        return self.engine(worlds).tables.value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
         """Parameters as `Tables.full` has them; of plain numbers values are checked, as tensors may be on their way."""
@@ -389,10 +406,9 @@ class Simulator(torch.nn.Module):
                 kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
                 raise SceneError(f"{name} is a {kind} tensor of {values.dtype}; give a dense one of real numbers")
             return values
-        try:
-            return torch.as_tensor(values, dtype=wp.dtype_to_torch(self.model.types.real))
-        except (TypeError, ValueError, RuntimeError):
-            raise SceneError(f"{name} = {values!r}; give numbers or a tensor") from None
+        return torch.as_tensor(
+            arguments.array(name, values, "give numbers or a tensor"), dtype=wp.dtype_to_torch(self.model.types.real)
+        )
 
     def _own(self, state: WorldState) -> Engine:
         """The engine of a state, of this simulator."""
@@ -466,6 +482,6 @@ class Simulator(torch.nn.Module):
 
 def _named(what: str, example: str, values) -> dict:
     """A dictionary by names; nothing for None."""
-    if not (values is None or isinstance(values, Mapping)):
-        raise SceneError(f"{what} are {values!r}; give a dictionary such as {{{example!r}: ...}}")
+    if not (values is None or (isinstance(values, Mapping) and all(isinstance(name, str) for name in values))):
+        raise SceneError(f"{what} are {arguments.shown(values)}; give a dictionary such as {{{example!r}: ...}}")
     return dict(values or {})

@@ -32,6 +32,8 @@ class Tables:
         Raises:
             SceneError: nothing has it.
         """
+        if not isinstance(name, str):
+            raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}")
         if name not in self._found:
             found = constants.array_places(self.model, name) if name in constants.NAMES else self._of_terms(name)
             if not found[1]:

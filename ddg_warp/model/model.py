@@ -212,15 +212,9 @@ class Model:
         Raises:
             ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
         """
-        parts, terms = self.net.sets if self.net is not None else (), self._terms()
-        if not isinstance(term, str) or term not in terms:
-            raise ValueError(
-                f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
-            )
-        known = terms[term]
-        if not isinstance(parameter, str) or parameter not in known:
-            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(known)}")
-        name, values, remade = f"{term}.{parameter}", self.valid_values(term, parameter, values), False
+        parts = self.net.sets if self.net is not None else ()
+        values, remade = self.valid_values(term, parameter, values), False
+        name = f"{term}.{parameter}"
         for group in self.groups:
             if name in group.parameters.values:
                 remade |= group.set_parameter(name, values)
@@ -238,16 +232,29 @@ class Model:
         self.layout += remade
 
     def valid_values(self, term: str, parameter: str, values) -> np.ndarray:
-        """Values of a parameter that there is as an array of numbers.
+        """Values of a parameter as an array of numbers.
 
         Raises:
-            ValueError: they are no numbers, not finite, or none that the parameter may have.
+            ValueError: there is no such parameter; they are no numbers, not finite, or none that the parameter may have.
         """
-        return valid_numbers(f"{term}.{parameter}", values, *self.parameter_rule(term, parameter))
+        rule = self.parameter_rule(term, parameter)
+        return valid_numbers(f"{term}.{parameter}", values, *rule)
 
     def parameter_rule(self, term: str, parameter: str) -> tuple:
-        """What values of a parameter that there is are, in words, and whether numbers are that."""
-        return self._terms()[term][parameter].valid
+        """What values of a parameter are, in words, and whether numbers are that.
+
+        Raises:
+            ValueError: nothing has the term, or the term has no such parameter.
+        """
+        terms = self._terms()
+        if not isinstance(term, str) or term not in terms:
+            raise ValueError(
+                f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
+            )
+        known = terms[term]
+        if not isinstance(parameter, str) or parameter not in known:
+            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(known)}")
+        return known[parameter].valid
 
     def _terms(self) -> dict[str, dict]:
         """Parameters of all terms: term -> name -> `Parameter`."""

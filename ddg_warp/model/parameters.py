@@ -3,6 +3,8 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp import arguments
+
 
 class ParameterTable:
     """Parameters of elements, in one buffer: row i of `table` is (offset, stride along the elements, stride across) of the i-th.
@@ -78,10 +80,7 @@ def valid_numbers(name: str, values, rule: str, holds) -> np.ndarray:
     Raises:
         ValueError: they are no numbers, not finite, or do not.
     """
-    try:
-        values = np.array(values, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} = {values!r}; give numbers") from None
+    values = np.array(arguments.array(name, values, "give numbers"))
     bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
     if bad.size:
         raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
