@@ -44,7 +44,7 @@ def select_kernel(dtype, serial: bool):
 @cache
 def blank_kernels(dtype):
     """blank(...): make entries of an array not numbers in worlds of a mask; bar(...): enter the outcome of worlds that rest in a step,
-    as a parameter of theirs is invalid or their first entry of an array is not a number.
+    as a parameter of theirs is invalid or their first entry of an array is not a number; judge(...): or any of an array is not finite.
     """
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
 
@@ -60,17 +60,20 @@ def blank_kernels(dtype):
         values: wp.array3d(dtype=dtype),
         share: int,
         resting: wp.array(dtype=int),
-        any_resting: wp.array(dtype=int),
     ):
         w = wp.tid()
         code = invalid[w]
         if code == 0 and wp.isnan(values[0, 0, w * share]):
             code = wp.static(outcome.GIVEN_UP)
         resting[w] = code
-        if code != 0:
-            any_resting[0] = 1
 
-    return blank, bar
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def judge(values: wp.array3d(dtype=dtype), share: int, resting: wp.array(dtype=int)):
+        i, j, k = wp.tid()
+        if not wp.isfinite(values[i, j, k]):
+            resting[k / share] = wp.static(outcome.INVALID_INPUT)
+
+    return blank, bar, judge
 
 
 @cache

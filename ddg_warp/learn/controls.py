@@ -18,13 +18,8 @@ class StepControls:
         self._usual = torch.tensor(np.array(self.model.scene.gravity, float), dtype=real, device=engine.device)
         self._pulled_by = False  # gravity that was given
 
-    def give(self, controls: dict, invalid: torch.Tensor) -> None:
-        """Hand the integrator loads and poses; masses that parameters give are loads, too, which residuals are compared with.
-
-        Args:
-            invalid: worlds that are taken out of the step where it is not zero (worlds,); their grips stay, as searches for contact are
-                of all worlds.
-        """
+    def give(self, controls: dict) -> None:
+        """Hand the integrator loads and poses; masses that parameters give are loads, too, which residuals are compared with."""
         engine, integrator, model = self.engine, self.engine.integrator, self.model
         loaded = engine.tables.weighs or any(name in controls for name in LOADS)
         if integrator.given is None and loaded:
@@ -43,10 +38,8 @@ class StepControls:
         if model.grips:
             place = view(engine.after.grips.pose)
             if "poses" in controls:
-                begin, poses = view(engine.before.grips.pose).T.reshape(controls["poses"].shape), controls["poses"]
-                poses = torch.where((invalid == 0)[:, None, None], poses, torch.nan_to_num(begin))
-                self._refuse_far_turns(poses)
-                place.copy_(poses.reshape(-1, 6).T)
+                self._refuse_far_turns(controls["poses"])
+                place.copy_(controls["poses"].reshape(-1, 6).T)
             else:
                 place.copy_(view(engine.before.grips.pose))
 
@@ -60,8 +53,8 @@ class StepControls:
             return
         ends = poses.detach().cpu().numpy()
         if counts_turns(ends):
-            begin = view(self.engine.before.grips.pose).T.reshape(ends.shape)
-            turns_between(begin.detach().cpu().numpy(), ends)
+            begin = view(self.engine.before.grips.pose).T.reshape(ends.shape).detach().cpu().numpy()
+            turns_between(begin, np.where(np.isfinite(ends), ends, begin))
 
     def give_field(self, controls: dict) -> None:
         """Hand the integrator the magnetic field of a step."""

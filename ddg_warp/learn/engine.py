@@ -10,7 +10,6 @@ import torch
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import outcome
 from ddg_warp.kernels.adjoint.step import asked_kernel, flag_kernels, smooth_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
@@ -76,7 +75,7 @@ class Engine:
         self._graphs = self._by_start = None
         self._numbered = False  # whether numbers of contact may be those of parameters
         self.integrator._worlds.watch()
-        self._invalid = view(self.integrator._worlds.invalid)
+        self.tables.invalid = view(self.integrator._worlds.invalid)
         self._codes = wp.zeros(worlds, dtype=int, device=model.wp_device)
         self.codes, self._resting = view(self._codes), self.integrator._worlds.resting
         self._told_of = Notice(model.wp_device)
@@ -101,15 +100,10 @@ class Engine:
         """Return tensors: the state after a step; flags (islands,) of every part, not numbers where it has no gradient, if that is
         asked; `codes` (worlds,); and the `lagged`, of 24 bytes a block in float64."""
         integrator = self.integrator
-        invalid = self.tables.invalid
-        for value in controls.values():
-            finite = torch.isfinite(value).flatten(1).all(1)
-            invalid = torch.where(finite, invalid, outcome.INVALID_INPUT)
-        self._invalid.copy_(invalid)
         self.fill(self.source, state)
         self._renumber(integrator._net)
         integrator._prepare(dt, self.before)
-        self.controls.give(controls, invalid)
+        self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
         wp.copy(self._codes, self._resting)

@@ -396,7 +396,9 @@ class Simulator(torch.nn.Module):
                     values = engine.tables.valid(name, values)
                 except ValueError as error:
                     raise SceneError(f"parameters: {error}") from None
-            result.append((name, engine.tables.full(name, self._tensor(f"parameters: {name}", values), judged)))
+                result.append((name, engine.tables.full(name, self._tensor(f"parameters: {name}", values), True)))
+            else:
+                result.append((name, engine.tables.full_of(name, self._tensor(f"parameters: {name}", values))))
         return result
 
     def _tensor(self, name: str, values) -> torch.Tensor:

@@ -20,7 +20,7 @@ class Tables:
 
     def __init__(self, model):
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
-        self._found, self._written, self._rules = {}, {}, {}
+        self._found, self._written, self._rules, self._full = {}, {}, {}, {}
         self.invalid = torch.zeros(model.worlds, dtype=torch.int32, device=self.device)
 
     def of(self, name: str) -> tuple[int, list[TermPlace | ArrayPlace]]:
@@ -58,6 +58,15 @@ class Tables:
         for part in model.net.sets if model.net is not None else ():
             result.update(f"{part.term.name}.{name}" for name in part.parameters.values)
         return sorted(result) + [name for name in constants.NAMES if constants.array_places(model, name)[1]]
+
+    def full_of(self, name: str, values: torch.Tensor) -> list[torch.Tensor]:
+        """As `full`; of a constant tensor that was handed in last as it is, what was found then."""
+        if values.requires_grad or torch._C._are_functorch_transforms_active():
+            return self.full(name, values)
+        kept = self._full.get(name)
+        if kept is None or kept[0] is not values or kept[1] != values._version:
+            kept = self._full[name] = values, values._version, self.full(name, values)
+        return kept[2]
 
     def full(self, name: str, values: torch.Tensor, judged: bool = False) -> list[torch.Tensor]:
         """A parameter of shape (), (B,), (E,) or (B, E) as each place has it with one number an element and world.

@@ -172,6 +172,13 @@ class Integrator:
             callback(target)
         return target
 
+    def _handed(self, after: State) -> list[wp.array]:
+        """Arrays of what a step to a state is given beside the state before it."""
+        loads = (
+            [getattr(self.given, name).flatten() for name in LOADS] if self.given is not None and self.given.any else []
+        )
+        return [*loads, *([self.field] if self.field is not None else []), *([after.grips.pose] if after.grips else [])]
+
     def resists(self, state: State) -> bool:
         """Whether spins resist turns of their axes in a step from a state; see `gyroscopic`."""
         validate.check_state("resists", self.model, state)
@@ -204,7 +211,8 @@ class Integrator:
         def launch():
             if anew:
                 self.forget()
-            self._worlds.bar(self._parts, self._buffers[source].own, self._buffers[1 - source].own)
+            before, after = self._buffers[source].own, self._buffers[1 - source].own
+            self._worlds.bar(self._parts, before, after, self._handed(after))
             self._launch(source)
 
         def replay():

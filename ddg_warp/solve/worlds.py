@@ -51,22 +51,35 @@ class Worlds:
         not a number."""
         self.invalid, self.start = self._zeros(self.model.worlds), self.model.state()
 
-    def bar(self, parts: list, before: State, after: State) -> None:
+    def bar(self, parts: list, before: State, after: State, handed: list[wp.array]) -> None:
         """Before a step: have watched worlds rest that are taken out of it, as they are at rest; launches alone, so that it can be
-        captured."""
+        captured.
+
+        Args:
+            handed: arrays of all worlds, one after the other, whose entries have to be finite.
+        """
         if self.invalid is None:
             return
         # of worlds that failed in the last step, entries of no node stay, which a step does not write
         wp.capture_if(self._any, lambda: self.take_over(self._failed, self.start, after))
-        values = next(array for array in before.arrays().values() if array.size > 1)
-        cube, (_, bar) = cubed(values), blank_kernels(values.dtype)
-        inputs = [self.invalid, cube, cube.shape[-1] // self.model.worlds]
+        values, worlds = next(array for array in before.arrays().values() if array.size > 1), self.model.worlds
+        cube, (_, bar, _) = cubed(values), blank_kernels(values.dtype)
+        self._launch(bar, worlds, [self.invalid, cube, cube.shape[-1] // worlds], [self.resting])
+        for array in handed:
+            cube, (*_, judge) = cubed(array), blank_kernels(array.dtype)
+            self._launch(judge, cube.shape, [cube, cube.shape[-1] // worlds], [self.resting])
         self._any.zero_()
-        self._launch(bar, self.model.worlds, inputs, [self.resting, self._any])
-        wp.capture_if(self._any, lambda: self.take_over(self.resting, self.start, before))
+        self._launch(self._find, worlds, [self.resting], [self._any])
+        wp.capture_if(self._any, lambda: self._to_start(before, after))
         for part in parts:
             inputs = [self.resting, part.islands_each]
             self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])
+
+    def _to_start(self, before: State, after: State) -> None:
+        """Have worlds that rest begin as at rest, and their grips end there, as searches for contact are of all worlds."""
+        self.take_over(self.resting, self.start, before)
+        if after.grips is not None:
+            self.take_part(self.resting, self.start.grips, after.grips, self.model.worlds)
 
     def settle(self, parts: list, before: State, after: State) -> None:
         """After a step: have worlds rest in which something was given up; launches alone, so that it can be captured."""
@@ -97,7 +110,7 @@ class Worlds:
         """Make a state not a number in worlds that failed."""
         for array in state.arrays().values():
             if array.shape[-1] % self.model.worlds == 0:
-                cube, (blank, _) = cubed(array), blank_kernels(array.dtype)
+                cube, (blank, *_) = cubed(array), blank_kernels(array.dtype)
                 self._launch(blank, cube.shape, [self._failed, cube.shape[-1] // self.model.worlds], [cube])
 
     def take_over(self, mask: wp.array, source: State, target: State) -> None:
@@ -195,6 +208,7 @@ class Worlds:
                 *(select_kernel(dtype, self._serial) for dtype in types),
             ]
             if self.invalid is not None:
+                types |= {self.model.types.real, wp.types.vector(3, self.model.types.real)}  # of what is handed in
                 kernels += [kernel for dtype in types for kernel in blank_kernels(dtype)]
             kernels += [forget_kernel(dtype) for dtype in (int, self.model.types.real)]
             arrays.load_kernels(kernels, self.model.wp_device)

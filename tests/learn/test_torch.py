@@ -450,12 +450,16 @@ def test_a_stiffness_is_found_again():
         ([1.0], None, r"parameters are \[1.0\]; give a dictionary"),
         (None, torch.zeros(3), "controls are tensor.*give a dictionary"),
         ({"rod_stretch": 1.0}, None, "nothing has 'rod_stretch'; this model has"),
-        ({"rod_stretch.stiffness": "stiff"}, None, "rod_stretch.stiffness = 'stiff'; give numbers"),
+        (
+            {"rod_stretch.stiffness": "stiff"},
+            None,
+            "rod_stretch.stiffness is 'stiff', no array of numbers; give numbers",
+        ),
         ({"rod_stretch.stiffness": -1.0}, None, "rod_stretch.stiffness: value 0 is -1; it is finite and not negative"),
         ({"rod_stretch.measure": [[1.0], [0.0]]}, None, "rod_stretch.measure: value 1 is 0; it is finite and positive"),
         ({"rod_stretch.rest": np.nan}, None, "rod_stretch.rest: value 0 is nan; it is finite"),
         (None, {"gravity": (0.0, np.nan, 0.0)}, "gravity: entry 1 is not finite"),
-        (None, {"forces": "none"}, "controls: forces = 'none'; give numbers or a tensor"),
+        (None, {"forces": "none"}, "controls: forces is 'none', no array of numbers; give numbers or a tensor"),
     ],
 )
 def test_what_does_not_fit_is_refused(parameters, controls, message):
@@ -582,7 +586,7 @@ def test_calls_that_do_not_fit_are_refused():
         (lambda: own.step(None), "the state is None; take one that initial_state"),
         (lambda: planar.step(state), "the state is loaded, or another simulator's"),
         (lambda: own.initial_state(0), "batch = 0"),
-        (lambda: own.initial_state(positions="here"), "positions = 'here'; give numbers or a tensor"),
+        (lambda: own.initial_state(positions="here"), "positions are 'here'; give finite numbers"),
         (lambda: own.rollout(state, steps=3, checkpoint_every=-1), "checkpoint_every = -1"),
         (lambda: Simulator(own.model, DT, scheme="leapfrog"), "scheme is 'leapfrog'"),
         (lambda: planar.step(planar.initial_state(), None, {"forces": force}), "point 0 stays in the plane of x and z"),
