@@ -44,15 +44,15 @@ def test_copies_go_on_bit_for_bit(device, kind, worlds, copied):
     assert (copy.deepcopy(state).model is model) and (copy.copy(state).model is model)
 
 
-def test_what_solvers_told_of_an_equilibrium_is_kept():
-    state = statics.solve(scene("rods").build("cpu", "float64"))
+def test_what_solvers_told_of_an_equilibrium_is_kept(device):
+    state = statics.solve(scene("rods").build(device, "float64"))
     for found in (copy.deepcopy(state), pickle.loads(pickle.dumps(state))):
         assert (found.stable, found.outcome, found.unbalanced) == (state.stable, state.outcome, state.unbalanced)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, pickle.dumps])
-def test_what_stays_on_its_device_says_so(copied):
-    model = scene("rods").build("cpu", "float64")
+def test_what_stays_on_its_device_says_so(device, copied):
+    model = scene("rods").build(device, "float64")
     integrator = ddg.Integrator(model)
     for own in (integrator, ddg.StepControl(integrator, 1e-3), statics.Equilibrium(model), Continuation(model)):
         with pytest.raises(ddg.SceneError, match=f"{type(own).__name__}: .* make another"):

@@ -172,6 +172,12 @@ class Integrator:
             callback(target)
         return target
 
+    def _begin(self, source: int) -> None:
+        """Launches before a step from a state that comes from elsewhere, in a buffer."""
+        self.forget()
+        before, after = self._buffers[source].own, self._buffers[1 - source].own
+        self._worlds.bar(self._parts, before, after, self._handed(after))
+
     def _handed(self, after: State) -> list[wp.array]:
         """Arrays of what a step to a state is given beside the state before it."""
         loads = (
@@ -208,16 +214,20 @@ class Integrator:
         for part in self._parts:
             part.prescribe(start, start + dt)
 
+        # where pairs may outgrow their room the step is done again, from what it has begun with once
+        again = anew and self._net is not None and self._net.newton.contact is not None
+        given = self.given is not None and self.given.any
+
         def launch():
-            if anew:
-                self.forget()
-            before, after = self._buffers[source].own, self._buffers[1 - source].own
-            self._worlds.bar(self._parts, before, after, self._handed(after))
+            if anew and not again:
+                self._begin(source)
             self._launch(source)
 
         def replay():
-            given = self.given is not None and self.given.any
             self._graphs.replay((source, anew, given, self._spinning), launch)
+
+        if again:
+            self._graphs.replay(("begin", source, given), lambda: self._begin(source))
 
         net = self._buffers[source].own.net
         # on its own: steps with and without it would be captured one by one

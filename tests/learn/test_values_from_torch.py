@@ -127,10 +127,10 @@ def test_worlds_that_lose_their_gradient_are_told_and_left_out():
     own = gripped()
     with pytest.warns(GradientWarning, match="state.differentiable") as caught:
         poses, (end,) = turned(own, [0.1, 1.8, 0.2])
+        assert own.outcomes().tolist() == ["converged", "no_gradient", "converged"]  # which waits for the device
         turned(own, [0.1, 1.8, 0.2])
     assert len(caught) == 1  # once
     assert end.differentiable.tolist() == [True, False, True]
-    assert own.outcomes().tolist() == ["converged", "no_gradient", "converged"]
     assert torch.isfinite(end.positions).all() and not end.failed.any()
     tips = end.positions[:, -1, 2]
     (whole,) = torch.autograd.grad(tips.sum(), poses, retain_graph=True)
@@ -299,7 +299,7 @@ def test_one_simulator_serves_several_threads():
     values = [float(factor * own.parameter("rod_bend_twist.stiffness_1")[0, 0]) for factor in (1.0, 2.0, 3.0)]
 
     def run(value: float) -> torch.Tensor:
-        factor = torch.tensor(value, dtype=REAL, requires_grad=True)
+        factor = torch.tensor(value, dtype=REAL, device=own.engine(1).device, requires_grad=True)
         *_, end = own.rollout(own.initial_state(), {"rod_bend_twist.stiffness_1": factor}, steps=15)
         return torch.stack([end.positions[0, -1, 2].detach(), *torch.autograd.grad(end.positions.sum(), factor)])
 
@@ -326,10 +326,10 @@ def test_a_policy_learns_in_worlds_some_of_which_lose_their_gradient():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         policy = torch.nn.Sequential(torch.nn.Linear(6, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1)).double()
-    search, random = torch.optim.Adam(policy.parameters(), lr=1e-2), torch.Generator().manual_seed(1)
+    search, random = torch.optim.Adam(policy.parameters(), lr=1e-2), torch.Generator("cpu").manual_seed(1)
 
     def seen(state, angle, number):
-        ends = [torch.nan_to_num(own)[:, -1, [0, 2]].cpu() for own in (3.0 * state.positions, 0.1 * state.velocities)]
+        ends = [torch.nan_to_num(own)[:, -1, [0, 2]] for own in (3.0 * state.positions, 0.1 * state.velocities)]
         return torch.cat([*ends, angle[:, None], torch.full((worlds, 1), number / steps, dtype=REAL)], 1)
 
     passed, lost = [], []
@@ -337,13 +337,13 @@ def test_a_policy_learns_in_worlds_some_of_which_lose_their_gradient():
         for _ in range(20):
             state, angle = own.initial_state(worlds), torch.zeros(worlds, dtype=REAL)
             for number in range(steps):
-                noise = 0.3 * torch.randn(worlds, generator=random, dtype=REAL)
+                noise = 0.3 * torch.randn(worlds, generator=random, dtype=REAL, device="cpu").to(angle.device)
                 angle = angle + 0.5 * torch.tanh(policy(seen(state, angle, number))[:, 0]) + noise
                 none = torch.zeros_like(angle)
                 poses = torch.stack([none, none, none, none, angle, none], 1)[:, None]
                 state = own.step(state, None, {"poses": poses})
-            off = (torch.nan_to_num(state.positions)[:, -1].cpu() - goal).norm(dim=1)
-            loss = off[state.differentiable.cpu()].mean()
+            off = (torch.nan_to_num(state.positions)[:, -1] - goal).norm(dim=1)
+            loss = off[state.differentiable].mean()
             search.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0, error_if_nonfinite=True)
