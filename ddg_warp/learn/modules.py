@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import torch
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 
@@ -56,3 +57,18 @@ def usual_values(simulator, name: str) -> torch.Tensor:
     """The values that a model has of a parameter (1, E), or (B, E) where its worlds differ."""
     found = simulator.parameter(name)
     return (found[:1] if (found == found[:1]).all() else found).clone()
+
+
+def asked(call: str, simulator, names, batch: int | None) -> tuple[tuple[str, ...], int]:
+    """Names and batch size (1 by default) that a module of a simulator's parameters is asked for.
+
+    Raises:
+        SceneError: what is given is no simulator, names are no texts, or there is none; names the call.
+    """
+    if not hasattr(simulator, "initial_state"):
+        raise SceneError(f"{call}: {arguments.shown(simulator)} is no simulator; give Simulator(model, dt)")
+    if not isinstance(names, tuple | list) or not names or not all(isinstance(name, str) for name in names):
+        raise SceneError(f"{call}: names are {arguments.shown(names)}; give several in a tuple, one at least")
+    if len(set(names)) < len(names):
+        raise SceneError(f"{call}: names are {arguments.shown(names)}; give each once")
+    return tuple(names), 1 if batch is None else arguments.count(f"{call}: batch", batch)

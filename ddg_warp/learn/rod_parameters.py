@@ -8,7 +8,7 @@ import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.learn import constants, contact_places
-from ddg_warp.learn.modules import parameter_key, usual_values
+from ddg_warp.learn.modules import asked, parameter_key, usual_values
 from ddg_warp.scene.drag import Laws, Viscous
 
 NAMES = ("stretching", "bending", "twisting", "density", "radius")
@@ -41,6 +41,7 @@ class RodParameters(torch.nn.Module):
         self, simulator, batch: int | None = None, names: tuple[str, ...] = ("stretching", "bending", "twisting")
     ):
         super().__init__()
+        names, batch = asked("RodParameters", simulator, names, batch)
         model = simulator.model
         powers = _powers(model)
         known = [name for name in NAMES if any(name in power for power in powers.values())]
@@ -51,7 +52,7 @@ class RodParameters(torch.nn.Module):
             _require_sizes(model.scene)
         made = {"dtype": torch.float64, "device": str(wp.device_to_torch(model.wp_device))}
         self.logarithms = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(torch.zeros((batch or 1, 1), **made)) for name in names}
+            {name: torch.nn.Parameter(torch.zeros((batch, 1), **made)) for name in names}
         )
         # in one order, as DistributedDataParallel tells buffers of its processes apart by that
         self._powers = {own: power for own, power in powers.items() if not power.keys().isdisjoint(names)}

@@ -10,7 +10,7 @@ from ddg_warp import arguments
 from ddg_warp.compile.shells import triangles_beside
 from ddg_warp.errors import SceneError
 from ddg_warp.learn import contact_places
-from ddg_warp.learn.modules import parameter_key, usual_values
+from ddg_warp.learn.modules import asked, parameter_key, usual_values
 from ddg_warp.learn.places import meeting
 from ddg_warp.model.rest_shapes import edges_along
 
@@ -55,7 +55,7 @@ class ShellParameters(torch.nn.Module):
         direction: (3,) of forms, not normal to any triangle as drawn.
 
     Attributes:
-        changes: c by name (batch or 1, K), of forms (batch or 1, K, 3).
+        changes: c by name (batch, K), of forms (batch, K, 3).
 
     Raises:
         SceneError: there is no such shell, its bending has no such quantity, or its Poisson's ratio is 0.5 and learned.
@@ -73,6 +73,7 @@ class ShellParameters(torch.nn.Module):
         direction=(1.0, 0.0, 0.0),
     ):
         super().__init__()
+        names, batch = asked("ShellParameters", simulator, names, batch)
         model = simulator.model
         device = str(wp.device_to_torch(model.wp_device))
         chosen = _shells(model, names, shells)
@@ -108,7 +109,7 @@ class ShellParameters(torch.nn.Module):
         self.changes = torch.nn.ParameterDict(
             {
                 name: torch.nn.Parameter(
-                    torch.zeros((batch or 1, count, 3)[: 2 + (name in FORMS)], dtype=torch.float64, device=device)
+                    torch.zeros((batch, count, 3)[: 2 + (name in FORMS)], dtype=torch.float64, device=device)
                 )
                 for name in self._names
             }

@@ -91,6 +91,17 @@ each("rollout", "controls", [lambda number: 3, lambda number: {"force": 1.0}], r
 each("rollout", "outcomes", [3], lambda v: made().outcomes(), "outcomes")
 each("parameter", "name", [None, 3, "stiffness", "rod_stretch.no"], lambda v: simulator().parameter(v), "parameters")
 each("parameter", "batch", [0, -1, 1.5, "two"], lambda v: simulator().parameter(NAME, v), "batch")
+for kind in ("RodParameters", "ShellParameters"):
+    def module(*given, kind=kind, **named):
+        """A module of parameters of a simulator."""
+        import ddg_warp.torch as own
+
+        return getattr(own, kind)(*given, **named)
+
+    each(kind, "simulator", [None, 3, model, "rods"], module, kind, "Simulator(model, dt)")
+    each(kind, "names", [None, 3, "bending", (), (3,), ("bending", "bending"), {"bending"}, ("no",)],
+         lambda v, module=module: module(simulator(), names=v), kind if kind == "RodParameters" else "")
+    each(kind, "batch", [0, -1, 1.5, "two", True], lambda v, module=module: module(simulator(), names=("bending",), batch=v), kind, "batch")
 refuse("stepping", {
     "copies of integrators": (lambda: __import__("copy").deepcopy(integrator()), "Integrator", "make another"),
     "controls of a step": (lambda: integrator().step(integrator().model.state(), 0.01, {3: 1.0}), "controls", "Controls"),
