@@ -87,7 +87,10 @@ each("rollout", "steps", [0, -1, 1.5, None, "ten", True], lambda v: roll(steps=v
 each("rollout", "save", [0, -1, 1.5, None, 3], lambda v: roll(save=v), "save")
 each("rollout", "checkpoint_every", [0, -1, 1.5, "all"], lambda v: roll(checkpoint_every=v), "checkpoint_every")
 each("rollout", "memory", [0.0, -1.0, NAN, "all", 10.0], lambda v: roll(memory=v), "memory")
-each("rollout", "controls", [lambda number: 3, lambda number: {"force": 1.0}], roll, "controls")
+refuse("rollout", {
+    "controls that are a number": (lambda: roll(lambda number: 3), "controls", "dictionary"),
+    "controls of no such name": (lambda: roll(lambda number: {"force": 1.0}), "controls", "'force'"),
+})
 each("rollout", "outcomes", [3], lambda v: made().outcomes(), "outcomes")
 each("parameter", "name", [None, 3, "stiffness", "rod_stretch.no"], lambda v: simulator().parameter(v), "parameters")
 each("parameter", "batch", [0, -1, 1.5, "two"], lambda v: simulator().parameter(NAME, v), "batch")
@@ -101,7 +104,8 @@ for kind in ("RodParameters", "ShellParameters"):
     each(kind, "simulator", [None, 3, model, "rods"], module, kind, "Simulator(model, dt)")
     each(kind, "names", [None, 3, "bending", (), (3,), ("bending", "bending"), {"bending"}, ("no",)],
          lambda v, module=module: module(simulator(), names=v), kind if kind == "RodParameters" else "")
-    each(kind, "batch", [0, -1, 1.5, "two", True], lambda v, module=module: module(simulator(), names=("bending",), batch=v), kind, "batch")
+    each(kind, "batch", [0, -1, 1.5, "two", True], lambda v, module=module: module(simulator(), names=("bending",), batch=v),
+         kind, "batch")
 refuse("stepping", {
     "copies of integrators": (lambda: __import__("copy").deepcopy(integrator()), "Integrator", "make another"),
     "controls of a step": (lambda: integrator().step(integrator().model.state(), 0.01, {3: 1.0}), "controls", "Controls"),
