@@ -75,7 +75,7 @@ each("simulator", "forces",
      lambda v: step(None, {"forces": v}), "forces")
 each("simulator", "poses", [np.zeros((2, 6)), np.zeros(6), np.full((1, 6), INF)], lambda v: step(None, {"poses": v}), "poses")
 each("simulator", "field", [(0.0, 0.0, 1.0)], lambda v: step(None, {"field": v}), "field")
-each("simulator", "state", [None, 3, "start", object()], lambda v: simulator().step(v), "state", "world_state(...)")
+each("simulator", "state", [None, 3, "start", (1, 2)], lambda v: simulator().step(v), "state", "world_state(...)")
 each("simulator", "batch", [0, -1, 1.5, "two", True, 2**31], lambda v: simulator().initial_state(v))
 each("simulator", "positions", [np.zeros((11, 3)), np.full((12, 3), NAN), "there", np.zeros((3, 12, 2)), 3.0],
      lambda v: simulator().initial_state(positions=v))
