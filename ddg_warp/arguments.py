@@ -108,7 +108,7 @@ def triangles(what: str, values) -> np.ndarray:
     try:
         found = np.asarray(values)
     except (TypeError, ValueError, RuntimeError):
-        found = np.zeros(0, object)
+        raise SceneError(f"{what} are no array, not of three vertices each; give whole numbers (T, 3)") from None
     if found.ndim != 2 or found.shape[1] != 3 or not len(found):
         raise SceneError(f"{what} have shape {found.shape}; give three vertices each, (T, 3), one at least")
     if found.dtype.kind not in "iu":

@@ -39,7 +39,7 @@ def build(angle: float = 45.0, law: str = "sadowsky", width: float = 0.1, n: int
     strip = scene.add_rod(
         on_cylinder(along, a),
         section=section.stiffness(material) if law == "kirchhoff" else section,
-        material=material,
+        material=None if law == "kirchhoff" else material,
         natural="straight",
         director=across(0.5 * (along[1:] + along[:-1]), a),
         name="strip",

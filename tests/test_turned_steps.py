@@ -204,11 +204,11 @@ def test_worlds_are_stiff_each_by_itself(device):
 
 
 def test_parameters_that_make_a_rod_stiff_are_noticed(device):
-    """Between steps of one length, and when they make it soft again: its edges are turned, and may go straight."""
+    """Between steps of one length, and when they make it soft again: its edges are turned, or may go straight, as of a new model."""
     model = cantilever(20, ddg.Circle(0.02), RUBBER).build(device, "float64")
     integrator, state = ddg.Integrator(model), model.state()
     axial = float(model.parameters()["0/rod_stretch/stiffness"].flat[0])
-    for factor, stiff, straight_turns in ((1.0, False, True), (1e3, True, False), (1.0, True, True)):
+    for factor, stiff, straight_turns in ((1.0, False, True), (1e3, True, False), (1.0, False, True)):
         model.set_parameter("rod_stretch", "stiffness", factor * axial)
         state = integrator.step(state, 0.01)
         assert integrator._parts[0].means.stiff == stiff

@@ -76,9 +76,11 @@ each("simulator", "forces",
 each("simulator", "poses", [np.zeros((2, 6)), np.zeros(6), np.full((1, 6), INF)], lambda v: step(None, {"poses": v}), "poses")
 each("simulator", "field", [(0.0, 0.0, 1.0)], lambda v: step(None, {"field": v}), "field")
 each("simulator", "state", [None, 3, "start", (1, 2)], lambda v: simulator().step(v), "state", "world_state(...)")
-each("simulator", "batch", [0, -1, 1.5, "two", True, 2**31], lambda v: simulator().initial_state(v))
-each("simulator", "positions", [np.zeros((11, 3)), np.full((12, 3), NAN), "there", np.zeros((3, 12, 2)), 3.0],
-     lambda v: simulator().initial_state(positions=v))
+each("simulator", "batch", [0, -1, 1.5, "two", True], lambda v: simulator().initial_state(v), "batch", "whole number")
+each("simulator", "batch", [2**31], lambda v: simulator().initial_state(v), "worlds at most")
+each("simulator", "positions", [np.full((12, 3), NAN), "there"], lambda v: simulator().initial_state(positions=v), "positions")
+each("simulator", "positions", [np.zeros((11, 3)), np.zeros((3, 12, 2)), 3.0], lambda v: simulator().initial_state(positions=v),
+     "points have shape", "(12, 3)")
 each("simulator", "world_state", [None, 3, "start"], lambda v: simulator().world_state(v), "world_state")
 each("simulator", "batch of an equilibrium", [3, 0, "two"], lambda v: simulator().equilibrium(state=begun(), batch=v), "batch")
 each("simulator", "options of an equilibrium", [{"foo": 1}, {"load_stps": 2}], lambda v: simulator().equilibrium(batch=2, **v),
@@ -103,7 +105,7 @@ for kind in ("RodParameters", "ShellParameters"):
 
     each(kind, "simulator", [None, 3, model, "rods"], module, kind, "Simulator(model, dt)")
     each(kind, "names", [None, 3, "bending", (), (3,), ("bending", "bending"), {"bending"}, ("no",)],
-         lambda v, module=module: module(simulator(), names=v), kind if kind == "RodParameters" else "")
+         lambda v, module=module: module(simulator(), names=v), kind)
     each(kind, "batch", [0, -1, 1.5, "two", True], lambda v, module=module: module(simulator(), names=("bending",), batch=v),
          kind, "batch")
 refuse("stepping", {

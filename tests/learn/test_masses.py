@@ -222,7 +222,7 @@ def test_densities_that_are_none_are_refused():
         ({"rod.mass": torch.ones(4)}, r"rod.mass has shape \(4,\); give \(\), \(1, 1\) for each world, \(1, 6\)"),
         ({"shell.mass": 1.0}, "nothing has 'shell.mass'; this model has .*rod.mass, rod.inertia, drag.tangential"),
         ({"drag.speed": 1.0}, "nothing has 'drag.speed'"),
-        ({"drag.normal": "thick"}, "drag.normal = 'thick'; give numbers"),
+        ({"drag.normal": "thick"}, "drag.normal is 'thick', no array of numbers; give numbers"),
     ],
 )
 def test_what_does_not_fit_is_refused(given, match):
