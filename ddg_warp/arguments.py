@@ -118,6 +118,8 @@ def triangles(what: str, values) -> np.ndarray:
 
 def number(what: str, value, rule: str = "one finite number", holds: Callable = np.isfinite) -> float:
     """One finite number for which a `rule` holds, or a refusal that names `what`."""
+    if type(value) is float and LEAST <= abs(value) <= MOST and holds(value):  # as of every step
+        return value
     result = floats(value)
     if not (result.ndim == 0 and np.isfinite(result) and holds(float(result))):
         raise SceneError(f"{what} is {shown(value)}; give {rule}")
@@ -231,7 +233,8 @@ def sealed(kind: type) -> type:
             self.__dict__["_sealed"] = True
 
     def set_attribute(self, name, value):
-        if "_sealed" in self.__dict__ and not name.startswith("_") and not hasattr(self, name):
+        own = self.__dict__
+        if name not in own and "_sealed" in own and not name.startswith("_") and not hasattr(self, name):
             known = (each for each in (*vars(self), *dir(type(self))) if not each.startswith("_"))
             raise SceneError(f"{kind.__name__} has no attribute {name!r}{meant(name, set(known))}")
         object.__setattr__(self, name, value)

@@ -129,7 +129,8 @@ def launches(what):
 
 def lock_of(owner) -> threading.RLock:
     """Return the lock of an object whose memory one call at a time may use."""
-    return vars(owner).get("_lock") or vars(owner).setdefault("_lock", threading.RLock())
+    lock = owner.__dict__.get("_lock")
+    return owner.__dict__.setdefault("_lock", threading.RLock()) if lock is None else lock
 
 
 @contextmanager
@@ -149,8 +150,13 @@ def one_at_a_time(method):
 
     @wraps(method)
     def entered(self, *args, **kwargs):
-        with alone(self):
+        lock = lock_of(self)  # as `alone`, which takes a hundredth of a small step
+        if not lock.acquire(blocking=False):
+            _turns.await_lock(lock)
+        try:
             return method(self, *args, **kwargs)
+        finally:
+            lock.release()
 
     return entered
 
