@@ -11,6 +11,11 @@ GREY = 0.75  # brightness of obstacles in pictures
 CROWDED = "nothing passes through anything"
 
 
+def rubbing(friction: float, **how) -> dict:
+    """Arguments of `Scene.contact` about friction: the coefficient, and how it acts where there is any."""
+    return {"friction": friction, **(how if friction else {})}
+
+
 def observe(model, state) -> dict[str, float]:
     """Pairs in contact, distinct pairs of rods among them, momentum [N s], kinetic and whole energy [J], force on obstacles [N]."""
     found, energies = model.contacts(state), model.energies(state)

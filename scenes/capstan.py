@@ -76,7 +76,7 @@ def build(
     scene.add_force(rod, 0, slack * ends[0])
     scene.fix(rod, [-1], motion=ddg.Motion(translation=lambda t: tuple(SPEED * t * ends[1])))
     scene.add_obstacle(ddg.Capsule((0.0, -DRUM, 0.0), (0.0, DRUM, 0.0), DRUM), name="drum")
-    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags)
+    scene.contact(range=range, stiffness=stiffness, **_touching.rubbing(friction, velocity=velocity, lags=lags))
     return scene
 
 

@@ -49,7 +49,7 @@ def build(
         initial=lambda model: _touching.jittered(model, seed),
     )
     scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending="hinge", name="cloth")
-    scene.contact(law=law, range=RANGE, friction=friction, velocity=1e-2)
+    scene.contact(law=law, range=RANGE, **_touching.rubbing(friction, velocity=1e-2))
     scene.add_obstacle(ddg.Sphere((0.0, 0.0, RADIUS), RADIUS), name="ball")
     scene.add_obstacle(ddg.Plane(), name="floor")
     return scene

@@ -51,7 +51,7 @@ def build(
     for end, sign in ((points[:, 2].min(), -1.0), (points[:, 2].max(), 1.0)):
         ring = np.flatnonzero(np.abs(points[:, 2] - end) < 1e-9)
         scene.hold(shell, ring, motion=ddg.Motion(angle=lambda t, sign=sign: sign * RATE * t))
-    scene.contact(law=law, range=RANGE, friction=friction, velocity=1e-2)
+    scene.contact(law=law, range=RANGE, **_touching.rubbing(friction, velocity=1e-2))
     return scene
 
 

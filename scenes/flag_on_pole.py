@@ -63,7 +63,7 @@ def build(
         force = shares(points, triangles)[:, None] * wind * 9.81 * CLOTH.density * THICKNESS * axis
         scene.add_vertex_force(flag, np.arange(len(points)), force, amplitude=lambda t, k=k: float(blowing(t)[k]))
     scene.add_obstacle(ddg.Capsule((0.0, 0.0, -HEIGHT), (0.0, 0.0, HEIGHT), POLE), name="pole")
-    scene.contact(range=RANGE, friction=friction, velocity=1e-2)
+    scene.contact(range=RANGE, **_touching.rubbing(friction, velocity=1e-2))
     return scene
 
 

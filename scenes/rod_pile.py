@@ -62,7 +62,7 @@ def build(
         name="rods",
     )
     # as fast as they fall, stiffer contact and friction take twice the iterations
-    scene.contact(stiffness=SOFT * young, friction=friction, velocity=SLIP)
+    scene.contact(stiffness=SOFT * young, **_touching.rubbing(friction, velocity=SLIP))
     scene.add_obstacle(ddg.Plane(), name="floor")
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         wall = ddg.Plane((0.5 * width * (1 - x), 0.5 * width * (1 - y), 0.0), (x, y, 0.0))

@@ -159,3 +159,25 @@ def test_solvers_suit_what_parameters_have_become(device, name, precision):
         assert integrator.statistics()["linear"] == fresh.statistics()["linear"]
         assert (integrator.statistics()["linear"] == before) == (factor == 1.0 or precision == "float64")
     same(integrator.step(start.copy(), DT), usual)
+
+
+@pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "rods in contact"])
+def test_captured_launches_stay(device, name):
+    """Values that fit their memory are written in place: the graphs of steps are the same objects, of an integrator and a simulator."""
+    torch = pytest.importorskip("torch")
+    from ddg_warp.torch import Simulator
+
+    model = built(name, device)
+    integrator, start = ddg.Integrator(model), moving(model)
+    own = Simulator(model, DT)
+    begin = own.world_state(moving(model))
+    held = []
+    for factor in (1.0, 1.01, 1.02):
+        for parameter, values in changed(model).items():
+            set_to(model, parameter, factor * values)
+        integrator.step(start.copy(), DT)
+        with torch.no_grad():
+            own.step(begin)
+        graphs = integrator._graphs._graphs | own.engine(WORLDS).integrator._graphs._graphs
+        held.append({key: id(graph) for key, graph in graphs.items()})
+    assert held[1] == held[2]

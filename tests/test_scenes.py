@@ -173,3 +173,9 @@ def test_defaults(device, name):
 
 def test_no_scene_is_left_out():
     assert set(SMALL) == set(scene_files())
+
+
+@pytest.mark.parametrize("name", ["capstan", "cloth_on_sphere", "cloth_twist", "flag_on_pole", "rod_pile"])
+def test_scenes_build_without_friction(name):
+    """Though a speed of slip, which has no effect without friction, is refused."""
+    assert load_scene(name).build(friction=0.0).touching.friction == 0.0
