@@ -133,12 +133,18 @@ def lock_of(owner) -> threading.RLock:
     return owner.__dict__.setdefault("_lock", threading.RLock()) if lock is None else lock
 
 
-@contextmanager
-def alone(owner) -> Iterator[None]:
-    """Keep other threads out of an object's memory."""
+def _acquired(owner) -> threading.RLock:
+    """Return the lock of an object once this thread holds it."""
     lock = lock_of(owner)
     if not lock.acquire(blocking=False):
         _turns.await_lock(lock)
+    return lock
+
+
+@contextmanager
+def alone(owner) -> Iterator[None]:
+    """Keep other threads out of an object's memory."""
+    lock = _acquired(owner)
     try:
         yield
     finally:
@@ -150,9 +156,7 @@ def one_at_a_time(method):
 
     @wraps(method)
     def entered(self, *args, **kwargs):
-        lock = lock_of(self)  # as `alone`, which takes a hundredth of a small step
-        if not lock.acquire(blocking=False):
-            _turns.await_lock(lock)
+        lock = _acquired(self)  # as `alone`, which takes a hundredth of a small step
         try:
             return method(self, *args, **kwargs)
         finally:

@@ -80,9 +80,8 @@ class ContactPlace:
                 f"may touch is searched for within {self._reach:.6g} m; build the scene with the largest range that is to be used"
             )
         usual = torch.as_tensor(self._usual, dtype=values.dtype, device=values.device)
-        self._assign(
-            torch.where(torch.isnan(values), usual, values)
-        )  # searches are of all worlds, refused ones among them
+        # Searches are of all worlds, refused ones among them.
+        self._assign(torch.where(torch.isnan(values), usual, values))
 
     def restore(self) -> None:
         """As of `TermPlace`."""

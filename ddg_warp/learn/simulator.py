@@ -142,8 +142,7 @@ class Simulator(torch.nn.Module):
         """A `WorldState` from elsewhere as one of this simulator."""
         engine = self.engine(len(state.codes))
         wanted = tensors(engine.before, engine.fields)
-        shapes = [tuple(value.shape) for value in wanted], [tuple(value.shape) for value in state.values]
-        if shapes[0] != shapes[1]:
+        if [tuple(value.shape) for value in wanted] != [tuple(value.shape) for value in state.values]:
             raise SceneError(
                 "world_state: the state is of another model: its arrays have other shapes than those of this simulator; give one of "
                 "the same scene"
@@ -299,15 +298,14 @@ class Simulator(torch.nn.Module):
         result = []
         for name, values in _named("parameters", "term.parameter", parameters).items():
             engine.tables.of(name)  # which refuses what there is not
-            judged = not isinstance(values, torch.Tensor)
-            if judged:
-                try:
-                    values = engine.tables.valid(name, values)
-                except ValueError as error:
-                    raise SceneError(f"parameters: {error}") from None
-                result.append((name, engine.tables.full(name, self._tensor(f"parameters: {name}", values), True)))
-            else:
+            if isinstance(values, torch.Tensor):
                 result.append((name, engine.tables.full_of(name, self._tensor(f"parameters: {name}", values))))
+                continue
+            try:
+                values = engine.tables.valid(name, values)
+            except ValueError as error:
+                raise SceneError(f"parameters: {error}") from None
+            result.append((name, engine.tables.full(name, self._tensor(f"parameters: {name}", values), True)))
         return result
 
     def _tensor(self, name: str, values) -> torch.Tensor:

@@ -60,7 +60,7 @@ class Group:
         """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
         `ParameterTable.set`."""
         elements = self.nodes
-        if values.shape in ((), (1,)) and (values.ndim == 0 or self.worlds == 1):
+        if values.ndim == 0:
             new = values.reshape(1, 1)
         elif values.shape == (self.worlds,):
             new = np.repeat(values, self.rods)[None]

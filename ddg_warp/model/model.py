@@ -214,6 +214,8 @@ class Model:
         """
         parts = self.net.sets if self.net is not None else ()
         values, remade = self.valid_values(term, parameter, values), False
+        if values.shape == (1,) and self.worlds == 1:
+            values = values.reshape(())  # one a world, of one world, is one number
         name = f"{term}.{parameter}"
         for group in self.groups:
             if name in group.parameters.values:

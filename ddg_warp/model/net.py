@@ -74,7 +74,7 @@ class DeviceSet:
     def set_parameter(self, name: str, values: np.ndarray) -> bool:
         """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
         `ParameterTable.set`."""
-        if values.shape in ((), (1,)) and (values.ndim == 0 or self.worlds == 1):
+        if values.ndim == 0:
             new = values.reshape(1, 1)
         elif values.shape == (self.worlds,):
             new = values[:, None]
@@ -123,10 +123,8 @@ class DeviceNet:
         self.edges = host.rod_edges
         self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
         self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
-        self._stiffnesses, self._along = (
-            (None, None),
-            {},
-        )  # the last ones and what they are of; elements of pieces of rods
+        self._stiffnesses = None, None  # the last ones and what they are of
+        self._along = {}  # elements of pieces of rods
         self.weighed, self.drag, felt = False, None, np.zeros((host.blocks, 3))
         if host.drag:
             ends, angles, coefficients = host.drag

@@ -12,10 +12,8 @@ HALF = 0.5  # of the smallest radius, the range of contact by default
 # Of forces that close the gap by some part of the range, by default: weights of a node; the share of EI / r^2, bending to ten radii;
 # the strain of what a node carries of a membrane; and that of a rod, which counts where its bending stiffness is next to none.
 WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
-BEYOND, RESOLVED = (
-    100.0,
-    1e-13,
-)  # range of contact over the size of the scene at most, and over its coordinates at least
+BEYOND = 100.0  # range of contact over the size of the scene, at most
+RESOLVED = 1e-13  # range of contact over the coordinates of the scene, at least
 INERTIA = 10.0  # of the mass of a node over the square of the step, the least stiffness of a step that had no room
 
 
