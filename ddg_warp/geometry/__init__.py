@@ -1,1 +1,1 @@
-"""Geometry in NumPy: curves, surfaces, meshes, discrete operators, forms of shells, turning numbers."""
+"""Geometry in NumPy: curves, surfaces, meshes, discrete operators, fundamental forms, edge-rotation updates."""

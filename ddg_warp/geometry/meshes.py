@@ -13,14 +13,14 @@ Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def rectangle(nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), pattern: str = "right") -> Mesh:
-    """A rectangle [0, size[0]] x [0, size[1]] of nx x ny cells.
+    """Return a rectangle [0, size[0]] x [0, size[1]] of nx x ny cells.
 
     Args:
         nx, ny: number of cells along x and y.
         size: lengths along x and y [m].
         pattern: how cells become triangles.
             `right`: two a cell, along the diagonal from (i, j) to (i + 1, j + 1).
-            `alternating`: two a cell, along one and the other diagonal in turn, like a checkerboard.
+            `alternating`: two a cell, along either diagonal like a checkerboard.
             `crossed`: four a cell. The centre of cell (i, j) is vertex (nx + 1)(ny + 1) + i + nx j.
             `equilateral`: rows of triangles that stand on the cells, with half ones at the ends; equilateral where
                 size[1] / ny = sqrt(3)/2 size[0] / nx.
@@ -44,7 +44,7 @@ def rectangle(nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), pattern:
 def jittered_rectangle(
     nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), jitter: float = 0.3, seed: int = 0
 ) -> Mesh:
-    """A rectangle [0, size[0]] x [0, size[1]] with an unstructured Delaunay mesh; the vertices are numbered as in `rectangle`.
+    """Return a rectangle [0, size[0]] x [0, size[1]] with an unstructured Delaunay mesh; the vertices are numbered as in `rectangle`.
 
     Args:
         nx, ny: number of cells along x and y that the vertices are taken from.
@@ -66,7 +66,7 @@ def jittered_rectangle(
 
 
 def disc(rings: int, radius: float = 1.0) -> Mesh:
-    """A disc around the origin of 6 rings^2 triangles of nearly equal size.
+    """Return a disc around the origin of 6 rings^2 triangles of nearly equal size.
 
     Vertex 0 is the centre; ring k has 6 k vertices from 1 + 3 k (k - 1) on, at angles from +x towards +y.
     """
@@ -78,12 +78,12 @@ def disc(rings: int, radius: float = 1.0) -> Mesh:
 def annulus(
     n_radial: int, n_around: int, inner: float, outer: float, slit: bool = False, pattern: str = "right"
 ) -> Mesh:
-    """A ring between two circles around the origin.
+    """Return a ring between two circles around the origin.
 
     Args:
         n_radial, n_around: number of cells along the radius and around.
         inner, outer: radii [m].
-        slit: whether the ring is cut along +x: the vertices there are doubled, those of the angle 2 pi being j = n_around.
+        slit: whether the ring is cut along +x: the vertices are doubled, j = n_around at the angle 2 pi.
         pattern: `right` or `alternating`, as in `rectangle`.
 
     Vertex (i, j) is i + (n_radial + 1) j, with i from the inner circle outwards and j around, from +x towards +y.
@@ -102,7 +102,7 @@ def annulus(
 def cylinder_panel(
     n_around: int, n_along: int, radius: float, length: float, angle: float, pattern: str = "right"
 ) -> Mesh:
-    """A part of a cylinder about the z axis, 0 <= z <= length, symmetric to the x axis, facing outwards.
+    """Return a sector of a cylinder about the z axis, 0 <= z <= length, symmetric to the x axis, facing outwards.
 
     Args:
         n_around, n_along: number of cells around and along the axis.
@@ -123,7 +123,7 @@ def cylinder_panel(
 
 
 def cylinder(n_around: int, n_along: int, radius: float, length: float, pattern: str = "right") -> Mesh:
-    """A whole cylinder about the z axis without ends, 0 <= z <= length, facing outwards.
+    """Return a whole cylinder about the z axis without ends, 0 <= z <= length, facing outwards.
 
     Vertex (i, j) is i + n_around j, with i around from +x towards +y and j along the axis; arguments as in `cylinder_panel`.
     """
@@ -137,7 +137,7 @@ def cylinder(n_around: int, n_along: int, radius: float, length: float, pattern:
 
 
 def sphere(subdivisions: int, radius: float = 1.0) -> Mesh:
-    """An icosphere of 20 x 4^subdivisions triangles around the origin: an icosahedron, each triangle halved along its sides.
+    """Return an icosphere of 20 x 4^subdivisions triangles around the origin: an icosahedron, each triangle halved along its sides.
 
     The 12 vertices of the icosahedron come first, with 5 triangles each; all others have 6.
     """
@@ -164,7 +164,7 @@ def sphere(subdivisions: int, radius: float = 1.0) -> Mesh:
 
 
 def spherical_cap(rings: int, radius: float = 1.0, angle: float = 0.5 * np.pi) -> Mesh:
-    """The part of a sphere around the origin within an angle of +z [rad], facing outwards; by default the half z >= 0.
+    """Return the cap of a sphere around the origin within an angle of +z [rad], facing outwards; by default z >= 0.
 
     The vertices are numbered as in `disc`: 0 is the pole, ring k is at the angle k / rings of `angle`.
     """
@@ -177,7 +177,7 @@ def spherical_cap(rings: int, radius: float = 1.0, angle: float = 0.5 * np.pi) -
 
 
 def torus(n_around: int, n_tube: int, major: float, minor: float, pattern: str = "right") -> Mesh:
-    """A torus about the z axis, facing outwards.
+    """Return a torus about the z axis, facing outwards.
 
     Args:
         n_around, n_tube: number of cells around the axis and around the tube.
@@ -216,7 +216,7 @@ def drop_unused(points, triangles) -> Mesh:
 
 
 def weld(points, triangles, tolerance: float) -> Mesh:
-    """The mesh with vertices that lie within a tolerance [m] of each other made one, and triangles that shrink by it left out.
+    """Return a mesh with vertices within a tolerance [m] of each other merged, and triangles that collapse left out.
 
     Raises:
         SceneError: no positive tolerance, or one that leaves no triangle.
@@ -236,8 +236,8 @@ def weld(points, triangles, tolerance: float) -> Mesh:
     count, group = connected_components(graph, directed=False)
     first = np.full(count, len(points))
     np.minimum.at(first, group, np.arange(len(points)))
-    kept, place = np.unique(first[group], return_inverse=True)  # the first of each group says where, in the order given
-    triangles = place.reshape(-1)[triangles]
+    kept, new_index = np.unique(first[group], return_inverse=True)  # the first vertex of each group gives its position
+    triangles = new_index.reshape(-1)[triangles]
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         raise SceneError(f"weld: a tolerance of {tolerance} m leaves no triangle; give less than the lengths of edges")
@@ -266,7 +266,7 @@ def _size(size) -> np.ndarray:
 
 
 def _lattice(nx: int, ny: int) -> np.ndarray:
-    """(i, j) of every vertex i + (nx + 1) j, shape ((nx + 1)(ny + 1), 2), float64."""
+    """Return (i, j) of every vertex i + (nx + 1) j, shape ((nx + 1)(ny + 1), 2), float64."""
     j, i = np.divmod(np.arange((nx + 1) * (ny + 1)), nx + 1)
     return np.stack([i, j], axis=1).astype(np.float64)
 
@@ -276,12 +276,12 @@ def _spatial(flat: np.ndarray) -> np.ndarray:
 
 
 def _polar(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Points of the plane z = 0, shape (P, 3)."""
+    """Return the points of the plane z = 0, shape (P, 3)."""
     return np.stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(len(angle))], axis=1)
 
 
 def _grid(nx: int, ny: int, pattern: str, wrap_x: bool = False, wrap_y: bool = False) -> np.ndarray:
-    """Triangles of nx x ny cells; where it wraps, the last row or column of vertices is the first."""
+    """Return the triangles of nx x ny cells; a wrapped grid has its first row or column of vertices as its last."""
     arguments.choice("pattern", pattern, ("right", "alternating"))
     mx, my = nx if wrap_x else nx + 1, ny if wrap_y else ny + 1
     j, i = np.divmod(np.arange(nx * ny), nx)
@@ -311,7 +311,7 @@ def _equilateral(nx: int, ny: int) -> Mesh:
     points = np.concatenate([np.stack([x, np.full(len(x), float(j))], axis=1) for j, x in enumerate(rows)])
     k, triangles = np.arange(nx + 1), []
     for j in range(ny):
-        # the row of nx + 1 vertices (short) and the one of nx + 2 (long) on its upper or lower side
+        # row of nx + 1 vertices (short), and row of nx + 2 (long) on its upper or lower side
         short, long = ((nx + 1) * r + r // 2 for r in (j + j % 2, j + 1 - j % 2))
         on_long = np.stack([long + k, short + k, long + k + 1], axis=1)
         on_short = np.stack([short + k[:-1], short + k[1:], long + k[1:]], axis=1)
@@ -320,7 +320,7 @@ def _equilateral(nx: int, ny: int) -> Mesh:
 
 
 def _rings(rings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(distance from the centre as a fraction (P,), angle (P,) [rad], triangles) of the mesh of `disc`."""
+    """Return (distance from the centre as a fraction (P,), angle (P,) [rad], triangles) of the mesh of `disc`."""
     _check_counts(rings=rings)
     distance, angle, triangles = [np.zeros(1)], [np.zeros(1)], []
     for k in range(1, rings + 1):

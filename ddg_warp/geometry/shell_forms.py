@@ -1,4 +1,4 @@
-"""Geometry of a surface as shells read it, in NumPy: fundamental forms and angles, with free, clamped and symmetry edges."""
+"""Fundamental forms and edge angles of shells in NumPy, with free, clamped and symmetry edges."""
 
 from dataclasses import dataclass
 
@@ -14,14 +14,14 @@ MODELS = (
     "hinge",
     "isometric",
 )  # of bending; see `ddg_warp.compile.shells`
-TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
+TURNING = ("midedge_dof", "midedge_boundary")  # models with an angle dof at mesh edges
 MEMBRANES = ("flat", "curved")
 FREE, NEIGHBOUR, CLAMPED, SYMMETRY = range(4)  # kinds of an edge, as kernels/measures/midedge_curvature.py numbers them
 
 
 @dataclass(frozen=True)
 class EdgeKinds:
-    """What the normal at each mesh edge is taken from.
+    """Source of the mid-edge normal of each mesh edge.
 
     Attributes:
         kind: FREE, NEIGHBOUR, CLAMPED or SYMMETRY (E,).
@@ -32,16 +32,16 @@ class EdgeKinds:
     vector: np.ndarray
 
     def of_triangles(self, surface) -> tuple[np.ndarray, np.ndarray]:
-        """Kinds (T, 3) and vectors (T, 3, 3) of the edges opposite to the corners."""
+        """Return the kinds (T, 3) and vectors (T, 3, 3) of the edges opposite to the corners."""
         return self.kind[surface.triangle_edges], self.vector[surface.triangle_edges]
 
 
 def edge_kinds(surface, clamped: dict | None = None, symmetry: dict | None = None) -> EdgeKinds:
-    """Kinds of the edges of a surface.
+    """Return the kinds of the edges of a surface.
 
     Args:
         surface: topology.
-        clamped: edge index -> normal of the surface there (3), on the side that the triangles' normals point to.
+        clamped: edge index -> normal of the surface at the edge (3), on the side that the triangles' normals point to.
         symmetry: edge index -> normal of the symmetry plane (3), either way.
 
     Raises:
@@ -66,7 +66,7 @@ def edge_kinds(surface, clamped: dict | None = None, symmetry: dict | None = Non
 
 
 def metric(surface, positions: np.ndarray) -> np.ndarray:
-    """First fundamental form (a11, a12, a22) of the triangles in the basis x1 - x0, x2 - x0 (T, 3) [m^2]."""
+    """Return the first fundamental form (a11, a12, a22) of the triangles in the basis x1 - x0, x2 - x0 (T, 3) [m^2]."""
     x0, x1, x2 = np.moveaxis(positions[surface.triangles], 1, 0)
     a1, a2 = x1 - x0, x2 - x0
     return np.stack([dot(a1, a1), dot(a1, a2), dot(a2, a2)], -1)
@@ -79,14 +79,14 @@ def second_form(
     rotations: np.ndarray | None = None,
     angles: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Second fundamental form (b11, b12, b22) of the triangles from mid-edge normals (T, 3) [m].
+    """Return the second fundamental form (b11, b12, b22) of the triangles from mid-edge normals (T, 3) [m].
 
     Args:
         surface: topology.
         positions: (P, 3) [m].
         kinds: of the edges.
-        rotations: angle of the mid-edge normal of each edge about it, from the averaged one (E,) [rad]; zero by default.
-        angles: `edge_angles` at these positions, where they are known.
+        rotations: angle from the averaged normal to the mid-edge normal about each edge (E,) [rad]; zero by default.
+        angles: `edge_angles` at the positions; computed by default.
     """
     angles = edge_angles(surface, positions, kinds) if angles is None else angles
     corners, edges, signs = positions[surface.triangles], surface.triangle_edges, surface.triangle_signs
@@ -104,42 +104,42 @@ def second_form(
 
 
 def dihedral(e: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between the triangles (e, a) and (b, e) about e, positive where convex on the side of their normals [rad]."""
+    """Return the angle between the triangles (e, a) and (b, e) about e, positive where convex on the side of their normals [rad]."""
     n, m = cross(e, a), cross(b, e)
     return np.arctan2(dot(cross(n, m), e), dot(n, m) * length(e))
 
 
 def tilt(e: np.ndarray, a: np.ndarray, N: np.ndarray) -> np.ndarray:
-    """Angle about e between the triangle (e, a) and the unit normal N of a clamp, signed as `dihedral` [rad]."""
+    """Return the angle about e between the triangle (e, a) and the unit normal N of a clamp, signed as `dihedral` [rad]."""
     n = cross(e, a)
     return np.arctan2(dot(cross(n, N), e), dot(n, N) * length(e))
 
 
 def mid_edge_nodes(surface) -> np.ndarray:
-    """Corners of the triangles and the corners behind their edges (T, 6); the triangle's own where there is none."""
+    """Return corners of each triangle and opposite corners of the three neighbours (T, 6); the triangle's own without one."""
     edges = surface.triangle_edges
-    side = np.where(surface.triangle_signs > 0, 1, 0)  # the neighbour is the one that runs the edge the other way
-    behind = surface.edge_opposite[edges, side]
-    return np.concatenate([surface.triangles, np.where(behind < 0, surface.triangles, behind)], axis=1)
+    side = np.where(surface.triangle_signs > 0, 1, 0)  # the neighbour runs the edge in the opposite direction
+    neighbour = surface.edge_opposite[edges, side]
+    return np.concatenate([surface.triangles, np.where(neighbour < 0, surface.triangles, neighbour)], axis=1)
 
 
 def edge_angles(surface, positions: np.ndarray, kinds: EdgeKinds) -> np.ndarray:
-    """Angle of every edge for the triangle on either side, as columns of `edge_triangles` (E, 2) [rad].
+    """Return the angle of every edge for the triangle on either side, as columns of `edge_triangles` (E, 2) [rad].
 
-    Dihedral where there is a neighbour, tilt of the triangle at a support, zero at free edges and where there is no triangle.
+    Dihedral with a neighbour, tilt of the triangle at a support, zero at free edges and without a triangle.
     """
     result = np.zeros((len(surface.edges), 2))
     for side in range(2):
         ends = surface.edges if side == 0 else surface.edges[:, ::-1]
-        corner, behind = surface.edge_opposite[:, side], surface.edge_opposite[:, 1 - side]
+        corner, neighbour = surface.edge_opposite[:, side], surface.edge_opposite[:, 1 - side]
         for kind in (NEIGHBOUR, CLAMPED, SYMMETRY):
-            at = np.flatnonzero((kinds.kind == kind) & (corner >= 0))
-            first, N = positions[ends[at, 0]], kinds.vector[at]
-            e, a, b = (positions[vertex[at]] - first for vertex in (ends[:, 1], corner, behind))
+            index = np.flatnonzero((kinds.kind == kind) & (corner >= 0))
+            first, N = positions[ends[index, 0]], kinds.vector[index]
+            e, a, b = (positions[vertex[index]] - first for vertex in (ends[:, 1], corner, neighbour))
             if kind == NEIGHBOUR:
-                result[at, side] = dihedral(e, a, b)
+                result[index, side] = dihedral(e, a, b)
             elif kind == CLAMPED:
-                result[at, side] = tilt(e, a, N)
+                result[index, side] = tilt(e, a, N)
             else:
-                result[at, side] = 0.5 * dihedral(e, a, a - 2.0 * dot(a, N)[:, None] * N)
+                result[index, side] = 0.5 * dihedral(e, a, a - 2.0 * dot(a, N)[:, None] * N)
     return result

@@ -1,8 +1,7 @@
 """Triangle meshes as oriented surfaces: edges, neighbours and boundary, in NumPy.
 
 Corner i of a triangle is opposite to its edge i, which runs from corner i + 1 to corner i + 2. An oriented triangle runs its
-edges counter-clockwise as seen from the side its normal points to; two triangles that share an edge run it in opposite
-directions.
+edges counter-clockwise as seen from the side its normal points to; two triangles at one edge run it in opposite directions.
 """
 
 from collections.abc import Callable
@@ -26,22 +25,22 @@ class Surface:
     Args:
         points: (P, 3) positions of the vertices [m].
         triangles: (T, 3) vertices of each triangle, counter-clockwise as seen from outside.
-        name: what messages call the surface.
+        name: of the surface in messages.
 
     Attributes:
         points: (P, 3) float64 [m].
         triangles: (T, 3) int.
         edges: (E, 2) int; edges[:, 0] < edges[:, 1], sorted.
-        edge_triangles: (E, 2) int; the triangle that runs the edge from edges[:, 0] to edges[:, 1], and the one that runs it
-            backwards; -1 where there is none.
-        edge_opposite: (E, 2) int; the vertex opposite to the edge in these triangles, or -1.
+        edge_triangles: (E, 2) int: the triangle that runs the edge from edges[:, 0] to edges[:, 1], and the triangle that runs it
+            backwards; or -1.
+        edge_opposite: (E, 2) int; the vertex opposite to the edge in `edge_triangles`, or -1.
         triangle_edges: (T, 3) int; the edge opposite to corner i, between the corners i + 1 and i + 2.
         triangle_signs: (T, 3) int; +1 where the triangle runs that edge, from corner i + 1 to corner i + 2, from edges[:, 0] to
             edges[:, 1], else -1.
         boundary: (E,) bool; whether the edge has one triangle only.
 
     Raises:
-        SceneError: an index, triangle, edge or vertex from which no such surface can be made; names the first.
+        SceneError: an index, triangle, edge or vertex that no manifold surface has; names the first.
     """
 
     def __init__(self, points, triangles, name: str = "surface"):
@@ -84,7 +83,7 @@ class Surface:
 
     @cached_property
     def pieces(self) -> int:
-        """Number of parts that share no vertex."""
+        """Number of connected components."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -93,7 +92,7 @@ class Surface:
         return int(connected_components(graph, directed=False)[0])
 
     def boundary_loops(self) -> list[np.ndarray]:
-        """Vertices of each boundary curve, with the surface to the left; the loop with the lowest vertex first, from there."""
+        """Return the vertices of each boundary loop, with the surface to the left, ordered by and starting at the lowest vertex."""
         edges = self.edges[self.boundary]
         forwards = self.edge_triangles[self.boundary, 0] >= 0
         following = np.full(len(self.points), -1)
@@ -109,33 +108,33 @@ class Surface:
         return loops
 
     def find_edges(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Index of the edge between the vertices a and b, in either direction; -1 where there is none."""
+        """Return the index of the edge between the vertices a and b, in either direction; -1 without an edge."""
         keys = _keys(self.edges[:, 0], self.edges[:, 1], len(self.points))
         wanted = _keys(a, b, len(self.points))
-        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        index = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         out_of_range = (np.minimum(a, b) < 0) | (np.maximum(a, b) >= len(self.points))
-        return np.where(out_of_range | (keys[found] != wanted), -1, found)
+        return np.where(out_of_range | (keys[index] != wanted), -1, index)
 
     def edge_between(self, a, b) -> np.ndarray:
-        """Index of the edge between the vertices a and b, in either direction; arrays broadcast.
+        """Return the index of the edge between the vertices a and b, in either direction; arrays broadcast.
 
         Raises:
             SceneError: there is no such edge; names the first pair.
         """
         a, b = np.broadcast_arrays(a, b)
-        found = self.find_edges(a, b)
-        for k in np.flatnonzero(found < 0)[:1]:
+        index = self.find_edges(a, b)
+        for k in np.flatnonzero(index < 0)[:1]:
             raise SceneError(
                 f"{self._name}: there is no edge between the vertices {a.flat[k]} and {b.flat[k]}; "
                 "give two corners of one triangle"
             )
-        return found
+        return index
 
     def edges_on(self, where: Callable[[np.ndarray], np.ndarray] | np.ndarray) -> np.ndarray:
-        """Indices of the edges with both ends in a set of vertices.
+        """Return the indices of the edges with both ends in a set of vertices.
 
         Args:
-            where: a function of the points (P, 3) that returns (P,) bool, such as `lambda x: x[:, 0] < 1e-9`; or (P,) bool; or
+            where: a function of the points (P, 3) that returns (P,) bool, such as `lambda x: x[:, 0] < 1e-9`, or (P,) bool, or
                 indices of vertices.
         """
         chosen = np.zeros(len(self.points), bool)
@@ -200,14 +199,14 @@ class Surface:
             )
 
     def _refuse_doubled(self) -> None:
-        """Refuse two triangles that lie on each other, back to back: angles and curvatures would not exist between them."""
+        """Refuse two coincident triangles back to back, between which angles and curvatures do not exist."""
         for edge in np.flatnonzero(~self.boundary & (self.edge_opposite[:, 0] == self.edge_opposite[:, 1]))[:1]:
             raise SceneError(
                 f"{self._name}: triangles {self._triangles_of(edge)} have the same three vertices; remove one of them"
             )
 
     def _refuse_several_fans(self, halves: np.ndarray) -> None:
-        """Refuse a vertex where parts of the surface only touch, by a walk over the triangles around every vertex."""
+        """Refuse a vertex with several triangle fans, by circulating over the triangles around every vertex."""
         twin = np.full(self.triangles.size, -1)
         inner = halves[~self.boundary]
         twin[inner], twin[inner[:, ::-1]] = inner[:, ::-1], inner
@@ -218,16 +217,16 @@ class Surface:
         vertex_of = self.triangles.ravel()
         start = np.empty(len(self.points), dtype=np.int64)
         start[vertex_of] = np.arange(len(twin))
-        first = np.flatnonzero(twin[3 * triangle + (corner + 2) % 3] < 0)  # nothing is clockwise of these
+        first = np.flatnonzero(twin[3 * triangle + (corner + 2) % 3] < 0)  # without a clockwise neighbour
         start[vertex_of[first]] = first
-        met = np.ones(len(self.points), dtype=np.int64)
-        vertex, here = np.arange(len(self.points)), following[start]
+        visited = np.ones(len(self.points), dtype=np.int64)
+        vertex, half_edge = np.arange(len(self.points)), following[start]
         while len(vertex):
-            going = (here >= 0) & (here != start[vertex])
-            vertex, here = vertex[going], here[going]
-            met[vertex] += 1
-            here = following[here]
-        for vertex in np.flatnonzero(met != np.bincount(vertex_of))[:1]:
+            going = (half_edge >= 0) & (half_edge != start[vertex])
+            vertex, half_edge = vertex[going], half_edge[going]
+            visited[vertex] += 1
+            half_edge = following[half_edge]
+        for vertex in np.flatnonzero(visited != np.bincount(vertex_of))[:1]:
             raise SceneError(
                 f"{self._name}: only parts of the surface touch at vertex {vertex}, they share no edge there; "
                 "give each part a vertex of its own"
@@ -241,5 +240,5 @@ class Surface:
 
 
 def _keys(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
-    """One number for each unordered pair of vertices, increasing like the sorted pairs."""
+    """Return one number for each unordered pair of vertices, ordered as the sorted pairs."""
     return np.minimum(a, b).astype(np.int64) * count + np.maximum(a, b)
