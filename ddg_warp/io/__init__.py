@@ -1,4 +1,4 @@
-"""Reading and writing curves, meshes and trajectories; every format's library is loaded only by its own module.
+"""Readers and writers of curves, meshes and trajectories; each format's library is loaded only by its own module.
 
 `usd` (BasisCurves in; curves or tubes, and meshes out), `mesh_read` (meshes in), `hdf5` (trajectory.h5 in and out), `dismech`
 (text in).
@@ -21,7 +21,7 @@ class CurveError(ValueError):
 
 
 class MeshError(ValueError):
-    """A file holds no usable mesh; the message names the file, the place in it and the remedy."""
+    """A file holds no usable mesh; the message names the file, the line or prim and the remedy."""
 
 
 class MissingFileError(CurveError, MeshError, FileNotFoundError):
@@ -33,14 +33,14 @@ class MissingFileError(CurveError, MeshError, FileNotFoundError):
 
 @dataclass(frozen=True)
 class Curves:
-    """How the points of a trajectory are joined to rods; the attributes of `model.curves`.
+    """Rods of a trajectory as runs of points; the attributes of `model.curves`.
 
     Attributes:
         counts: Points of each rod, shape (R,), int; their sum is P.
         closed: Whether a rod's last point is joined to its first, shape (R,), bool.
         radius: Radius at each point [m], shape (P,), float64.
         names: Name of each rod, shape (R,), str.
-        batch: Batch of each rod, shape (R,), int; the rods of a batch share name and material.
+        batch: Batch of each rod, shape (R,), int; rods of a batch have one name and material.
     """
 
     counts: np.ndarray
@@ -51,13 +51,13 @@ class Curves:
 
     @classmethod
     def tiled(cls, curves, worlds: int) -> Curves:
-        """`worlds` copies of a model's curves, one after the other."""
+        """Return `worlds` copies of a model's curves, one after the other."""
         return cls(**{each.name: np.tile(getattr(curves, each.name), worlds) for each in fields(cls)})
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Triangles among the points of a trajectory; the attributes of `model.surfaces`, which is None where there are none.
+    """Triangles among the points of a trajectory; the attributes of `model.surfaces`, None without surfaces.
 
     Attributes:
         triangles: Rows of `state.points()` at the corners of each triangle, shape (T, 3), int; surface after surface.
@@ -72,12 +72,12 @@ class Surfaces:
     thickness: np.ndarray
 
     def parts(self) -> list[slice]:
-        """The triangles of each surface."""
+        """Return the triangles of each surface."""
         return [slice(a, b) for a, b in zip(self.first, [*self.first[1:], len(self.triangles)], strict=True)]
 
     @classmethod
     def tiled(cls, surfaces: Surfaces, worlds: int, point_count: int) -> Surfaces:
-        """`worlds` copies of a model's surfaces, one after the other, each among `point_count` points of its own."""
+        """Return `worlds` copies of a model's surfaces, one after the other, each among its own `point_count` points."""
         world = np.arange(worlds)[:, None]
         return cls(
             triangles=(surfaces.triangles + point_count * world[..., None]).reshape(-1, 3),
@@ -89,13 +89,13 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class Shapes:
-    """The rods and surfaces of all worlds, and where they stand among the points of a frame, world after world.
+    """Rods and surfaces of all worlds, with the rows of their points in a frame, world after world.
 
-    In each world the points of the rods come first, then those that only surfaces have.
+    In each world the points of rods come first, then points that only surfaces have.
 
     Attributes:
         curves: The rods of all worlds.
-        rows: Row of each of their points in a frame, shape (n,), int.
+        rows: Row of each rod point in a frame, shape (n,), int.
         surfaces: The surfaces of all worlds, or None.
         point_count: Points of one world.
         worlds: Number of worlds.
@@ -109,7 +109,7 @@ class Shapes:
 
     @classmethod
     def of(cls, curves, surfaces: Surfaces | None = None, worlds: int = 1) -> Shapes:
-        """Those of a model's `curves` and `surfaces`, which are of one world."""
+        """Return the shapes of all worlds from the `curves` and `surfaces` of one world of a model."""
         rod_points = int(np.sum(curves.counts))
         point_count = rod_points if surfaces is None else max(rod_points, int(surfaces.triangles.max()) + 1)
         rows = np.arange(rod_points) + point_count * np.arange(worlds)[:, None]
@@ -119,18 +119,18 @@ class Shapes:
 
 @dataclass(frozen=True)
 class CurveSet:
-    """Polylines that were stored together; z is up, lengths are in metres.
+    """Polylines of one prim, dataset or section; z is up, lengths are in metres.
 
-    It has the attributes of `model.curves`, so that writers and pictures take either.
+    A curve set has the attributes of `model.curves`, so that writers and pictures accept both.
 
     Attributes:
         points: Positions [m], shape (P, 3), float64; the rods one after the other.
         counts: Points of each rod, shape (R,), int; their sum is P.
         closed: Whether a rod's last point is joined to its first, shape (R,), bool.
-        radius: Radius at each point [m], shape (P,), float64; None where the file gives none. It may be 0 at the tips of open rods: an
+        radius: Radius at each point [m], shape (P,), float64; None where the file gives none. Tips of open rods may have radius 0: an
             edge has the mean of its ends.
-        path: Where the curves stood in the file: a USD prim path, an HDF5 dataset, a section.
-        attributes: Further values of each rod by name, shape (R,), such as the ids and groups of a groom; a `Recorder` keeps them.
+        path: Location of the curves in the file: a USD prim path, an HDF5 dataset, a section.
+        attributes: Further values of each rod by name, shape (R,), such as ids and groups of a groom; a `Recorder` stores them.
     """
 
     points: np.ndarray
@@ -142,28 +142,28 @@ class CurveSet:
 
     @property
     def names(self) -> np.ndarray:
-        """The name of each rod, shape (R,), str: the last part of `path`, the same for all."""
+        """Name of each rod, shape (R,), str: the last component of `path` for all."""
         return np.full(len(self.counts), self.path.rstrip("/").rpartition("/")[2] or "rods")
 
     @property
     def batch(self) -> np.ndarray:
-        """The batch of each rod, shape (R,), int: one for all."""
+        """Batch of each rod, shape (R,), int: one for all."""
         return np.zeros(len(self.counts), dtype=int)
 
     def rods(self) -> list[np.ndarray]:
-        """The points of each rod [m], each of shape (n, 3)."""
+        """Return the points of each rod [m], each of shape (n, 3)."""
         return np.split(self.points, np.cumsum(self.counts)[:-1])
 
 
 def checked_curves(points, counts, closed, radius, path: str, source: str) -> CurveSet:
-    """A `CurveSet` from raw arrays, refused where a rod could not be built from it.
+    """Return a `CurveSet` from raw arrays, checked so that rods can be built from it.
 
     Args:
         points: Positions [m], shape (P, 3).
         counts: Points of each rod, shape (R,).
         closed: One flag or one for each rod.
         radius: Radius [m], one value, or shape (P,), or None.
-        path: Where in the file the curves stand.
+        path: Location of the curves in the file.
         source: File name, for messages.
     """
     where = f"{source}, {path}"
@@ -198,7 +198,7 @@ def checked_curves(points, counts, closed, radius, path: str, source: str) -> Cu
 
 
 def _refuse_unusable(points, counts, closed, radius, where: str) -> None:
-    """Names the first curve that is too short, not finite, or of no thickness."""
+    """Refuse curves that are too short, not finite or without thickness; the error names the first."""
     if not len(counts):
         raise CurveError(f"{where}: there is not a single curve; export it with its curves")
     least = np.where(closed, 3, 2)
@@ -218,23 +218,23 @@ def _refuse_unusable(points, counts, closed, radius, where: str) -> None:
         tips = np.zeros(len(radius), bool)
         tips[np.concatenate([last, last - counts + 1])] = np.tile(~closed, 2)
         tips &= np.repeat(np.logical_or.reduceat(positive, last - counts + 1), counts) & (radius == 0.0)
-        for bad in np.flatnonzero(~(positive | tips))[:1]:
+        for k in np.flatnonzero(~(positive | tips))[:1]:
             raise CurveError(
-                f"{where}: curve {owner[bad]} has a radius of {radius[bad]} m; give it a positive width, which may taper to 0 at the "
+                f"{where}: curve {owner[k]} has a radius of {radius[k]} m; give it a positive width, which may taper to 0 at the "
                 "ends of an open curve alone"
             )
 
 
-def as_path(what: str, value, error: type[ValueError] = DataError) -> Path:
-    """Return a path given as text or as a path, or raise an `error` that names `what`."""
-    given = os.fspath(value) if isinstance(value, os.PathLike) else value
-    if not isinstance(given, str) or not given or "\0" in given:
-        raise error(f"{what} is {value!r}; give a path, as text or pathlib.Path")
-    return Path(given)
+def as_path(label: str, value, error: type[ValueError] = DataError) -> Path:
+    """Return a path given as text or as a path, or raise an `error` that names `label`."""
+    text = os.fspath(value) if isinstance(value, os.PathLike) else value
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise error(f"{label} is {value!r}; give a path, as text or pathlib.Path")
+    return Path(text)
 
 
 def shown(words: list[str], most: int = 60) -> str:
-    """Return words of a file for a message: in one line, without letters that cannot be printed, the first of many."""
+    """Return words of a file on one line for a message, at most `most` letters, unprintable letters replaced."""
     text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(words))
     return text if len(text) <= most else f"{text[:most]}..."
 
@@ -243,12 +243,12 @@ def is_file(path: Path) -> bool:
     """Return True if a path leads to a file."""
     try:
         return path.is_file()
-    except OSError:  # a name too long, or a folder that may not be looked into
+    except OSError:  # a name too long, or a folder without permission
         return False
 
 
 def existing(path) -> Path:
-    """`path` as a Path, refused where there is no such file."""
+    """Return `path` as a Path, or raise a MissingFileError if no such file exists."""
     path = as_path("the file to read", path, MissingFileError)
     if not is_file(path):
         raise MissingFileError(f"{path}: there is no such file; check the path")
@@ -256,16 +256,16 @@ def existing(path) -> Path:
 
 
 def read(path, outside: bool = False) -> list[CurveSet]:
-    """Return the curves of a USD, HDF5 or DisMech text file, told apart by the suffix.
+    """Return the curves of a USD, HDF5 or DisMech text file, distinguished by suffix.
 
     Args:
         path: The file.
-        outside: Whether other files that a USD or HDF5 file takes data from may be opened: layers, references and payloads out of its
+        outside: Whether other files that a USD or HDF5 file refers to may be opened: layers, references and payloads outside its
             folder, external links and virtual datasets.
 
     Raises:
         CurveError: The file holds no usable curves.
-        TrajectoryError: An HDF5 file is damaged, or takes data from another file, and may not.
+        TrajectoryError: An HDF5 file is damaged, or refers to another file without permission.
     """
     outside = arguments.flag("read: outside", outside)
     suffix = as_path("the file to read", path, MissingFileError).suffix.lower()

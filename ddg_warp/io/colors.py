@@ -1,11 +1,11 @@
-"""The colors of pictures and scenes."""
+"""Colors of pictures and scenes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 SCALE = ("#c9d6e8", "#6f9bd1", "#3b5fa8", "#7a2f79", "#d1495b")
-"""From low to high, at equal distances."""
+"""Colors of a scale from low to high, at equal distances."""
 PALETTE = ((0.12, 0.47, 0.71), (0.89, 0.47, 0.20), (0.17, 0.63, 0.42), (0.74, 0.27, 0.35), (0.55, 0.42, 0.70))
 """RGB of batches of rods and of surfaces, in turn."""
 OBSTACLE, CONTACT = (0.62, 0.63, 0.65), (0.86, 0.15, 0.13)
@@ -13,7 +13,7 @@ OBSTACLE, CONTACT = (0.62, 0.63, 0.65), (0.86, 0.15, 0.13)
 
 
 def on_scale(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """RGB (n, 3) of values (n,) between low and high; what is beyond has the color of the end."""
+    """Return RGB (n, 3) of values (n,) on the scale from low to high; values beyond an end get its color."""
     anchors = np.array([[int(color[k : k + 2], 16) for k in (1, 3, 5)] for color in SCALE]) / 255.0
-    at = np.linspace(low, high, len(SCALE))
-    return np.stack([np.interp(values, at, anchors[:, channel]) for channel in range(3)], axis=1)
+    nodes = np.linspace(low, high, len(SCALE))
+    return np.stack([np.interp(values, nodes, anchors[:, channel]) for channel in range(3)], axis=1)

@@ -1,4 +1,4 @@
-"""What touches what, as it is asked of a model, recorded and read back."""
+"""Contacts of a state: pairs in contact with gaps, points and forces."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# of each pair, and their shapes
+# fields of a pair, with their shapes
 FIELDS = {"world": (), "objects": (2,), "point": (3,), "gap": (), "force": (3,), "friction": (3,)}
-LEAST, MOST = 1e-3, 10.0  # of the typical force, shares that are told apart
-WHOLE = ("world", "objects")  # those that are whole numbers
+LEAST, MOST = 1e-3, 10.0  # bounds of displayed forces, over the typical force
+WHOLE = ("world", "objects")  # fields of whole numbers
 
 
 @dataclass(frozen=True)
@@ -17,12 +17,12 @@ class Contacts:
     """Pairs of edges, points or triangles in contact at a state; see `Model.contacts`.
 
     Attributes:
-        world: (n,) that each pair is in; objects: (n, 2), both their objects, places in `names`.
-        names: of rods, shells and obstacles that may touch, such as "rod 3".
-        point: between the closest points (n, 3) [m]; gap: (n,) [m].
-        force: of contact, without friction, on the first object (n, 3) [N]; the second has its opposite.
-        friction: on the first object (n, 3) [N], by the velocities of the state and its forces of contact; a step takes those forces
-            as they were at its start. Of an equilibrium with friction it is by the way there; else nothing rubs in a state at rest.
+        world: world of each pair (n,); objects: both objects of each pair, as indices into `names` (n, 2).
+        names: of rods, shells and obstacles with contact, such as "rod 3".
+        point: midpoint of the closest points (n, 3) [m]; gap: (n,) [m].
+        force: contact force without friction on the first object (n, 3) [N], opposite on the second.
+        friction: friction force on the first object (n, 3) [N], from velocities and contact forces of the state. A step uses the
+            contact forces at its start. Frictional equilibria depend on the load path; other states at rest have no friction.
     """
 
     world: np.ndarray
@@ -39,11 +39,11 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Touching:
-    """What recordings of contact need to know; `Model.touching`.
+    """Names and typical scales of contact, for recordings; `Model.touching`.
 
     Attributes:
-        names: of what may touch, as in `Contacts`.
-        size: a typical radius [m]; force: a typical force of contact [N], the stiffness times the range.
+        names: of objects with contact, as in `Contacts`.
+        size: a typical radius [m]; force: a typical contact force [N], stiffness times activation distance.
     """
 
     names: list[str]
@@ -51,6 +51,6 @@ class Touching:
     force: float
 
     def widths(self, force: np.ndarray) -> np.ndarray:
-        """Diameters [m] (n,) of the balls by which forces (n, 3) are shown: their volume grows with the force."""
-        share = np.linalg.norm(force, axis=-1) / self.force
-        return 2.0 * self.size * np.cbrt(np.clip(share, LEAST, MOST))
+        """Return the diameters [m] (n,) of balls that show forces (n, 3): the volume is proportional to the force."""
+        ratio = np.linalg.norm(force, axis=-1) / self.force
+        return 2.0 * self.size * np.cbrt(np.clip(ratio, LEAST, MOST))

@@ -1,4 +1,4 @@
-"""Points of cubic curves of USD: B-splines, Catmull-Rom splines and Bezier curves, as weights of their vertices.
+"""Sampling of cubic curves of USD as weights of vertices: B-splines, Catmull-Rom splines and Bezier curves.
 
 Source: UsdGeomBasisCurves, openusd.org (segments by basis and wrap; phantom points of pinned curves).
 """
@@ -14,10 +14,10 @@ BASES = {
     "bspline": np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0,
     "catmullRom": np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]) / 2.0,
 }
-"""Weights of the four vertices of a segment, by the powers of the parameter from 0 to 1."""
+"""Weights of the four vertices of a segment, by powers of the parameter from 0 to 1."""
 PERIODIC, PINNED = "periodic", "pinned"
 BEZIER_STEP = 3
-REACH = 6  # vertices that a point can depend on: four, and one more at a pinned end each
+REACH = 6  # vertices that a point can depend on: four, plus one at each pinned end
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Sampled:
     """Points of a curve, or of several curves one after the other.
 
     Attributes:
-        vertices, weights: vertices that each point is blended from, and their weights, shape (P, 6) or (P, 1).
-        knots, shares: knots before and after each point, shape (P, 2), and the share of the second, shape (P,).
+        vertices, weights: Vertices that each point is blended from, with weights, shape (P, 6) or (P, 1).
+        knots, shares: Knots before and after each point, shape (P, 2). Weights of the second knots, shape (P,).
         counts: Points of each curve, shape (R,).
         knot_counts: Knots of each curve, shape (R,).
     """
@@ -48,7 +48,7 @@ class Sampled:
 
 
 def segments(basis: str, wrap: str, count: int) -> int:
-    """Return the number of segments of a curve of so many vertices; 0 where its basis does not take so many."""
+    """Return the number of segments of a curve of `count` vertices; 0 if the basis does not allow this count."""
     if basis == "bezier":
         whole, rest = divmod(count - (wrap != PERIODIC), BEZIER_STEP)
         return whole if not rest else 0
@@ -57,13 +57,13 @@ def segments(basis: str, wrap: str, count: int) -> int:
 
 
 def linear(counts: np.ndarray) -> Sampled:
-    """Return the vertices of polylines as they are."""
+    """Return the vertices of polylines, unchanged."""
     every = np.arange(counts.sum())
     return Sampled(every[:, None], np.ones((len(every), 1)), np.stack([every, every], 1), 0.0 * every, counts, counts)
 
 
 def sampled(basis: str, wrap: str, counts: np.ndarray, samples: int) -> Sampled:
-    """Return points of curves: the knots and, between two of them, `samples` - 1 points at equal parameters.
+    """Return points of curves: the knots and `samples` - 1 points at equal parameters between neighbouring knots.
 
     Args:
         basis: One of `BASES`.
@@ -80,17 +80,17 @@ def sampled(basis: str, wrap: str, counts: np.ndarray, samples: int) -> Sampled:
 
 
 def _local(basis: str, wrap: str, count: int, samples: int) -> tuple:
-    """(vertices, weights, knots, shares of the points; knots) of one curve, see `Sampled`."""
+    """Return (vertices, weights, knots, knot weights of the points; knots) of one curve, see `Sampled`."""
     number, closed = segments(basis, wrap, count), wrap == PERIODIC
     segment = np.repeat(np.arange(number), samples)
-    share = np.tile(np.arange(samples) / samples, number)
+    parameter = np.tile(np.arange(samples) / samples, number)
     if not closed:
-        segment, share = np.append(segment, number - 1), np.append(share, 1.0)
-    step, ahead = (BEZIER_STEP, 0) if basis == "bezier" else (1, 0 if wrap not in (PERIODIC, PINNED) else 1)
+        segment, parameter = np.append(segment, number - 1), np.append(parameter, 1.0)
+    step, offset = (BEZIER_STEP, 0) if basis == "bezier" else (1, 0 if wrap not in (PERIODIC, PINNED) else 1)
     vertices = np.zeros((len(segment), REACH), int)
     weights = np.zeros((len(segment), REACH))
-    vertices[:, :4] = step * segment[:, None] - ahead + np.arange(4)
-    weights[:, :4] = share[:, None] ** np.arange(4) @ BASES[basis]
+    vertices[:, :4] = step * segment[:, None] - offset + np.arange(4)
+    weights[:, :4] = parameter[:, None] ** np.arange(4) @ BASES[basis]
     if closed:
         vertices %= count
     # A point beyond a pinned end continues the line through the last two vertices: 2 p_0 - p_1.
@@ -101,4 +101,4 @@ def _local(basis: str, wrap: str, count: int, samples: int) -> tuple:
         weights[out] *= 2.0
         vertices[out] = end
     knots = np.arange(number + (not closed))
-    return vertices, weights, np.stack([segment, (segment + 1) % len(knots)], 1), share, knots
+    return vertices, weights, np.stack([segment, (segment + 1) % len(knots)], 1), parameter, knots

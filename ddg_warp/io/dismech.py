@@ -1,4 +1,4 @@
-"""Rods from the text files of the DisMech family (MATLAB, Python: sections; C++: bare coordinates).
+"""Reader of rods in text files of the DisMech family (MATLAB, Python: sections; C++: bare coordinates).
 
     *Nodes               one `x, y, z` a line, metres (also `*rodNodes`)
     0.0, 0.0, 0.0
@@ -8,8 +8,8 @@
 
 The MATLAB and Python programs count nodes from 1. A file in which an edge names node 0 is taken to count from 0.
 The C++ program has no sections: its files hold one node a line, separated by blanks, in order along a single rod.
-Sections that those programs derive from the edges (`*elStretchRod`, ...) are skipped. Separators are commas or
-blanks; what follows a `#` or `%` is a comment. Comments may be in any encoding.
+Sections that the programs derive from edges (`*elStretchRod`, ...) are skipped. Separators are commas or blanks.
+Text after `#` or `%` is a comment, in any encoding.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ DERIVED_PREFIX = "el"
 
 
 def read_rods(path) -> CurveSet:
-    """The rods of a DisMech text file; its edges must form separate paths and cycles.
+    """Return the rods of a DisMech text file, in which edges form separate paths and cycles.
 
     Nodes are returned in the order in which the edges run through them. The format stores no radius.
     """
@@ -38,16 +38,16 @@ def read_rods(path) -> CurveSet:
         raise CurveError(f"{path}: the file holds a shell (`*Triangles`), which cannot be read as rods; remove them")
     edges, base = _edges(sections, len(nodes), path)
     neighbours = _neighbours(edges, len(nodes))
-    for node, others in enumerate(neighbours):
-        _refuse_joint(f"{path}: node {node + base}", others)
-    chains = _chains(neighbours)
-    order = np.concatenate([chain for chain, _ in chains])
-    counts, closed = [len(chain) for chain, _ in chains], [closed for _, closed in chains]
+    for node, adjacent in enumerate(neighbours):
+        _refuse_joint(f"{path}: node {node + base}", adjacent)
+    paths = _chains(neighbours)
+    order = np.concatenate([nodes_in_order for nodes_in_order, _ in paths])
+    counts, closed = [len(nodes_in_order) for nodes_in_order, _ in paths], [closed for _, closed in paths]
     return checked_curves(nodes[order], counts, closed, None, "Nodes", str(path))
 
 
 def _sections(path) -> dict[str, list[tuple]]:
-    """Rows of numbers by section name; lines before the first header are nodes."""
+    """Return rows of numbers by section name; lines before the first header are nodes."""
     sections: dict[str, list[tuple]] = {name: [] for name in COLUMNS}
     sections["headers"] = []
     current = "nodes"
@@ -87,7 +87,7 @@ def _row(text: str, section: str, where: str) -> tuple:
 
 
 def _edges(sections: dict[str, list[tuple]], node_count: int, path) -> tuple[np.ndarray, int]:
-    """(node pairs counted from 0, shape (E, 2); the file's first node, 0 or 1); one rod where there are no sections."""
+    """Return (node pairs counted from 0 (E, 2), first node of the file, 0 or 1); one rod without sections."""
     if not sections["headers"]:
         first = np.arange(node_count - 1)
         return np.column_stack([first, first + 1]), 0
@@ -115,35 +115,35 @@ def _neighbours(edges: np.ndarray, node_count: int) -> list[list[int]]:
     return neighbours
 
 
-def _refuse_joint(node: str, others: list[int]) -> None:
-    """A rod's node has one or two neighbours, each once."""
-    if not others:
+def _refuse_joint(node: str, adjacent: list[int]) -> None:
+    """Refuse a node without one or two different neighbours."""
+    if not adjacent:
         raise CurveError(f"{node} belongs to no edge; remove it or join it")
-    if len(others) > 2:
-        raise CurveError(f"{node} joins {len(others)} edges; networks are not supported yet, split the rods there")
-    if len(set(others)) < len(others):
+    if len(adjacent) > 2:
+        raise CurveError(f"{node} joins {len(adjacent)} edges; networks are not supported yet, split the rods there")
+    if len(set(adjacent)) < len(adjacent):
         raise CurveError(f"{node}: an edge is listed twice; remove one")
 
 
 def _chains(neighbours: list[list[int]]) -> list[tuple[list[int], bool]]:
-    """Paths and cycles as (nodes in order, closed), by their first node in the file."""
-    ends = [node for node, others in enumerate(neighbours) if len(others) == 1]
-    seen: set[int] = set()
-    chains = []
+    """Return paths and cycles as (nodes in order, closed), ordered by first node in the file."""
+    ends = [node for node, adjacent in enumerate(neighbours) if len(adjacent) == 1]
+    visited: set[int] = set()
+    paths = []
     for start in ends + list(range(len(neighbours))):
-        if start not in seen:
-            chain = _walk(start, neighbours)
-            seen.update(chain)
-            chains.append((chain, len(neighbours[start]) == 2))
-    return sorted(chains, key=lambda chain: min(chain[0]))
+        if start not in visited:
+            nodes = _walk(start, neighbours)
+            visited.update(nodes)
+            paths.append((nodes, len(neighbours[start]) == 2))
+    return sorted(paths, key=lambda nodes: min(nodes[0]))
 
 
 def _walk(start: int, neighbours: list[list[int]]) -> list[int]:
-    """The nodes met from `start` until an end or until the cycle closes."""
-    chain, previous, node = [start], None, start
+    """Return the nodes along the edges from `start` to an end or around a cycle."""
+    nodes, previous, node = [start], None, start
     while True:
-        onward = [other for other in neighbours[node] if other != previous]
-        if not onward or onward[0] == start:
-            return chain
-        previous, node = node, onward[0]
-        chain.append(node)
+        following = [neighbour for neighbour in neighbours[node] if neighbour != previous]
+        if not following or following[0] == start:
+            return nodes
+        previous, node = node, following[0]
+        nodes.append(node)

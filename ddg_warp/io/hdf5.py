@@ -1,25 +1,25 @@
-"""trajectory.h5: what a run recorded, what it was made of, and where it can go on.
+"""Writer of trajectory.h5: recorded frames of a run, its model, and checkpoints to resume from.
 
     /trajectory   time (F,) [s], points (F, P, 3) [m], velocities (F, P, 3) [m/s] and directors (F, E, 3) if wanted,
                   series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3);
-                  at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)), the rods of all worlds, which have none, then
-                  their triangles: fields if wanted, of all worlds; obstacle_points (F, M, 3) or (F, B, M, 3) [m], nodes of
-                  obstacles that something moves; contacts/{world, objects, point, gap, force, friction} (n, ...), pairs of all frames
-                  one after the other if wanted, those of frame f up to contacts/ends[f]
+                  at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)) if wanted: fields of all worlds, cells are the rods
+                  (without values), then the triangles; obstacle_points (F, M, 3) or (F, B, M, 3) [m], nodes of moving
+                  obstacles; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
+                  one after the other, up to contacts/ends[f] for frame f
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
                   any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `Touching`, parameters/NAME,
                   attributes/NAME of rods
-    /control      how the run was driven
-    /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which; below each,
-                  run/NAME is what the run has counted up to that frame, see `Counts`
+    /control      options of the run
+    /checkpoint   a and b, alternately the state at the last frame, at full precision; the attribute current names the last;
+                  below each, run/NAME are counts of the run up to that frame, see `Counts`
     /VTKHDF       the same points for ParaView, see `vtkhdf`
-    attributes    provenance: version, date, machine and what the caller adds
+    attributes    provenance: version, date, machine and attributes of the caller
 
-Frames are appended a block at a time, each block with its checkpoint in one transaction (see `journal`): a process
-killed at any time leaves a file that ends with a complete block, from which the run resumes. Every block of a field has a
-checksum (HDF5's Fletcher32), model and checkpoints have one each (CRC-32), and readers verify them.
+Frames are appended in blocks, each with its checkpoint in one transaction (see `journal`). A process killed at any time leaves a
+file that ends with a complete block, from which the run resumes. Every block of a field has a checksum (HDF5's
+Fletcher32), model and checkpoints have a CRC-32 each, and readers verify all of them.
 
-ParaView and VTK's reader know the format by the suffix .vtkhdf: a link of that name stands beside the file.
+ParaView and VTK recognise the format by the suffix .vtkhdf: the writer adds a link with that suffix.
 """
 
 from __future__ import annotations
@@ -64,30 +64,30 @@ from ddg_warp.io.vtkhdf import write_view
 
 __all__ = ["TrajectoryError", "TrajectoryReader", "TrajectoryWriter", "read_rods"]
 
-BLOCK_BYTES = 2**27  # frames held in memory at most
-PAIR_BYTES = 80  # of a pair in contact
+BLOCK_BYTES = 2**27  # frames buffered in memory at most
+PAIR_BYTES = 80  # bytes of a pair in contact
 OTHER_SLOT = {"a": "b", "b": "a"}
 
 
 class TrajectoryWriter:
-    """Appends frames to a trajectory file.
+    """Writer that appends frames to a trajectory file.
 
     Args:
         path: The file; an existing one is replaced. `resume` continues one instead.
         model: The model whose states are recorded.
-        block: Frames written together; fewer where they would fill 128 MiB.
+        block: Frames written together; fewer if they exceed 128 MiB.
         velocities: Whether to record velocities.
         directors: Whether to record the first material director of every edge.
-        provenance: Attributes of the file; what is neither text nor a number is stored as JSON.
-        control: How the run is driven, stored in /control: names and numbers, texts or arrays.
+        provenance: Attributes of the file; values other than text and numbers are stored as JSON.
+        control: Options of the run, stored in /control: names and numbers, texts or arrays.
         at_points: Names of fields at the points.
         at_cells: Names of fields of the triangles.
         attributes: Values of each rod by name, shape (R,), stored in /model/attributes.
         contacts: Whether frames come with contacts.
-        time: What the times of frames are, "state" or "frame", stored with them; see `Recorder`.
+        time: Meaning of frame times, "state" or "frame", stored with them; see `Recorder`.
 
     Attributes:
-        checkpoint: The state that a resumed file goes on from, as of `State.snapshot`; None where there was none.
+        checkpoint: State that a resumed file continues from, see `State.snapshot`; None without a checkpoint.
     """
 
     checkpoint: dict[str, np.ndarray] | None = None
@@ -133,11 +133,11 @@ class TrajectoryWriter:
 
     @classmethod
     def resume(cls, path, model, *, block: int = 64, provenance: Mapping | None = None) -> TrajectoryWriter:
-        """Continues a trajectory after the frame of its checkpoint; later frames are cut off.
+        """Continue a trajectory after the checkpoint; later frames are dropped.
 
         Args:
             path, model, block: See the class.
-            provenance: Attributes of the file that are other than at the start, such as a later end.
+            provenance: Attributes of the file that have changed, such as a later end.
         """
         path = existing(path)
         with undamaged(path):
@@ -149,12 +149,12 @@ class TrajectoryWriter:
         with TrajectoryReader(path) as reader:
             frame, slot, names = reader.checkpoint_frame, reader.checkpoint_slot, reader.recorded
             contacts, checkpoint = reader.contacts is not None, reader.checkpoint()
-            if other := _other(reader, model):
-                what, which = other
-                also = ", and parameters as they were when its recording began" if what == "parameters" else ""
+            if difference := _other(reader, model):
+                kind, field = difference
+                also = ", and parameters as they were when its recording began" if kind == "parameters" else ""
                 raise TrajectoryError(
-                    f"{path}: the file holds other {what} than the model; resume with its own scene{also}"
-                    f"{which and f' ({which} differs)'}"
+                    f"{path}: the file holds other {kind} than the model; resume with its own scene{also}"
+                    f"{field and f' ({field} differs)'}"
                 )
         writer = cls.__new__(cls)
         writer._prepare(path, model, block, names, contacts)
@@ -181,7 +181,7 @@ class TrajectoryWriter:
 
     @property
     def fields(self) -> list[str]:
-        """Names of the fields that frames come with."""
+        """Names of the fields of a frame."""
         return [name.rpartition("/")[2] for name in self._names if "/" in name]
 
     def append(
@@ -193,15 +193,15 @@ class TrajectoryWriter:
         counts: Mapping[str, np.ndarray] | None = None,
         time: float | None = None,
     ) -> None:
-        """Adds the frame of a state and what was observed of it; every frame observes the same names.
+        """Append the frame of a state with observed numbers; every frame observes the same names.
 
         Args:
             state: The state.
             observed: Numbers by name.
             fields: Fields by name: of points (worlds, P), of triangles (worlds, T).
-            contacts: What touches, where that is recorded.
-            counts: What the run has counted up to this state, by name.
-            time: Time of the frame; by default that of the state [s].
+            contacts: Contacts of the state, if recorded.
+            counts: Counts of the run up to this state, by name.
+            time: Time of the frame [s]; by default the time of the state.
         """
         observed = checked_observed(observed)
         if self._frames and observed.keys() != self._frames[0]["series"].keys():
@@ -221,7 +221,7 @@ class TrajectoryWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Writes the frames held in memory, with the checkpoint of the last one, as one transaction.
+        """Write the buffered frames with the checkpoint of the last one as one transaction.
 
         Raises:
             OSError: The disk is full, or fails; the file stays as it was.
@@ -250,7 +250,7 @@ class TrajectoryWriter:
         self._pairs = 0
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Write the buffered frames."""
         self.flush()
 
     def _prepare(self, path, model, block: int, names: list[str], contacts: bool) -> None:
@@ -266,7 +266,7 @@ class TrajectoryWriter:
         self._block = max(1, min(block, BLOCK_BYTES // frame_bytes))
 
     def _shape(self, name: str) -> tuple[int, ...]:
-        """Shape of one frame of a field."""
+        """Return the shape of one frame of a field."""
         curves, worlds, rows = self._model.curves, self._model.worlds, self._shapes.point_count
         if "/" in name:
             of_a_world = (
@@ -288,7 +288,7 @@ class TrajectoryWriter:
             extend(group, name, values, self._block)
 
     def _cut(self, frame: int, provenance: Mapping) -> None:
-        """Drops the frames from `frame` on, and brings the attributes up to date."""
+        """Drop the frames from `frame` on, and update the attributes."""
         with transaction(self.path) as file:
             write_attributes(file, provenance)
             trajectory = file["trajectory"]
@@ -303,7 +303,7 @@ class TrajectoryWriter:
 
 @contextmanager
 def _removed_on_failure(path: Path) -> Iterator[None]:
-    """Leaves no file behind that could not be completed."""
+    """Remove a file if writing fails."""
     try:
         yield
     except BaseException:
@@ -312,7 +312,7 @@ def _removed_on_failure(path: Path) -> Iterator[None]:
 
 
 def _link(path: Path) -> None:
-    """Gives a file a second name by which ParaView knows its format, where the disk has links."""
+    """Link a file under the suffix .vtkhdf, by which ParaView knows its format, if the disk has links."""
     name = path.with_suffix(".vtkhdf")
     with suppress(OSError, NotImplementedError):
         name.unlink(missing_ok=True)
@@ -320,7 +320,7 @@ def _link(path: Path) -> None:
 
 
 def _origin() -> dict[str, str]:
-    """Where and when a file was made."""
+    """Return program, version, date and machine of a file."""
     try:
         ours = version("ddg_warp")
     except PackageNotFoundError:
@@ -330,20 +330,20 @@ def _origin() -> dict[str, str]:
 
 
 def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
-    """What in a file is not of this model, and which part of it; None where all is."""
+    """Return (kind, field) of the first content of a file that differs from the model, or None."""
     for name in CURVE_FIELDS:
         if not _equal(getattr(reader.curves, name), getattr(model.curves, name)):
             return "rods", name
-    for what in ("surfaces", "obstacles", "touching"):
-        found, wanted = getattr(reader, what), getattr(model, what)
-        what = "contact" if what == "touching" else what
-        if found is None or wanted is None:
-            if found is not wanted:
-                return what, ""
+    for kind in ("surfaces", "obstacles", "touching"):
+        recorded, wanted = getattr(reader, kind), getattr(model, kind)
+        kind = "contact" if kind == "touching" else kind
+        if recorded is None or wanted is None:
+            if recorded is not wanted:
+                return kind, ""
             continue
-        for each in fields_of(found):
-            if not _equal(getattr(found, each.name), getattr(wanted, each.name)):
-                return what, each.name
+        for each in fields_of(recorded):
+            if not _equal(getattr(recorded, each.name), getattr(wanted, each.name)):
+                return kind, each.name
     parameters = model.parameters()
     for name in sorted(reader.parameters.keys() | parameters.keys()):
         if not (name in parameters and _equal(reader.parameters.get(name), parameters[name])):
@@ -351,8 +351,8 @@ def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
     return None
 
 
-def _equal(found, wanted) -> bool:
-    return np.array_equal(np.asarray(found), np.asarray(wanted))
+def _equal(recorded, wanted) -> bool:
+    return np.array_equal(np.asarray(recorded), np.asarray(wanted))
 
 
 def _triangles(surfaces) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The reading half of `hdf5`: trajectories, and rods from either kind of HDF5 file."""
+"""Readers of HDF5 files: trajectories, and rods from trajectories or plain files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ddg_warp.io.obstacles import Obstacles
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
-COUNTS = "run"  # group of a checkpoint: what the run had counted up to there
+COUNTS = "run"  # group of a checkpoint: counts of the run up to the frame
 FRAMES = ("points", "velocities", "directors", "obstacle_points")
 
 
-RATIO = 1024  # times its file that a dataset can be large; what compresses better is made up of fill values
+RATIO = 1024  # largest size of a dataset over the size of its file; only fill values compress better
 
 
 class MissingFrameError(TrajectoryError, IndexError):
@@ -34,7 +34,7 @@ class MissingFrameError(TrajectoryError, IndexError):
 
 @contextmanager
 def undamaged(path: Path) -> Iterator[None]:
-    """What HDF5 says, in errors of many kinds, of a damaged file becomes a TrajectoryError; errors of the disk stay."""
+    """Raise a TrajectoryError for the errors of many kinds of HDF5 in a damaged file; pass errors of the disk on."""
     try:
         yield
     except (TrajectoryError, CurveError):
@@ -57,7 +57,7 @@ def undamaged(path: Path) -> Iterator[None]:
 
 
 class Frames:
-    """A field of all frames, read when indexed; `shape`, `ndim` and `len` as of an array."""
+    """Field of all frames, read when indexed; `shape`, `ndim` and `len` as an array."""
 
     def __init__(self, dataset: h5py.Dataset, path: Path):
         self._dataset, self._path = dataset, path
@@ -73,11 +73,11 @@ class Frames:
 
 
 def rows(dataset: h5py.Dataset, path: Path, chosen=slice(None)) -> np.ndarray:
-    """Rows of a dataset, in memory.
+    """Read rows of a dataset.
 
     Raises:
-        TrajectoryError: Their checksum says that the file has changed since they were written; names them, and the rows that can be
-            read. Or they cannot be chosen so.
+        TrajectoryError: The checksum shows that the file has changed; names the damaged and the readable rows. Or the index is
+            invalid.
     """
     with undamaged(path):
         _check_size(dataset)
@@ -95,16 +95,16 @@ def rows(dataset: h5py.Dataset, path: Path, chosen=slice(None)) -> np.ndarray:
 
 
 def _told(dataset: h5py.Dataset, path: Path) -> TrajectoryError:
-    """Which rows of a dataset cannot be read, and which can."""
+    """Return an error that names the damaged and the readable rows of a dataset."""
     count, size = len(dataset), dataset.chunks[0]
     lost = [first for first in range(0, count, size) if not _readable(dataset, first)]
-    bad = np.zeros(count, bool)
+    mask = np.zeros(count, bool)
     for first in lost:
-        bad[first : first + size] = True
-    rest = f"{_ranges(~bad)} can be read" if not bad.all() else "no others can be read"
-    what = "pairs" if "/contacts/" in dataset.name and not dataset.name.endswith("/ends") else "frames"
+        mask[first : first + size] = True
+    intact = f"{_ranges(~mask)} can be read" if not mask.all() else "no others can be read"
+    kind = "pairs" if "/contacts/" in dataset.name and not dataset.name.endswith("/ends") else "frames"
     return TrajectoryError(
-        f"{path}: {dataset.name} is damaged: the checksum of {what} {_ranges(bad)} is not that of what was written; {rest}. Take a "
+        f"{path}: {dataset.name} is damaged: the checksum of {kind} {_ranges(mask)} is not that of what was written; {intact}. Take a "
         "copy of the file, or record the run anew"
     )
 
@@ -118,27 +118,27 @@ def _readable(dataset: h5py.Dataset, row: int) -> bool:
 
 
 def _ranges(chosen: np.ndarray) -> str:
-    """Indices of a mask as text: "0 to 3, 8 to 9"."""
+    """Return the indices of a mask as text: "0 to 3, 8 to 9"."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
     return ", ".join(f"{first} to {stop - 1}" for first, stop in edges.reshape(-1, 2))
 
 
 def checksum(arrays: Mapping[str, np.ndarray]) -> int:
-    """CRC-32 of arrays by name: their names, kinds and values."""
-    found = 0
+    """Return the CRC-32 of the names, kinds and values of arrays."""
+    crc = 0
     for name, value in sorted(arrays.items()):
         content = "\0".join(value.ravel()).encode() if value.dtype.kind == "U" else np.ascontiguousarray(value)
-        found = zlib.crc32(content, zlib.crc32(f"{name} {value.shape} {value.dtype.kind}".encode(), found))
-    return found
+        crc = zlib.crc32(content, zlib.crc32(f"{name} {value.shape} {value.dtype.kind}".encode(), crc))
+    return crc
 
 
 def seal(group: h5py.Group, arrays: Mapping[str, np.ndarray]) -> None:
-    """Stores the checksum of the datasets below a group, which are these arrays by path, with it, for `check_seal`."""
+    """Store the checksum of `arrays`, the datasets below a group by path, with the group, for `check_seal`."""
     group.attrs["crc32"] = checksum(arrays)
 
 
 def check_seal(group: h5py.Group, path: Path) -> None:
-    """Refuses a group whose datasets have changed since they were sealed; those of older files have no seal."""
+    """Refuse a group with datasets changed since `seal`; groups of older files have no seal."""
     if "crc32" in group.attrs and group.attrs["crc32"] != checksum(all_arrays(group)):
         raise TrajectoryError(
             f"{path}: {group.name} is damaged: its checksum is not that of what was written; take a copy of the file, or record the "
@@ -147,7 +147,7 @@ def check_seal(group: h5py.Group, path: Path) -> None:
 
 
 def _check_size(dataset: h5py.Dataset) -> None:
-    """Refuses a dataset that holds nothing, or more than its file can."""
+    """Refuse a dataset that is empty, or larger than its file can hold."""
     if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
         raise TypeError(
             f"{dataset.name} is {'empty' if isinstance(dataset, h5py.Dataset) else 'a group'}, not an array"
@@ -160,10 +160,10 @@ def _check_size(dataset: h5py.Dataset) -> None:
 
 
 def refuse_links(file: h5py.File, path: Path) -> None:
-    """Refuses a file whose data are in other files, which may be anybody's.
+    """Refuse a file with data in other, possibly foreign files.
 
     Raises:
-        TrajectoryError: Names the first object of the file that is elsewhere.
+        TrajectoryError: Names the first object with data in another file.
     """
 
     def elsewhere(name: str, link) -> str | None:
@@ -172,12 +172,12 @@ def refuse_links(file: h5py.File, path: Path) -> None:
         item = file.get(name) if isinstance(link, h5py.HardLink) else None
         if isinstance(item, h5py.Dataset) and item.external:
             return f"the values of {name} are in {item.external[0][0]}"
-        others = {each.file_name for each in item.virtual_sources()} - {"."} if _is_virtual(item) else ()
-        return f"the values of {name} are in {min(others)}" if others else None
+        files = {each.file_name for each in item.virtual_sources()} - {"."} if _is_virtual(item) else ()
+        return f"the values of {name} are in {min(files)}" if files else None
 
-    if found := file.visititems_links(elsewhere):
+    if reference := file.visititems_links(elsewhere):
         raise TrajectoryError(
-            f"{path}: {found}: data of other files are not read; put them into this one, or read it with outside=True if you "
+            f"{path}: {reference}: data of other files are not read; put them into this one, or read it with outside=True if you "
             "know where it comes from"
         )
 
@@ -187,7 +187,7 @@ def _is_virtual(item) -> bool:
 
 
 class ContactFrames:
-    """What touches in each frame, read when indexed by a number: `Contacts`."""
+    """`Contacts` of each frame, read when indexed by a number."""
 
     def __init__(self, group: h5py.Group, names: list[str], path: Path):
         self._group, self._names, self._path = group, names, path
@@ -203,33 +203,33 @@ class ContactFrames:
             )
         first, last = self._ends[range(len(self))[frame] :][:2]
         with undamaged(self._path):
-            found = {name: rows(self._group[name], self._path, slice(first, last)) for name in PAIR_FIELDS}
-        return Contacts(names=self._names, **found)
+            values = {name: rows(self._group[name], self._path, slice(first, last)) for name in PAIR_FIELDS}
+        return Contacts(names=self._names, **values)
 
 
 class TrajectoryReader:
-    """Reads a trajectory file, also one that is being written or whose writer was killed.
+    """Reader of a trajectory file, also while it is being written or after its writer was killed.
 
     Args:
         path: The file.
-        outside: Whether it may have its data in other files: by external links, external storage or virtual datasets.
+        outside: Whether the file may refer to other files: by external links, external storage or virtual datasets.
 
     Attributes:
         time: Times of the frames [s], shape (F,).
-        time_is: What they are: "state", times of their states, or "frame", their numbers; see `Recorder`.
+        time_is: Meaning of `time`: "state", times of the states, or "frame", numbers of the frames; see `Recorder`.
         points: Positions [m], shape (F, P, 3) or (F, B, P, 3), read when indexed: `reader.points[f]`.
         velocities: Velocities [m/s], like `points`, or None.
         directors: First material directors, shape (F, E, 3) or (F, B, E, 3), read when indexed, or None.
-        fields: Fields by name, read when indexed: of points (F, B P), of cells (F, B (R + T)), the rods, which have none, first.
+        fields: Fields by name, read when indexed: of points (F, B P), of cells (F, B (R + T)), first the rods (without values).
         series: Observed values by name, each of shape (F,).
-        curves: How the points are joined to rods.
-        surfaces: How the points are joined to triangles, or None.
-        obstacles: What rods and surfaces touch, as surfaces, or None.
-        obstacle_points: Nodes of obstacles that something moves [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
-        contacts: What touches, `Contacts` of each frame, read when indexed by a number, or None where it was not recorded.
-        touching: What recordings of contact need to know, or None.
+        curves: Rods among the points.
+        surfaces: Triangles among the points, or None.
+        obstacles: Obstacles as surfaces, or None.
+        obstacle_points: Nodes of moving obstacles [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
+        contacts: `Contacts` of each frame, read when indexed by a number, or None if not recorded.
+        touching: Names and typical scales of contact, or None.
         parameters: The model's parameters by name.
-        attributes: Values of each rod by name that a groom came with.
+        attributes: Values of each rod by name, from a groom.
         provenance: The attributes of the file.
         recorded: Names of the recorded fields.
     """
@@ -248,14 +248,14 @@ class TrajectoryReader:
             raise
 
     def _read(self) -> None:
-        """Everything but the fields of the frames."""
+        """Read everything but the fields of the frames."""
         if "trajectory" not in self._file:
             raise TrajectoryError(f"{self.path}: there is no group /trajectory; is it a trajectory.h5?")
         trajectory, model = self._file["trajectory"], self._file["model"]
         check_seal(model, self.path)
         self.time, self.time_is = rows(trajectory["time"], self.path), str(trajectory.attrs.get("time", "state"))
         self.recorded = [name for name in FRAMES if name in trajectory]
-        self.recorded += [f"{at}/{name}" for at in ("at_points", "at_cells") for name in trajectory.get(at, ())]
+        self.recorded += [f"{kind}/{name}" for kind in ("at_points", "at_cells") for name in trajectory.get(kind, ())]
         fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
         self.points, self.velocities = fields["points"], fields.get("velocities")
         self.directors = fields.get("directors")
@@ -297,7 +297,7 @@ class TrajectoryReader:
 
     @property
     def closed(self) -> np.ndarray:
-        """Whether each rod is closed, shape (R,), bool."""
+        """Closed rods, shape (R,), bool."""
         return self.curves.closed
 
     @property
@@ -307,7 +307,7 @@ class TrajectoryReader:
 
     @property
     def checkpoint_slot(self) -> str:
-        """Which of the two places holds the last checkpoint."""
+        """Name of the group of the last checkpoint, "a" or "b"."""
         if "checkpoint" not in self._file:
             raise TrajectoryError(f"{self.path}: the run ended before its first block was written; start it again")
         with undamaged(self.path):
@@ -315,13 +315,13 @@ class TrajectoryReader:
 
     @property
     def checkpoint_frame(self) -> int:
-        """Number of frames up to and with the checkpoint's."""
+        """Number of frames up to and including the checkpoint."""
         slot = self.checkpoint_slot
         with undamaged(self.path):
             return int(self._file["checkpoint"][slot].attrs["frame"])
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """The last complete state, for `model.restore`."""
+        """Return the last complete state, for `model.restore`."""
         frame = self.checkpoint_frame
         if frame > len(self):
             raise TrajectoryError(f"{self.path}: the checkpoint is of frame {frame}, but there are {len(self)}")
@@ -331,31 +331,31 @@ class TrajectoryReader:
             return {name: value for name, value in all_arrays(group).items() if not name.startswith(f"{COUNTS}/")}
 
     def run_counts(self) -> dict[str, np.ndarray]:
-        """What the run had counted up to its checkpoint, by name; empty where the file has none."""
+        """Return counts of the run up to the checkpoint, by name; empty if the file has none."""
         with undamaged(self.path):
             group = self._file["checkpoint"][self.checkpoint_slot]
             check_seal(group, self.path)
             return all_arrays(group[COUNTS]) if COUNTS in group else {}
 
     def close(self) -> None:
-        """Closes the file; arrays already read stay."""
+        """Close the file; arrays already read stay valid."""
         self._file.close()
 
 
 def read_rods(path, frame: int = -1, world: int = 0, *, outside: bool = False) -> list[CurveSet]:
-    """Rods from an HDF5 file, of either kind.
+    """Return rods of an HDF5 file, a trajectory or a plain file.
 
     A trajectory gives one set for each batch of rods, at one frame (by default the last) of one world.
-    Any other file has at its root `points`, (R, n, 3) or (P, 3) [m]; with the latter `counts`, (R,); and it may have
-    `closed`, one flag or (R,), and `radius`, one value or (P,) [m].
+    A plain file has at its root `points`, (R, n, 3), or (P, 3) with `counts`, (R,) [m]. Optional are `closed`, one flag or (R,),
+    and `radius`, one value or (P,) [m].
 
     Args:
         path: The file.
-        frame, world: Of a trajectory; other files have one of each.
-        outside: Whether the file may have its data in other files; see `TrajectoryReader`.
+        frame, world: Frame and world of a trajectory; plain files have one of each.
+        outside: Whether the file may refer to other files; see `TrajectoryReader`.
 
     Raises:
-        CurveError, TrajectoryError: The file holds no rods, or none of that frame and world.
+        CurveError, TrajectoryError: The file holds no rods, or no such frame or world.
     """
     path, frame, world = existing(path), arguments.index("frame", frame), arguments.index("world", world)
     with undamaged(path), open_to_read(path) as file:
@@ -378,10 +378,10 @@ def read_rods(path, frame: int = -1, world: int = 0, *, outside: bool = False) -
 
 
 def _read_plain(file: h5py.File, path: Path) -> CurveSet:
-    points, *others = (
+    points, *optional = (
         _array(file[name]) if name in file else None for name in ("points", "counts", "closed", "radius")
     )
-    counts, closed, radius = others
+    counts, closed, radius = optional
     if counts is None and points.ndim != 3:
         raise CurveError(f"{path}: `points` has shape {points.shape} and there are no `counts`; add the points per rod")
     counts = np.full(points.shape[0], points.shape[1]) if counts is None else counts
@@ -400,7 +400,7 @@ def _by_batch(curves: Curves, points: np.ndarray, path: Path) -> list[CurveSet]:
 
 
 def _refuse_misfits(curves: Curves, surfaces: Surfaces | None, point_count: int) -> None:
-    """Raises a ValueError where rods or surfaces are not among the points."""
+    """Raise a ValueError if rods or surfaces do not fit the points."""
     rods, total = len(curves.counts), int(np.sum(curves.counts))
     fits = (curves.counts >= 0).all() and len(curves.radius) == total <= point_count
     fits = fits and {len(curves.closed), len(curves.names), len(curves.batch)} == {rods}
@@ -413,27 +413,27 @@ def _refuse_misfits(curves: Curves, surfaces: Surfaces | None, point_count: int)
 
 
 def _array(dataset: h5py.Dataset) -> np.ndarray:
-    """A dataset in memory; texts as str."""
+    """Read a dataset; texts as str."""
     _check_size(dataset)
     return dataset.asstr()[()].astype(str) if h5py.check_string_dtype(dataset.dtype) else dataset[()]
 
 
 def paths_of(group: h5py.Group) -> set[str]:
-    """Every dataset below a group, as its path from there."""
+    """Return the paths of all datasets below a group, relative to the group."""
     paths = set()
     group.visititems(lambda name, item: paths.update([name] if isinstance(item, h5py.Dataset) else []))
     return paths
 
 
 def all_arrays(group: h5py.Group) -> dict[str, np.ndarray]:
-    """Every dataset below a group, by its path from there."""
+    """Read all datasets below a group, by relative path."""
     arrays = {}
     group.visititems(lambda name, item: arrays.update({name: _array(item)} if isinstance(item, h5py.Dataset) else {}))
     return arrays
 
 
 def _plain(value):
-    """An attribute as a Python value; JSON is decoded where it is an object or a list."""
+    """Return an attribute as a Python value; JSON objects and lists are decoded."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, str) and value[:1] in {"{", "["}:

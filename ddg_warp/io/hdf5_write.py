@@ -1,4 +1,4 @@
-"""What `hdf5` writes: descriptions of a model, and rows of frames."""
+"""Writing of HDF5 groups: descriptions of a model, and rows of frames."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PAIR_CHUNK = 4096  # pairs in contact
 
 
 def write_attributes(group: h5py.Group, values: Mapping) -> None:
-    """Writes attributes; what is neither text nor a number as JSON."""
+    """Write attributes; values other than text and numbers as JSON."""
     for name, value in values.items():
         group.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value, default=str)
 
 
 def write_model(group: h5py.Group, model) -> None:
-    """Writes rods, surfaces, obstacles and parameters of a model."""
+    """Write rods, surfaces, obstacles and parameters of a model."""
     curves, parameters = group.create_group("curves"), group.create_group("parameters")
     for name in CURVE_FIELDS:
         overwrite(curves, name, np.asarray(getattr(model.curves, name)))
@@ -40,7 +40,7 @@ def write_model(group: h5py.Group, model) -> None:
 
 
 def write_control(group: h5py.Group, control: Mapping) -> None:
-    """Writes how a run is driven: arrays as datasets, everything else as attributes."""
+    """Write the options of a run: arrays as datasets, everything else as attributes."""
     arrays = {name: value for name, value in control.items() if isinstance(value, np.ndarray)}
     for name, value in arrays.items():
         overwrite(group, name, value)
@@ -48,17 +48,17 @@ def write_control(group: h5py.Group, control: Mapping) -> None:
 
 
 def extend_contacts(group: h5py.Group, frames: Sequence[Contacts], block: int) -> None:
-    """Appends the pairs of frames, one after the other, and where those of each frame end."""
+    """Append the pairs of frames, one after the other, and the end index of each frame."""
     last = group["ends"][-1] if "ends" in group and len(group["ends"]) else 0
-    ends = last + np.cumsum([len(found) for found in frames], dtype=np.int64)
+    ends = last + np.cumsum([len(contacts) for contacts in frames], dtype=np.int64)
     extend(group, "ends", ends, block, np.int64)
     for name, shape in FIELDS.items():
-        values = [np.zeros((0, *shape)), *(getattr(found, name) for found in frames)]
+        values = [np.zeros((0, *shape)), *(getattr(contacts, name) for contacts in frames)]
         extend(group, name, np.concatenate(values), PAIR_CHUNK, np.int64 if name in WHOLE else np.float64)
 
 
 def cut_contacts(group: h5py.Group, frame: int) -> None:
-    """Drops the pairs of the frames from `frame` on."""
+    """Drop the pairs of the frames from `frame` on."""
     last = int(group["ends"][frame - 1]) if frame else 0
     group["ends"].resize(frame, axis=0)
     for name in FIELDS:
@@ -66,7 +66,7 @@ def cut_contacts(group: h5py.Group, frame: int) -> None:
 
 
 def extend(group: h5py.Group, name: str, rows: np.ndarray, block: int, dtype=np.float64) -> None:
-    """Appends rows to a dataset, which is made if there is none.
+    """Append rows to a dataset, creating it on the first call.
 
     Chunks hold a power of two of rows, at most a block and about a mebibyte: a block of 64 then fills whole chunks. Each has a
     checksum, which every reader verifies.
@@ -84,7 +84,7 @@ def extend(group: h5py.Group, name: str, rows: np.ndarray, block: int, dtype=np.
 
 
 def overwrite(group: h5py.Group, name: str, value: np.ndarray) -> None:
-    """Writes a dataset, in place where one of the same kind exists."""
+    """Write a dataset, in place if one of the same shape and type exists."""
     if value.dtype.kind in "UO":
         value = value.astype(h5py.string_dtype())
     if name in group and (group[name].shape, group[name].dtype) == (value.shape, value.dtype):

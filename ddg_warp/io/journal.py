@@ -1,23 +1,26 @@
-"""Atomic changes to one file: all of a transaction's writes happen, or none, even if the process is killed.
+"""Atomic transactions on one file: all writes happen, or none, even if the process is killed.
 
 HDF5 updates its metadata in place, so that a process killed while a file is open for writing can leave it unreadable.
 Here HDF5 writes through a file object instead. Bytes beyond the old end go straight to the file, where nothing refers
-to them yet. Changes to older bytes stay in memory, as pages; at the end they are written to a journal beside the file,
-with a checksum, and only then to the file. A process killed
-    before the journal is complete    leaves the old content (and a tail that nothing refers to),
-    after it                          leaves a journal from which a reader, or the next writer, has the new content.
-This is redo logging as databases do it; appended data are written once, only the few changed pages twice.
+to them yet. Changes to older bytes stay in memory as pages. At the end they are written to a journal next to the file,
+with a checksum, and only then to the file. The content after a kill depends on the time:
 
-A journal belongs to one version of one file. Every transaction gives the file a new random token, at a place that stays; the journal
-names the place, both tokens and the size of the file before. Beside any other file, or another version of it, a journal is
-passed over by readers and refused by writers.
+    before the journal is complete    the old content (and a tail that nothing refers to),
+    after                             the new content, which a reader or the next writer takes from the journal.
 
-HDF5 does not survive a write that fails: objects that it could not flush crash the process when they are closed. So a write
-for which the disk has no room ends in memory, as if all were well, and the transaction fails once HDF5 has let go of the file.
+This is the redo log of databases; appended data are written once, only the few changed pages twice.
 
-A program that knows no journals sees the file inconsistent only while its changed pages are being written, some ten
-microseconds a transaction. To keep it so short, large data that are replaced, such as checkpoints, alternate between
-two places: the one not in use is declared `scratch` and written straight to the file.
+A journal belongs to one version of one file. Every transaction writes a new random token at a fixed offset of the file; the journal
+stores the offset, both tokens and the previous size of the file. A journal of another file or version is ignored by readers and
+refused by writers.
+
+HDF5 does not survive a write that fails: closing objects that it could not flush crashes the process. A write without room on
+the disk therefore goes to memory and reports success, and the transaction fails once HDF5 has closed the file.
+
+A program that ignores journals sees an inconsistent file only while changed pages are being written.
+
+Measured: some ten microseconds a transaction. To stay there, replaced large data such as checkpoints alternate between two groups:
+the group not in use is declared `scratch` and written straight to the file.
 """
 
 from __future__ import annotations
@@ -42,23 +45,23 @@ if TYPE_CHECKING:
 PAGE = 4096  # bytes
 MAGIC = b"ddgwal02"
 TOKEN = 16  # bytes of the token that names a version of a file
-# magic; `Version`: sizes before and after, place of the token, tokens before and after; number of pages
+# magic; `Version` (sizes before and after, offset of the token, tokens before and after), number of pages
 HEADER = struct.Struct(f"<8sQQQ{TOKEN}s{TOKEN}sQ")
 CHECKSUM = struct.Struct("<I")
-FORMAT = ("v110", "v110")  # of HDF5: checksums of metadata, read by HDF5 1.10 and later
+FORMAT = ("v110", "v110")  # of HDF5, with checksums of metadata; read by HDF5 1.10 and later
 Pages = dict[int, bytearray]
 
 
 class TrajectoryError(ValueError):
-    """A trajectory cannot be read or continued; the message names the file, what is wrong with it and the remedy."""
+    """A trajectory cannot be read or continued; the message names the file, the fault and the remedy."""
 
 
 class Version(NamedTuple):
-    """The version of a file that a journal belongs to, and the one that it makes of it.
+    """File version that a journal belongs to, and the version after replaying the journal.
 
     Attributes:
         before, size: Length before, and with the pages of the journal [bytes].
-        place: Where the token stands in the file; 0 where the file has none yet.
+        place: Offset of the token in the file [bytes]; 0 for a file without a token.
         token, next: The token before, and afterwards.
     """
 
@@ -70,13 +73,13 @@ class Version(NamedTuple):
 
 
 class PagedFile(io.RawIOBase):
-    """A file whose bytes below its initial end change only in memory, page by page.
+    """File with copy-on-write of existing bytes: changes to them stay in memory, page by page.
 
     Args:
         path: The file; it must exist.
         mode: "rb" or "r+b".
         pages: Content by page number that replaces the file's own.
-        size: Length of the file with those pages [bytes]; by default its length on disk.
+        size: Length of the file with `pages` [bytes]; by default its length on disk.
     """
 
     def __init__(self, path: Path, mode: str, pages: Pages | None = None, size: int | None = None):
@@ -86,9 +89,9 @@ class PagedFile(io.RawIOBase):
         self._limit = -(-self.size // PAGE) * PAGE
         self._position = 0
         self.scratch: list[tuple[int, int]] = []
-        """Ranges (start, stop) of old bytes whose content nobody needs: writes inside go straight to the file."""
+        """Ranges (start, stop) of old bytes with obsolete content: writes inside go straight to the file."""
         self.failure: OSError | None = None
-        """Why bytes are missing in the file: the first write that failed."""
+        """First write that failed, for which bytes are missing in the file."""
 
     def readable(self) -> bool:
         return True
@@ -134,7 +137,7 @@ class PagedFile(io.RawIOBase):
                 position += os.pwrite(self._file.fileno(), data[position - start :], position)
         except OSError as error:
             self.failure = error
-            self._limit, self.scratch = sys.maxsize, []  # from here on, all goes to memory
+            self._limit, self.scratch = sys.maxsize, []  # all further writes go to memory
             self._position = position
             return position - start + self.write(data[position - start :])
         self._position = stop
@@ -142,15 +145,15 @@ class PagedFile(io.RawIOBase):
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
-        """Sets the length that a commit gives the file; bytes on disk stay until then."""
+        """Set the length of the file after the commit; bytes on disk stay until then."""
         self.size = self._position if size is None else size
         return self.size
 
     def sync(self) -> None:
-        """Waits until the appended bytes are on the disk.
+        """Wait until the appended bytes are on the disk.
 
         Raises:
-            OSError: Some of them are not, because the disk is full or fails.
+            OSError: Bytes are missing, because the disk is full or fails.
         """
         if self.failure is not None:
             raise self.failure
@@ -161,7 +164,7 @@ class PagedFile(io.RawIOBase):
         super().close()
 
     def _on_disk(self, start: int, length: int) -> bytes:
-        """`length` bytes of the file from `start`; zeros beyond its end."""
+        """Return `length` bytes of the file from `start`; zeros beyond the end."""
         pieces, position = [], start
         while position < start + length:
             piece = os.pread(self._file.fileno(), start + length - position, position)
@@ -174,17 +177,16 @@ class PagedFile(io.RawIOBase):
 
 @contextmanager
 def transaction(path, scratch: str = "", new: bool = False) -> Iterator[h5py.File]:
-    """Opens an HDF5 file for changes that become part of it together, at the end, or not at all.
+    """Open an HDF5 file for changes that are committed together at the end, or not at all.
 
     Args:
         path: The file.
-        scratch: A group whose datasets nobody reads until this transaction is through; what is written to them stays
-            written even if it is not.
-        new: Whether to begin with an empty file, whatever was there.
+        scratch: A group with datasets that nobody reads before the commit; writes to them stay even if the transaction fails.
+        new: Whether to begin with an empty file, replacing an existing one.
 
     Raises:
         OSError: The disk is full, or fails; the file is as it was.
-        TrajectoryError: The file is a link, or the journal beside it belongs to another file.
+        TrajectoryError: The file is a link, or its journal belongs to another file.
     """
     import h5py
 
@@ -214,7 +216,7 @@ def transaction(path, scratch: str = "", new: bool = False) -> Iterator[h5py.Fil
 
 
 def no_link(path, flags: int) -> int:
-    """Descriptor of a file that is opened to be written, refused where the name is a link: its target may be anybody's."""
+    """Open a file for writing and return the descriptor; refuse a link, which may lead to a foreign file."""
     try:
         return os.open(path, flags | os.O_NOFOLLOW, 0o666)
     except OSError as error:
@@ -227,33 +229,33 @@ def no_link(path, flags: int) -> int:
 
 
 def _next_version(file: h5py.File, size: int) -> Version:
-    """The version of a file before a transaction; the file gets the token of the next one."""
+    """Return the version of a file before a transaction, and write the token of the next version to the file."""
     token = secrets.token_bytes(TOKEN)
     values = np.frombuffer(token, np.uint8)
     if "version" not in file:
         file.create_dataset("version", data=values)
         return Version(size, next=token)
-    found = file["version"]
-    before = found[:].tobytes()
-    found[...] = values
-    return Version(size, place=found.id.get_offset(), token=before, next=token)
+    dataset = file["version"]
+    before = dataset[:].tobytes()
+    dataset[...] = values
+    return Version(size, place=dataset.id.get_offset(), token=before, next=token)
 
 
 def _places(group: h5py.Group) -> list[tuple[int, int]]:
-    """Where in the file the values of the datasets below a group lie, (start, stop) in bytes."""
-    places = []
+    """Return the byte ranges (start, stop) of the datasets below a group."""
+    ranges = []
 
     def note(_, item) -> None:
         offset = item.id.get_offset() if hasattr(item, "shape") else None  # None: no values, or in chunks
         if offset is not None:
-            places.append((offset, offset + item.id.get_storage_size()))
+            ranges.append((offset, offset + item.id.get_storage_size()))
 
     group.visititems(note)
-    return places
+    return ranges
 
 
 def open_to_read(path) -> h5py.File:
-    """Opens an HDF5 file for reading, with the changes of a complete journal of it and without touching the disk."""
+    """Open an HDF5 file for reading, with the changes of its complete journal, without writing to the disk."""
     import h5py
 
     path = Path(path)
@@ -265,7 +267,7 @@ def open_to_read(path) -> h5py.File:
 
 
 def recover(path) -> None:
-    """Carries out what a complete journal holds; removes the journal.
+    """Replay a complete journal onto the file, and remove the journal.
 
     Raises:
         TrajectoryError: The journal belongs to another file, or to another version of it.
@@ -289,17 +291,17 @@ def recover(path) -> None:
 
 
 def _belongs(path: Path, version: Version) -> bool:
-    """Whether a journal is of this file, whose pages may have been written already, all or some."""
+    """Return True if a journal belongs to a file, even if its pages have been written already, all or some."""
     with open(path, "rb") as file:
         if os.fstat(file.fileno()).st_size < min(version.before, version.size):
             return False
         file.seek(version.place)
-        found = file.read(TOKEN) if version.place else version.token
-    return len(found) == TOKEN and all(a in pair for a, *pair in zip(found, version.token, version.next, strict=True))
+        token = file.read(TOKEN) if version.place else version.token
+    return len(token) == TOKEN and all(a in pair for a, *pair in zip(token, version.token, version.next, strict=True))
 
 
 def _runs(pages: Pages) -> list[tuple[int, bytearray]]:
-    """(first byte, content) of neighbouring pages taken together, so that few writes do it."""
+    """Return (first byte, content) of runs of neighbouring pages, to write with few calls."""
     runs: list[tuple[int, bytearray]] = []
     for page in sorted(pages):
         if runs and runs[-1][0] + len(runs[-1][1]) == page * PAGE:
@@ -326,7 +328,7 @@ def _write_journal(path: Path, version: Version, pages: Pages) -> None:
 
 
 def _read_journal(path: Path) -> tuple[Version, Pages] | None:
-    """(version of the file that it belongs to, pages), or None where there is no complete journal."""
+    """Return (version of the file, pages) of a journal, or None without a complete journal."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:

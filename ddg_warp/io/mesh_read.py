@@ -1,7 +1,7 @@
-"""Triangle meshes from OBJ and USD files.
+"""Reader of triangle meshes in OBJ and USD files.
 
-OBJ files know neither units nor which way is up: their numbers are taken as metres with z up. All objects and groups of an
-OBJ file are taken together; texture coordinates and normals are not read.
+OBJ files state neither units nor the up axis: numbers are taken as metres with z up. All objects and groups of an OBJ file form
+one mesh; texture coordinates and normals are not read.
 Source: B1. Object Files, Advanced Visualizer manual, Wavefront Technologies (statements v, f, o, g; line continuation).
 """
 
@@ -18,7 +18,7 @@ from ddg_warp.errors import SceneWarning
 from ddg_warp.geometry import polygons
 from ddg_warp.io import MeshError, existing, shown
 
-BEYOND = 2**31  # a vertex that no file has, for any larger number
+BEYOND = 2**31  # a vertex index that no file has; larger numbers are clipped to it
 USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
 
 
@@ -27,15 +27,15 @@ def read_mesh(
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
 
-    Polygons that are not convex are cut by ears in their plane, others into fans from their first corner. Vertices that no face uses
-    are dropped, with a `SceneWarning`. `Surface` checks what comes back.
+    Convex polygons are cut into fans from the first corner, others by ear clipping. Vertices that no face uses are dropped, with a
+    `SceneWarning`. `Surface` checks the topology of the result.
 
     Args:
         path: A .obj, .usd, .usda, .usdc or .usdz file.
-        prim: For USD, path of the Mesh prim, or of one above it; needed where the file has several meshes.
-        weld: Vertices within this distance [m] of each other become one, as seams of exported files need; None keeps all.
-        outside: For USD, whether layers, references and payloads out of the folder of the file may be opened. An OBJ file is read
-            alone: files that it names (mtllib) are never opened.
+        prim: For USD, path of the Mesh prim, or of an ancestor; needed if the file has several meshes.
+        weld: Vertices within this distance [m] of each other become one, for seams of exported files; None keeps all.
+        outside: For USD, whether layers, references and payloads outside the folder of the file may be opened. Files that an OBJ
+            file names (mtllib) are never opened.
 
     Raises:
         MeshError: the file cannot be read; names the file, the line or prim, and the remedy.
@@ -45,11 +45,11 @@ def read_mesh(
 
     path = existing(path)
     points, triangles, name = _read(path, prim, arguments.flag("read_mesh: outside", outside))
-    used, told = meshes.drop_unused(points, triangles), len(points)
-    if len(used[0]) < told:
-        first = np.argmin(np.isin(np.arange(told), triangles))
+    used, count = meshes.drop_unused(points, triangles), len(points)
+    if len(used[0]) < count:
+        first = np.argmin(np.isin(np.arange(count), triangles))
         warnings.warn(
-            f"{path}: {told - len(used[0])} of {told} vertices are dropped, the first of them {first}: no face uses them",
+            f"{path}: {count - len(used[0])} of {count} vertices are dropped, the first of them {first}: no face uses them",
             SceneWarning,
             stacklevel=2,
         )
@@ -71,23 +71,23 @@ def _read(path: Path, prim: str | None, outside: bool) -> tuple[np.ndarray, np.n
 def triangulated(
     points: np.ndarray, counts: np.ndarray, indices: np.ndarray, where: str, lines: list[int] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(triangles (T, 3), face of each triangle (T,)): convex faces as fans from their first corner, others by ears in their plane.
+    """Return (triangles (T, 3), face of each triangle (T,)): fans for convex faces, ear clipping for others.
 
     Args:
         points: (P, 3).
         counts: Corners of each face, shape (F,).
         indices: Points of the corners, face after face.
-        where: What messages begin with.
-        lines: Line in which each face stands, for messages that name lines instead of faces.
+        where: Begin of messages.
+        lines: Line of each face, for messages that name lines instead of faces.
     """
 
-    def place(face: int) -> str:
+    def name_of(face: int) -> str:
         return f"{where}: face {face}" if lines is None else f"{where}:{lines[face]}: the face"
 
     if not len(counts):
         raise MeshError(f"{where}: there is not a single face; export the mesh with its faces")
     for face in np.flatnonzero(counts < 3)[:1]:
-        raise MeshError(f"{place(face)} has {counts[face]} corners; a face has at least 3, so delete it")
+        raise MeshError(f"{name_of(face)} has {counts[face]} corners; a face has at least 3, so delete it")
     if counts.sum() != len(indices):
         raise MeshError(
             f"{where}: the faces have {counts.sum()} corners, but {len(indices)} are listed; export it again"
@@ -95,7 +95,7 @@ def triangulated(
     for corner in np.flatnonzero((indices < 0) | (indices >= len(points)))[:1]:
         face = np.searchsorted(np.cumsum(counts), corner, side="right")
         raise MeshError(
-            f"{place(face)} has a corner at a vertex that does not exist, there are {len(points)}; correct it"
+            f"{name_of(face)} has a corner at a vertex that does not exist, there are {len(points)}; correct it"
         )
     for vertex in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
         raise MeshError(f"{where}: vertex {vertex} is not finite; re-export it or delete it")
@@ -107,18 +107,18 @@ def triangulated(
         same = np.flatnonzero(counts == count)
         corners = indices[(np.cumsum(counts) - counts)[same][:, None] + np.arange(count)]
         for number in np.flatnonzero(~fans_suit(points[corners])):
-            found, fault = polygons.triangulate(points[corners[number]])
+            local, fault = polygons.triangulate(points[corners[number]])
             if fault:
                 line = "" if lines is None else f":{lines[same[number]]}"
                 raise MeshError(
                     f"{where}{line}: face {same[number]} with {count} corners {fault}; cut it into triangles, or correct it"
                 )
-            triangles[face == same[number]] = corners[number][found]
+            triangles[face == same[number]] = corners[number][local]
     return triangles, face
 
 
 def fans_suit(corners: np.ndarray) -> np.ndarray:
-    """Whether fans from the first corners of faces (F, n, 3) are good triangles of them (F,)."""
+    """Return (F,) bool: True for faces (F, n, 3) that fans from the first corner triangulate well."""
     steps = np.diff(corners, axis=1)[:, 1:], (corners[:, 1:] - corners[:, :1])[:, :-1]
     vectors, normals = np.cross(steps[1], steps[0]), polygons.area_vectors(corners)[:, None]
     sizes = np.linalg.norm(vectors, axis=-1) * np.linalg.norm(normals, axis=-1)
@@ -138,7 +138,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
                 corners = [int(word.partition("/")[0]) for word in words]
                 if 0 in corners:
                     raise MeshError(f"{path}:{number}: the face names vertex 0; an OBJ file counts from 1, correct it")
-                # what is negative counts back from the last vertex so far
+                # negative indices count back from the last vertex so far
                 indices += [min(k - 1, BEYOND) if k > 0 else max(len(points) + k, -1) for k in corners]
                 counts.append(len(corners))
                 lines.append(number)
@@ -156,7 +156,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
 
 
 def _statements(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """(number of the first line, words) of every statement; comments are gone, lines that end with \\ are joined."""
+    """Yield (number of the first line, words) of every statement, without comments; lines ending in \\ are joined."""
     pending: list[str] = []
     start = 0
     with open(path, encoding="utf-8-sig", errors="replace") as file:

@@ -1,4 +1,4 @@
-"""Obstacles as surfaces to look at: what writers and pictures show of bodies that nothing bends."""
+"""Obstacles as surfaces, for writers and pictures."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ddg_warp.io import Curves
 from ddg_warp.io.revolve import Revolution
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 
-BEYOND = 0.25  # of the size of what else is there, by which planes are shown beyond it
+BEYOND = 0.25  # margin of displayed planes around all other objects, over their size
 CELLS = 12  # along each side of a plane
-DIVISIONS = 3  # of the triangles of a ball
-AROUND, ALONG = 32, 8  # corners around a capsule, and edges from an end's pole to its side
-SHARP = np.cos(np.radians(35.0))  # between a triangle and the normal at its corner, above which surfaces look smooth
+DIVISIONS = 3  # subdivisions of an icosahedron for a ball
+AROUND, ALONG = 32, 8  # corners around a capsule, and edges from the pole of an end to the side
+SHARP = np.cos(np.radians(35.0))  # cosine between a triangle and the vertex normal above which shading is smooth
 
 
 @dataclass(frozen=True)
 class Obstacles:
-    """Obstacles of a model, and where their nodes make them stand; see `model.obstacles`.
+    """Obstacles of a model as surfaces that follow their nodes; see `model.obstacles`.
 
-    A plane has three nodes, its point and two 1 m from there along directions in it, and is shown as a rectangle; a ball has its
-    center, a capsule both ends of its line, a mesh its vertices, shown without its thickness.
+    A plane has three nodes, its point and two more 1 m away along in-plane directions, and is shown as a rectangle. A ball has its
+    center, a capsule both ends of its axis, a mesh its vertices, shown without thickness.
 
     Attributes:
-        names, kinds: Of each obstacle, shape (K,), str; kinds as in `scene.obstacles`.
-        radius: Of each [m], shape (K,).
-        counts: Nodes of each, shape (K,), int.
-        moved: Whether something moves it, shape (K,), bool.
-        rest: Nodes of all where they are at rest [m], shape (N, 3).
-        spans: From where to where planes are shown along both directions [m], shape (K, 4); 0 of others.
-        sizes: Triangles of each mesh, shape (K,), int; 0 of others.
-        triangles: Of all meshes, nodes counted from the first of each, shape (T, 3), int.
+        names, kinds: Name and kind of each obstacle, shape (K,), str; kinds as in `scene.obstacles`.
+        radius: Radius of each [m], shape (K,).
+        counts: Number of nodes of each, shape (K,), int.
+        moved: Whether an obstacle moves, shape (K,), bool.
+        rest: Nodes of all obstacles at rest [m], shape (N, 3).
+        spans: Displayed range of planes along both directions [m], shape (K, 4); 0 for other kinds.
+        sizes: Number of triangles of each mesh, shape (K,), int; 0 for other kinds.
+        triangles: Triangles of all meshes, nodes counted from the first of each mesh, shape (T, 3), int.
     """
 
     names: np.ndarray
@@ -51,14 +51,14 @@ class Obstacles:
 
     @classmethod
     def of(cls, obstacles, points: np.ndarray) -> Obstacles:
-        """Those of a scene, of which planes are shown where something else is.
+        """Return the obstacles of a scene, with planes displayed around all other objects.
 
         Args:
             obstacles: `scene.obstacles`.
-            points: Positions of what else is there [m], shape (P, 3).
+            points: Positions of rods and shells [m], shape (P, 3).
         """
         shapes = [each.shape for each in obstacles]
-        others = np.concatenate([points, *(_box(shape) for shape in shapes if shape.kind != PLANE)])
+        surroundings = np.concatenate([points, *(_box(shape) for shape in shapes if shape.kind != PLANE)])
         solid = [shape.cells if shape.kind == MESH else np.zeros((0, 3), int) for shape in shapes]
         return cls(
             names=np.array([each.name for each in obstacles], object),
@@ -67,7 +67,7 @@ class Obstacles:
             counts=np.array([len(shape.points) for shape in shapes]),
             moved=np.array([each.motion is not None for each in obstacles]),
             rest=np.concatenate([shape.points for shape in shapes]),
-            spans=np.array([_span(shape.points, others) if shape.kind == PLANE else np.zeros(4) for shape in shapes]),
+            spans=np.array([_span(shape.points, surroundings) if shape.kind == PLANE else np.zeros(4) for shape in shapes]),
             sizes=np.array([len(cells) for cells in solid]),
             triangles=np.concatenate(solid),
         )
@@ -77,16 +77,16 @@ class Obstacles:
 
     @property
     def moving(self) -> np.ndarray:
-        """Which nodes are of obstacles that something moves, shape (N,), bool."""
+        """Mask of nodes of moving obstacles, shape (N,), bool."""
         return np.repeat(self.moved, self.counts)
 
     def rows(self, k: int) -> slice:
-        """The nodes of an obstacle among those that move."""
+        """Return the nodes of an obstacle among all moving nodes."""
         first = int(self.counts[:k][self.moved[:k]].sum())
         return slice(first, first + int(self.counts[k]))
 
     def cells(self, k: int) -> np.ndarray:
-        """Triangles of an obstacle among the points that `points` gives, shape (t, 3), seen counter-clockwise from outside."""
+        """Return triangles of an obstacle among its `points`, shape (t, 3), counter-clockwise seen from outside."""
         kind = self.kinds[k]
         if kind == PLANE:
             return _square()[1]
@@ -97,12 +97,12 @@ class Obstacles:
         return self._meshes[k][1]
 
     def points(self, k: int, nodes: np.ndarray | None = None) -> np.ndarray:
-        """Points of an obstacle's surface [m], shape (p, 3), with its nodes (n, 3) [m]; by default at rest."""
+        """Return points of an obstacle's surface [m], shape (p, 3), for its nodes (n, 3) [m]; by default at rest."""
         kind = self.kinds[k]
         nodes = self._rest(k) if nodes is None else np.asarray(nodes, float)
         if kind == PLANE:
-            (low, high, left, right), place = self.spans[k], _square()[0][:, :2]
-            return nodes[0] + ([low, left] + place * [high - low, right - left]) @ (nodes[1:] - nodes[0])
+            (low, high, left, right), unit_square = self.spans[k], _square()[0][:, :2]
+            return nodes[0] + ([low, left] + unit_square * [high - low, right - left]) @ (nodes[1:] - nodes[0])
         if kind == BALL:
             return nodes[0] + self.radius[k] * _ball()[0]
         if kind == CAPSULE:
@@ -110,10 +110,10 @@ class Obstacles:
         return nodes[self._meshes[k][0]]
 
     def surface(self, moved: np.ndarray | None = None, chosen=None) -> tuple[np.ndarray, np.ndarray]:
-        """Points [m], (p, 3), and triangles, (t, 3), of some obstacles (K,) bool, by default of all.
+        """Return points [m], (p, 3), and triangles, (t, 3), of the chosen obstacles (K,) bool, by default of all.
 
         Args:
-            moved: Nodes of all obstacles that something moves [m], shape (M, 3), in one world; by default at rest.
+            moved: Nodes of all moving obstacles [m], shape (M, 3), in one world; by default at rest.
         """
         points, cells, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
         for k in np.flatnonzero(np.ones(len(self), bool) if chosen is None else chosen):
@@ -129,32 +129,32 @@ class Obstacles:
 
     @cached_property
     def _meshes(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of each mesh the nodes that are its points, and triangles among these, with corners of their own where edges are sharp."""
+        """Display nodes and triangles of each mesh; with sharp edges every triangle has its own corners."""
         parts = []
-        for k, own in enumerate(np.split(self.triangles, np.cumsum(self.sizes)[:-1])):
-            if not len(own):
-                parts.append((own.ravel(), own))
+        for k, triangles in enumerate(np.split(self.triangles, np.cumsum(self.sizes)[:-1])):
+            if not len(triangles):
+                parts.append((triangles.ravel(), triangles))
                 continue
-            surface, rest = SimpleNamespace(triangles=own), self._rest(k)
-            cosine = np.einsum("tci,ti->tc", vertex_normals(surface, rest)[own], face_normals(surface, rest))
+            surface, rest = SimpleNamespace(triangles=triangles), self._rest(k)
+            cosine = np.einsum("tci,ti->tc", vertex_normals(surface, rest)[triangles], face_normals(surface, rest))
             sharp = (cosine < SHARP).any()
-            each = np.arange(own.size).reshape(-1, 3)
-            parts.append((own.ravel(), each) if sharp else (np.arange(len(rest)), own))
+            each = np.arange(triangles.size).reshape(-1, 3)
+            parts.append((triangles.ravel(), each) if sharp else (np.arange(len(rest)), triangles))
         return parts
 
     def _around(self, k: int, ends: np.ndarray) -> np.ndarray:
-        """Points of a capsule, which turns as little as possible from where it is at rest."""
-        before, now = (polyline.unit((line[1] - line[0])[None]) for line in (self._rest(k), ends))
-        first = polyline.unit(np.cross(before, np.eye(3)[np.argmin(np.abs(before))]))
-        first = polyline.transport(first, before, now) if polyline.dot(before, now)[0] > -1.0 + 1e-9 else first
-        frame = np.concatenate([first, np.cross(now, first), now])
+        """Return points of a capsule, rotated by parallel transport of its axis from rest."""
+        rest_axis, axis = (polyline.unit((line[1] - line[0])[None]) for line in (self._rest(k), ends))
+        first = polyline.unit(np.cross(rest_axis, np.eye(3)[np.argmin(np.abs(rest_axis))]))
+        first = polyline.transport(first, rest_axis, axis) if polyline.dot(rest_axis, axis)[0] > -1.0 + 1e-9 else first
+        frame = np.concatenate([first, np.cross(axis, first), axis])
         directions, second, _ = _capsule()
         return ends[second.astype(int)] + self.radius[k] * directions @ frame
 
 
 @cache
 def _square() -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of a square of side 1, small enough to be sorted by their depth in pictures."""
+    """Return points and triangles of a square of side 1, small enough for depth sorting in pictures."""
     return meshes.rectangle(CELLS, CELLS)
 
 
@@ -166,7 +166,7 @@ def _ball() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _capsule() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of a capsule along z: directions from its ends (p, 3), whether from the second end (p,), triangles."""
+    """Return directions from the ends of a capsule along z (p, 3), mask of the second end (p,), and triangles."""
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * ALONG + 1)
     angle = np.concatenate([angle[: ALONG + 1], angle[ALONG:]])
     meridian = np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
@@ -179,12 +179,12 @@ def _capsule() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _box(shape) -> np.ndarray:
-    """Two corners of a box around a shape [m]."""
+    """Return both corners of the bounding box of a shape [m]."""
     return np.array([shape.points.min(0) - shape.radius, shape.points.max(0) + shape.radius])
 
 
 def _span(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """From where to where a plane is shown along both of its directions [m]: where the points are, and some way beyond."""
+    """Return the displayed range of a plane along both directions [m]: the range of the points plus a margin."""
     along = (points - nodes[0]) @ (nodes[1:] - nodes[0]).T
     low, high = along.min(0), along.max(0)
     beyond = BEYOND * np.ptp(points, axis=0).max()

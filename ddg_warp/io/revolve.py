@@ -1,4 +1,4 @@
-"""Curves turned about the z axis: surfaces of revolution from the meridians of axisymmetric shells."""
+"""Surfaces of revolution about the z axis, from the meridians of axisymmetric shells."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ddg_warp.io import CurveError, Curves, Shapes, Surfaces
 
 
 class Revolution:
-    """Surfaces that curves in the plane of x and z sweep around the z axis.
+    """Surfaces swept by curves in the plane of x and z around the z axis.
 
     Args:
         curves: Open curves, such as a trajectory's.
-        points: Their points at some time [m], shape (P, 3); points on the axis are poles.
+        points: Points of the curves at some time [m], shape (P, 3); points on the axis are poles.
         sides: Corners of each ring, three at least.
 
     Attributes:
-        shapes: The surfaces as what a writer of USD takes.
+        shapes: The surfaces as `Shapes`, for writers.
     """
 
     def __init__(self, curves: Curves, points: np.ndarray, sides: int):
@@ -40,17 +40,17 @@ class Revolution:
         self.shapes = Shapes(no_curves, none, surfaces, sides * starts[-1], 1)
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """Points of the surfaces (P sides, 3), ring after ring, from those of the curves (P, 3)."""
+        """Return points of the surfaces (P sides, 3), ring after ring, from points of the curves (P, 3)."""
         x, _, z = points[:, :, None].transpose(1, 0, 2)
         cos, sin = np.cos(self._angle), np.sin(self._angle)
         return np.stack([x * cos, x * sin, z + 0.0 * cos], axis=-1).reshape(-1, 3)
 
     def _strips(self, rows: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Two triangles for each side of each edge, one at poles; normals to the left of the curve."""
+        """Return two triangles for each side of each edge, one at poles; normals to the left of the curve."""
         sides = len(self._angle)
-        here = rows[:-1, None] * sides + np.arange(sides)
-        beside = rows[:-1, None] * sides + (np.arange(sides) + 1) % sides
-        lower = np.stack([here, here + sides, beside + sides], -1)
-        upper = np.stack([here, beside + sides, beside], -1)
+        corner = rows[:-1, None] * sides + np.arange(sides)
+        next_corner = rows[:-1, None] * sides + (np.arange(sides) + 1) % sides
+        lower = np.stack([corner, corner + sides, next_corner + sides], -1)
+        upper = np.stack([corner, next_corner + sides, next_corner], -1)
         off = points[rows, 0] != 0.0
         return np.concatenate([lower[off[1:]].reshape(-1, 3), upper[off[:-1]].reshape(-1, 3)])

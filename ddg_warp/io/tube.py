@@ -1,4 +1,4 @@
-"""A closed tube of polygons around each rod, for programs that draw no curves or drop their materials."""
+"""Closed polygon tubes around rods, for programs without curves or curve materials."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ SIDES = 10
 
 
 def tube_faces(counts: np.ndarray, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Faces of the tubes, seen counter-clockwise from outside.
+    """Return the faces of the tubes, counter-clockwise seen from outside.
 
     Point p of the rods has the mesh vertices SIDES p ... SIDES p + SIDES - 1, see `tube_points`.
 
@@ -31,7 +31,7 @@ def tube_faces(counts: np.ndarray, closed: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def tube_points(points: np.ndarray, counts: np.ndarray, closed: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Vertices of the tubes [m], shape (SIDES P, 3): a ring around each point, turning as little as possible.
+    """Return the vertices of the tubes [m], shape (SIDES P, 3): a ring around each point, parallel-transported.
 
     Args:
         points: Positions of the rods [m], shape (P, 3).
@@ -48,7 +48,7 @@ def tube_points(points: np.ndarray, counts: np.ndarray, closed: np.ndarray, radi
 
 
 def _edges(counts: np.ndarray, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(first point, second point) of every edge, rod after rod."""
+    """Return (first point, second point) of every edge, rod after rod."""
     last = np.cumsum(counts) - 1
     start = np.delete(np.arange(counts.sum()), last[~closed])
     after = np.arange(counts.sum()) + 1
@@ -57,7 +57,7 @@ def _edges(counts: np.ndarray, closed: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _tangents(points: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Mean direction of the edges at each point, shape (P, 3), of length 1."""
+    """Return the mean direction of the edges at each point, shape (P, 3), of length 1."""
     start, end = _edges(counts, closed)
     direction = _unit(points[end] - points[start])
     tangents = np.zeros_like(points)
@@ -67,28 +67,28 @@ def _tangents(points: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> np.
 
 
 def _transported(tangents: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """A normal at each point, shape (P, 3), parallel-transported from the first point of its rod.
+    """Return a normal at each point, shape (P, 3), parallel-transported from the first point of the rod.
 
-    The angle that a closed rod's normals are off after one turn is spread over its points.
+    The holonomy of a closed rod is distributed evenly over its points.
     """
     first = np.cumsum(counts) - counts
     normals = np.zeros_like(tangents)
     axis = np.eye(3)[np.argmin(np.abs(tangents[first]), axis=1)]
     normals[first] = _unit(np.cross(tangents[first], axis))
     for step in range(1, counts.max()):
-        here = first[counts > step] + step
-        normals[here] = _carried(normals[here - 1], tangents[here - 1], tangents[here])
+        index = first[counts > step] + step
+        normals[index] = _carried(normals[index - 1], tangents[index - 1], tangents[index])
     last = first + counts - 1
     back = _carried(normals[last], tangents[last], tangents[first])
     sine = np.einsum("ij,ij->i", np.cross(back, normals[first]), tangents[first])
     excess = np.where(closed, np.arctan2(sine, np.einsum("ij,ij->i", back, normals[first])), 0.0)
-    share = (np.arange(len(tangents)) - np.repeat(first, counts)) / np.repeat(counts, counts)
-    angle = (np.repeat(excess, counts) * share)[:, None]
+    fraction = (np.arange(len(tangents)) - np.repeat(first, counts)) / np.repeat(counts, counts)
+    angle = (np.repeat(excess, counts) * fraction)[:, None]
     return np.cos(angle) * normals + np.sin(angle) * np.cross(tangents, normals)
 
 
 def _carried(normal: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """`normal` turned with the smallest rotation that takes the unit vector `before` to `after`, each (k, 3)."""
+    """Return the parallel transport of `normal` from the unit vector `before` to `after`, each (k, 3)."""
     axis = np.cross(before, after)
     cosine = np.einsum("ij,ij->i", before, after)[:, None]
     along = np.einsum("ij,ij->i", axis, normal)[:, None] / np.maximum(1.0 + cosine, 1e-12)
