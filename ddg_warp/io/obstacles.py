@@ -67,7 +67,9 @@ class Obstacles:
             counts=np.array([len(shape.points) for shape in shapes]),
             moved=np.array([each.motion is not None for each in obstacles]),
             rest=np.concatenate([shape.points for shape in shapes]),
-            spans=np.array([_span(shape.points, surroundings) if shape.kind == PLANE else np.zeros(4) for shape in shapes]),
+            spans=np.array(
+                [_span(shape.points, surroundings) if shape.kind == PLANE else np.zeros(4) for shape in shapes]
+            ),
             sizes=np.array([len(cells) for cells in solid]),
             triangles=np.concatenate(solid),
         )
@@ -129,7 +131,7 @@ class Obstacles:
 
     @cached_property
     def _meshes(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Display nodes and triangles of each mesh; with sharp edges every triangle has its own corners."""
+        """Displayed nodes and triangles of each mesh; with sharp edges every triangle has its own corners."""
         parts = []
         for k, triangles in enumerate(np.split(self.triangles, np.cumsum(self.sizes)[:-1])):
             if not len(triangles):
@@ -160,7 +162,7 @@ def _square() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _ball() -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of a ball of radius 1."""
+    """Return points and triangles of a ball of radius 1."""
     return meshes.sphere(DIVISIONS)
 
 

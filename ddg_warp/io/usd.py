@@ -1,11 +1,12 @@
-"""USD: recorded rods and surfaces out. `read_curves` and `validate` are here too, for one import.
+"""Writer of recorded rods and surfaces to USD, exported together with `read_curves` and `validate`.
 
-All rods of a batch (of one name and one material) stand in one prim below /World, with a preview surface of its own: a linear
-BasisCurves, or a Mesh of tubes for programs that draw no curves or drop their materials. Every surface and every obstacle is a
-Mesh of its own, contact is Points. z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
-USD saves a file in place, over its old table of contents, so that a process killed meanwhile leaves it unreadable.
-The stage therefore lives in a file `NAME.partial.usdc`; after each save a copy of it takes the final name in one step.
-USD does not survive a full disk either. Before each save the room is taken that it can need at most, and given back.
+All rods of a batch (of one name and one material) form one prim below /World, with its own preview surface. The prim is a linear
+BasisCurves, or a Mesh of tubes for programs without curves or curve materials. Every surface and every obstacle is one
+Mesh, contact is Points. z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
+
+USD saves a file over its old table of contents: a process killed meanwhile leaves it unreadable. The stage is therefore
+saved to `NAME.partial.usdc`, and a copy of it replaces the final file atomically after each save.
+USD does not survive a full disk either. Before each save its largest size is allocated on the disk and released.
 """
 
 from __future__ import annotations
@@ -30,26 +31,26 @@ from ddg_warp.io.usd_read import read_curves
 
 __all__ = ["CurvesWriter", "read_curves", "validate"]
 
-ROOM = 2**16  # bytes that a save can need beside what it has to write
-TABLE = 256  # bytes at most that the table of contents has for a frame of a prim
-TEXT = 4  # bytes of text for a byte of numbers, at most
-GROWTH = 8  # saves are at least an eighth of the recording apart, which bounds what their copies cost
+ROOM = 2**16  # bytes of overhead of a save
+TABLE = 256  # largest table entry for a frame of a prim [bytes]
+TEXT = 4  # largest number of bytes of text for a byte of numbers
+GROWTH = 8  # saves are at least an eighth of the recording apart, which bounds the cost of copies
 
 
 class CurvesWriter:
-    """Writes frames of rods and surfaces to a USD file.
+    """Writer of frames of rods and surfaces to a USD file.
 
     Args:
         path: The file, .usdc or .usda; an existing one is replaced.
         curves: Rods without points, such as `model.curves`, or a `CurveSet`; or `Shapes` of rods and surfaces.
         fps: Time codes per second.
-        colors: RGB of each rod, shape (R, 3), or of each of their points; by default one color a batch.
-        color_by: Name of a scalar that gives the color instead, and its values at the two ends of the scale.
+        colors: RGB of each rod, shape (R, 3), or of each rod point; by default one color a batch.
+        color_by: Name of a scalar shown by color instead, and its values at both ends of the scale.
         tube: Whether to write tubes instead of curves.
-        attributes: Values of each rod by name, shape (R,), of a world: numbers or texts, such as the ids and groups of a groom.
+        attributes: Values of each rod of a world by name, shape (R,): numbers or texts, such as ids and groups of a groom.
         block: Frames between two saves, at least; a killed process leaves the frames saved last.
-        obstacles: What rods and surfaces touch, such as `model.obstacles`; those that something moves once a world.
-        touching: What recordings of contact need to know, where frames come with contacts.
+        obstacles: Obstacles, such as `model.obstacles`; moving obstacles are written once a world.
+        touching: Names and typical scales of contact, for frames with contacts.
     """
 
     def __init__(
@@ -115,26 +116,26 @@ class CurvesWriter:
         obstacles: np.ndarray | None = None,
         contacts: Contacts | None = None,
     ) -> None:
-        """Adds a frame.
+        """Write a frame.
 
         Args:
-            time: Time [s], later than those before.
+            time: Time [s], later than the frames before.
             points: Positions [m], shape (P, 3).
             velocities: Velocities [m/s], shape (P, 3).
             scalars: Values at the points by name, each of shape (P,), or vectors (P, 3), written unchanged as primvars.
             triangle_scalars: Values of the triangles of all surfaces by name, each of shape (T,), likewise.
-            obstacles: Nodes of obstacles that something moves [m], shape (M, 3), world after world.
-            contacts: What touches.
+            obstacles: Nodes of moving obstacles [m], shape (M, 3), world after world.
+            contacts: Contacts of the frame.
 
         Raises:
-            CurveError: The time code is that of a frame before, or the points are not as many as the curves have.
+            CurveError: The time code is not later than the frame before, or the number of points is wrong.
         """
         time, points = arguments.number("CurvesWriter: time", time), np.asarray(points)
         if points.shape != (self._rows, 3):
             raise CurveError(
                 f"{self.path}: points have shape {points.shape}, not ({self._rows}, 3); give those of all curves"
             )
-        code = Usd.TimeCode(float(f"{time * self._fps:.12g}"))  # of whole numbers, as frames have
+        code = Usd.TimeCode(float(f"{time * self._fps:.12g}"))  # rounded, so that frames have whole numbers
         if self._frames and code.GetValue() <= self._stage.GetEndTimeCode():
             raise CurveError(
                 f"{self.path}: a frame at {time} s has no later time code than the one before, at {self._fps} a second; write frames "
@@ -151,7 +152,7 @@ class CurvesWriter:
             self.save()
 
     def save(self) -> None:
-        """Gives the final file all frames so far.
+        """Write all frames so far to the final file.
 
         Raises:
             OSError: The disk is full; the final file stays as it was.
@@ -168,7 +169,7 @@ class CurvesWriter:
         self._saved = self._frames
 
     def close(self) -> None:
-        """Saves what is left and lets go of the stage."""
+        """Save the remaining frames and close the stage."""
         if self._stage is not None:
             self._save_stage(copies=0)
             self._prims, self._stage = [], None
@@ -178,14 +179,14 @@ class CurvesWriter:
                 self._partial.unlink(missing_ok=True)
 
     def abandon(self) -> None:
-        """Lets go of the stage; the final file keeps the frames saved last."""
+        """Close the stage without saving; the final file keeps the frames saved last."""
         self._prims, self._stage = [], None
         self._partial.unlink(missing_ok=True)
 
     def _save_stage(self, copies: int) -> None:
-        """Saves the stage to its own file, once there is room for it and for copies of it.
+        """Save the stage to the partial file, if the disk has room for it and for copies.
 
-        USD appends new values and writes its tables anew.
+        USD appends new values and rewrites its tables.
         """
         unsaved = self._unsaved + sum(prim.unsaved for prim in self._prims)
         growth = ROOM + unsaved + TABLE * self._frames * len(self._prims)
@@ -206,7 +207,7 @@ class CurvesWriter:
 
 
 def _size_of_defaults(stage: Usd.Stage) -> int:
-    """Bytes of the arrays that do not change with time."""
+    """Return the size of arrays that do not change with time [bytes]."""
     values = (attribute.Get() for prim in stage.Traverse() for attribute in prim.GetAuthoredAttributes())
     return sum(
         memoryview(value).nbytes for value in values if isinstance(value, Vt.FloatArray | Vt.IntArray | Vt.Vec3fArray)
@@ -214,7 +215,7 @@ def _size_of_defaults(stage: Usd.Stage) -> int:
 
 
 def _take_room(path: Path, size: int) -> None:
-    """Raises an OSError, of `path`, where no file of so many bytes fits beside it."""
+    """Raise an OSError of `path` if the disk has no room for `size` bytes."""
     trial = path.with_name(f"{path.stem}.room{path.suffix}")
     try:
         trial.unlink(missing_ok=True)
@@ -234,7 +235,7 @@ def _drawable(curves) -> Shapes:
 
 
 def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attributes: Mapping) -> list[PointsPrim]:
-    """One prim for each batch; two where it has open and closed rods, because USD wraps all curves of a prim alike."""
+    """Define one prim for each batch; two for open and closed rods, because USD wraps all curves of a prim alike."""
     curves = shapes.curves
     if colors is not None and len(colors) == len(curves.counts):
         colors = np.repeat(colors, curves.counts, axis=0)
@@ -254,7 +255,7 @@ def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attri
 
 
 def _define_surfaces(stage: Usd.Stage, shapes: Shapes, color_by) -> list[PointsPrim]:
-    """One prim for each surface, in the colors that follow those of the rods."""
+    """Define one prim for each surface, with colors after the rods' colors in the palette."""
     surfaces, batches = shapes.surfaces, len(np.unique(shapes.curves.batch))
     of_a_world = len(surfaces.names) // shapes.worlds
     prims = []
@@ -265,7 +266,7 @@ def _define_surfaces(stage: Usd.Stage, shapes: Shapes, color_by) -> list[PointsP
 
 
 def _free_path(stage: Usd.Stage, name: str) -> str:
-    """A path below /World from a name, with a number if it is taken."""
+    """Return a path below /World from a name, with a number if it is taken."""
     base = path = f"/World/{Tf.MakeValidIdentifier(name)}"
     number = 1
     while stage.GetPrimAtPath(path):

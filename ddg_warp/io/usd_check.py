@@ -1,4 +1,4 @@
-"""A check of USD files: the validators that come with USD, and what they miss (counts, extents, NaN)."""
+"""Validation of USD files: the validators of USD, plus checks of counts, extents and NaN."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32
 
 
 def validate(path, outside: bool = False) -> list[str]:
-    """What is wrong with a USD file, a sentence each; empty where all is well.
+    """Return the problems of a USD file, one sentence each; empty for a valid file.
 
-    USD's own validators run where the installed USD has them. Beside them, for every BasisCurves and Mesh at every
-    time sample: counts match the points, all is finite, widths are positive but for tips of 0, normals are unit vectors or 0 where
-    there are any, and the extent contains the points. Of Points as many widths as points, positive, and finite values.
+    USD's own validators run if the installed USD has them. In addition every time sample of every BasisCurves and Mesh is checked.
+    Counts match the points, values are finite, widths are positive except for tips of 0, normals (if any) are unit vectors or 0, and
+    the extent contains the points. Points have as many widths as points, positive, and finite values.
 
     Args:
         path: The file.
-        outside: Whether layers, references and payloads out of the folder of the file may be opened.
+        outside: Whether layers, references and payloads outside the folder of the file may be opened.
     """
     try:
         with opened(existing(path), CurveError, outside) as stage:
@@ -32,15 +32,15 @@ def validate(path, outside: bool = False) -> list[str]:
 
 
 def _problems_of(stage: Usd.Stage, path) -> list[str]:
-    """Those of a whole stage."""
+    """Return the problems of a whole stage."""
     problems = _from_validators(stage)
     shapes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves) or prim.IsA(UsdGeom.Mesh)]
     if not shapes:
         problems.append(f"{path}: there are neither BasisCurves nor meshes")
     points = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Points)]
-    found = [(prim, problem) for prim in shapes for problem in _problems(prim)]
-    found += [(prim, problem) for prim in points for problem in _problems_of_points(UsdGeom.Points(prim))]
-    return problems + [f"{prim.GetPath()}: {problem}" for prim, problem in found]
+    located = [(prim, problem) for prim in shapes for problem in _problems(prim)]
+    located += [(prim, problem) for prim in points for problem in _problems_of_points(UsdGeom.Points(prim))]
+    return problems + [f"{prim.GetPath()}: {problem}" for prim, problem in located]
 
 
 def _from_validators(stage: Usd.Stage) -> list[str]:
@@ -72,7 +72,7 @@ def _problems(prim: Usd.Prim) -> list[str]:
 
 
 def _problems_of_points(prim: UsdGeom.Points) -> list[str]:
-    """Those of Points, of which every time sample has a number of its own."""
+    """Return the problems of Points, whose number may differ between time samples."""
     problems = []
     for time in prim.GetPointsAttr().GetTimeSamples() or [Usd.TimeCode.Default()]:
         widths = np.array(prim.GetWidthsAttr().Get(time) or [])
@@ -83,7 +83,7 @@ def _problems_of_points(prim: UsdGeom.Points) -> list[str]:
 
 
 def _check_faces(mesh: UsdGeom.Mesh) -> tuple[int, list[str]]:
-    """(points that the faces use, problems)."""
+    """Return (number of points that faces use, problems)."""
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [0])
     indices = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [-1])
     problems = [] if indices.min() >= 0 else [f"corner {np.argmin(indices)} has the index {indices.min()}"]
@@ -93,7 +93,7 @@ def _check_faces(mesh: UsdGeom.Mesh) -> tuple[int, list[str]]:
 
 
 def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float | np.ndarray) -> list[str]:
-    """Problems of the points, velocities and extent at one time; `margin` is half the largest width, or of the width of each point."""
+    """Return problems of points, velocities and extent at one time; `margin` is half the largest width, or half of each width."""
     points = np.array(shape.GetPointsAttr().Get(time) or [], dtype=np.float64).reshape(-1, 3)
     if len(points) != count:
         return [f"there are {len(points)} points, but the topology takes {count}"]

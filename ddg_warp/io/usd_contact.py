@@ -1,4 +1,4 @@
-"""USD prims of contact: obstacles as a Mesh of triangles, what touches as Points."""
+"""USD prims of contact: obstacles as a Mesh of triangles, contacts as Points."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ddg_warp.io.usd_prims import Frame, PointsPrim, define_mesh, floats, vector
 
 
 class ObstaclePrim(PointsPrim):
-    """An obstacle as a Mesh, of one sample where nothing moves it.
+    """Obstacle as a Mesh, with one sample if it does not move.
 
     Args:
-        stage: Where to define it.
+        stage: Stage of the new prim.
         path: Path of the new prim.
         obstacles: All obstacles.
-        number: Of this one.
-        world: Of which it follows the nodes.
+        number: Index of this obstacle.
+        world: World of its nodes.
     """
 
     def __init__(self, stage: Usd.Stage, path: str, obstacles: Obstacles, number: int, world: int = 0):
         self._obstacles, self._number = obstacles, number
-        self.triangles = obstacles.cells(number)  # what `vertex_normals` asks of a surface
+        self.triangles = obstacles.cells(number)  # read by `vertex_normals`
         mesh = define_mesh(stage, path, np.full(len(self.triangles), 3), self.triangles.ravel(), double_sided=True)
-        own = obstacles.rows(number)
-        rows = np.arange(own.start, own.stop) + world * np.count_nonzero(obstacles.moving)
+        nodes = obstacles.rows(number)
+        rows = np.arange(nodes.start, nodes.stop) + world * np.count_nonzero(obstacles.moving)
         super().__init__(mesh, rows, np.array(OBSTACLE), None)
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         if not obstacles.moved[number]:
@@ -46,12 +46,12 @@ class ObstaclePrim(PointsPrim):
 
 
 class ContactsPrim(PointsPrim):
-    """What touches, as Points as wide as the force says, with the forces and gaps themselves as primvars.
+    """Contacts as Points of widths by force, with forces and gaps as primvars.
 
     Args:
-        stage: Where to define it.
+        stage: Stage of the new prim.
         path: Path of the new prim.
-        touching: What recordings of contact need to know.
+        touching: Names and typical scales of contact.
     """
 
     def __init__(self, stage: Usd.Stage, path: str, touching: Touching):
@@ -65,17 +65,17 @@ class ContactsPrim(PointsPrim):
         self._values = [self._primvars.CreatePrimvar(name, kind, vertex) for name, kind in kinds.items()]
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
-        found = frame.contacts
-        points, widths = vectors(found.point), floats(self._touching.widths(found.force))
+        contacts = frame.contacts
+        points, widths = vectors(contacts.point), floats(self._touching.widths(contacts.force))
         prim = UsdGeom.Points(self._prim)
-        extent = UsdGeom.Points.ComputeExtent(points, widths) if len(found) else vectors(np.zeros((2, 3)))
+        extent = UsdGeom.Points.ComputeExtent(points, widths) if len(contacts) else vectors(np.zeros((2, 3)))
         force, friction, gap = self._values
         for attribute, value in (
             (prim.GetPointsAttr(), points),
             (prim.GetWidthsAttr(), widths),
             (prim.GetExtentAttr(), extent),
-            (force.GetAttr(), vectors(found.force)),
-            (friction.GetAttr(), vectors(found.friction)),
-            (gap.GetAttr(), floats(found.gap)),
+            (force.GetAttr(), vectors(contacts.force)),
+            (friction.GetAttr(), vectors(contacts.friction)),
+            (gap.GetAttr(), floats(contacts.gap)),
         ):
             self._sample(attribute, value, code)

@@ -1,6 +1,6 @@
-"""Materials of USD scenes: a preview surface for each prim's color, bound to it, so that programs that shade show the colors, too.
+"""Materials of USD prims: a preview surface that shows the prim's color in programs that shade.
 
-The surface reads the primvar displayColor where the prim has one for every vertex or face, as when it is colored by a scalar.
+The surface reads the primvar displayColor of prims that have one for every vertex or face, such as prims colored by a scalar.
 Source: UsdPreviewSurface specification, openusd.org.
 """
 
@@ -14,12 +14,12 @@ SCOPE = "/World/Materials"
 
 
 def bind_preview_surface(stage: Usd.Stage, prim: Usd.Prim, color: np.ndarray) -> None:
-    """Gives a prim a material of its own.
+    """Bind a new preview surface to a prim.
 
     Args:
         stage: The stage of the prim.
         prim: Curves or a mesh.
-        color: Its RGB, (3,), shown where it has no displayColor, or (n, 3), whose mean is.
+        color: RGB without a displayColor, (3,), or the mean of (n, 3).
     """
     if not stage.GetPrimAtPath(SCOPE):
         UsdGeom.Scope.Define(stage, SCOPE)

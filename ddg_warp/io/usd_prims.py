@@ -17,12 +17,12 @@ from ddg_warp.io.contacts import Contacts
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd_materials import bind_preview_surface
 
-HEADER = 64  # bytes at most that a value takes in a file beside its numbers
+HEADER = 64  # largest overhead of a value in a file [bytes]
 
 
 @dataclass(frozen=True)
 class ColorBy:
-    """A scalar that decides the color, and its values at the two ends of the scale.
+    """Scalar shown by color, with its values at both ends of the scale.
 
     Raises:
         SceneError: The ends are no finite numbers, or not in order.
@@ -40,8 +40,10 @@ class ColorBy:
 
 @dataclass(frozen=True)
 class Frame:
-    """What prims write at one time; points (P, 3) [m], velocities (P, 3) [m/s] or None, scalars by name; nodes (worlds M, 3) [m] of
-    obstacles that something moves, and contacts, or None."""
+    """Data of one time sample: points (P, 3) [m], velocities (P, 3) [m/s] or None, scalars by name.
+
+    Nodes of moving obstacles (worlds M, 3) [m] and contacts may be None.
+    """
 
     points: np.ndarray
     velocities: np.ndarray | None
@@ -52,19 +54,19 @@ class Frame:
 
 
 class PointsPrim:
-    """Some of the points of a frame as a prim.
+    """Prim of some of the points of a frame.
 
     Args:
         prim: The prim, without samples.
-        rows: Rows of its points among those of a frame, shape (p,).
+        rows: Rows of its points in a frame, shape (p,).
         color: One RGB, or one for each point, shape (p, 3).
-        color_by: What the color is taken from where a frame has it.
+        color_by: Scalar that gives the color in frames that have it.
     """
 
     def __init__(self, prim: UsdGeom.PointBased, rows: np.ndarray, color: np.ndarray, color_by: ColorBy | None):
         self._prim, self._rows, self._color_by = prim, rows, color_by
         self.unsaved = 0
-        """Bytes of values that no save has written yet, at most."""
+        """Upper bound of the size of unsaved values [bytes]."""
         self._primvars = UsdGeom.PrimvarsAPI(prim)
         uniform = color.ndim == 1
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
@@ -73,7 +75,7 @@ class PointsPrim:
         bind_preview_surface(prim.GetPrim().GetStage(), prim.GetPrim(), color)
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
-        """Sets the samples of one frame."""
+        """Write the samples of one frame."""
         shown = vectors(self._vertices(np.asarray(frame.points, dtype=np.float64)[self._rows]))
         self._sample(self._prim.GetPointsAttr(), shown, code)
         self._sample(self._prim.GetExtentAttr(), self._extent(shown), code)
@@ -92,13 +94,13 @@ class PointsPrim:
         primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind)
         self._sample(primvar.GetAttr(), floats(values), code)
         if self._color_by is not None and name == self._color_by.name:
-            self._color.GetAttr().ClearDefault()  # the samples are at other places than the one color was
+            self._color.GetAttr().ClearDefault()  # samples are at vertices or faces, the default is constant
             self._color.SetInterpolation(kind)
             colors = on_scale(values, self._color_by.low, self._color_by.high)
             self._sample(self._color.GetAttr(), vectors(colors), code)
 
     def _sample(self, attribute: Usd.Attribute, value, code: Usd.TimeCode) -> None:
-        """Sets the value of an attribute at a time."""
+        """Set the value of an attribute at a time."""
         attribute.Set(value, code)
         self.unsaved += memoryview(value).nbytes + HEADER
 
@@ -106,7 +108,7 @@ class PointsPrim:
         return points
 
     def _at_vertices(self, values: np.ndarray) -> np.ndarray:
-        """Values at the points, as values at the vertices."""
+        """Return values at the vertices from values at the points."""
         return values
 
     def _extent(self, vertices: Vt.Vec3fArray) -> Vt.Vec3fArray:
@@ -117,7 +119,7 @@ class CurvesPrim(PointsPrim):
     """Rods as one BasisCurves prim.
 
     Args:
-        stage: Where to define it.
+        stage: Stage of the new prim.
         path: Path of the new prim.
         curves: The rods, all closed or all open.
         rows, color, color_by: See `PointsPrim`.
@@ -130,14 +132,14 @@ class CurvesPrim(PointsPrim):
         self._primvars.CreatePrimvar("radius", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex).Set(radius)
 
     def add_attributes(self, attributes: Mapping[str, np.ndarray]) -> None:
-        """Keeps values of each rod, (R,), numbers or texts, as uniform primvars."""
+        """Store values of each rod, (R,), numbers or texts, as uniform primvars."""
         for name, values in attributes.items():
             kind, make = KINDS[values.dtype.kind if values.dtype.kind in KINDS else "U"]
             primvar = self._primvars.CreatePrimvar(Tf.MakeValidIdentifier(name), kind, UsdGeom.Tokens.uniform)
             primvar.Set(make(self._at_faces(values)))
 
     def _at_faces(self, values: np.ndarray) -> np.ndarray:
-        """Values of the rods, as values of what the prim calls uniform: curves."""
+        """Return values of the uniform elements of the prim, here curves, from values of the rods."""
         return values
 
     def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
@@ -157,7 +159,7 @@ class CurvesPrim(PointsPrim):
 
 
 class TubesPrim(CurvesPrim):
-    """Rods as one Mesh; a velocity is that of the centreline."""
+    """Rods as one Mesh of tubes, with velocities of the centreline."""
 
     def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
         sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
@@ -165,7 +167,7 @@ class TubesPrim(CurvesPrim):
 
     def _at_faces(self, values: np.ndarray) -> np.ndarray:
         sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
-        first = indices[np.cumsum(sizes) - sizes] // SIDES  # point whose ring the face begins at
+        first = indices[np.cumsum(sizes) - sizes] // SIDES  # point of the first ring of the face
         return values[np.repeat(np.arange(len(values)), self._curves.counts)[first]]
 
     def _vertices(self, points: np.ndarray) -> np.ndarray:
@@ -179,19 +181,19 @@ class TubesPrim(CurvesPrim):
 
 
 class SurfacePrim(PointsPrim):
-    """One surface as a Mesh of triangles, seen from both sides, with a normal at each vertex.
+    """Surface as a double-sided Mesh of triangles, with a normal at each vertex.
 
     Args:
-        stage: Where to define it.
+        stage: Stage of the new prim.
         path: Path of the new prim.
         surfaces: All surfaces.
-        part: The triangles of this one.
+        part: Triangles of this surface.
         color, color_by: See `PointsPrim`.
     """
 
     def __init__(self, stage: Usd.Stage, path: str, surfaces: Surfaces, part: slice, color, color_by):
         rows, local = np.unique(surfaces.triangles[part], return_inverse=True)
-        self.triangles = local.reshape(-1, 3)  # what `vertex_normals` asks of a surface
+        self.triangles = local.reshape(-1, 3)  # read by `vertex_normals`
         self._part = part
         mesh = define_mesh(stage, path, np.full(len(self.triangles), 3), self.triangles.ravel(), double_sided=True)
         super().__init__(mesh, rows, color, color_by)
@@ -211,7 +213,7 @@ class SurfacePrim(PointsPrim):
 
 
 def define_mesh(stage: Usd.Stage, path: str, sizes: np.ndarray, indices: np.ndarray, double_sided: bool):
-    """A Mesh without points, of faces with `sizes` corners and their `indices`, as they are."""
+    """Define a Mesh without points, with faces of `sizes` corners at `indices`, not subdivided."""
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateFaceVertexCountsAttr(_ints(sizes))
     mesh.CreateFaceVertexIndicesAttr(_ints(indices))
@@ -221,12 +223,12 @@ def define_mesh(stage: Usd.Stage, path: str, sizes: np.ndarray, indices: np.ndar
 
 
 def vectors(values) -> Vt.Vec3fArray:
-    """Vectors (n, 3) for USD."""
+    """Return vectors (n, 3) as a USD array."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32).reshape(-1, 3))
 
 
 def floats(values) -> Vt.FloatArray:
-    """Numbers (n,) for USD."""
+    """Return numbers (n,) as a USD array."""
     return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
@@ -244,4 +246,4 @@ KINDS = {
     "f": (Sdf.ValueTypeNames.FloatArray, floats),
     "U": (Sdf.ValueTypeNames.StringArray, _texts),
 }
-"""Type of a primvar for a kind of NumPy array; texts for what is neither a whole number nor a real one."""
+"""Primvar type and conversion by kind of NumPy array; texts for all other kinds."""

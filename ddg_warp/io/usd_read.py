@@ -1,10 +1,10 @@
-"""Curves and meshes from USD files, in metres with z up: transforms, metersPerUnit and upAxis are applied.
+"""Reader of curves and meshes in USD files, in metres with z up, with transforms, metersPerUnit and upAxis applied.
 
-Every BasisCurves prim becomes a `CurveSet`; of a file with several meshes one is chosen by its path. Other curves (NURBS) are told, and
-instances of a PointInstancer refused. Attributes are taken at the default time, or at their first sample where they have no default.
-Widths are diameters; under a transform that scales, they scale by the cube root of its volume change. A cubic curve becomes the
-polyline through points on it, see `read_curves`.
-Layers, references and payloads are followed within the folder of a file, and out of it only where that is allowed.
+Every BasisCurves prim becomes a `CurveSet`; in a file with several meshes one is selected by path. Other curves (NURBS) are
+reported, and instances of a PointInstancer refused. Attributes are read at the default time, or at the first sample without a
+default. Widths are diameters; a scaling transform multiplies them by the cube root of its determinant. A cubic curve becomes a
+polyline through points on the curve, see `read_curves`.
+Layers, references and payloads are followed within the folder of a file, and outside it only with permission.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from ddg_warp.io.mesh_read import triangulated
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 LISTED = 5  # prims in a message
-SHORT = 0.01  # of its length by which the polyline of a cubic curve may fall short of it
-FINER = 4  # times as many points that a length is compared with
+SHORT = 0.01  # largest relative length error of a polyline without a warning
+FINER = 4  # points of the reference polyline for lengths, over points of the polyline
 INSTANCES = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 DRAWN = ("displayColor", "displayOpacity", "widths", "normals", "radius")
 
@@ -34,56 +34,56 @@ DRAWN = ("displayColor", "displayOpacity", "widths", "normals", "radius")
 def read_curves(path, prim: str | None = None, samples: int = 1, outside: bool = False) -> list[CurveSet]:
     """Return the curves of a USD file, one set for each BasisCurves prim, in metres with z up.
 
-    Warns (`SceneWarning`) of curves that are no BasisCurves, of files that it refers to and that are missing, and of cubic curves whose
-    polyline is more than 1 % too short.
+    Warns (`SceneWarning`) of curves other than BasisCurves, of missing referenced files, and of cubic curves with polylines more than
+    1 % too short.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path of the prim to read, with all below it; by default the whole file.
         samples: Points of each segment of a cubic curve. 1 gives its knots: vertices (Catmull-Rom), every third vertex (Bezier), or
-            (p0 + 4 p1 + p2) / 6 (B-spline). With more points between them lengths converge with the square of their number.
-        outside: Whether layers, references and payloads out of the folder of the file may be opened.
+            (p0 + 4 p1 + p2) / 6 (B-spline). Lengths converge with the square of `samples`.
+        outside: Whether layers, references and payloads outside the folder of the file may be opened.
 
     Raises:
-        CurveError: The file has no curves to read, or one that no rod can be built from; names prim and curve.
+        CurveError: The file has no curves to read, or a curve that no rod can be built from; names prim and curve.
     """
     path, samples = existing(path), arguments.count("read_curves: samples", samples)
     with opened(path, CurveError, outside) as stage:
-        curves, others = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
-        others = [each for each in others if each.IsA(UsdGeom.Curves)]
+        curves, unread = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
+        unread = [each for each in unread if each.IsA(UsdGeom.Curves)]
         if not curves:
-            there = f"; it holds {_listed(others)}" if others else ""
+            contents = f"; it holds {_listed(unread)}" if unread else ""
             raise CurveError(
-                f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}{there}; export curves as BasisCurves, not "
+                f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}{contents}; export curves as BasisCurves, not "
                 "meshes or NURBS"
             )
-        if others:
-            _warn(f"{path}: {_listed(others)} {'is' if len(others) == 1 else 'are'} not read; export BasisCurves")
+        if unread:
+            _warn(f"{path}: {_listed(unread)} {'is' if len(unread) == 1 else 'are'} not read; export BasisCurves")
         return [_read_prim(each, path, samples) for each in curves]
 
 
 def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the mesh of a USD file, in metres with z up: (points (P, 3), triangles (T, 3), name of the prim).
 
-    Polygons are cut as `triangulated` does; holes are left out. A subdivision surface is taken as its control mesh. Triangles run
-    counter-clockwise as seen from outside, also where the file says leftHanded or a transform mirrors.
+    Polygons are cut by `triangulated`; holes are left out. A subdivision surface is read as its control mesh. Triangles run
+    counter-clockwise seen from outside, also for leftHanded meshes and mirroring transforms.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path of the Mesh prim, or of one above it; needed where the file has several meshes.
-        outside: Whether layers, references and payloads out of the folder of the file may be opened.
+        prim: Path of the Mesh prim, or of an ancestor; needed if the file has several meshes.
+        outside: Whether layers, references and payloads outside the folder of the file may be opened.
 
     Raises:
         MeshError: The file has no mesh to read, or a bad one; names prim and face.
     """
     path = existing(path)
     with opened(path, MeshError, outside) as stage:
-        meshes, others = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
+        meshes, unread = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
         if len(meshes) != 1:
-            there = f"; it holds {_listed(others)}" if others and not meshes else ""
+            contents = f"; it holds {_listed(unread)}" if unread and not meshes else ""
             listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:LISTED]) or "none"
             raise MeshError(
-                f"{path}: there are {len(meshes)} meshes to read ({listed}){there}; give prim= the path of one"
+                f"{path}: there are {len(meshes)} meshes to read ({listed}){contents}; give prim= the path of one"
             )
         (mesh,) = meshes
         where = f"{path}, {mesh.GetPath()}"
@@ -102,18 +102,20 @@ def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> tupl
 
 @contextmanager
 def opened(path: Path, error: type[ValueError], outside: bool) -> Iterator[Usd.Stage]:
-    """Open the stage of a file, whose prims live no longer than it; what USD says of a damaged one becomes an `error`.
+    """Open the stage of a file, and raise an `error` for USD errors of a damaged file.
+
+    Prims are valid while the stage is open.
 
     Args:
         path: The file.
-        error: Class of what is raised.
-        outside: Whether layers out of the folder of the file may be opened.
+        error: Class of the error.
+        outside: Whether layers outside the folder of the file may be opened.
     """
     arguments.flag("outside", outside)
     try:
         layers = _layers(path, error, outside)
         stage = Usd.Stage.Open(layers[0])
-        for layer in stage.GetUsedLayers():  # which variables in asset paths may have chosen
+        for layer in stage.GetUsedLayers():  # variables in asset paths may select layers
             _refuse_outside(path, layer.realPath, error, outside)
         yield stage
     except Tf.ErrorException as reason:
@@ -126,36 +128,36 @@ def opened(path: Path, error: type[ValueError], outside: bool) -> Iterator[Usd.S
 
 
 def _layers(path: Path, error: type[ValueError], outside: bool) -> list[Sdf.Layer]:
-    """All layers that a file is composed of, itself first; each is looked at before those that it names are opened."""
-    layers, seen = [Sdf.Layer.FindOrOpen(str(path))], set()
+    """Return all layers that compose a file, the root first; each path is checked before the layer is opened."""
+    layers, visited = [Sdf.Layer.FindOrOpen(str(path))], set()
     for layer in layers:
         for asset in layer.GetCompositionAssetDependencies():
             name = layer.ComputeAbsolutePath(Sdf.Layer.SplitIdentifier(asset)[0])
-            found = Ar.GetResolver().Resolve(name).GetPathString()
-            if not found:
+            location = Ar.GetResolver().Resolve(name).GetPathString()
+            if not location:
                 _warn(f"{path}: @{asset}@, to which the file refers, is missing; put it there, or flatten the stage")
-            elif found not in seen:
-                _refuse_outside(path, found, error, outside)
-                seen.add(found)
-                layers.append(Sdf.Layer.FindOrOpen(found))
+            elif location not in visited:
+                _refuse_outside(path, location, error, outside)
+                visited.add(location)
+                layers.append(Sdf.Layer.FindOrOpen(location))
     return layers
 
 
-def _refuse_outside(path: Path, found: str, error: type[ValueError], outside: bool) -> None:
-    """Refuse a layer out of the folder of a file, unless that is allowed."""
-    if outside or not found:
+def _refuse_outside(path: Path, target: str, error: type[ValueError], outside: bool) -> None:
+    """Refuse a layer outside the folder of a file without permission."""
+    if outside or not target:
         return
-    if Ar.IsPackageRelativePath(found):
-        found = Ar.SplitPackageRelativePathOuter(found)[0]
+    if Ar.IsPackageRelativePath(target):
+        target = Ar.SplitPackageRelativePathOuter(target)[0]
     folders = (path.parent.resolve(), path.resolve().parent)
-    if not any(Path(found).resolve().is_relative_to(folder) for folder in folders):
+    if not any(Path(target).resolve().is_relative_to(folder) for folder in folders):
         raise error(
-            f"{path}: the file refers to {found}, out of its folder; flatten the stage, or allow it by outside=True where you trust it"
+            f"{path}: the file refers to {target}, out of its folder; flatten the stage, or allow it by outside=True where you trust it"
         )
 
 
 def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]) -> tuple[list, list]:
-    """(prims of a kind in a file, or below the prim at a path; prims of other kinds that have a shape)."""
+    """Return (prims of a kind in a file or below the prim at a path, all other geometric prims)."""
     if prim is not None and not (isinstance(prim, str) and Sdf.Path.IsValidPathString(prim)[0]):
         raise error(f"{path}: prim = {prim!r} is no path of a prim; give one such as '/World/Hair'")
     root = stage.GetPrimAtPath(prim) if prim else stage.GetPseudoRoot()
@@ -174,13 +176,13 @@ def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: t
     for each in [stage.GetPrimAtPath(prefix) for prefix in root.GetPath().GetPrefixes()] + within:
         if each.HasAuthoredMetadata("clips"):
             raise error(f"{path}: {each.GetPath()} takes values from other files (clips); flatten the stage")
-    found = [each for each in within if each.IsA(kind)]
-    others = [each for each in within if each.IsA(UsdGeom.Gprim) and not each.IsA(kind)]
-    return [kind(each) for each in found], others
+    matching = [each for each in within if each.IsA(kind)]
+    remaining = [each for each in within if each.IsA(UsdGeom.Gprim) and not each.IsA(kind)]
+    return [kind(each) for each in matching], remaining
 
 
 def _listed(prims: list[Usd.Prim]) -> str:
-    """Prims by path and type, the first of many."""
+    """Return the first few prims by path and type, as text."""
     shown = [f"{each.GetPath()} ({each.GetTypeName()})" for each in prims[:LISTED]]
     return ", ".join(shown + (["..."] if len(prims) > LISTED else []))
 
@@ -190,11 +192,11 @@ def _warn(text: str) -> None:
 
 
 def _points(shape: UsdGeom.PointBased, where: str, error: type[ValueError]) -> tuple[np.ndarray, Usd.TimeCode]:
-    """(points in the prim's units, shape (P, 3); the time at which other attributes are taken)."""
+    """Return (points in the prim's units (P, 3), time at which other attributes are read)."""
     attribute = shape.GetPointsAttr()
     if not attribute.HasValue():
         raise error(f"{where}: there are no points; export the prim with its points")
-    # EarliestTime means the first sample of an attribute, and its default where it has no samples.
+    # EarliestTime means the first sample of an attribute, or the default without samples.
     time = Usd.TimeCode.EarliestTime() if attribute.Get() is not None else Usd.TimeCode(attribute.GetTimeSamples()[0])
     points = np.array(_value(attribute, time), dtype=np.float64)
     if points.size and (points.ndim != 2 or points.shape[1] != 3):
@@ -221,8 +223,8 @@ def _read_prim(curves: UsdGeom.BasisCurves, path: Path, samples: int) -> CurveSe
 
 
 def _attributes(curves: UsdGeom.BasisCurves, time: Usd.TimeCode, count: int) -> dict[str, np.ndarray]:
-    """Primvars with one value a curve, or one for all, by name: numbers and texts; what is drawn is left out."""
-    found = {}
+    """Return primvars with one value a curve, or one for all, by name: numbers and texts, except display attributes."""
+    attributes = {}
     for primvar in UsdGeom.PrimvarsAPI(curves).GetPrimvarsWithValues():
         name, value = primvar.GetPrimvarName(), primvar.ComputeFlattened(time)
         if name in DRAWN or value is None:
@@ -231,21 +233,21 @@ def _attributes(curves: UsdGeom.BasisCurves, time: Usd.TimeCode, count: int) -> 
         if primvar.GetInterpolation() == UsdGeom.Tokens.constant and len(values) == 1:
             values = np.repeat(values, count)
         if primvar.GetInterpolation() in (UsdGeom.Tokens.uniform, UsdGeom.Tokens.constant) and len(values) == count:
-            found[name] = values
-    return found
+            attributes[name] = values
+    return attributes
 
 
 def _value(attribute: Usd.Attribute, time: Usd.TimeCode):
-    """The default value, or that at `time` where there is none."""
+    """Return the default value, or the value at `time` without a default."""
     default = attribute.Get()
     return attribute.Get(time) if default is None else default
 
 
 def _whole(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
-    """Whole numbers of an attribute; empty where it has no value.
+    """Return the whole numbers of an attribute; empty without a value.
 
     Raises:
-        ValueError: It has others.
+        ValueError: The attribute is no array of whole numbers.
     """
     values = np.array(_value(attribute, time) or np.zeros(0, int))
     if values.dtype.kind not in "iu" or values.ndim != 1:
@@ -256,7 +258,7 @@ def _whole(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
 def _placement(
     shape: UsdGeom.PointBased, time: Usd.TimeCode, where: str, error: type[ValueError]
 ) -> tuple[np.ndarray, float]:
-    """(matrix for row vectors to metres with z up, shape (4, 4); its mean scale)."""
+    """Return (matrix for row vectors to metres with z up (4, 4), its mean scale)."""
     stage = shape.GetPrim().GetStage()
     unit, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
     if not 0.0 < unit < np.inf:
@@ -273,7 +275,7 @@ def _placement(
 def _sampled(
     curves: UsdGeom.BasisCurves, counts: np.ndarray, points: np.ndarray, samples: int, where: str
 ) -> cubic.Sampled:
-    """Points of each curve, as weights of its vertices; warns of polylines that are too short."""
+    """Return points of each curve as weights of vertices; warn of polylines that are too short."""
     kind, basis, wrap = (each.Get() for each in (curves.GetTypeAttr(), curves.GetBasisAttr(), curves.GetWrapAttr()))
     if kind == UsdGeom.Tokens.linear:
         return cubic.linear(counts)
@@ -289,33 +291,33 @@ def _sampled(
                 f"{where}: curve {np.argmax(counts == count)} is a cubic {basis} ({wrap}) of {count} vertices; such curves have "
                 f"{', '.join(allowed)}, ...: resample it"
             )
-    found = cubic.sampled(basis, wrap, counts, samples)
+    sampling = cubic.sampled(basis, wrap, counts, samples)
     finer = cubic.sampled(basis, wrap, counts, FINER * samples)
     closed = wrap == UsdGeom.Tokens.periodic
     with np.errstate(all="ignore"):
-        short = 1.0 - _lengths(found, points, closed) / _lengths(finer, points, closed)
+        short = 1.0 - _lengths(sampling, points, closed) / _lengths(finer, points, closed)
     short = np.nan_to_num(short)
     if (worst := short.max()) > SHORT:
         _warn(
             f"{where}: the polyline of curve {np.argmax(short)} is {100.0 * worst:.2g} % shorter than its cubic {basis}; read more "
             f"points on it by read_curves(path, samples={int(np.ceil(samples * np.sqrt(worst / SHORT)))})"
         )
-    return found
+    return sampling
 
 
 def _lengths(curves: cubic.Sampled, points: np.ndarray, closed: bool) -> np.ndarray:
-    """Lengths of the polylines through points on curves, shape (R,)."""
-    at, first = curves.blend(points), np.cumsum(curves.counts) - curves.counts
-    steps = np.linalg.norm(np.roll(at, -1, axis=0) - at, axis=1)
+    """Return the lengths of polylines through points on curves, shape (R,)."""
+    points_on_curves, first = curves.blend(points), np.cumsum(curves.counts) - curves.counts
+    steps = np.linalg.norm(np.roll(points_on_curves, -1, axis=0) - points_on_curves, axis=1)
     last = first + curves.counts - 1
-    steps[last] = np.linalg.norm(at[first] - at[last], axis=1) if closed else 0.0
+    steps[last] = np.linalg.norm(points_on_curves[first] - points_on_curves[last], axis=1) if closed else 0.0
     return np.add.reduceat(steps, first)
 
 
 def _widths(
     curves: UsdGeom.BasisCurves, time: Usd.TimeCode, sampled: cubic.Sampled, vertex_count: int, where: str
 ) -> np.ndarray | None:
-    """Width at each point of all curves, in the prim's units, shape (P,); None where the prim has no widths."""
+    """Return the width at each point of all curves, in the prim's units, shape (P,); None without widths."""
     primvar = UsdGeom.PrimvarsAPI(curves).GetPrimvar("widths")  # takes precedence over the attribute
     if primvar.HasValue():
         value, kind = primvar.ComputeFlattened(time), primvar.GetInterpolation()

@@ -1,8 +1,7 @@
-"""A view of a trajectory that ParaView opens: the group /VTKHDF, a transient PolyData (VTKHDF 2.0): rods as polylines, surfaces
-as triangles.
+"""View of a trajectory for ParaView: the group /VTKHDF, a transient PolyData of polylines and triangles (VTKHDF 2.0).
 
-Points and velocities are virtual datasets over /trajectory, and the times a link to it, so that nothing is stored
-twice. The topology is stored once: every step points to the same part, which begins at offset 0.
+Points and velocities are virtual datasets over /trajectory, and times a link to it, so that nothing is stored twice.
+The topology is stored once: every step refers to the same piece at offset 0.
 Source: the VTKHDF specification, docs.vtk.org, "Poly data" and "Temporal Data".
 """
 
@@ -25,7 +24,7 @@ STATIC_OFFSETS = {"PartOffsets": (), "CellOffsets": (len(CELL_KINDS),), "Connect
 
 
 def write_view(file: h5py.File, shapes: Shapes) -> None:
-    """Makes /VTKHDF show all frames of /trajectory.
+    """Update /VTKHDF to show all frames of /trajectory.
 
     Args:
         file: Open for writing.
@@ -44,7 +43,7 @@ def write_view(file: h5py.File, shapes: Shapes) -> None:
 
 
 def _write_topology(view: h5py.Group, shapes: Shapes) -> None:
-    """What does not change from step to step."""
+    """Write the topology and other data that all steps have in common."""
     view.attrs["Version"] = np.array(VERSION)
     view.attrs.create("Type", np.bytes_("PolyData"))  # VTK reads fixed-length ASCII only
     view["NumberOfPoints"] = [shapes.worlds * shapes.point_count]
@@ -54,7 +53,7 @@ def _write_topology(view: h5py.Group, shapes: Shapes) -> None:
         cells["Polygons"] = (triangles.ravel(), 3 * np.arange(len(triangles) + 1))
     for kind in CELL_KINDS:
         _write_cells(view.create_group(kind), *cells.get(kind, ([], [0])))
-    radius = np.zeros(shapes.worlds * shapes.point_count)  # points of surfaces have none
+    radius = np.zeros(shapes.worlds * shapes.point_count)  # zero at points of surfaces
     radius[shapes.rows] = shapes.curves.radius
     view.create_group("PointData")["radius"] = radius
     steps = view.create_group("Steps")
@@ -70,7 +69,7 @@ def _write_cells(group: h5py.Group, connectivity, offsets) -> None:
 
 
 def _polylines(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
-    """(connectivity, offsets) of one polyline a rod; a closed one returns to its first point."""
+    """Return (connectivity, offsets) of one polyline a rod; closed rods return to the first point."""
     curves = shapes.curves
     ends = np.cumsum(curves.counts)
     starts = ends - curves.counts
@@ -79,7 +78,7 @@ def _polylines(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write_steps(view: h5py.Group, trajectory: h5py.Group, point_count: int) -> None:
-    """Where each step begins in every array."""
+    """Write the offsets of each step in every array."""
     frame_count, steps = len(trajectory["time"]), view["Steps"]
     steps.attrs["NSteps"] = frame_count
     _resize(steps, "NumberOfParts", frame_count, fill=1)
@@ -89,27 +88,27 @@ def _write_steps(view: h5py.Group, trajectory: h5py.Group, point_count: int) -> 
     moving = [_resize(steps, "PointOffsets", frame_count)]
     if "velocities" in trajectory:
         moving.append(_resize(steps["PointDataOffsets"], "velocity", frame_count))
-    for dataset, known in moving:
-        dataset[known:] = point_count * np.arange(known, frame_count)
+    for dataset, written in moving:
+        dataset[written:] = point_count * np.arange(written, frame_count)
     for data, source in DATA.items():
         for name in trajectory.get(source, ()):
-            dataset, known = _resize(steps.require_group(f"{data}Offsets"), name, frame_count)
-            dataset[known:] = trajectory[source][name].shape[1] * np.arange(known, frame_count)
+            dataset, written = _resize(steps.require_group(f"{data}Offsets"), name, frame_count)
+            dataset[written:] = trajectory[source][name].shape[1] * np.arange(written, frame_count)
 
 
 def _resize(group: h5py.Group, name: str, length: int, shape: tuple[int, ...] = (), fill: int = 0):
-    """(dataset of that length, its length before); what is not written has the value `fill` and takes no space."""
+    """Resize a dataset; return (dataset, length before). Unwritten values are `fill` and take no space."""
     dataset = group.get(name)
     if dataset is None:
         options = {"maxshape": (None, *shape), "chunks": (STEP_CHUNK, *shape), "fillvalue": fill}
         dataset = group.create_dataset(name, shape=(0, *shape), dtype=np.int64, **options)
-    known = min(len(dataset), length)
+    written = min(len(dataset), length)
     dataset.resize(length, axis=0)
-    return dataset, known
+    return dataset, written
 
 
 def _flatten(group: h5py.Group, name: str, source: h5py.Dataset) -> None:
-    """Shows `source` as a virtual dataset: vectors (F, ..., 3) as (all points of all frames, 3), numbers (F, n) as (F n,)."""
+    """Create a virtual dataset over `source`: vectors (F, ..., 3) as (points of all frames, 3), numbers (F, n) as (F n,)."""
     import h5py
 
     if name in group:
