@@ -1,1 +1,1 @@
-"""What a user describes: rods, shells, joints, supports, loads, materials, motions."""
+"""Scene description: rods, shells, joints, supports, loads, materials, motions, contact."""

@@ -1,4 +1,4 @@
-"""What a scene is told, entry by entry: analyses, rods and shells, and what holds, loads and joins them."""
+"""Entries of a scene: analyses, rods, shells, supports, loads, joints and attachments."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -20,11 +20,11 @@ RUN = 2**16  # nodes
 @arguments.called
 @dataclass(frozen=True)
 class Dynamics:
-    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
+    """Time integration with steps dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
 
-    In each step forces balance to `rtol` of the load of a rod or shell: its weight and what else it is given; in contact all but a part
-    `outliers` of them; see `Integrator`.
-    `precision` ("float64", "mixed" or "float32") is that of models that are built without one; by default what suits the device.
+    Each step converges to residuals of `rtol` of the load of a rod or shell, its weight and other loads. In contact a fraction
+    `outliers` of bodies may exceed the tolerance; see `Integrator`.
+    `precision` ("float64", "mixed" or "float32") is the default of `Scene.build`; None selects by device.
     """
 
     dt: float = 0.01
@@ -47,7 +47,7 @@ class Dynamics:
 @arguments.called
 @dataclass(frozen=True)
 class Statics:
-    """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
+    """Equilibrium by load stepping: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
 
     load_steps: int = 1
 
@@ -58,11 +58,11 @@ class Statics:
 @arguments.called
 @dataclass(frozen=True)
 class Trace:
-    """Follow the path of equilibria from load parameter 0 by arc length, through limit points.
+    """Arc-length continuation of equilibria from load parameter 0, through limit points.
 
     Attributes:
         watch: displacements to record by name (`Displacement`).
-        stop: where to end.
+        stop: termination criteria.
         step, max_step, load_scale: see `ddg_warp.solve.continuation.ContinuationOptions`.
     """
 
@@ -85,48 +85,47 @@ class Trace:
 
 @dataclass(frozen=True, init=False)
 class Law:
-    """A constitutive law for a term of rods, instead of the quadratic one.
+    """Constitutive law for a term of rods, instead of the quadratic law.
 
     Attributes:
-        density: a `ddg_warp.kernels.densities.Density`, of the package or one's own.
-        values: of its parameters by family: a number, or an array that broadcasts to (rods, edges), or a list with one for each
-            strain. At vertices stiffnesses are those of both half edges in series, and what else there is the mean over them (see
-            `ddg_warp.compile.half_cells`). What is not given comes from the rod: stiffnesses of its section, strains at rest,
-            viscosity.
+        density: a `ddg_warp.kernels.densities.Density`, of the package or user-defined.
+        values: parameters by family: a number, or an array that broadcasts to (rods, edges), or a list with one for each strain. At
+            vertices stiffnesses of both half edges act in series, and other parameters are averaged over them (see
+            `ddg_warp.compile.half_cells`). Defaults come from the rod: stiffnesses of its section, strains at rest, viscosity.
     """
 
     density: object
     values: dict
 
     def __init__(self, density, **values):
-        for name, given in values.items():
-            for number in given if isinstance(given, list | tuple) else [given]:
-                found = arguments.array(
+        for name, entry in values.items():
+            for number in entry if isinstance(entry, list | tuple) else [entry]:
+                array = arguments.array(
                     f"Law: {name}", number, "give a number, an array, or a list with one for each strain"
                 )
-                arguments.sized(f"Law: {name}", found)
+                arguments.sized(f"Law: {name}", array)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "values", deepcopy(values))
 
 
-def laws_of(what: str, section, material, laws) -> dict[str, Law]:
-    """Laws by term: those that a section brings, and those given.
+def laws_of(label: str, section, material, laws) -> dict[str, Law]:
+    """Return laws by term: laws of the section, overridden by `laws`.
 
     Raises:
-        SceneError: something else is given.
+        SceneError: `laws` holds other objects.
     """
-    brought = section.laws(material) if hasattr(section, "laws") else {}
+    section_laws = section.laws(material) if hasattr(section, "laws") else {}
     if laws is not None and not isinstance(laws, Mapping):
-        raise SceneError(f"{what}: laws = {laws!r}; give a dictionary from terms to Law(density, ...)")
+        raise SceneError(f"{label}: laws = {laws!r}; give a dictionary from terms to Law(density, ...)")
     for term, law in (laws or {}).items():
         if not isinstance(law, Law) or not hasattr(law.density, "parameters"):
-            raise SceneError(f"{what}: the law of {term!r} is {law!r}; give Law(density, ...)")
-    return {**brought, **(laws or {})}
+            raise SceneError(f"{label}: the law of {term!r} is {law!r}; give Law(density, ...)")
+    return {**section_laws, **(laws or {})}
 
 
 @dataclass
 class RodBatch:
-    """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
+    """Rods of one `add_rods` call with equal node count and closedness; section, shape and rest shape may differ."""
 
     points: np.ndarray  # (R, n, 3) [m]
     section: Stiffness
@@ -139,11 +138,11 @@ class RodBatch:
     first: int  # index of its first rod
     laws: Mapping[str, Law] = field(default_factory=dict)  # by term
     curvature: str = "tangent"  # or "angle"
-    sized: bool = True  # whether all stiffnesses and masses follow from the size of its section
+    sized: bool = True  # whether all stiffnesses and masses follow from the size of the section
 
     @property
     def by_angle(self) -> bool:
-        """Whether curvature is the turning angle over the length."""
+        """True if curvature is the turning angle over the length."""
         return self.curvature == "angle"
 
     @property
@@ -159,15 +158,15 @@ class RodBatch:
         return self.nodes if self.closed else self.nodes - 1
 
     def runs(self, rows: np.ndarray) -> list[np.ndarray]:
-        """Rows of its rods in runs so short that what is computed of them stays in the processor's cache."""
+        """Return rows of rods in runs short enough for the processor's cache."""
         return np.array_split(rows, -(-len(rows) * self.nodes // RUN))
 
 
 @dataclass(frozen=True)
 class Support:
-    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last").
+    """Fixed dofs of some rods: node components, twist angles of edges, or an end frame (`end` is "first" or "last").
 
-    `tangent` and `director` (rods, 3) are those of the end at rest, extrapolated from the rod where they are None.
+    `tangent` and `director` (rods, 3) give the end frame at rest; None extrapolates them from the rod.
     """
 
     rods: np.ndarray
@@ -178,12 +177,12 @@ class Support:
     motion: Motion | Grip | None = None
     tangent: np.ndarray | None = None
     director: np.ndarray | None = None
-    call: str = "fix"  # what users know it by
+    call: str = "fix"  # method of the scene, for messages
 
 
 @dataclass(frozen=True)
 class Load:
-    """A dead force on a node [N], or on an edge a twisting moment or a couple [N m]; times amplitude(t) if given."""
+    """Dead force on a node [N], or twisting moment or couple on an edge [N m], times amplitude(t) if given."""
 
     rods: np.ndarray
     node: int = 0
@@ -196,7 +195,7 @@ class Load:
 
 @dataclass
 class Shell:
-    """A triangle mesh with thickness and material; see `Scene.add_shell`."""
+    """Triangle mesh with thickness and material; see `Scene.add_shell`."""
 
     surface: Surface
     thickness: np.ndarray
@@ -219,9 +218,9 @@ class Shell:
 
 @dataclass(frozen=True)
 class ShellSupport:
-    """What is held of a shell: components of vertices, and what the surface does at the mesh edges between them.
+    """Support of a shell: fixed components of vertices, and a condition at mesh edges between these vertices.
 
-    `edges` is "" (free to turn), "clamp" (the normal is held) or "symmetry" (mirrored across the plane with normal `normal`).
+    `edges` is "" (free to rotate), "clamp" (fixed normal) or "symmetry" (mirrored across the plane with normal `normal`).
     """
 
     shell: int
@@ -230,7 +229,7 @@ class ShellSupport:
     edges: str = ""
     normal: tuple = (0.0, 0.0, 0.0)
     motion: Motion | Grip | None = None
-    call: str = "hold"  # what users know it by
+    call: str = "hold"  # method of the scene, for messages
 
 
 @dataclass(frozen=True)
@@ -245,7 +244,7 @@ class ShellLoad:
 
 @dataclass(frozen=True)
 class EdgeCouple:
-    """A couple per length (E,) [N] about boundary edges (E,) of a shell, times amplitude(t) if given."""
+    """Couple per length (E,) [N] about boundary edges (E,) of a shell, times amplitude(t) if given."""
 
     shell: int
     edges: np.ndarray
@@ -255,7 +254,7 @@ class EdgeCouple:
 
 @dataclass(frozen=True)
 class Pressure:
-    """Pressure [Pa] along the normals of triangles, which follow the surface unless `dead`; times amplitude(t) if given."""
+    """Pressure [Pa] along the normals of triangles, a follower load unless `dead`, times amplitude(t) if given."""
 
     shell: int
     triangles: np.ndarray
@@ -266,7 +265,7 @@ class Pressure:
 
 @dataclass(frozen=True)
 class Joint:
-    """Rods joined at nodes, (rod, node) each: hinged (positions alone) or rigid (their frames turn together)."""
+    """Joint of rods at nodes, (rod, node) each: hinged (common position) or rigid (common position and rotation)."""
 
     members: tuple[tuple[int, int], ...]
     rigid: bool
@@ -274,7 +273,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Attachment:
-    """Nodes of a rod that are vertices of a shell; whether edges between them that lie on mesh edges turn with the shell."""
+    """Nodes of a rod merged with vertices of a shell; `glued` edges on mesh edges rotate with the shell."""
 
     rod: int
     nodes: np.ndarray

@@ -1,4 +1,4 @@
-"""Laws of drag on rods, and the coefficients per length that they give: see `kernels.drag` for the theory. NumPy only."""
+"""Drag laws of rods and coefficients per length: see `kernels.drag` for the theory. NumPy only."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,11 +19,11 @@ THEORIES = {
 
 @dataclass(frozen=True, eq=False)
 class Resistance:
-    """Drag in proportion to velocity, its coefficients given outright: numbers, or arrays along rods as of `along_edges`.
+    """Drag proportional to velocity, with coefficients as numbers, or arrays along rods (see `along_edges`).
 
     Attributes:
         tangential, normal: force per length over velocity along and across the rod [N s/m^2].
-        rotational: moment per length over the spin about the tangent [N s].
+        rotational: moment per length over the angular velocity about the tangent [N s].
     """
 
     tangential: float | np.ndarray
@@ -36,19 +36,19 @@ class Resistance:
             object.__setattr__(self, name, _numbers(f"drag: {name}", getattr(self, name), unit))
 
     def spread(self, along: Callable) -> "Resistance":
-        """Return this law with values on edges, which `along(name, values)` makes of those along rods."""
+        """Return the law with values on edges, `along(name, values)` of the values along rods."""
         names = "tangential", "normal", "rotational"
         return replace(self, **{name: along(name, getattr(self, name)) for name in names})
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
-        """Rows of `kernels.drag`, of edges with these radii (R, edges) of rods of these lengths (R, 1)."""
+        """Return rows of `kernels.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [self.tangential, self.normal, self.rotational, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 @arguments.called
 @dataclass(frozen=True, eq=False)
 class Viscous:
-    """Drag of a viscous fluid on a slender rod, without inertia of the fluid, walls and neighbours.
+    """Drag of a viscous fluid on a slender rod, neglecting inertia of the fluid, walls and neighbours.
 
     With the radius a of the section and a length S,
 
@@ -61,8 +61,8 @@ class Viscous:
     Attributes:
         viscosity: mu [Pa s].
         theory: "cox", "gray_hancock" or "lighthill".
-        scale: S [m]; of "cox" the length of the rod by default.
-        radius: a [m], that of the section by default: a number, or an array along rods as of `along_edges`.
+        scale: S [m]; with "cox" the length of the rod by default.
+        radius: a [m], by default of the section: a number, or an array along rods (see `along_edges`).
     """
 
     viscosity: float
@@ -81,11 +81,11 @@ class Viscous:
             raise SceneError(f"Viscous: theory {self.theory!r} needs a scale [m], the length of a wave")
 
     def spread(self, along: Callable) -> "Viscous":
-        """As of `Resistance`."""
+        """Return the law with values on edges, `along(name, values)` of the values along rods."""
         return self if self.radius is None else replace(self, radius=along("radius", self.radius))
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
-        """As of `Resistance`.
+        """Return rows of `kernels.drag` for edges of radii (R, edges) of rods of lengths (R, 1).
 
         Raises:
             SceneError: the rod is too thick for the theory.
@@ -113,16 +113,16 @@ class Viscous:
 @arguments.called
 @dataclass(frozen=True)
 class Granular:
-    """Drag of a granular medium, by the direction of the velocity and not by its size: see `kernels.drag` (Maladen et al. 2009).
+    """Drag of a granular medium, a function of the direction of velocity only: see `kernels.drag` (Maladen et al. 2009).
 
     With the angle psi between velocity and rod, forces per length are C_S sin(beta) across and C_F cos(psi) + C_L (1 - sin(beta))
-    along it, tan(beta) = sin(psi) / tan(gamma). A step takes the velocity that its start has, with an error of first order: a rod that
-    is set in motion at once is held back too much in its first step.
+    along it, tan(beta) = sin(psi) / tan(gamma). The velocity is time-lagged, with a first-order error: drag is too large in the
+    first step of a rod that starts abruptly.
 
     Attributes:
         lateral, friction, leading: C_S, C_F, C_L [N/m]; C_L may be negative, though not below -C_F.
         angle: gamma [rad], between 0 and pi / 2.
-        speed: v0 [m/s], below which forces go to zero with the velocity: small against velocities of interest.
+        speed: v0 [m/s], below which forces are proportional to velocity: small against velocities of interest.
     """
 
     lateral: float
@@ -132,7 +132,7 @@ class Granular:
     speed: float = 1e-3
 
     def spread(self, along: Callable) -> "Granular":
-        """As of `Resistance`."""
+        """Return the law itself, without values along rods."""
         return self
 
     def __post_init__(self):
@@ -144,15 +144,15 @@ class Granular:
         arguments.positive("Granular: speed", self.speed, "m/s")
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
-        """As of `Resistance`."""
+        """Return rows of `kernels.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [0.0, 0.0, 0.0, self.lateral, self.friction, self.leading, np.tan(self.angle), self.speed]
 
 
 def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
-    """Velocity (3,) [m/s] of the fluid at t.
+    """Return the velocity (3,) [m/s] of the fluid at t.
 
     Raises:
-        error: it is not finite, or leaves the plane of a planar scene; names the function and the time.
+        error: the flow is not finite, or leaves the plane of a planar scene; names the function and the time.
     """
     flow = arguments.value_at("flow", scene.flow, t, 3, error) if callable(scene.flow) else np.array(scene.flow, float)
     if flow.shape != (3,):
@@ -165,73 +165,73 @@ def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
 
 
 def check_flow(scene) -> None:
-    """Refuse a flow at t = 0 that is none, or that no rod feels."""
+    """Refuse an invalid flow at t = 0, or a flow without rods with drag."""
     flow_at(scene, 0.0, SceneError)
     if not scene.drags and (callable(scene.flow) or any(scene.flow)):
         raise SceneError("flow is given, and no rod feels it; call drag(...), or leave flow out")
 
 
-def _not_negative(what: str, value, unit: str) -> float:
-    return arguments.number(what, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
+def _not_negative(label: str, value, unit: str) -> float:
+    return arguments.number(label, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
 
 
-def _numbers(what: str, values, unit: str, rule: str = "not negative", holds=np.greater_equal) -> float | np.ndarray:
-    """A number, or numbers along rods (n,) or (rods, n), for which a rule holds against zero; or a refusal that names `what`."""
-    found = arguments.floats(values) if not isinstance(values, bool) else np.array(np.nan)
-    if found.ndim > 2 or not found.size or not (np.isfinite(found).all() and holds(found, 0.0).all()):
+def _numbers(label: str, values, unit: str, rule: str = "not negative", holds=np.greater_equal) -> float | np.ndarray:
+    """Return a number, or numbers along rods (n,) or (rods, n), compared with zero by `holds`; or refuse them, naming `label`."""
+    numbers = arguments.floats(values) if not isinstance(values, bool) else np.array(np.nan)
+    if numbers.ndim > 2 or not numbers.size or not (np.isfinite(numbers).all() and holds(numbers, 0.0).all()):
         raise SceneError(
-            f"{what} is {arguments.shown(values)}; give a number, or numbers along the rod, finite and {rule} [{unit}]"
+            f"{label} is {arguments.shown(values)}; give a number, or numbers along the rod, finite and {rule} [{unit}]"
         )
-    arguments.sized(what, found)
-    return found.copy() if found.ndim else float(found)
+    arguments.sized(label, numbers)
+    return numbers.copy() if numbers.ndim else float(numbers)
 
 
-def along_edges(what: str, values, rods: int, batch) -> np.ndarray:
-    """Return values on edges, each broadcastable to (rods, edges), of rods of a batch from what is given along them.
+def along_edges(label: str, values, rods: int, batch) -> np.ndarray:
+    """Return values on edges, broadcastable to (rods, edges), from values along rods of a batch.
 
     Args:
-        what: named by refusals.
-        values: a number; or (n,) or (rods, n) with n the number of edges, or of nodes of open rods, between which they are linear.
-        rods: how many rods they are given for.
-        batch: whose nodes and edges the rods have.
+        label: name of the values in messages.
+        values: a number; or (n,) or (rods, n) with n the number of edges, or of nodes of open rods with linear interpolation.
+        rods: number of rods.
+        batch: `RodBatch` of the rods.
 
     Raises:
-        SceneError: they do not fit.
+        SceneError: the shape does not fit.
     """
     values, ends = np.atleast_2d(values), not batch.closed and batch.nodes
     if values.shape[0] in (1, rods) and values.shape[1] in (1, batch.edges, ends):
         return 0.5 * (values[:, :-1] + values[:, 1:]) if values.shape[1] == ends else values
     raise SceneError(
-        _misfit(what, values, rods, batch, f"{batch.edges} edges" + f" or {batch.nodes} nodes" * bool(ends))
+        _misfit(label, values, rods, batch, f"{batch.edges} edges" + f" or {batch.nodes} nodes" * bool(ends))
     )
 
 
 def at_nodes(values, rods: int, batch) -> np.ndarray:
-    """Return drag of bodies at nodes, broadcastable to (rods, nodes), of rods of a batch; see `along_edges`."""
+    """Return drag of bodies at nodes of rods of a batch, broadcastable to (rods, nodes); see `along_edges`."""
     values = np.atleast_2d(values)
     if values.shape[0] in (1, rods) and values.shape[1] in (1, batch.nodes):
         return values
     raise SceneError(_misfit("nodes", values, rods, batch, f"{batch.nodes} nodes"))
 
 
-def _misfit(what: str, values: np.ndarray, rods: int, batch, there: str) -> str:
+def _misfit(label: str, values: np.ndarray, rods: int, batch, sizes: str) -> str:
     shape = values.shape[1:] if len(values) == 1 else values.shape
     return (
-        f"drag: {what} has shape {shape}, and rods '{batch.name}' have {there}; give one number, one for each of these, or such a row "
+        f"drag: {label} has shape {shape}, and rods '{batch.name}' have {sizes}; give one number, one for each of these, or such a row "
         f"for each of the {rods} rods"
     )
 
 
 @dataclass(frozen=True)
 class RodDrag:
-    """Drag of some rods: their law, and force over velocity of bodies at their nodes [N s/m]."""
+    """Drag of some rods: law, and force over velocity of bodies at nodes [N s/m]."""
 
     rods: np.ndarray
     law: Resistance | Viscous | Granular
     nodes: float | np.ndarray
 
     def of(self, rows: np.ndarray, batch) -> "RodDrag":
-        """Return the drag of some of its rods, those at `rows`, which are of a batch: laws by edge, bodies by node."""
+        """Return the drag of the rods at `rows`, all of one batch, with values by edge and node."""
 
         def chosen(values: np.ndarray) -> np.ndarray:
             return values[rows] if len(values) > 1 else values
@@ -242,29 +242,29 @@ class RodDrag:
 
 
 def rod_drag(batches, rods: np.ndarray, law, tangential, normal, rotational, nodes) -> RodDrag:
-    """Return what `Scene.drag` is given for rods of a scene's batches, checked; arguments as there."""
+    """Return the checked `RodDrag` of a call of `Scene.drag`; arguments as there."""
     bodies = 0.0 if nodes is None else _numbers("drag: nodes", nodes, "N s/m")
-    given = tangential is not None or normal is not None or np.any(rotational)
+    has_coefficients = tangential is not None or normal is not None or np.any(rotational)
     if law is None:
-        bare = nodes is not None and not given  # bodies alone
+        bare = nodes is not None and not has_coefficients  # bodies alone
         law = Resistance(0.0, 0.0) if bare else Resistance(tangential, normal, rotational)
     elif not isinstance(law, Resistance | Viscous | Granular):
         raise SceneError(f"drag: law is {law!r}; give Viscous(viscosity), Granular(...), or tangential and normal")
-    elif given:
+    elif has_coefficients:
         raise SceneError("drag: a law and coefficients are given; give one of them")
     result = RodDrag(rods, law, bodies)
     for batch in batches:
         rows = np.flatnonzero((rods >= batch.first) & (rods < batch.first + batch.rods))
         if rows.size:
-            result.of(rows, batch)  # refuses what does not fit
+            result.of(rows, batch)  # refuses shapes that do not fit
     return result
 
 
 class Laws:
-    """Which law of drag every rod of a scene has.
+    """Drag laws of all rods of a scene.
 
     Attributes:
-        given: the laws; of_rods: place of its law among them, of every rod (R,); -1 without.
+        given: the laws; of_rods: index of the law of every rod in `given` (R,), -1 without a law.
 
     Raises:
         SceneError: a rod has two.
@@ -272,43 +272,43 @@ class Laws:
 
     def __init__(self, scene):
         self._drags, self.of_rods = scene.drags, np.full(scene.rod_count, -1)
-        self.given, self._row = [given.law for given in scene.drags], np.zeros(scene.rod_count, int)
-        for place, given in enumerate(scene.drags):
-            twice = given.rods[self.of_rods[given.rods] >= 0]
+        self.given, self._row = [drag.law for drag in scene.drags], np.zeros(scene.rod_count, int)
+        for index, drag in enumerate(scene.drags):
+            twice = drag.rods[self.of_rods[drag.rods] >= 0]
             if twice.size:
                 raise SceneError(f"drag: rod {twice[0]} has drag already; give it one law")
-            self.of_rods[given.rods] = place
-            self._row[given.rods] = np.arange(len(given.rods))
+            self.of_rods[drag.rods] = index
+            self._row[drag.rods] = np.arange(len(drag.rods))
 
     def coefficients(self, rods: np.ndarray, batch, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Rows of `kernels.drag` (R, edges, rows) of rods (R,) of a batch with drag; none on edges without length, which are ghosts."""
+        """Return rows of `kernels.drag` (R, edges, rows) of rods (R,) of a batch with drag; zero on ghost edges (length 0)."""
         from ddg_warp.kernels.drag import FIRST, LAST, ROWS
 
         result, laws = np.zeros((*lengths.shape, ROWS)), self.of_rods[rods]
         real = lengths[0] > 0.0
         radius = np.broadcast_to(radius, lengths.shape)[:, real]
-        for place in np.unique(laws):
-            chosen = laws == place
-            found = np.zeros((chosen.sum(), batch.edges, ROWS))
+        for index in np.unique(laws):
+            chosen = laws == index
+            rows = np.zeros((chosen.sum(), batch.edges, ROWS))
             length = lengths[chosen].sum(1, keepdims=True)
-            given = self._drags[place].of(self._row[rods[chosen]], batch)
-            for i, values in enumerate(given.law.coefficients(f"drag: rods '{batch.name}'", radius[chosen], length)):
-                found[..., i] = values
-            bodies = np.broadcast_to(given.nodes, (len(found), batch.nodes))
-            found[..., FIRST] = bodies[:, : batch.edges]
+            drag = self._drags[index].of(self._row[rods[chosen]], batch)
+            for i, values in enumerate(drag.law.coefficients(f"drag: rods '{batch.name}'", radius[chosen], length)):
+                rows[..., i] = values
+            bodies = np.broadcast_to(drag.nodes, (len(rows), batch.nodes))
+            rows[..., FIRST] = bodies[:, : batch.edges]
             if not batch.closed:
-                found[:, -1, LAST] = bodies[:, -1]
-            result[np.ix_(chosen, real)] = found
+                rows[:, -1, LAST] = bodies[:, -1]
+            result[np.ix_(chosen, real)] = rows
         return result
 
 
 def holds(coefficients: np.ndarray) -> np.ndarray:
-    """Which first and last nodes of edges (2, ...) are held back in all directions, by coefficients (rows, ...)."""
+    """Return masks of first and last nodes of edges (2, ...) with drag in all directions, by coefficients (rows, ...)."""
     tangential, normal, _, lateral, friction, _, _, _, first, last = coefficients
     along = (tangential + friction > 0.0) & (normal + lateral > 0.0)
     return np.stack([along | (first > 0.0), along | (last > 0.0)])
 
 
 def least(coefficients: np.ndarray) -> np.ndarray:
-    """The smallest drag per length and velocity [N s/m^2] of rods (R,), by coefficients (R, edges, rows); none of what is granular."""
+    """Return the smallest drag per length and velocity [N s/m^2] of rods (R,) from coefficients (R, edges, rows); 0 if granular."""
     return coefficients[..., :2].mean(1).min(1)

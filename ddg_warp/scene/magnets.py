@@ -1,4 +1,4 @@
-"""What a scene says about magnets: magnetised rods, the field that they are in, and pairs that act on each other."""
+"""Magnetism of a scene: magnetised rods, the applied field, and dipole pairs."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from ddg_warp.errors import SceneError, SolverError
 
 @dataclass(frozen=True)
 class Magnet:
-    """Magnetisation (E, 3) [A/m] of edges (E,) of each of some rods, along their first and second director and tangent."""
+    """Magnetisation (E, 3) [A/m] of edges (E,) of some rods, along first director, second director and tangent."""
 
     rods: np.ndarray
     edges: np.ndarray
@@ -19,28 +19,28 @@ class Magnet:
 
 @dataclass(frozen=True)
 class MagneticField:
-    """B(x, t) = value + gradient (x - origin) [T]: constants, or functions of the time."""
+    """Applied field B(x, t) = value + gradient (x - origin) [T]: constants, or functions of time."""
 
     value: object
     gradient: object
     origin: np.ndarray
-    planar: bool  # whether it stays in the plane of x and z
+    planar: bool  # whether the field must lie in the plane of x and z
 
     def at(self, t: float, otherwise: float, error=SolverError) -> np.ndarray:
-        """B at the origin of space, then the rows of the gradient (12,), at t; constants times `otherwise`.
+        """Return B at the origin of space and the rows of the gradient (12,) at t; constants are scaled by `otherwise`.
 
         Raises:
-            SolverError: a function is not finite, or gives no field; names the function and the time.
+            SolverError: a function is not finite, or no magnetic field; names the function and the time.
         """
         value, gradient = (
-            arguments.value_at(f"the magnetic {what}", given, t, 3, error) if callable(given) else otherwise * given
-            for what, given in (("field", self.value), ("field's gradient", self.gradient))
+            arguments.value_at(f"the magnetic {label}", source, t, 3, error) if callable(source) else otherwise * source
+            for label, source in (("field", self.value), ("field's gradient", self.gradient))
         )
         self._check(value, gradient, t, error)
         return np.concatenate([value - gradient @ self.origin, gradient.ravel()])
 
     def over(self, points: np.ndarray, t: float, otherwise: float) -> np.ndarray:
-        """B at points (n, 3) [T]; see `at`."""
+        """Return B at points (n, 3) [T]; see `at`."""
         field, gradient = np.split(self.at(t, otherwise), [3])
         return field + points @ gradient.reshape(3, 3).T
 
@@ -61,7 +61,7 @@ class MagneticField:
 
 @dataclass(frozen=True)
 class Dipoles:
-    """All pairs of edges of some magnetised rods (None: all), no farther apart than `cutoff` [m] at rest, as point dipoles."""
+    """Point-dipole pairs of all edges of some magnetised rods (None: all) within `cutoff` [m] at rest."""
 
     rods: np.ndarray | None
     cutoff: float
@@ -70,37 +70,37 @@ class Dipoles:
 @arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Magnets:
-    """The part of a scene that is magnetic."""
+    """Magnetism of a scene."""
 
     magnets: list[Magnet] = field(default_factory=list, init=False)
     dipoles: list[Dipoles] = field(default_factory=list, init=False)
     applied_field: MagneticField | None = field(default=None, init=False)
 
     def magnetize(self, rods, magnetisation, edges=None) -> None:
-        """Give rods a magnetisation that is fixed in the material frame of their edges, as of a hard-magnetic elastomer.
+        """Add a magnetisation of rods, fixed in the material frame of edges (hard-magnetic elastomer).
 
-        The moment of an edge is that times its volume at rest, with the area of its section; a `Stiffness` needs one. Magnetised
-        rods are solved together, as joined ones are. Several calls add up.
+        The dipole moment of an edge is the magnetisation times its volume at rest; a `Stiffness` needs an `area`. Magnetised rods
+        belong to the coupled system. Several calls add up.
 
         Args:
             rods: one rod or several.
-            magnetisation: along the tangent, a number [A/m]; or along first director, second director and tangent, (3,), or (E, 3)
-                with one an edge. In dimension 2 the first director is across the plane, and the second the tangent, turned by 90
-                degrees from x towards z. Rods without twist have a tangent alone.
-            edges: which; all by default.
+            magnetisation: along the tangent, a number [A/m]; or along first director, second director and tangent, (3,) or (E, 3)
+                by edge. In dimension 2 the first director is across the plane, and the second is the tangent rotated by 90
+                degrees from x towards z. Rods without twist have only a tangent.
+            edges: magnetised edges; all by default.
 
         Raises:
             SceneError: an edge that does not exist, or a component that the rod has no director for.
         """
         rods, added = arguments.once("magnetize: rods", self._rods(rods)), []
-        given = arguments.floats(magnetisation)
-        given = given * [0.0, 0.0, 1.0] if given.ndim == 0 else given
+        vector = arguments.floats(magnetisation)
+        vector = vector * [0.0, 0.0, 1.0] if vector.ndim == 0 else vector
         for batch in self._batches(rods):
-            own = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
-            where = f"magnetize: rod {own[0]} ('{batch.name}')"
-            _, chosen = self._on_rods("magnetize", own, "edge", slice(None) if edges is None else edges)
+            batch_rods = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
+            where = f"magnetize: rod {batch_rods[0]} ('{batch.name}')"
+            _, chosen = self._on_rods("magnetize", batch_rods, "edge", slice(None) if edges is None else edges)
             chosen = arguments.once(f"{where}: edges", np.array(chosen) % batch.edges)
-            each = arguments.broadcast(f"{where}: magnetisation", given, (len(chosen), 3))
+            each = arguments.broadcast(f"{where}: magnetisation", vector, (len(chosen), 3))
             if not batch.twist and self.dimension == 3 and each[:, :2].any():
                 raise SceneError(
                     f"{where} has no twist, and so no directors; give the component along its tangent alone"
@@ -111,20 +111,20 @@ class Magnets:
                 )
             if not np.all(np.asarray(batch.section.area) > 0.0):
                 raise SceneError(f"{where}: its section has no area; give Stiffness(..., area=...) [m^2]")
-            added.append(Magnet(own, chosen, each))
+            added.append(Magnet(batch_rods, chosen, each))
         self.magnets += added
 
     def magnetic_field(self, value, gradient=None, origin=(0.0, 0.0, 0.0)) -> None:
-        """The magnetic field B = value + gradient (x - origin) that magnetised rods are in.
+        """Apply the magnetic field B = value + gradient (x - origin) to magnetised rods.
 
-        Energy -V M . B of every edge, at its middle, with the field at the time that a step balances forces at (the end of a step of
-        implicit Euler's, the middle of one of the midpoint rule). In statics constants grow with the load parameter, which is the
-        time of functions. All worlds are in it; their magnetisations may differ (`Model.set_parameter`).
+        The energy of an edge is -V M . B at its midpoint. The field is evaluated at the end of a step of implicit Euler, or the middle
+        of a step of the midpoint rule. In statics constants grow with the load parameter, which is the time of functions. All worlds
+        have the same field; magnetisations may differ (`Model.set_parameter`).
 
         Args:
-            value: B at the origin (3,) [T], or a function of the time [s] that gives it.
-            gradient: dB_i/dx_j (3, 3) [T/m], or a function of the time; none by default. It has neither divergence nor curl:
-                its trace is zero and it is symmetric.
+            value: B at the origin (3,) [T], or a function of time [s] that returns it.
+            gradient: dB_i/dx_j (3, 3) [T/m], or a function of time; zero by default. Symmetric (no curl), with zero trace (no
+                divergence).
             origin: (3,) [m].
 
         Raises:
@@ -137,18 +137,18 @@ class Magnets:
         if not callable(gradient):
             gradient = np.zeros((3, 3)) if gradient is None else gradient
             gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3), own=2)
-        given = MagneticField(value, gradient, origin, self.dimension == 2)
-        given.at(0.0, 1.0, SceneError)
-        self.applied_field = given
+        applied = MagneticField(value, gradient, origin, self.dimension == 2)
+        applied.at(0.0, 1.0, SceneError)
+        self.applied_field = applied
 
     def add_dipoles(self, rods=None, cutoff: float | None = None) -> None:
-        """Let magnetised edges of rods act on each other as point dipoles in their middles, of the same and of other rods.
+        """Add dipole-dipole interaction of magnetised edges, as point dipoles at their midpoints.
 
-        All pairs whose middles are no farther apart than `cutoff` at rest are listed, once and for all, but those that share a node:
-        n edges have n^2 / 2 without it. Two edges that come close attract without bound, and nothing keeps them apart.
+        All pairs with midpoints within `cutoff` at rest are listed once, except edges with a common node: n edges have n^2 / 2 pairs
+        without a cutoff. The attraction of close edges is unbounded.
 
         Args:
-            rods: magnetised ones; all that are by default.
+            rods: magnetised rods; by default all magnetised rods.
             cutoff: [m]; none by default.
         """
         rods = None if rods is None else arguments.once("add_dipoles: rods", self._rods(rods))

@@ -1,4 +1,4 @@
-"""Materials and cross-sections of rods: what turns Young's modulus and a radius into EA, EI1, EI2, GJ and inertia."""
+"""Materials and cross-sections of rods: EA, EI1, EI2, GJ and inertia from moduli and dimensions."""
 
 from copy import deepcopy
 from dataclasses import dataclass
@@ -9,19 +9,19 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
-DRAWN = 1e-3  # radius of rods that are drawn and have none [m]
+DRAWN = 1e-3  # displayed radius of rods without one [m]
 
 
 @arguments.called
 @dataclass(frozen=True)
 class Material:
-    """Isotropic linear elastic material.
+    """Isotropic linear elastic material with Kelvin-Voigt damping.
 
     Attributes:
         young: Young's modulus E [Pa].
         poisson: Poisson's ratio nu, -1 < nu <= 0.5; the shear modulus is E / 2(1 + nu).
         density: mass density rho [kg/m^3].
-        viscosity: strain-rate damping eta / E [s]: every stiffness k brings a viscosity k * this.
+        viscosity: strain-rate damping eta / E [s]: every stiffness k has the viscosity k eta / E.
     """
 
     young: float
@@ -44,7 +44,7 @@ class Material:
 @arguments.called
 @dataclass(frozen=True)
 class Stiffness:
-    """Stiffness and inertia of a section, given outright.
+    """Stiffness and inertia of a section as numbers.
 
     Attributes:
         EA: stretching stiffness [N].
@@ -52,10 +52,10 @@ class Stiffness:
         GJ: twisting stiffness [N m^2].
         mass_per_length: rho A [kg/m].
         rotary_inertia: rho (I1 + I2) [kg m], inertia about the tangent per length.
-        radius: of the rod in contact, in `Viscous` drag, and of the drawn tube [m]; None where it is not known. Contact and such drag
-            ask for it, and tubes are drawn with that of `DRAWN`, 1 mm, which `report` says.
+        radius: of the rod in contact, in `Viscous` drag, and of the displayed tube [m]; None if unknown. Contact and viscous drag
+            require it; tubes have the radius `DRAWN`, 1 mm, by default, which `report` states.
         viscosity: strain-rate damping [s], as in `Material`.
-        area: of the section [m^2], which a magnetisation needs; 0 where it is not known.
+        area: of the section [m^2], which a magnetisation needs; 0 if unknown.
     """
 
     EA: float
@@ -69,47 +69,47 @@ class Stiffness:
     area: float = 0.0
 
     def stiffness(self, material: Material | None) -> "Stiffness":
-        """This section itself; a material, if given, is ignored."""
+        """Return the section itself, with EI2 = EI1 by default; a material is ignored."""
         return self if self.EI2 is not None else Stiffness(**{**self.__dict__, "EI2": self.EI1})
 
 
-def stiffness_of(what: str, section, material: Material | None) -> Stiffness:
+def stiffness_of(label: str, section, material: Material | None) -> Stiffness:
     """Return the stiffness of a section of a material.
 
     Raises:
-        SceneError: there is no such section, it lacks a material or has no use for one, or the numbers of both do not go together.
+        SceneError: an invalid section, a missing or superfluous material, or numbers that do not broadcast.
     """
     if isinstance(section, type) or not hasattr(section, "stiffness"):
         raise SceneError(
-            f"{what}: section {arguments.shown(section)} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
+            f"{label}: section {arguments.shown(section)} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
         )
     if isinstance(section, Stiffness) and material is not None:
-        raise SceneError(f"{what}: a Stiffness is given outright, and takes nothing of a material; leave material out")
+        raise SceneError(f"{label}: a Stiffness is given outright, and takes nothing of a material; leave material out")
     if not isinstance(material, Material) and not isinstance(section, Stiffness):
-        raise SceneError(f"{what}: a {type(section).__name__} needs a material; give material=Material(...)")
+        raise SceneError(f"{label}: a {type(section).__name__} needs a material; give material=Material(...)")
     try:
-        with np.errstate(all="ignore"):  # what overflows is refused at `build`
+        with np.errstate(all="ignore"):  # overflow is refused at `build`
             return deepcopy(section.stiffness(material))
     except ValueError as reason:
         raise SceneError(
-            f"{what}: numbers of the section and of the material do not go together: {reason}; give numbers that broadcast "
+            f"{label}: numbers of the section and of the material do not go together: {reason}; give numbers that broadcast "
             "to (rods, edges)"
         ) from None
 
 
-def _require(what: str, value, rule: str, holds) -> None:
-    """Refuse what is no finite number, or numbers, that fulfil a rule."""
-    numbers = arguments.array(what, value, rule)
+def _require(label: str, value, rule: str, holds) -> None:
+    """Refuse values that are not finite, or violate a rule."""
+    numbers = arguments.array(label, value, rule)
     if not (numbers.size and np.isfinite(numbers).all() and np.all(holds(numbers))):
-        raise SceneError(f"{what} = {arguments.shown(value)}; {rule}")
-    arguments.sized(what, numbers)
+        raise SceneError(f"{label} = {arguments.shown(value)}; {rule}")
+    arguments.sized(label, numbers)
 
 
 def _require_sizes(section, *names: str) -> None:
     kind, names = type(section).__name__, names or tuple(vars(section))
-    for what in names:
-        _require(f"{kind}: {what}", getattr(section, what), "it is positive [m]", lambda v: v > 0.0)
-    shapes = [np.shape(getattr(section, what)) for what in names]
+    for size in names:
+        _require(f"{kind}: {size}", getattr(section, size), "it is positive [m]", lambda v: v > 0.0)
+    shapes = [np.shape(getattr(section, size)) for size in names]
     try:
         np.broadcast_shapes(*shapes)
     except ValueError:
@@ -144,7 +144,7 @@ class Circle:
         _require_sizes(self)
 
     def stiffness(self, material: Material) -> Stiffness:
-        """A = pi r^2, I = pi r^4 / 4, J = 2 I."""
+        """Return the stiffness: A = pi r^2, I = pi r^4 / 4, J = 2 I."""
         i = pi * np.asarray(self.radius) ** 4 / 4.0
         return _elastic(material, pi * np.asarray(self.radius) ** 2, i, i, 2.0 * i)
 
@@ -161,7 +161,7 @@ class Ellipse:
         _require_sizes(self)
 
     def stiffness(self, material: Material) -> Stiffness:
-        """I1 = pi a^3 b / 4, I2 = pi a b^3 / 4, J = pi a^3 b^3 / (a^2 + b^2) (Saint-Venant, exact)."""
+        """Return the stiffness: I1 = pi a^3 b / 4, I2 = pi a b^3 / 4, J = pi a^3 b^3 / (a^2 + b^2) (Saint-Venant, exact)."""
         a, b = np.asarray(self.a), np.asarray(self.b)
         torsion = pi * a**3 * b**3 / (a * a + b * b)
         return _elastic(material, pi * a * b, pi * a**3 * b / 4.0, pi * a * b**3 / 4.0, torsion)
@@ -179,7 +179,7 @@ class Rectangle:
         _require_sizes(self)
 
     def stiffness(self, material: Material) -> Stiffness:
-        """I1 = h w^3 / 12, I2 = w h^3 / 12, J by Saint-Venant's series (Timoshenko and Goodier, section 109)."""
+        """Return the stiffness: I1 = h w^3 / 12, I2 = w h^3 / 12, J by Saint-Venant's series (Timoshenko and Goodier, section 109)."""
         w, h = np.asarray(self.width, float), np.asarray(self.height, float)
         long, short = np.maximum(w, h), np.minimum(w, h)
         odd = np.arange(1, 40, 2)
@@ -191,14 +191,15 @@ class Rectangle:
 @arguments.called
 @dataclass(frozen=True)
 class Ribbon:
-    """Thin flat section whose cross-section bends along with bending and twist, as that of a strip of plate does.
+    """Thin flat section that deforms with bending and twist like a strip of plate.
 
-    Between a rod (narrow) and an inextensible strip (wide), which bend softly by curvature 2. See `kernels.densities.ribbon`.
+    The ribbon interpolates between a rod (narrow) and an inextensible strip (wide), soft in curvature 2. See
+    `kernels.densities.ribbon`.
 
     Attributes:
         width: W along the first director [m]; a number, or an array that broadcasts to (rods, edges).
         thickness: h along the second director [m], less than the width.
-        law: "audoly_neukirch" (exact in uniform bending and twist), "sano_wada" (a simpler form of it), or "sadowsky"
+        law: "audoly_neukirch" (exact in uniform bending and twist), "sano_wada" (simplified), or "sadowsky"
             (inextensible).
     """
 
@@ -213,12 +214,12 @@ class Ribbon:
         arguments.choice("Ribbon: law", self.law, ("audoly_neukirch", "sano_wada", "sadowsky"))
 
     def stiffness(self, material: Material) -> Stiffness:
-        """I1 = h W^3 / 12, I2 = W h^3 / 12 and J = W h^3 / 3, that of a strip of plate."""
+        """Return the stiffness of a strip of plate: I1 = h W^3 / 12, I2 = W h^3 / 12, J = W h^3 / 3."""
         w, h = np.asarray(self.width, float), np.asarray(self.thickness, float)
         return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, w * h**3 / 3.0)
 
     def laws(self, material: Material) -> dict:
-        """The law of bending and twist, with the curvature sqrt(60 / (1 - nu^2)) h / W^2 at which its regime changes."""
+        """Return the law of bending and twist, with crossover curvature sqrt(60 / (1 - nu^2)) h / W^2."""
         from ddg_warp.kernels.densities.ribbon import LAWS
         from ddg_warp.scene.descriptions import Law
 

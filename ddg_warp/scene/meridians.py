@@ -1,4 +1,4 @@
-"""What a scene says about axisymmetric shells: their meridians, and what holds and loads them."""
+"""Axisymmetric shells of a scene, described by meridians, with supports and loads."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -18,7 +18,7 @@ ENDS = {"first": 0, "last": -1}
 
 @dataclass
 class AxisymmetricShell:
-    """A shell of revolution; see `Meridians.add_axisymmetric_shell`."""
+    """Shell of revolution; see `Meridians.add_axisymmetric_shell`."""
 
     points: np.ndarray  # (n, 2) radius and height [m]
     thickness: np.ndarray
@@ -29,7 +29,7 @@ class AxisymmetricShell:
 
 @dataclass(frozen=True)
 class RingSupport:
-    """What is held of nodes of a meridian; `tangent` is the direction (2,) that a rim keeps, None where it may turn."""
+    """Support of nodes of a meridian; `tangent` is the fixed direction (2,) of a rim, None if free to rotate."""
 
     shell: int
     nodes: np.ndarray
@@ -37,7 +37,7 @@ class RingSupport:
     tangent: tuple | None = None
     clamped: bool = False
     motion: Motion | Grip | None = None
-    call: str = "hold_ring"  # what users know it by
+    call: str = "hold_ring"  # method of the scene, for messages
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class RingPressure:
 @arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Meridians:
-    """The part of a scene that turns about the z axis: every energy, force and mass is that of the whole revolution."""
+    """Axisymmetric shells of a scene, with energies, forces and masses of the whole revolution about the z axis."""
 
     axisymmetric_shells: list[AxisymmetricShell] = field(default_factory=list, init=False)
     ring_supports: list[RingSupport] = field(default_factory=list, init=False)
@@ -74,31 +74,31 @@ class Meridians:
     def add_axisymmetric_shell(
         self, points, *, thickness, material: Material, rest="shape", name: str = "shell of revolution"
     ) -> int:
-        """Add a shell of revolution about the z axis, deforming as one, by its meridian in the plane of x and z.
+        """Add a shell of revolution about the z axis with axisymmetric deformation, by its meridian in the plane of x and z.
 
-        An end of the meridian on the axis is a pole: it stays there, and the surface stays smooth. Other ends are rims, free
-        where nothing holds them.
+        An end of the meridian on the axis is a pole, which stays on the axis with a smooth surface. Other ends are rims, free by
+        default.
 
         Args:
             points: radius and height of the nodes at rest (n, 2) [m]; only ends may have radius 0.
             thickness: one number or one an edge [m].
             material: `Material`; its density gives the mass, its viscosity the strain-rate damping.
-            rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone; or two arrays (metric
-                (n - 1, 2) [1], curvature (n, 2) [1/m]), along the meridian and around the axis: squared natural stretch of
-                edges against the points, and natural curvature at nodes, positive where the angle of the tangent grows.
+            rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone. Or two arrays (metric
+                (n - 1, 2) [1], curvature (n, 2) [1/m]), along the meridian and around the axis. The metric is the squared natural
+                stretch of edges against the points; natural curvature at nodes is positive where the angle of the tangent grows.
             name: shown in reports and output.
 
         Returns:
             Index among the axisymmetric shells.
 
         Raises:
-            SceneError: what is given is no meridian; the message names shell and node.
+            SceneError: no valid meridian; the message names shell and node.
         """
-        what = f"axisymmetric shell '{arguments.text('add_axisymmetric_shell: name', name)}'"
-        points = arguments.array(f"{what}: points", points, "give (n, 2), radius and height").copy()
-        thickness = arguments.array(f"{what}: thickness", thickness, "give one number, or one an edge").copy()
+        label = f"axisymmetric shell '{arguments.text('add_axisymmetric_shell: name', name)}'"
+        points = arguments.array(f"{label}: points", points, "give (n, 2), radius and height").copy()
+        thickness = arguments.array(f"{label}: thickness", thickness, "give one number, or one an edge").copy()
         for part, values in (("points", points), ("thickness", thickness)):
-            arguments.sized(f"{what}: {part}", values)
+            arguments.sized(f"{label}: {part}", values)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
             raise SceneError(
                 f"axisymmetric shell '{name}': points have shape {points.shape}; give (n, 2), n at least 3: radius, height"
@@ -114,20 +114,20 @@ class Meridians:
         return len(self.axisymmetric_shells) - 1
 
     def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | Grip | None = None) -> None:
-        """Hold radius ("x") or height ("z") of nodes of a meridian; the surface may turn there (simply supported).
+        """Fix radius ("x") or height ("z") of nodes of a meridian, free to rotate (simply supported).
 
-        `motion` moves them in the plane of x and z, by a translation, which may be another one for each node, and a rotation about the
-        y axis.
+        `motion` moves the nodes in the plane of x and z, by a translation, which may differ between nodes, and a rotation about the y
+        axis.
         """
         self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion))
 
     def clamp_ring(
         self, shell: int, end: str, components: str = "xz", tangent=None, motion: Motion | Grip | None = None
     ) -> None:
-        """Hold components and the direction of the meridian at a rim, its "first" or "last" node; a motion turns it, too.
+        """Clamp a rim, the "first" or "last" node: fix components and the direction of the meridian, which a motion rotates.
 
         Args:
-            tangent: direction (2,) of the meridian there, the way it runs; by default that of the points, extrapolated.
+            tangent: direction (2,) of the meridian at the rim, from first to last; by default extrapolated from the points.
         """
         if tangent is not None:
             tangent = arguments.broadcast("clamp_ring: tangent (2,)", tangent, (2,), own=1)
@@ -143,14 +143,14 @@ class Meridians:
         self._hold_ring(support)
 
     def symmetry_ring(self, shell: int, end: str) -> None:
-        """Put a rim on a plane of symmetry across the axis, which the meridian meets at a right angle."""
+        """Add a symmetry plane normal to the axis at a rim, orthogonal to the meridian."""
         node = self._end(shell, end)
         points = self.axisymmetric_shells[shell].points
         edge = points[1] - points[0] if node == 0 else points[-1] - points[-2]
         self.clamp_ring(shell, end, "z", tangent=(0.0, np.copysign(1.0, edge[1])))
 
     def add_ring_force(self, shell: int, nodes, force, amplitude: Callable[[float], float] | None = None) -> None:
-        """Dead force per length of ring at rest on nodes (2,) or (n, 2): radial and axial [N/m]."""
+        """Add a dead force per length of ring at rest on nodes (2,) or (n, 2): radial and axial [N/m]."""
         nodes = arguments.once("add_ring_force: nodes", self._nodes(shell, nodes))
         radius = self.axisymmetric_shells[shell].points[nodes, 0]
         if not radius.all():
@@ -160,7 +160,7 @@ class Meridians:
         self.ring_loads.append(RingLoad(shell, nodes, 2.0 * np.pi * radius[:, None] * force, amplitude))
 
     def add_pole_force(self, shell: int, force: float, end: str = "first", amplitude=None) -> None:
-        """Dead axial force [N] on a pole."""
+        """Add a dead axial force [N] on a pole."""
         node = self._end(shell, end)
         if self.axisymmetric_shells[shell].points[node, 0] != 0.0:
             raise SceneError(f"add_pole_force: the {end} node of shell {shell} is no pole; use add_ring_force")
@@ -171,21 +171,21 @@ class Meridians:
     def add_axisymmetric_pressure(
         self, shell: int, pressure, edges=None, *, dead: bool = False, amplitude=None
     ) -> None:
-        """Pressure [Pa] on the surface of edges (all by default), towards the left of the meridian as it runs in x and z.
+        """Add pressure [Pa] on edges (all by default), towards the left of the meridian in the plane of x and z.
 
-        It follows the surface: statics takes its exact derivative; in dynamics its forces are those on the predicted surface. With
-        `dead` it keeps directions and areas of the rest shape.
+        Pressure is a follower load: statics uses its exact load stiffness; in dynamics its forces are time-lagged, evaluated on the
+        predicted surface. With `dead` it keeps directions and areas of the rest shape.
         """
         self._check_axisymmetric(shell)
         count = len(self.axisymmetric_shells[shell].points) - 1
-        what = "add_axisymmetric_pressure"
+        call = "add_axisymmetric_pressure"
         index = slice(None) if edges is None else edges
-        index = arguments.once(f"{what}: edges", arguments.indices(f"{what}: edges", index, count))
-        bad = index[(index < 0) | (index >= count)]
-        if bad.size:
-            raise SceneError(f"{what}: edge {bad[0]} does not exist; shell {shell} has {count}")
-        pressure = arguments.broadcast(f"{what}: pressure", pressure, index.shape)
-        dead, amplitude = arguments.flag(f"{what}: dead", dead), arguments.amplitude(what, amplitude)
+        index = arguments.once(f"{call}: edges", arguments.indices(f"{call}: edges", index, count))
+        missing = index[(index < 0) | (index >= count)]
+        if missing.size:
+            raise SceneError(f"{call}: edge {missing[0]} does not exist; shell {shell} has {count}")
+        pressure = arguments.broadcast(f"{call}: pressure", pressure, index.shape)
+        dead, amplitude = arguments.flag(f"{call}: dead", dead), arguments.amplitude(call, amplitude)
         self.ring_pressures.append(RingPressure(shell, index, pressure, dead, amplitude))
 
     def _hold_ring(self, support: RingSupport) -> None:
@@ -211,9 +211,9 @@ class Meridians:
         self._check_axisymmetric(shell)
         count = len(self.axisymmetric_shells[shell].points)
         index = arguments.indices("nodes", nodes, count)
-        bad = index[(index < -count) | (index >= count)]
-        if bad.size:
-            raise SceneError(f"node {bad[0]} does not exist: axisymmetric shell {shell} has {count} nodes")
+        missing = index[(index < -count) | (index >= count)]
+        if missing.size:
+            raise SceneError(f"node {missing[0]} does not exist: axisymmetric shell {shell} has {count} nodes")
         return index % count
 
 
@@ -221,7 +221,7 @@ def _check_meridian(points: np.ndarray, thickness: np.ndarray, name: str) -> Non
     inner = np.zeros(len(points), bool)
     inner[1:-1] = True
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    for bad, text in (
+    for faulty, text in (
         (~np.isfinite(points).all(1), "node {} is at a non-finite position"),
         (points[:, 0] < 0.0, "node {} has a negative radius"),
         (inner & (points[:, 0] == 0.0), "node {} is on the axis; only the ends of a meridian may be"),
@@ -230,7 +230,7 @@ def _check_meridian(points: np.ndarray, thickness: np.ndarray, name: str) -> Non
             "edge {} has no length, two nodes lie at one point; remove one of them",
         ),
     ):
-        for node in np.flatnonzero(bad)[:1]:
+        for node in np.flatnonzero(faulty)[:1]:
             raise SceneError(f"axisymmetric shell '{name}': {text.format(node)}")
     if thickness.shape not in ((), (len(lengths),)) or not (np.isfinite(thickness) & (thickness > 0.0)).all():
         raise SceneError(

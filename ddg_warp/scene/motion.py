@@ -1,4 +1,4 @@
-"""Prescribed motion of supports: rigid motions that count their turns, and displacements node by node."""
+"""Prescribed motion of supports: rigid motions with cumulative angle, and displacements by node."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,8 +8,8 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SolverError
 
-LOOKS = 64  # times at which a translation is asked for what it moves
-JUMP = 0.25  # part of its change over a step that a motion makes at one instant, from which it is a jump
+LOOKS = 64  # times at which a translation is sampled for moving components
+JUMP = 0.25  # least jump at one instant, over the change of a motion in a step
 
 
 def _still(t: float) -> tuple[float, float, float]:
@@ -23,17 +23,16 @@ def _unturned(t: float) -> float:
 @arguments.called
 @dataclass(frozen=True)
 class Motion:
-    """A rigid motion of supports: rotation about an axis through `pivot`, then translation.
+    """Rigid motion of supports: rotation about an axis through `pivot`, then translation.
 
-    A point X of the rest state is at pivot + R(angle(t)) (X - pivot) + translation(t). The angle is cumulative: it counts turns
-    past 2 pi, however far it goes in a step, so that an end can be wound up. In statics t is the load parameter.
+    A point X of the rest state moves to pivot + R(angle(t)) (X - pivot) + translation(t). The angle is cumulative and may exceed
+    2 pi, also within a step, so that an end can be wound up. In statics t is the load parameter.
 
-    Both are zero at t = 0: supports start where they are at rest. Functions of time are the same in all worlds of a model; what is to
-    move in each for itself, or is decided from step to step, is held by a `Grip`.
+    Both are zero at t = 0: supports start at rest. Functions of time are the same in all worlds of a model. For motions that differ
+    between worlds, or are decided step by step, use a `Grip`.
 
     Attributes:
-        translation: t -> displacement (3,) [m]; or (n, 3), one for each node that `fix` names (of one rod after the other), or each
-            vertex that `hold` does, in that order.
+        translation: t -> displacement (3,) [m]; or (n, 3), one for each node of `fix` (rod after rod) or vertex of `hold`, in order.
         angle: t -> cumulative angle about `axis` [rad].
         axis: direction of the rotation (3,), any length.
         pivot: a point on the axis (3,) [m].
@@ -43,7 +42,9 @@ class Motion:
     angle: Callable[[float], float] = _unturned
     axis: tuple = (0.0, 0.0, 1.0)
     pivot: tuple = (0.0, 0.0, 0.0)
-    count: int | None = field(init=False, default=None, repr=False, compare=False)  # of nodes, one displacement each
+    count: int | None = field(
+        init=False, default=None, repr=False, compare=False
+    )  # number of nodes with one displacement each
     unit: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
@@ -59,30 +60,30 @@ class Motion:
 
     @property
     def turns(self) -> bool:
-        """Whether it was given an angle."""
+        """True for a motion with an angle."""
         return self.angle is not _unturned
 
     @property
     def shifts(self) -> bool:
-        """Return True if it was given a translation."""
+        """True for a motion with a translation."""
         return self.translation is not _still
 
     @property
     def planar(self) -> bool:
-        """Whether what lies in the plane of x and z turns within it."""
+        """True for a rotation that keeps the plane of x and z."""
         return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)
 
     def moves(self, duration: float) -> np.ndarray:
-        """Which components of a point it moves (3,), as far as its translation tells at some times until `duration`."""
+        """Return the moving components of a point (3,), from samples of the translation until `duration`."""
         about = np.abs(self.unit) < 1.0 if self.turns else np.zeros(3, bool)
         times = duration * (np.arange(LOOKS) + 1.0) / LOOKS
         return about | np.any([(self.shift(t) != 0.0).any(0) for t in times], axis=0)
 
     def shift(self, t: float) -> np.ndarray:
-        """Translations at t, (1, 3) or (n, 3) [m].
+        """Return translations at t, (1, 3) or (n, 3) [m].
 
         Raises:
-            SolverError: they are not finite, or not as many as at t = 0.
+            SolverError: translations are not finite, or differ in shape from t = 0.
         """
         value = arguments.value_at("the motion's translation", self.translation, t, 3)
         if (len(value) if value.ndim == 2 else None) != self.count:
@@ -93,18 +94,18 @@ class Motion:
         return np.atleast_2d(value)
 
     def turned(self, t: float) -> float:
-        """Cumulative angle at t [rad].
+        """Return the cumulative angle at t [rad].
 
         Raises:
-            SolverError: it is not finite.
+            SolverError: the angle is not finite.
         """
         return float(arguments.value_at("the motion's angle", self.angle, t))
 
     def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
-        """What the device needs of a step: turn (3), rotation at its start (9), pivot (3), translations (3, 3) in a row.
+        """Return rows for the device: rotation vector (3), rotation at the start (9), pivot (3), translations (3, 3).
 
-        From t0 to t1 is a `part` of the step, from its fraction `start` on, and goes on alike over the whole. One row, or one for each
-        node.
+        The interval from t0 to t1 is the fraction `part` of the step after the fraction `start`, extrapolated to the whole step. One
+        row, or one for each node.
         """
         a0, a1 = self.turned(t0), self.turned(t1)
         first, last = self.shift(t0), self.shift(t1)
@@ -116,33 +117,33 @@ class Motion:
         return np.column_stack([np.tile(same, (len(first), 1)), first, last])
 
     def jump(self, t0: float, t1: float) -> float | None:
-        """A time between t0 and t1 at which the motion jumps, found by halving where it changes most; None where it does not."""
+        """Return the time of a jump between t0 and t1, by bisection of the largest change; None without a jump."""
 
-        def at(t):
+        def values_at(t):
             return np.append(self.shift(t).ravel(), self.turned(t))
 
-        low, high = at(t0), at(t1)
+        low, high = values_at(t0), values_at(t1)
         whole = np.abs(high - low).max()
         while t1 - t0 > 64.0 * np.spacing(max(abs(t0), abs(t1))):
             middle = 0.5 * (t0 + t1)
-            here = at(middle)
-            if np.abs(here - low).max() >= np.abs(high - here).max():
-                t1, high = middle, here
+            value = values_at(middle)
+            if np.abs(value - low).max() >= np.abs(high - value).max():
+                t1, high = middle, value
             else:
-                t0, low = middle, here
+                t0, low = middle, value
         return t1 if np.abs(high - low).max() > JUMP * whole > 0.0 else None
 
     def rotation(self, angle: float) -> np.ndarray:
-        """Rotation matrix about the axis (Rodrigues)."""
+        """Return the rotation matrix about the axis (Rodrigues)."""
         k = self.unit
         cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
         return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
 
     def place(self, t: float, points: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Where points of the rest state (n, 3) are at t [m]; `rows` are those of their translations where each has its own."""
+        """Return points of the rest state (n, 3) moved to t [m]; `rows` select translations given by node."""
         turned = (points - self.pivot) @ self.rotation(self.turned(t)).T
         return turned + self.pivot + self.shift(t)[slice(None) if self.count is None else rows]
 
     def turn(self, t: float, vectors: np.ndarray) -> np.ndarray:
-        """Where vectors of the rest state (n, 3) point at t."""
+        """Return vectors of the rest state (n, 3) rotated to t."""
         return vectors @ self.rotation(self.turned(t)).T

@@ -1,4 +1,4 @@
-"""Obstacles: bodies that rods and shells touch and that nothing bends, still or moved."""
+"""Obstacles: kinematic rigid colliders of a scene, fixed or moving."""
 
 from dataclasses import dataclass, field
 
@@ -15,7 +15,7 @@ PLANE, BALL, CAPSULE, MESH = "plane", "ball", "capsule", "mesh"
 @arguments.called
 @dataclass(frozen=True)
 class Plane:
-    """A half-space: everything behind the plane through `point` whose `normal` points outwards."""
+    """Half-space behind the plane through `point` with outward `normal`."""
 
     point: tuple = (0.0, 0.0, 0.0)
     normal: tuple = (0.0, 0.0, 1.0)
@@ -28,14 +28,14 @@ class Plane:
         normal = arguments.direction("Plane: normal", self.normal)
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
-        # a motion moves the plane by three points of it
+        # three points, for rigid motions
         object.__setattr__(self, "points", np.stack([point, point + first, point + np.cross(normal, first)]))
 
 
 @arguments.called
 @dataclass(frozen=True)
 class Sphere:
-    """A ball of a `radius` [m] about its `center` [m]."""
+    """Ball of a `radius` [m] about `center` [m]."""
 
     center: tuple
     radius: float
@@ -48,14 +48,14 @@ class Sphere:
 
     @property
     def points(self) -> np.ndarray:
-        """Its center (1, 3)."""
+        """Center as an array (1, 3)."""
         return np.array([self.center], float)
 
 
 @arguments.called
 @dataclass(frozen=True)
 class Capsule:
-    """All that is within a `radius` [m] of the line from `start` to `end` [m]."""
+    """Points within a `radius` [m] of the segment from `start` to `end` [m]."""
 
     start: tuple
     end: tuple
@@ -72,14 +72,14 @@ class Capsule:
 
     @property
     def points(self) -> np.ndarray:
-        """Both ends of its line (2, 3)."""
+        """End points of the axis (2, 3)."""
         return np.array([self.start, self.end], float)
 
 
 @arguments.called
 @dataclass(frozen=True)
 class Mesh:
-    """A surface of triangles that nothing passes, from either side; open or closed.
+    """Triangle mesh with contact on both sides, open or closed.
 
     Attributes:
         points: vertices (P, 3) [m]; cells: corners of the triangles (T, 3), as `io.read_mesh` gives both.
@@ -112,7 +112,7 @@ SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2,
 
 
 def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
-    """A box about its `center` [m] with half lengths `half` (3,) [m], turned by a `rotation` (3, 3), round by a `radius`."""
+    """Return a box about `center` [m] with half lengths `half` (3,) [m], a `rotation` (3, 3), rounded by `radius` [m]."""
     center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():
         raise SceneError(f"Box: half = {half}; half lengths are positive [m]")
@@ -125,15 +125,15 @@ def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A shape of a scene, and what moves it: see `Scene.add_obstacle`."""
+    """Obstacle with shape and motion: see `Scene.add_obstacle`."""
 
     shape: Plane | Sphere | Capsule | Mesh
     motion: Motion | Grip | None
     name: str
 
-    call, components = "add_obstacle", "xyz"  # as of supports, which hold its points
+    call, components = "add_obstacle", "xyz"  # interface of supports
 
     @property
     def spins(self) -> bool:
-        """Whether its surface may move where its points stay: a round one that turns."""
+        """True for a rounded obstacle that rotates: its surface may move although its points are fixed."""
         return self.shape.radius > 0.0 and self.motion is not None and self.motion.turns

@@ -1,4 +1,4 @@
-"""Paths of equilibria: what a continuation leaves behind, and what it may be told to watch."""
+"""Equilibrium paths of a continuation, with watched displacements and termination criteria."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,10 +14,10 @@ REGULAR, LIMIT_POINT, BIFURCATION = "regular", "limit point", "bifurcation"
 @arguments.called
 @dataclass(frozen=True)
 class Displacement:
-    """A displacement from rest [m]: that of a point along an axis, or a weighted sum of several.
+    """Displacement from rest [m] of a point along an axis, or a weighted sum of several.
 
     Attributes:
-        terms: (row of `State.points`, axis "x", "y" or "z", weight) each.
+        terms: (row of `State.points`, axis "x", "y" or "z", weight) of each term.
     """
 
     terms: tuple[tuple[int, str, float], ...]
@@ -39,14 +39,14 @@ class Displacement:
 
     @classmethod
     def of(cls, row: int, axis: str, weight: float = 1.0) -> "Displacement":
-        """Of one point; with weight -1 along the axis backwards."""
+        """Return the displacement of one point; weight -1 reverses the axis."""
         return cls(((row, axis, weight),))
 
     def vector(self, tangent) -> np.ndarray:
-        """Its derivative with respect to all dofs (size,).
+        """Return the derivative with respect to all dofs (size,).
 
         Raises:
-            SceneError: there is no such point or axis.
+            SceneError: an unknown point or axis.
         """
         dofs, result = tangent.point_dofs(), np.zeros(tangent.size)
         for row, axis, weight in self.terms:
@@ -63,20 +63,20 @@ class Displacement:
 
 @dataclass(eq=False)
 class Point:
-    """An equilibrium of a path.
+    """Equilibrium of a path.
 
     Attributes:
-        state: the equilibrium; its time is the load parameter.
+        state: the equilibrium, with the load parameter as time.
         load: load parameter.
-        arclength: along the path from its start, in the metric of the continuation.
+        arclength: arc length from the start, in the metric of the continuation.
         values: watched displacements by name [m].
-        negative: number of negative eigenvalues of the tangent stiffness: 0 where the equilibrium is stable. At
-            a limit point or bifurcation without the one that vanishes.
+        negative: number of negative eigenvalues of the tangent stiffness (inertia count): 0 for stable equilibria. The zero
+            eigenvalue of a limit point or bifurcation is not counted.
         kind: "regular", "limit point" (the load is stationary) or "bifurcation" (another path crosses).
         direction: unit tangent of the path: dofs (size,) and load parameter at the end.
-        mode: of a bifurcation, the critical eigenvector (size,) of unit length in the metric; None elsewhere.
-        iterations: Newton iterations it took.
-        mode_displacements: the mode by node (P, 3), in the order of `State.points`; None where there is none.
+        mode: critical eigenvector of a bifurcation (size,), of unit length in the metric; else None.
+        iterations: number of Newton iterations.
+        mode_displacements: the mode by node (P, 3), in the order of `State.points`; None without a mode.
     """
 
     state: Any
@@ -92,13 +92,13 @@ class Point:
 
     @property
     def stable(self) -> bool:
-        """Whether the second variation of the potential is positive."""
+        """True if the second variation of the potential is positive."""
         return self.negative == 0
 
 
 @dataclass(eq=False)
 class Path:
-    """Equilibria in the order in which the path runs through them.
+    """Equilibria in order along a path.
 
     Attributes:
         points: see `Point`.
@@ -123,7 +123,7 @@ class Path:
 
     @property
     def stable(self) -> np.ndarray:
-        """Whether each point is stable (points,) bool."""
+        """Stability of each point (points,) bool."""
         return self.negative == 0
 
     @property
@@ -137,28 +137,28 @@ class Path:
         return np.array([point.arclength for point in self.points])
 
     def values(self, name: str) -> np.ndarray:
-        """A watched displacement (points,) [m]; their names are the keys of `points[0].values`."""
+        """Return a watched displacement (points,) [m]; names are the keys of `points[0].values`."""
         return np.array([point.values[name] for point in self.points])
 
     def of_kind(self, kind: str) -> list[Point]:
-        """The points of a kind: "regular", "limit point" or "bifurcation"."""
+        """Return the points of a kind: "regular", "limit point" or "bifurcation"."""
         return [point for point in self.points if point.kind == kind]
 
     @property
     def limit_points(self) -> list[Point]:
-        """Where the load is stationary."""
+        """Points with stationary load."""
         return self.of_kind(LIMIT_POINT)
 
     @property
     def bifurcations(self) -> list[Point]:
-        """Where another path crosses."""
+        """Points with a crossing path."""
         return self.of_kind(BIFURCATION)
 
 
 @arguments.called
 @dataclass(frozen=True)
 class Stop:
-    """Where a path ends; what comes first counts, and the last point lies exactly on a bound that it met.
+    """Termination criteria of a path; the first met counts, and the last point lies exactly on that bound.
 
     Attributes:
         steps: accepted steps.
@@ -178,15 +178,15 @@ class Stop:
             arguments.count("Stop: limit_points", self.limit_points)
         bounds = {"load": self.load}
         if self.displacement is not None:
-            given = self.displacement
-            if not (isinstance(given, tuple | list) and len(given) == 3 and isinstance(given[0], str)):
-                shown = arguments.shown(given)
+            entry = self.displacement
+            if not (isinstance(entry, tuple | list) and len(entry) == 3 and isinstance(entry[0], str)):
+                shown = arguments.shown(entry)
                 raise SceneError(
                     f"Stop: displacement is {shown}; give (name of what is watched, lowest, highest value)"
                 )
-            bounds["displacement"] = given[1:]
+            bounds["displacement"] = entry[1:]
         for name, bound in bounds.items():
-            found = arguments.floats(bound)
-            if found.shape != (2,) or not found[0] < found[1]:
+            limits = arguments.floats(bound)
+            if limits.shape != (2,) or not limits[0] < limits[1]:
                 shown = arguments.shown(getattr(self, name))
                 raise SceneError(f"Stop: {name} is {shown}; its lowest value comes before a higher one")

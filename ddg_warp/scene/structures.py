@@ -1,4 +1,4 @@
-"""What joins a scene's rods and adds surfaces to them: shells, joints, attachments, and what holds and loads shells."""
+"""Shells of a scene with supports and loads, joints of rods, and attachments of rods to shells."""
 
 import warnings
 from collections.abc import Callable, Iterable
@@ -28,13 +28,13 @@ from ddg_warp.scene.material import Material
 from ddg_warp.scene.meridians import Meridians
 from ddg_warp.scene.motion import Motion
 
-COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may be apart, over the largest coordinate
+COINCIDE = 1e-6  # largest distance of coincident or coplanar points, over the largest coordinate
 
 
 @arguments.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Structures(Meridians, Magnets, Contacts):
-    """The part of a scene that is a net: whatever is not a rod of its own."""
+    """Shells, joints and attachments of a scene: everything but uncoupled rods."""
 
     shells: list[Shell] = field(default_factory=list, init=False)
     shell_supports: list[ShellSupport] = field(default_factory=list, init=False)
@@ -64,18 +64,18 @@ class Structures(Meridians, Magnets, Contacts):
             thickness: one number or one a triangle [m].
             material: `Material`; its density gives the mass, its viscosity the strain-rate damping.
             bending: "midedge_dof", "midedge_boundary", "midedge", "hinge" or "isometric"; see `ddg_warp.compile.shells`.
-            membrane: "flat" (constant strain triangles) or "curved" (their sides have the length of the arcs over them, by the
-                normals of bending "midedge_dof"): thin shells that bend far do not lock. For statics, where an iteration costs
-                about twice the time; dynamics refuses it.
-            rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone; or two arrays
-                (abar (T, 3) [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
+            membrane: "flat" (constant strain triangles) or "curved" (sides as long as arcs by the normals of bending "midedge_dof").
+                "curved" avoids membrane locking of thin shells at large bending, for statics only. It about doubles the time of an
+                iteration.
+            rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone. Or two arrays (abar (T, 3)
+                [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
             name: shown in reports and output.
 
         Returns:
             Index of the shell.
 
         Raises:
-            SceneError: what is given is no surface; the message names shell and triangle.
+            SceneError: no valid surface; the message names shell and triangle.
         """
         surface = Surface(points, triangles, arguments.text("add_shell: name", name))
         if not isinstance(material, Material):
@@ -88,27 +88,27 @@ class Structures(Meridians, Magnets, Contacts):
             arguments.choice(f"shell '{name}': rest", rest, ("shape", "flat"))
         else:
             rest = _forms(f"shell '{name}': rest", rest, len(surface.triangles))
-        what = f"shell '{name}': thickness"
-        thickness = arguments.array(what, thickness, "give one number, or one a triangle [m]").copy()
-        arguments.sized(what, thickness)
+        label = f"shell '{name}': thickness"
+        thickness = arguments.array(label, thickness, "give one number, or one a triangle [m]").copy()
+        arguments.sized(label, thickness)
         _warn_of_pieces(surface)
         self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name))
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None) -> None:
-        """Hold components of vertices of a shell, which `motion` moves; the surface may turn there (simply supported).
+        """Fix or prescribe components of vertices of a shell, free to rotate (simply supported).
 
-        The motion may give every vertex a displacement of its own.
+        `motion` may give a displacement for every vertex.
         """
         self._hold("hold", shell, vertices, components, motion=motion)
 
     def clamp_boundary(
         self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None
     ) -> None:
-        """Hold components of vertices, and the surface's normal at the mesh edges between them, inside the surface, too.
+        """Clamp a shell: fix components of vertices, and the normal at mesh edges between them, interior edges too.
 
-        `motion` moves the components and turns the normals as one body, however many times; it moves no other components, so
-        that with "yz" a clamp that turns can slide along x.
+        `motion` moves the components and rotates the normals as one body, also by more than one revolution. Other components stay
+        free, so that with "yz" a rotating clamp can slide along x.
         """
         vertices = self._vertices(shell, vertices)
         surface = self.shells[shell].surface
@@ -116,22 +116,22 @@ class Structures(Meridians, Magnets, Contacts):
         self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
 
     def symmetry(self, shell: int, vertices, axis, motion: Motion | Grip | None = None) -> None:
-        """Put vertices on a symmetry plane, which the surface meets at a right angle.
+        """Add a symmetry plane through boundary vertices, orthogonal to the surface.
 
         Args:
             shell: index.
             vertices: at the boundary, in one plane.
-            axis: of space that the plane is across, "x", "y" or "z"; or the plane's normal (3,), of any length.
-            motion: a translation that moves the plane along an axis of space.
+            axis: coordinate axis normal to the plane, "x", "y" or "z"; or the normal (3,), of any length (skew support).
+            motion: translation of the plane along a coordinate axis.
 
         Raises:
-            SceneError: the vertices are in no plane, not at the boundary, or the plane can not be moved like that.
+            SceneError: vertices in no common plane or not at the boundary, or an unsupported motion of the plane.
         """
         if isinstance(axis, str):
             normal = np.eye(3)["xyz".index(arguments.choice("symmetry: axis", axis, ("x", "y", "z")))]
         else:
             normal = arguments.direction("symmetry: axis, 'x', 'y' or 'z' or the plane's normal,", axis)
-            # to rounding, an axis of space is one
+            # a coordinate axis to rounding is made exact
             axis = "xyz"[np.argmax(np.abs(normal))] if np.sort(np.abs(normal))[1] < 1e-15 else ""
             normal = np.round(normal) if axis else normal
         vertices = self._vertices(shell, vertices)
@@ -152,42 +152,42 @@ class Structures(Meridians, Magnets, Contacts):
         self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()), motion=motion)
 
     def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
-        """Dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
+        """Add a dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
         vertices = arguments.once("add_vertex_force: vertices", self._vertices(shell, vertices))
         force = arguments.broadcast("add_vertex_force: force", force, (len(vertices), 3), own=1)
         amplitude = arguments.amplitude("add_vertex_force", amplitude)
         self.shell_loads.append(ShellLoad(shell, vertices, force, amplitude))
 
     def add_edge_force(self, shell: int, path, force, amplitude: Callable[[float], float] | None = None) -> None:
-        """Dead force per length (3,) [N/m] along mesh edges, shared out by half the length to either end at rest.
+        """Add a dead force per length (3,) [N/m] along mesh edges, half of each edge's force to either end.
 
         Args:
             shell: index.
-            path: vertices, in any order, of a part of the boundary: all boundary edges between them are loaded; or mesh edges, inside
-                the surface, too, as pairs of vertices (E, 2).
+            path: boundary vertices in any order, which load all boundary edges between them; or any mesh edges as pairs of vertices
+                (E, 2).
             force: per length [N/m].
-            amplitude: of the time, or None.
+            amplitude: function of time, or None.
         """
         surface, edges = self._mesh_edges("add_edge_force", shell, path)
         force = np.array(arguments.vector("add_edge_force: force", force))
         half = 0.5 * np.linalg.norm(np.diff(surface.points[surface.edges[edges]], axis=1)[:, 0], axis=1)
-        share = np.bincount(surface.edges[edges].ravel(), np.repeat(half, 2), len(surface.points))
-        vertices = np.flatnonzero(share)
+        length = np.bincount(surface.edges[edges].ravel(), np.repeat(half, 2), len(surface.points))
+        vertices = np.flatnonzero(length)
         amplitude = arguments.amplitude("add_edge_force", amplitude)
-        self.shell_loads.append(ShellLoad(shell, vertices, share[vertices, None] * force, amplitude))
+        self.shell_loads.append(ShellLoad(shell, vertices, length[vertices, None] * force, amplitude))
 
     def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> None:
-        """Couple per length [N] about boundary edges, as long as at rest: an edge moment, which follows the edge.
+        """Add a couple per length at rest [N] about boundary edges: a follower edge moment.
 
-        It is positive by the right hand about the edge with the surface to its left, so that it makes the surface convex on the side
-        of its normals. It does the work of the angle of the normal at the edge, so that bending needs one there: "midedge_dof" or
-        "midedge_boundary". It has no potential where the edge moves out of its direction.
+        Positive by the right hand about the edge with the surface to its left: a positive couple makes the surface convex on the side
+        of its normals. It is conjugate to the angle of the mid-edge normal, which needs bending "midedge_dof" or "midedge_boundary".
+        It has no potential if the edge changes its direction.
 
         Args:
             shell: index.
-            path: as for `add_edge_force`, of the boundary alone.
-            couple: one number, or one an edge where edges are given as pairs [N].
-            amplitude: of the time, or None.
+            path: as for `add_edge_force`, boundary edges only.
+            couple: one number, or one an edge for edges as pairs [N].
+            amplitude: function of time, or None.
 
         Raises:
             SceneError: an edge inside the surface, or one without an angle.
@@ -210,27 +210,28 @@ class Structures(Meridians, Magnets, Contacts):
     def add_pressure(
         self, shell: int, pressure, triangles=None, *, dead: bool = False, amplitude: Callable | None = None
     ) -> None:
-        """Pressure [Pa] on triangles (all by default) along their normals.
+        """Add pressure [Pa] along the normals of triangles (all by default).
 
-        It follows the surface: it has no potential where the boundary moves. Statics takes its exact, unsymmetric derivative; in
-        dynamics its forces are those on the predicted surface. With `dead` it keeps directions and areas of the rest shape.
+        Pressure is a follower load, without potential if the boundary moves. Statics uses its exact, unsymmetric load stiffness; in
+        dynamics its forces are time-lagged, evaluated on the predicted surface. With `dead` it keeps normals and areas of the rest
+        shape.
         """
         self._check_shell(shell)
         count = len(self.shells[shell].triangles)
         index = slice(None) if triangles is None else triangles
         index = arguments.once("add_pressure: triangles", arguments.indices("add_pressure: triangles", index, count))
-        bad = index[(index < 0) | (index >= count)]
-        if bad.size:
-            raise SceneError(f"add_pressure: triangle {bad[0]} does not exist; shell {shell} has {count}")
+        missing = index[(index < 0) | (index >= count)]
+        if missing.size:
+            raise SceneError(f"add_pressure: triangle {missing[0]} does not exist; shell {shell} has {count}")
         pressure = arguments.broadcast("add_pressure: pressure", pressure, index.shape)
         dead, amplitude = arguments.flag("add_pressure: dead", dead), arguments.amplitude("add_pressure", amplitude)
         self.pressures.append(Pressure(shell, index, pressure, dead, amplitude))
 
     def join(self, members: Iterable[tuple[int, int]], rigid: bool = True) -> None:
-        """Join rods at nodes, (rod, node) each: at the same point at rest.
+        """Join rods at nodes, (rod, node) each, which coincide at rest.
 
-        A rigid joint turns with its own rotation and bends every edge that meets there against it, by half a cell each, so that
-        two collinear rods joined rigidly are one rod. A hinged joint shares the position alone.
+        A rigid joint has rotation dofs, and bends every adjacent edge against this rotation over half a cell, so that two collinear
+        rods joined rigidly are one rod. A hinged joint has only a common position.
         """
         pairs = []
         for member in members if np.iterable(members) else [members]:
@@ -244,24 +245,24 @@ class Structures(Meridians, Magnets, Contacts):
         self.joints.append(Joint(tuple(pairs), arguments.flag("join: rigid", rigid)))
 
     def attach(self, rod: int, nodes, shell: int, vertices, spin: str = "glued") -> None:
-        """Make nodes of a rod and vertices of a shell one: a stiffener, a rim, a post. They are at the same points at rest.
+        """Merge nodes of a rod with vertices of a shell, coincident at rest: a stiffener, a rim, a post.
 
         Args:
             rod: index.
             nodes: of the rod.
             shell: index.
-            vertices: as many.
-            spin: "glued": every rod edge between two of these nodes that lies on a mesh edge turns about it with the surface and
-                keeps the angle to it that its directors have at rest; of two triangles their mean turns it, so that a fold along
-                the rod costs what it did. "free": nothing holds the rod's spin about its own axis.
+            vertices: as many as nodes.
+            spin: "glued" couples the twist of rod edges on mesh edges to the shell (rod-shell coupling). The directors of such an
+                edge rotate about it with the surface, at the same angle as at rest. Two triangles act by their mean,
+                which leaves the stiffness of a fold along the rod unchanged. "free" leaves the twist uncoupled.
 
-        Glue holds the turn about the edge alone. A rod whose edges are not mesh edges (a post, a line from a vertex) stands on a ball
-        joint and may spin; one without twist has no spin. With bending "midedge_dof" the surface's own normal at the edge turns the
-        rod, on any mesh; without it that of the triangles does, which is right where the mesh is alike along the rod. Edges on a
-        symmetry plane do not turn.
+        The coupling constrains only rotation about the edge. A rod off the mesh edges (a post, a line from a vertex) has a ball joint
+        and may spin; a rod without twist has no spin. With bending "midedge_dof" the mid-edge normal rotates the rod, on any mesh.
+        Otherwise the triangle normals do, which is accurate for a uniform mesh along the rod. Edges on a symmetry plane do not
+        rotate.
 
         Raises:
-            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that lie apart.
+            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that do not coincide.
         """
         (rod,), nodes = self._on_rods("attach", arguments.index("attach: rod", rod), "node", nodes)
         vertices = self._vertices(shell, vertices)
@@ -271,7 +272,7 @@ class Structures(Meridians, Magnets, Contacts):
         self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices, glued))
 
     def _hold(self, call: str, shell, vertices, components, **options) -> None:
-        if options.get("edges") != "symmetry":  # an oblique plane has none
+        if options.get("edges") != "symmetry":  # a skew support has no components
             arguments.components(call, components)
         motion, vertices = options.get("motion"), self._vertices(shell, vertices)
         validate.check_motion(call, motion, planar=False)
@@ -289,13 +290,13 @@ class Structures(Meridians, Magnets, Contacts):
         self._check_shell(shell)
         count = len(self.shells[shell].points)
         index = arguments.indices("vertices", vertices, count)
-        bad = index[(index < 0) | (index >= count)]
-        if bad.size:
-            raise SceneError(f"vertex {bad[0]} does not exist: shell {shell} has {count} vertices")
+        missing = index[(index < 0) | (index >= count)]
+        if missing.size:
+            raise SceneError(f"vertex {missing[0]} does not exist: shell {shell} has {count} vertices")
         return index
 
     def _mesh_edges(self, call: str, shell: int, path) -> tuple[Surface, np.ndarray]:
-        """The surface of a shell, and its edges that vertices of its boundary, or pairs of vertices, name."""
+        """Return the surface of a shell and edges between boundary vertices or pairs of vertices."""
         self._check_shell(shell)
         surface = self.shells[shell].surface
         if np.ndim(path) == 2 and np.shape(path)[1] == 2 and np.asarray(path).dtype.kind in "iu":
@@ -307,7 +308,7 @@ class Structures(Meridians, Magnets, Contacts):
         )
 
     def _need_edges(self, call: str, shell: int, vertices, among: np.ndarray, kind: str, instead: str) -> np.ndarray:
-        """The edges between vertices; refuses a vertex that is at none of them."""
+        """Return the edges between vertices; refuse a vertex without such an edge."""
         surface = self.shells[shell].surface
         edges = np.intersect1d(surface.edges_on(vertices), among)
         alone = np.setdiff1d(vertices, surface.edges[edges])
@@ -319,20 +320,20 @@ class Structures(Meridians, Magnets, Contacts):
         return edges
 
 
-def _forms(what: str, rest, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rest forms (abar, bbar), copies."""
+def _forms(label: str, rest, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies of the rest forms (abar, bbar), checked."""
     if not isinstance(rest, list | tuple) or len(rest) != 2:
-        raise SceneError(f"{what} is {arguments.shown(rest)}; it is 'shape', 'flat' or two arrays (abar, bbar)")
-    forms = tuple(arguments.array(what, values).copy() for values in rest)
+        raise SceneError(f"{label} is {arguments.shown(rest)}; it is 'shape', 'flat' or two arrays (abar, bbar)")
+    forms = tuple(arguments.array(label, values).copy() for values in rest)
     for values in forms:
         if values.shape != (triangles, 3) or not np.isfinite(values).all():
-            raise SceneError(f"{what} has shape {values.shape}; both arrays are finite and of shape {(triangles, 3)}")
-        arguments.sized(what, values)
+            raise SceneError(f"{label} has shape {values.shape}; both arrays are finite and of shape {(triangles, 3)}")
+        arguments.sized(label, values)
     return forms
 
 
 def _warn_of_pieces(surface: Surface) -> None:
-    """Warn of a mesh in pieces some vertices of which lie on each other: it was likely meant to be welded."""
+    """Warn of a mesh in several components with coincident vertices, which likely needs welding."""
     pieces = surface.pieces
     if pieces == 1:
         return

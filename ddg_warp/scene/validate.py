@@ -1,4 +1,4 @@
-"""What a scene must fulfil before anything is built: every refusal names the object, its index and the remedy."""
+"""Validation of a scene before compilation: every error names the object, the index and the remedy."""
 
 import numbers
 import warnings
@@ -14,15 +14,15 @@ from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.motion import Motion
 
-DOUBLED = 1e-10  # length of an edge, over the longest of its rod, at which its two nodes are one
+DOUBLED = 1e-10  # edge length over the longest of the rod below which both nodes coincide
 STARTS = 1e-9  # displacement over the size of the scene, or angle [rad], up to which a motion starts at zero
 
 
 def check_settings(scene) -> None:
-    """Gravity, dimension, damping, analysis and functions of a scene.
+    """Check gravity, dimension, damping, analysis and functions of a scene.
 
     Raises:
-        SceneError: the first thing found wrong.
+        SceneError: the first error.
     """
     arguments.vector("gravity", scene.gravity)
     if not (isinstance(scene.dimension, numbers.Integral) and scene.dimension in (2, 3)):
@@ -44,10 +44,10 @@ def check_settings(scene) -> None:
 
 
 def check_scene(scene) -> None:
-    """What belongs to no rod: settings, gravity in the plane, and motions that start where their supports are at rest.
+    """Check everything but rods: settings, gravity, drag, magnets, contact, and motions that start at rest.
 
     Raises:
-        SceneError: the first thing found wrong.
+        SceneError: the first error.
     """
     check_settings(scene)
     if scene.dimension == 2 and scene.gravity[1] != 0.0:
@@ -60,7 +60,7 @@ def check_scene(scene) -> None:
     every = (*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles)
     supports = [s for s in every if isinstance(s.motion, Motion)]  # a grip starts at rest
     if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
-        return  # a state may start elsewhere, and equilibria have no time before the first
+        return  # an initial state may be displaced, and equilibria have no initial time
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
     size = max(
         (np.nanmax(np.ptp(o.points.reshape(-1, o.points.shape[-1]), axis=0)) for o in objects if o.points.size),
@@ -68,8 +68,8 @@ def check_scene(scene) -> None:
     )
     for support in supports:
         motion = support.motion
-        held = ["xyz".index(c) for c in support.components]
-        shift, angle = motion.shift(0.0)[:, held], motion.turned(0.0)
+        fixed = ["xyz".index(c) for c in support.components]
+        shift, angle = motion.shift(0.0)[:, fixed], motion.turned(0.0)
         if np.abs(shift).max() > STARTS * size:
             row = int(np.argmax(np.abs(shift).max(axis=1)))
             raise SceneError(
@@ -85,7 +85,7 @@ def check_scene(scene) -> None:
 
 
 def _check_magnets(scene) -> None:
-    """Refuse a field or dipoles without anything magnetised, and magnets that nothing acts on."""
+    """Refuse a field or dipoles without magnetised rods, and magnets without field or dipoles."""
     magnetised = np.concatenate([np.zeros(0, int), *(magnet.rods for magnet in scene.magnets)])
     if scene.applied_field is not None and not magnetised.size:
         raise SceneError("magnetic_field: nothing is magnetised; add scene.magnetize(rod, ...), or leave the field out")
@@ -101,7 +101,7 @@ def _check_magnets(scene) -> None:
 
 
 def check_motion(call: str, motion, planar: bool) -> None:
-    """Refuse what is no motion, or turns out of the plane of x and z where that is all there is."""
+    """Refuse an object that is no motion, or a rotation out of the plane of x and z if `planar`."""
     if motion is not None and not isinstance(motion, Motion | Grip):
         raise SceneError(f"{call}: motion is {motion!r}; give Motion(translation=..., angle=...) or Grip(pivot=...)")
     if motion is not None and planar and not motion.planar:
@@ -110,24 +110,26 @@ def check_motion(call: str, motion, planar: bool) -> None:
         )
 
 
-def directions(what: str, value, rods: np.ndarray) -> np.ndarray:
-    """Unit vectors (rods, 3) from a direction (3,), or one a rod."""
-    result = arguments.array(what, value, f"give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
+def directions(label: str, value, rods: np.ndarray) -> np.ndarray:
+    """Return unit vectors (rods, 3) from a direction (3,), or one a rod."""
+    result = arguments.array(label, value, f"give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
     if result.shape not in ((3,), (1, 3), (len(rods), 3)):
         shown = arguments.shown(value)
-        raise SceneError(f"{what} is {shown}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
+        raise SceneError(f"{label} is {shown}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
     result = np.broadcast_to(result, (len(rods), 3))
-    bad = np.flatnonzero(~(np.isfinite(result).all(1) & result.any(1)))
-    if bad.size:
-        raise SceneError(f"{what} of rod {rods[bad[0]]} is {result[bad[0]]}; give a finite vector that is not zero")
+    faulty = np.flatnonzero(~(np.isfinite(result).all(1) & result.any(1)))
+    if faulty.size:
+        raise SceneError(
+            f"{label} of rod {rods[faulty[0]]} is {result[faulty[0]]}; give a finite vector that is not zero"
+        )
     return arguments.unit(result)
 
 
 def check_batch(batch, dimension: int) -> None:
-    """Points, lengths, folds and parameters of one `RodBatch`.
+    """Check points, lengths, folds and parameters of one `RodBatch`.
 
     Raises:
-        SceneError: the first thing found wrong.
+        SceneError: the first error.
     """
     name = f"('{batch.name}')"
     if not batch.rods:
@@ -138,25 +140,25 @@ def check_batch(batch, dimension: int) -> None:
     for rows in batch.runs(np.arange(batch.rods)):
         _check_shape(batch, rows, dimension)
     section = batch.section
-    for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity", "area"):
-        if what == "radius" and section.radius is None:
+    for parameter in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity", "area"):
+        if parameter == "radius" and section.radius is None:
             continue
         try:
-            value = arguments.array(what, getattr(section, what))
+            value = arguments.array(parameter, getattr(section, parameter))
             np.broadcast_to(value, (batch.rods, batch.edges))
         except ValueError:
             raise SceneError(
-                f"rod {batch.first} {name}: {what} = {arguments.shown(getattr(section, what))}; give a "
+                f"rod {batch.first} {name}: {parameter} = {arguments.shown(getattr(section, parameter))}; give a "
                 f"number, or numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
             ) from None
         if not np.all(np.isfinite(value)) or np.any(value < 0.0):
-            raise SceneError(f"rod {batch.first} {name}: {what} = {value}; it must be finite and not negative")
-        arguments.sized(f"rod {batch.first} {name}: {what}", value)
+            raise SceneError(f"rod {batch.first} {name}: {parameter} = {value}; it must be finite and not negative")
+        arguments.sized(f"rod {batch.first} {name}: {parameter}", value)
     needed = ["EA"] + (["EI1", "EI2"] if batch.bend else []) + (["GJ"] if batch.twist else [])
-    for what in needed:
-        if np.any(np.asarray(getattr(section, what)) == 0.0):
+    for parameter in needed:
+        if np.any(np.asarray(getattr(section, parameter)) == 0.0):
             raise SceneError(
-                f"rod {batch.first} {name}: {what} is zero; leave the term out (bend=False, twist=False) instead"
+                f"rod {batch.first} {name}: {parameter} is zero; leave the term out (bend=False, twist=False) instead"
             )
     if batch.bend and not batch.twist and dimension == 3 and np.any(np.asarray(section.EI1) != np.asarray(section.EI2)):
         raise SceneError(f"rod {batch.first} {name}: EI1 and EI2 differ, which needs twist=True")
@@ -191,12 +193,12 @@ def _check_natural(batch, dimension: int) -> None:
     natural, vertices = batch.natural, batch.edges - (0 if batch.closed else 1)
     if isinstance(natural, str) and natural in ("shape", "straight"):
         return
-    parts = 1 if dimension == 2 else 3
+    count = 1 if dimension == 2 else 3
     where = f"rod {batch.first} ('{batch.name}')"
     several = isinstance(natural, list | tuple) or getattr(natural, "ndim", 0)
-    if not several or len(natural) != parts:
+    if not several or len(natural) != count:
         shown = arguments.shown(natural)
-        raise SceneError(f"{where}: natural is {shown}; give 'shape', 'straight' or {parts} arrays [1/m]")
+        raise SceneError(f"{where}: natural is {shown}; give 'shape', 'straight' or {count} arrays [1/m]")
     for value in natural:
         try:
             value = np.broadcast_to(arguments.array(f"{where}: natural", value), (batch.rods, vertices))
@@ -212,40 +214,40 @@ def _check_natural(batch, dimension: int) -> None:
 
 
 def _check_director(batch, dimension: int) -> None:
-    given, full = batch.director, (batch.rods, batch.edges, 3)
-    if given.shape not in ((3,), (batch.rods, 3), full, (1, *full[1:])):
+    director, full = batch.director, (batch.rods, batch.edges, 3)
+    if director.shape not in ((3,), (batch.rods, 3), full, (1, *full[1:])):
         raise SceneError(
-            f"rod {batch.first} ('{batch.name}'): director has shape {given.shape}; give (3,), (rods, 3) or (rods, edges, 3)"
+            f"rod {batch.first} ('{batch.name}'): director has shape {director.shape}; give (3,), (rods, 3) or (rods, edges, 3)"
         )
-    given = given if given.ndim == 3 else np.broadcast_to(given, (batch.rods, 3))[:, None]
-    _refuse(~np.isfinite(given).all(-1), batch, "director of edge {k} is not finite; give finite numbers")
+    director = director if director.ndim == 3 else np.broadcast_to(director, (batch.rods, 3))[:, None]
+    _refuse(~np.isfinite(director).all(-1), batch, "director of edge {k} is not finite; give finite numbers")
     if dimension == 3:
-        tangents = polyline.unit(polyline.edge_vectors(batch.points, batch.closed)[:, : given.shape[1]])
-        across = polyline.length(polyline.cross(given, tangents))
+        tangents = polyline.unit(polyline.edge_vectors(batch.points, batch.closed)[:, : director.shape[1]])
+        across = polyline.length(polyline.cross(director, tangents))
         _refuse(
-            across <= 1e-9 * polyline.length(given),
+            across <= 1e-9 * polyline.length(director),
             batch,
             "director of edge {k} is parallel to the edge; give one across it",
         )
 
 
-def check_index(what: str, index: int, size: np.ndarray, rods: np.ndarray) -> None:
-    """Refuse a node or edge index that a rod does not have; `size` and `rods` run over the rods concerned."""
-    bad = np.flatnonzero((index >= size) | (index < -size))
-    if bad.size:
-        raise SceneError(f"{what} {index} does not exist: rod {rods[bad[0]]} has {size[bad[0]]} {what}s")
+def check_index(kind: str, index: int, size: np.ndarray, rods: np.ndarray) -> None:
+    """Refuse a node or edge index out of range; `size` is the number of nodes or edges of each of `rods`."""
+    missing = np.flatnonzero((index >= size) | (index < -size))
+    if missing.size:
+        raise SceneError(f"{kind} {index} does not exist: rod {rods[missing[0]]} has {size[missing[0]]} {kind}s")
 
 
-def _refuse(bad: np.ndarray, batch, message: str, rows: np.ndarray | None = None) -> None:
-    """Raise for the first True of bad (rods, nodes or edges or vertices), of all rods of a batch or of some rows."""
-    if bad.any():
-        rod, k = np.argwhere(bad)[0]
+def _refuse(faulty: np.ndarray, batch, message: str, rows: np.ndarray | None = None) -> None:
+    """Raise for the first True of `faulty` (rods, items), of all rods of a batch or of `rows`."""
+    if faulty.any():
+        rod, k = np.argwhere(faulty)[0]
         rod = rod if rows is None else rows[rod]
         raise SceneError(f"rod {batch.first + rod} ('{batch.name}'): " + message.format(k=k))
 
 
 def warn_of_massless(model) -> None:
-    """Warn of what gravity does not act on in statics, because it has no mass."""
+    """Warn of massless rods and shells under gravity in statics."""
     if not any(model.scene.gravity):
         return
     for batch in model.scene.batches:
