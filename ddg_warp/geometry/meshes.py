@@ -83,7 +83,7 @@ def annulus(
     Args:
         n_radial, n_around: number of cells along the radius and around.
         inner, outer: radii [m].
-        slit: whether the ring is cut along +x: the vertices are doubled, j = n_around at the angle 2 pi.
+        slit: whether the ring is cut along +x, with doubled vertices on the cut: j = n_around is the angle 2 pi.
         pattern: `right` or `alternating`, as in `rectangle`.
 
     Vertex (i, j) is i + (n_radial + 1) j, with i from the inner circle outwards and j around, from +x towards +y.

@@ -106,7 +106,7 @@ def reference_twist(tangents: np.ndarray, frames: np.ndarray, closed: bool) -> n
 def curvatures(
     tangents: np.ndarray, frames: np.ndarray, closed: bool, by_angle: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return integrated material curvatures of every vertex about both directors, (R, vertices) each.
+    """Return integrated material curvatures of every vertex towards first and second director, (R, vertices) each.
 
     The magnitude is 2 tan(phi/2), about the means of both edges' directors; or phi `by_angle`, about the directors halfway between.
     """

@@ -19,8 +19,8 @@ the disk therefore goes to memory and reports success, and the transaction fails
 
 A program that ignores journals sees an inconsistent file only while changed pages are being written.
 
-Measured: some ten microseconds a transaction. To stay there, replaced large data such as checkpoints alternate between two groups:
-the group not in use is declared `scratch` and written straight to the file.
+Measured: some ten microseconds a transaction. Large data that are replaced, such as checkpoints, alternate between two groups to
+keep it short: the group not in use is declared `scratch` and written straight to the file.
 """
 
 from __future__ import annotations

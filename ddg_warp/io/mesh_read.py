@@ -77,7 +77,7 @@ def triangulated(
         points: (P, 3).
         counts: Corners of each face, shape (F,).
         indices: Points of the corners, face after face.
-        where: Begin of messages.
+        where: Start of messages.
         lines: Line of each face, for messages that name lines instead of faces.
     """
 
