@@ -1,4 +1,4 @@
-"""Controls: what a time step, or a search for an equilibrium, is given beside its state, world by world."""
+"""Controls: loads, poses of grips, gravity and field of one time step or static solve, per world."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -12,20 +12,20 @@ from ddg_warp.errors import SceneError
 @arguments.called
 @dataclass(frozen=True, eq=False)
 class Controls:
-    """What acts during one step, constant over it: `integrator.step(state, dt, controls)`. What is not given is as the scene has it.
+    """Control inputs of one step, constant over it: `integrator.step(state, dt, controls)`.
 
-    Every field is one array for all worlds, or has an axis of worlds in front. What the scene has as functions of time, motions and
-    loads, stays as it is, the same for all worlds; these loads add to it. They belong to the step alone: what is asked of a state
-    afterwards (reactions, spectra, energy of gravity) knows the loads of the scene.
+    Every field is one array for all worlds, or has an axis of worlds in front. Fields left out are as in the scene. Motions and loads
+    that the scene gives as functions of time stay, the same in all worlds; control loads add to them. Controls belong to the step
+    alone: later queries of a state (reactions, spectra, energy of gravity) know only the loads of the scene.
 
-    `statics.solve(model, controls=...)` takes them, too: the load parameter scales loads, gravity and the field as it does those of
-    the scene, and poses are those at its end.
+    `statics.solve(model, controls=...)` takes them, too. The load parameter then scales loads, gravity and the field like the loads
+    of the scene, and poses are reached at its end.
 
     Attributes:
-        poses: of every `Grip` at the end of the step (grips, 6) or (worlds, grips, 6): translation [m] and rotation vector [rad],
-            relative to rest, in the order of `model.grips`. Grips rest where they are without.
-        forces: on points (P, 3) or (worlds, P, 3) [N], in the order of `State.points`; on rows of one node, which joined
-            rods have, their sum; of a shell of revolution on the whole ring.
+        poses: pose of every `Grip` at the end of the step (grips, 6) or (worlds, grips, 6), in the order of `model.grips`: translation
+            [m] and rotation vector [rad] relative to rest. Without, grips stay where they are.
+        forces: on points (P, 3) or (worlds, P, 3) [N], in the order of `State.points`. Rows of one node (joined rods) add up. A shell
+            of revolution takes the force on the whole ring.
         moments: about the tangents of edges (edges,) or (worlds, edges) [N m], in the order of `State.angles`.
         gravity: (3,) or (worlds, 3) [m/s^2], instead of the scene's.
         field: (3,) or (worlds, 3) [T], a uniform magnetic field on top of the scene's.
@@ -38,25 +38,25 @@ class Controls:
     field: Any = None
 
     def checked(self, model) -> dict[str, np.ndarray]:
-        """What is given, by name, each as an array with an axis of worlds (1 or worlds, ...).
+        """Return the given fields by name, each with an axis of worlds (1 or worlds, ...).
 
         Raises:
             SceneError: a shape does not fit, a value is not finite, or the model has nothing that it could act on.
         """
-        known = shapes(model)
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        found = {
-            name: _numbers(name, values, known[name], model.worlds)
-            for name, values in given.items()
+        expected = shapes(model)
+        inputs = {field.name: getattr(self, field.name) for field in fields(self)}
+        result = {
+            name: _numbers(name, values, expected[name], model.worlds)
+            for name, values in inputs.items()
             if values is not None
         }
-        _refuse_missing(model, found)
-        _refuse_out_of_plane(model, found)
-        return found
+        _refuse_missing(model, result)
+        _refuse_out_of_plane(model, result)
+        return result
 
 
 def checked(controls: Controls | None, model, call: str = "step") -> dict[str, np.ndarray]:
-    """What controls give, see `Controls.checked`; nothing without."""
+    """Return the arrays of `Controls.checked` by name; {} without controls."""
     if controls is None:
         return {}
     if not isinstance(controls, Controls):
@@ -68,31 +68,30 @@ def checked(controls: Controls | None, model, call: str = "step") -> dict[str, n
 
 
 def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
-    """The one place where arrays of others become ours."""
+    """Return the values of a field as a checked float array with an axis of worlds."""
     values = arguments.array(f"Controls: {name}", values)
     if values.shape not in (shape, (worlds, *shape)):
         raise SceneError(
             f"Controls: {name} have shape {values.shape}; they are {shape}, or {(worlds, *shape)} for each of the worlds"
         )
     if not np.isfinite(values).all():
-        *world, place = np.argwhere(~np.isfinite(values))[0][: values.ndim - len(shape) + 1]
+        *world, entry = np.argwhere(~np.isfinite(values))[0][: values.ndim - len(shape) + 1]
         where = f" in world {world[0]}" if world else ""
-        raise SceneError(f"Controls: {name}: entry {place}{where} is not finite; give finite numbers")
+        raise SceneError(f"Controls: {name}: entry {entry}{where} is not finite; give finite numbers")
     return values if values.ndim > len(shape) else values[None]
 
 
 def shapes(model) -> dict[str, tuple]:
-    """Of what a model's worlds are given each, by name."""
+    """Return the shape of every field of `Controls` for one world, by name."""
     points, edges, grips = model.points_count, model.order.edges_count, len(model.grips)
     return {"forces": (points, 3), "moments": (edges,), "gravity": (3,), "field": (3,), "poses": (grips, 6)}
 
 
 def require_acting(model, names) -> None:
-    """Refuse what would act on nothing.
+    """Refuse poses without grips, and a field without magnetised rods.
 
     Raises:
-        SceneError: poses are among the names, and there is no grip; or a magnetic field, and nothing is magnetised or the scene has no
-            field that it adds to.
+        SceneError: `names` has poses, and there is no grip; or a field, and no rod is magnetised or the scene has no field.
     """
     if "field" in names and not model.magnetic:
         raise SceneError(
@@ -105,21 +104,21 @@ def require_acting(model, names) -> None:
         )
 
 
-def _refuse_missing(model, found: dict[str, np.ndarray]) -> None:
-    """Refuse what would act on nothing, and moments about edges without an angle."""
-    require_acting(model, found)
-    if "moments" in found:
-        bad = np.flatnonzero(found["moments"].any(0) & ~model.order.twisted)
-        if bad.size:
-            edge, rod = model.order.edge(bad[0])
+def _refuse_missing(model, inputs: dict[str, np.ndarray]) -> None:
+    """Refuse fields that act on nothing, and moments about edges without a twist angle."""
+    require_acting(model, inputs)
+    if "moments" in inputs:
+        untwisted = np.flatnonzero(inputs["moments"].any(0) & ~model.order.twisted)
+        if untwisted.size:
+            edge, rod = model.order.edge(untwisted[0])
             raise SceneError(
                 f"Controls: moments: edge {edge} of rod {rod} ('{model.curves.names[rod]}') has no twist; give 0, or add the rod with "
                 "twist=True, in dimension 3"
             )
 
 
-def _refuse_out_of_plane(model, found: dict[str, np.ndarray]) -> None:
-    """Refuse what leaves the plane of x and z that planar scenes, and meridians of shells of revolution, stay in."""
+def _refuse_out_of_plane(model, inputs: dict[str, np.ndarray]) -> None:
+    """Refuse controls that leave the x-z plane of planar scenes and of meridians."""
     scene = model.scene
     planar = scene.dimension == 2
     flat, grips = np.full(model.points_count, planar), np.full(len(model.grips), planar)
@@ -129,21 +128,21 @@ def _refuse_out_of_plane(model, found: dict[str, np.ndarray]) -> None:
             grips[model.grips.index(support.motion)] = True
     flat[model.order.meridian_rows] = True
     text = "stays in the plane of x and z"
-    if "poses" in found:
-        poses = np.abs(found["poses"]).max(0)
+    if "poses" in inputs:
+        poses = np.abs(inputs["poses"]).max(0)
         for grip in np.flatnonzero(grips & poses[:, [1, 3, 5]].any(1))[:1]:
             raise SceneError(
                 f"Controls: poses: what grip {grip} holds {text}; give 0 for its translation along y and its rotation about x and z"
             )
-    if "forces" in found:
-        for point in np.flatnonzero(flat & found["forces"][..., 1].any(0))[:1]:
+    if "forces" in inputs:
+        for point in np.flatnonzero(flat & inputs["forces"][..., 1].any(0))[:1]:
             raise SceneError(f"Controls: forces: point {point} {text}; give 0 along y")
-    if "field" in found and planar and found["field"][:, 1].any():
-        raise SceneError(f"Controls: field {tuple(found['field'][0].tolist())}: the scene {text}; give 0 along y")
-    if "gravity" in found and found["gravity"][:, along].any():
-        what = (
+    if "field" in inputs and planar and inputs["field"][:, 1].any():
+        raise SceneError(f"Controls: field {tuple(inputs['field'][0].tolist())}: the scene {text}; give 0 along y")
+    if "gravity" in inputs and inputs["gravity"][:, along].any():
+        reason = (
             "shells of revolution are about z; give 0 along x and y"
             if along == [0, 1]
             else f"the scene {text}; give 0 along y"
         )
-        raise SceneError(f"Controls: gravity {tuple(found['gravity'][0].tolist())}: {what}")
+        raise SceneError(f"Controls: gravity {tuple(inputs['gravity'][0].tolist())}: {reason}")

@@ -1,4 +1,4 @@
-"""How edges that are glued to shells follow these where a state is given; see `ddg_warp.compile.net.glue`."""
+"""Rod-shell coupling: set twist angles of glued edges from a given shell; see `ddg_warp.compile.net.glue`."""
 
 import numpy as np
 import warp as wp
@@ -8,7 +8,7 @@ from ddg_warp.kernels.net.elements import term_kernels
 
 
 def follow(net, state, angles: bool, rates: bool) -> None:
-    """Turn glued edges that are free with the surface as its nodes are (angles) and move (rates), in place."""
+    """Set twist angles (`angles`) and rates (`rates`) of free glued edges from the surface."""
     for index, part in enumerate(net.sets):
         if part.term.name != TERM.name:
             continue
@@ -28,8 +28,8 @@ def follow(net, state, angles: bool, rates: bool) -> None:
             _turn(state.v, edges, np.where(free, -slip, 0.0))
 
 
-def _turn(blocks: wp.array, places: np.ndarray, by: np.ndarray) -> None:
-    """Add to the first of the three reals of blocks; where one is named twice the last counts."""
+def _turn(blocks: wp.array, indices: np.ndarray, angle: np.ndarray) -> None:
+    """Add `angle` to the first component of dof blocks; of a repeated index the last counts."""
     values = blocks.numpy()
-    values[places, 0] += by
+    values[indices, 0] += angle
     blocks.assign(values)

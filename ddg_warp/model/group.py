@@ -1,4 +1,4 @@
-"""A group of rods of one kind on a device: its constant arrays, all worlds side by side."""
+"""Rod group on a device: constant arrays of uncoupled rods of one kind."""
 
 from dataclasses import replace
 
@@ -13,10 +13,11 @@ from ddg_warp.scene import drag
 
 
 class Group:
-    """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod).
+    """Constant device arrays of one rod group, all worlds side by side (column = world * R + rod).
 
-    `parameters` are "term.parameter" of all terms, broadcastable to (node, column); `weighed` is whether `mass` and `rotary` may be
-    others than those of `host`.
+    Attributes:
+        parameters: "term.parameter" of all terms, broadcastable to (node, column).
+        weighed: whether `mass` and `rotary` may differ from `host`.
     """
 
     def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
@@ -54,11 +55,14 @@ class Group:
         self.outer = put(_outer_forces(host, self.gravity_host, load, moment), real)
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
-        self._stiffnesses = None, ()  # and what they are of
+        self._stiffnesses = None, ()  # key and values
 
     def set_parameter(self, name: str, values: np.ndarray) -> bool:
-        """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
-        `ParameterTable.set`."""
+        """Replace "term.parameter"; return True if its memory was reallocated.
+
+        Args:
+            values: of shape (), (worlds,), (elements,) or (worlds, elements).
+        """
         elements = self.nodes
         if values.ndim == 0:
             new = values.reshape(1, 1)
@@ -81,11 +85,11 @@ class Group:
 
     @property
     def node_mass(self) -> wp.array:
-        """As of `DeviceNet`, [node][column]."""
+        """Masses of nodes as [node][column]."""
         return self.mass
 
     def dof_masses(self) -> np.ndarray:
-        """Masses of all dofs, rod by rod (columns n block,)."""
+        """Return masses of all dofs, rod by rod (columns n block,)."""
         if self.weighed:
             mass, rotary = (arrays.download(array).astype(float) for array in (self.mass, self.rotary))
         else:
@@ -93,9 +97,9 @@ class Group:
         return np.stack([mass] * self.dim + [rotary] * self.kind.twist, axis=-1).transpose(1, 0, 2).ravel()
 
     def stiffnesses(self, s: float) -> tuple[np.ndarray, ...]:
-        """Stiffnesses of every rod (columns,) over a step of s [s]; see `precision.stiffnesses`.
+        """Return stiffnesses of every rod (columns,) over a step of s [s]; see `precision.stiffnesses`.
 
-        The last ones are remembered, as a step asks for them several times after every change of a parameter.
+        The last result is cached: a step needs it several times after every change of a parameter.
         """
         if self._stiffnesses[0] != (s, self.parameters.version):
             self._stiffnesses = (s, self.parameters.version), self._find_stiffnesses(s)
@@ -106,36 +110,39 @@ class Group:
         mass, length = host.mass.sum(0) / host.count, host.length
         if self.kind.drag:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
-            length = np.where(host.fixed.any(0), length, np.inf)  # over long steps a free rod has nothing but drag
+            length = np.where(host.fixed.any(0), length, np.inf)  # over long steps only drag acts on a free rod
         mass, length = (np.tile(values, self.worlds) for values in (mass, length))
         return precision.stiffnesses(self.kind, mass, length, self.parameters.values, s)
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of every rod (columns,) over a step of s [s]; see `precision.float32_error`."""
+        """Return the float32 error of every rod (columns,) over a step of s [s]; see `precision.float32_error`."""
         stretching, _, softest = self.stiffnesses(s)
         return precision.float32_error(stretching, softest)
 
     def split_errors(self, s: float) -> np.ndarray:
-        """The same with tensions as unknowns; infinite where they cannot be: beside bending, of one stretch."""
+        """Return the float32 errors of the mixed axial-force formulation (columns,).
+
+        The formulation needs bending and one stretch per edge; errors of other rods are infinite.
+        """
         _, bending, softest = self.stiffnesses(s)
         errors = precision.float32_error(np.maximum(bending, precision.largest_carried(softest)), softest)
         return errors if self.kind.span == 2 and self.kind.edge_strains == self.kind.tensions == 1 else errors + np.inf
 
 
 def _last_anchor(host: ChainGroup) -> np.ndarray:
-    """The last node of every rod (R,) that is held in all directions, -1 where none is."""
+    """Return the last node of every rod (R,) that is fixed in all directions, or -1."""
     return np.where(host.anchored, np.arange(host.shape[0])[:, None], -1).max(axis=0)
 
 
 def _constant_loads(host: ChainGroup) -> tuple[np.ndarray, np.ndarray]:
-    """Constant forces on nodes (n, R, dim) [N] and moments on the angles of edges (n, R), or (1, 1) without twist [N m]."""
+    """Return constant nodal forces (n, R, dim) [N] and edge moments (n, R) [N m]; moments (1, 1) without twist."""
     load = host.constant_loads()
     force = load[: host.nodes].reshape(*host.shape, 3)[..., :: 2 if host.kind.dim == 2 else 1]
     return force, load[host.nodes :, 0].reshape(host.shape) if host.kind.twist else np.zeros((1, 1))
 
 
 def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:
-    """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
+    """Return the load scale of every rod (R,) [N]: sum of the magnitudes of external forces."""
     forces, rods = np.zeros_like(host.mass), len(host.rods)
     for d, g in enumerate(gravity):
         force = host.mass * g
@@ -149,7 +156,10 @@ def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, momen
 
 
 def changing_forces(host: ChainGroup) -> np.ndarray:
-    """Sizes of loads that change, at their full amplitude, or follow, by place [N]; moments over the length of the rod."""
+    """Return magnitudes of time-dependent and follower loads by storage index [N].
+
+    Time-dependent loads count with their full amplitude, moments over the length of the rod.
+    """
     force = np.zeros(host.size)
     for timed in host.timed:
         arm = np.where(timed.places < host.nodes, 1.0, host.length[timed.places % len(host.rods)])

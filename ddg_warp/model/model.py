@@ -1,4 +1,4 @@
-"""Model: a scene frozen for a device. Constant arrays, terms, dof map, and what can be asked of a state."""
+"""Model: constant device data compiled from a scene: arrays, terms, dof map; and queries of a state."""
 
 from functools import cached_property
 
@@ -31,16 +31,17 @@ class Model:
     """A built scene; see `Scene.build`.
 
     Attributes:
-        scene: what it was built from.
+        scene: the scene it was built from.
         curves: rods in the user's order.
-        groups: rods of one kind and similar length each; those that are part of the net are not among them.
-        net: shells and what is joined, or None.
-        motions: the different motions of its supports; grips: those that every step is told, in the order in which `Controls` give
-            their poses: as supports were added, of rods, then of shells, then of shells of revolution.
+        groups: rod groups: uncoupled rods, each group of one kind and similar length.
+        net: coupled system: shells, and rods that are joined, attached or in contact; None without.
+        motions: distinct motions of supports.
+        grips: motions that are control inputs, in the order of `Controls.poses`: as supports were added, of rods, then of shells,
+            then of shells of revolution.
         precision: scalar types.
         worlds: number of independent copies.
-        allow_rounding: whether what float32 loses in rounding is stepped and solved nevertheless.
-        order: of its points and edges, as the user counts them.
+        allow_rounding: whether steps and solves run although float32 rounding exceeds its limit.
+        order: points and edges in the user's order.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class Model:
         return "\n ".join([*lines, "model.report() says more>"])
 
     def __reduce__(self):
-        """Have pickle, torch.save and copy.deepcopy build the scene again, with the parameters and rest shapes that the model has."""
+        """Have pickle, torch.save and copy.deepcopy rebuild the scene with the current parameters and rest shapes."""
         return Recipe.build, (Recipe(self, self.worlds),)
 
     @property
@@ -104,7 +105,7 @@ class Model:
 
     @property
     def curves(self) -> Curves:
-        """Rods, then meridians of axisymmetric shells, as thick as these."""
+        """Rods, then meridians of axisymmetric shells with the radius of half the thickness."""
         return self.order.curves
 
     @property
@@ -114,12 +115,12 @@ class Model:
 
     @property
     def obstacles(self) -> Obstacles | None:
-        """Obstacles as surfaces to look at; None without."""
+        """Obstacles as surfaces, for display; None without."""
         return self.order.obstacles
 
     @property
     def touching(self) -> Touching | None:
-        """What recordings of contact need to know; None without."""
+        """Contact metadata of recordings: labels, sizes, force scale; None without contact."""
         host = self.net.host.touching if self.net is not None else None
         if host is None:
             return None
@@ -130,7 +131,7 @@ class Model:
 
     @cached_property
     def touch(self):
-        """What may touch, and what does at states that it is asked about (`Touch`); None without contact."""
+        """Contact queries at given states (`Touch`); None without contact."""
         from ddg_warp.solve.contact.touch import Touch
 
         if self.net is None or self.net.host.touching is None:
@@ -139,7 +140,7 @@ class Model:
 
     @property
     def magnetic(self) -> bool:
-        """Whether rods of it are in a magnetic field."""
+        """True if rods are in a magnetic field."""
         return self.net is not None and any(part.term.measure.field for part in self.net.sets)
 
     @property
@@ -148,14 +149,14 @@ class Model:
         return self.order.points_count
 
     def report(self) -> str:
-        """What is in the model, what it costs, and what is left out."""
+        """Return a text: content of the model, cost, and omissions."""
         from ddg_warp.ask.report import report
 
         return report(self)
 
     @one_at_a_time
     def energies(self, state: State) -> dict[str, float]:
-        """Energies by term at a state [J]; see `ddg_warp.ask.inquiry`."""
+        """Return energies by term at a state [J]; see `ddg_warp.ask.inquiry`."""
         from ddg_warp.ask.inquiry import energies
 
         validate.check_state("energies", self, state)
@@ -163,7 +164,7 @@ class Model:
 
     @one_at_a_time
     def reactions(self, state: State, **options) -> list:
-        """Forces and moments of the supports; see `ddg_warp.ask.inquiry.reactions`."""
+        """Return forces and moments of the supports; see `ddg_warp.ask.inquiry.reactions`."""
         from ddg_warp.ask.inquiry import reactions
 
         validate.check_state("reactions", self, state)
@@ -171,7 +172,7 @@ class Model:
 
     @one_at_a_time
     def drag(self, state: State):
-        """Forces and power of the drag on rods, an `inquiry.Drag`; see `ddg_warp.ask.inquiry.drag`."""
+        """Return forces and power of the drag on rods; see `ddg_warp.ask.inquiry.drag`."""
         from ddg_warp.ask.inquiry import drag
 
         validate.check_state("drag", self, state)
@@ -179,7 +180,7 @@ class Model:
 
     @one_at_a_time
     def pushed_apart(self, state: State, gap: float | None = None) -> tuple[State, float]:
-        """A state like another at which nothing overlaps, and how far a node moved at most [m]; see `ask.pushed_apart`."""
+        """Return a state without overlaps and the largest node displacement [m]; see `ask.pushed_apart`."""
         from ddg_warp.ask.pushed_apart import pushed_apart
 
         validate.check_state("pushed_apart", self, state)
@@ -187,7 +188,7 @@ class Model:
 
     @one_at_a_time
     def contacts(self, state: State):
-        """What touches what at a state, `io.contacts.Contacts`; see `ask.contacts`."""
+        """Return the contact pairs of a state, an `io.contacts.Contacts`; see `ask.contacts`."""
         from ddg_warp.ask.contacts import contacts
 
         validate.check_state("contacts", self, state)
@@ -195,19 +196,19 @@ class Model:
 
     @one_at_a_time
     def stresses(self, state: State) -> dict:
-        """Axial forces and moments along the rods; see `ddg_warp.ask.inquiry.stresses`."""
+        """Return conjugate stresses of rods and shells by term; see `ddg_warp.ask.inquiry.stresses`."""
         from ddg_warp.ask.inquiry import stresses
 
         validate.check_state("stresses", self, state)
         return stresses(self, state)
 
     def set_parameter(self, term: str, parameter: str, values) -> None:
-        """Change a parameter of a term for all rods that have it, in every world or one by one.
+        """Set a parameter of a term in all rods and shells, for all worlds or per world.
 
         Args:
             term, parameter: names as `parameters` gives them, such as "rod_bend_twist", "stiffness_1".
-            values: one number, one a world (worlds,), one an element (elements,), or (worlds, elements); elements of the longest
-                rod of a group, those of clamped ends included.
+            values: one number, one a world (worlds,), one an element (elements,), or (worlds, elements). Elements are of the longest
+                rod of a group, clamped ends included.
 
         Raises:
             ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
@@ -226,24 +227,24 @@ class Model:
         self.note_change(remade)
 
     def note_change(self, remade: bool) -> None:
-        """Count a change of parameters or rest shapes, in `version`, and whether their memory was made anew, in `layout`.
+        """Count a change of parameters or rest shapes in `version`, and a reallocation in `layout`.
 
-        What the host derives from parameters holds for one version, captured launches for one layout.
+        Host data derived from parameters is valid for one version, captured launches for one layout.
         """
         self.version += 1
         self.layout += remade
 
     def valid_values(self, term: str, parameter: str, values) -> np.ndarray:
-        """Values of a parameter as an array of numbers.
+        """Return values of a parameter as a checked array of numbers.
 
         Raises:
-            ValueError: there is no such parameter; they are no numbers, not finite, or none that the parameter may have.
+            ValueError: there is no such parameter, or a value is no number, not finite or not allowed.
         """
         rule = self.parameter_rule(term, parameter)
         return valid_numbers(f"{term}.{parameter}", values, *rule)
 
     def parameter_rule(self, term: str, parameter: str) -> tuple:
-        """What values of a parameter are, in words, and whether numbers are that.
+        """Return the rule for values of a parameter: a text, and a predicate of arrays.
 
         Raises:
             ValueError: nothing has the term, or the term has no such parameter.
@@ -253,43 +254,44 @@ class Model:
             raise ValueError(
                 f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
             )
-        known = terms[term]
-        if not isinstance(parameter, str) or parameter not in known:
-            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(known)}")
-        return known[parameter].valid
+        rules = terms[term]
+        if not isinstance(parameter, str) or parameter not in rules:
+            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(rules)}")
+        return rules[parameter].valid
 
     def _terms(self) -> dict[str, dict]:
-        """Parameters of all terms: term -> name -> `Parameter`."""
+        """Return the parameters of all terms: term -> name -> `Parameter`."""
         parts = self.net.sets if self.net is not None else ()
         terms: dict[str, dict] = {}
-        for own in (*(t for group in self.groups for t in group.kind.terms), *(part.term for part in parts)):
-            terms.setdefault(own.name, {}).update({known.name: known for known in own.parameters})
+        for term in (*(t for group in self.groups for t in group.kind.terms), *(part.term for part in parts)):
+            terms.setdefault(term.name, {}).update({parameter.name: parameter for parameter in term.parameters})
         return terms
 
     def set_rest(self, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
-        """Change the rest shape of a shell in every world: growth, swelling, bilayers, creases, pre-stress.
+        """Set the rest shape of a shell in every world: growth, swelling, bilayers, creases, pre-stress.
 
-        What is not given stays. Masses stay too, as does the direction of clamped normals. See `rest_shapes` for forms from
-        principal stretches and curvatures.
+        Forms left out stay, as do masses and the direction of clamped normals. See `rest_shapes` for forms from principal stretches
+        and curvatures.
 
         Args:
             shell: index of the shell.
-            points: (P, 3) [m], a shape whose metric, curvature and angles are those at rest.
+            points: (P, 3) [m], a shape that gives metric, curvature and angles at rest.
             metric: first fundamental form (T, 3) [m^2], (11, 12, 22) in the basis of the first two edges of a triangle.
             curvature: second fundamental form (T, 3) [m] in the same basis; bending "midedge_dof" and "midedge".
-            angle: of the mesh edges (E,) [rad], positive where convex on the side of the normals; bending "hinge".
+            angle: dihedral angle of mesh edges (E,) [rad], positive where convex on the side of the normals; bending "hinge".
 
         Raises:
-            ValueError: no such shell, a shape that does not fit, a metric without area, or what this bending model does not have.
+            ValueError: no such shell, a shape that does not fit, a metric without area, or a form that this bending model lacks.
         """
         from ddg_warp.model.rest_shapes import set_rest
 
         set_rest(self, shell, points=points, metric=metric, curvature=curvature, angle=angle)
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group).
+        """Return parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group).
 
-        Of the net, `net/term/parameter`, where sets of one term with other laws are numbered from the second on, `net/term 1/...`.
+        Parameters of the coupled system are `net/term/parameter`. Further element sets of a term, with other laws, are numbered:
+        `net/term 1/...`.
         """
         result = {}
         for i, group in enumerate(self.groups):
@@ -300,20 +302,21 @@ class Model:
         for part in self.net.sets if self.net is not None else ():
             laws.setdefault(part.term.name, []).append(part)
         for term, parts in laws.items():
-            for number, part in enumerate(parts):  # rods with laws of their own have sets of their own
+            for number, part in enumerate(parts):  # one element set for each law
                 place = f"net/{term}" + (f" {number}" if number else "")
                 result |= {f"{place}/{name}": values for name, values in part.parameters.values.items()}
         return result
 
     def state(self, points=None, velocities=None, spins=None, angles=None) -> State:
-        """A first state: the rest state at rest, or with other positions and velocities.
+        """Return an initial state: the rest state without motion, or given positions and velocities.
 
         Args:
-            points: positions (P, 3) or (worlds, P, 3) [m] in the order of `curves`. Reference frames are carried from rest to
-                these positions, and edges glued to a shell turn with it; ghost nodes of clamped ends stay.
+            points: positions (P, 3) or (worlds, P, 3) [m] in the order of `curves`. Reference frames are transported from rest to
+                these positions, and edges glued to a shell follow it. Ghost nodes of clamped ends stay.
             velocities: (P, 3) or (worlds, P, 3) [m/s].
-            spins: rate of the edges' angles (edges,) or (worlds, edges) [rad/s]; without, zero, but as the shell turns where they
-                are glued. Steps from here on let them resist turns of the rods' tangents, see `Integrator`, gyroscopic.
+            spins: rate of twist angles (edges,) or (worlds, edges) [rad/s]; by default zero, and as the shell rotates where edges
+                are glued. Given spins switch on gyroscopic moments in the following steps, see `Integrator`, gyroscopic.
+            angles: twist angles (edges,) or (worlds, edges) [rad]; by default zero.
 
         Raises:
             ValueError: a shape does not fit, or a value is not finite.
@@ -341,14 +344,14 @@ class Model:
                     arrays.assign(data.theta, theta)
         if self.net is not None:
             state.net = self.net.rest()
-            for values, array, what in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
+            for values, array, label in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
                 if values is not None:
-                    array.assign(self.order.put_blocks(values, array.numpy(), what))
+                    array.assign(self.order.put_blocks(values, array.numpy(), label))
             if angles is not None and self.scene.attachments:
                 raise ValueError("angles: edges that are glued to a shell turn with it; leave angles out")
-            for given, array, what in ((spins, state.net.v, "spins"), (angles, state.net.q, "angles")):
-                if given is not None:
-                    values, start = self.order.of_edges(given, what)
+            for edge_values, array, label in ((spins, state.net.v, "spins"), (angles, state.net.q, "angles")):
+                if edge_values is not None:
+                    values, start = self.order.of_edges(edge_values, label)
                     blocks = array.numpy().reshape(self.worlds, -1, 3)
                     for rod in self.net.host.rods:
                         blocks[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
@@ -361,7 +364,7 @@ class Model:
         return state
 
     def empty_state(self) -> State:
-        """Arrays of a state, not yet filled."""
+        """Allocate a state."""
         net, grips = self.net.empty() if self.net is not None else None, None
         if self.grips:
             shape = (6, self.worlds * len(self.grips))
@@ -369,7 +372,7 @@ class Model:
         return State(self, [self.group_state(group) for group in self.groups], net, grips=grips)
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:
-        """The state that `State.snapshot` saved, bit by bit.
+        """Return the state of a `State.snapshot`, bit by bit.
 
         Raises:
             ValueError: the snapshot is of another model.
@@ -394,7 +397,7 @@ class Model:
         return state
 
     def group_state(self, group: Group) -> GroupState:
-        """Arrays of the state of a group of rods, not yet filled."""
+        """Allocate the state of a rod group."""
         kind, real = group.kind, self.types.real
         vector = wp.types.vector(kind.dim, real)
         nodes = (group.nodes, group.columns)
@@ -414,7 +417,7 @@ class Model:
         )
 
     def carry_frames(self, state: State) -> None:
-        """Transport the reference frames of a state to its current tangents."""
+        """Transport reference frames of a state to the current tangents."""
         for group, data in zip(self.groups, state.groups, strict=True):
             if group.kind.twist:
                 new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
@@ -431,7 +434,7 @@ class Model:
             self.net.carry(state.net, state.net)
 
     def update_strains(self, state: State) -> None:
-        """Store the strains of a state where strain-rate damping looks for them."""
+        """Store the strains of a state for strain-rate damping."""
         for group, data in zip(self.groups, state.groups, strict=True):
             if group.kind.viscous:
                 self.strains(group, data, data.last)
@@ -439,7 +442,7 @@ class Model:
             self.net.update_strains(state.net)
 
     def strains(self, group: Group, data: GroupState, out: wp.array, stress: wp.array | None = None) -> None:
-        """Launch the strain kernel of a group; stresses go to `stress`, if given (viscous parts at rest). Can be captured."""
+        """Launch the strain kernel of a group; write elastic stresses to `stress` if given. Can be captured."""
         wp.launch(
             element.strain_kernel(group.kind, self.types.real),
             (group.elements, group.columns),
@@ -451,15 +454,15 @@ class Model:
 
 
 def _device(name):
-    """A Warp device by its name; by default CUDA if there is one."""
+    """Return a Warp device by name; by default CUDA if there is one."""
     try:
         return wp.get_device(("cuda:0" if wp.is_cuda_available() else "cpu") if name is None else name)
     except (ValueError, RuntimeError, TypeError, AttributeError):
-        known = ", ".join(device.alias for device in wp.get_devices())
-        raise SceneError(f"device is {name!r}; there is {known}") from None
+        devices = ", ".join(device.alias for device in wp.get_devices())
+        raise SceneError(f"device is {name!r}; there is {devices}") from None
 
 
 def needs_net(scene) -> bool:
-    """Whether a scene has anything but rods on their own."""
+    """Return True if a scene has more than uncoupled rods."""
     parts = scene.shells, scene.joints, scene.attachments, scene.magnets, scene.axisymmetric_shells, scene.touching
     return any(map(bool, parts))

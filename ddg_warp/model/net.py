@@ -1,4 +1,4 @@
-"""A net on a device: constant arrays, its states, and what can be launched on them."""
+"""Coupled system on a device: constant arrays, states, and launches on them."""
 
 from dataclasses import dataclass, field
 
@@ -16,16 +16,16 @@ from ddg_warp.model.rod_elements import RodElements
 
 @dataclass
 class NetState:
-    """Device arrays of a net with N blocks, W worlds.
+    """Device arrays of the coupled system with N dof blocks and W worlds.
 
     Attributes:
-        q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
-        a: accelerations of blocks (W N,), as of `GroupState`, as far as they are trusted; see `kernels.net.foresight`.
+        q, v: blocks (W N,) of positions [m], twist angles and rotation vectors since the last step [rad], and their rates.
+        a: accelerations of blocks (W N,) for the warm start; see `GroupState` and `kernels.net.foresight`.
         frame: director and tangent of rod edges (6, W edges).
-        lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
-        data: data (rows, W E) of those sets, by index, that have normals among them that supports turn, or the magnetic field.
-        rate: 1/h of the step that has led there (W,) [1/s], where that had inertia in the stiffness of contact, else zero; empty in
-            scenes whose contact never has.
+        lag: time-lagged rows of each element set (rows, W E).
+        last: strains of each damped set at this state.
+        data: data (rows, W E), by index, of sets in the magnetic field or with normals that supports rotate.
+        rate: 1/h of the last step (W,) [1/s] if inertia entered its contact stiffness, else 0. Empty without such contact.
     """
 
     q: wp.array
@@ -48,10 +48,11 @@ class NetState:
 
 
 class DeviceSet:
-    """Elements of one term on the device; parameters as in `Group`: one buffer, and rows (offset, along, across worlds).
+    """Element set on the device, with its parameters as in `Group`.
 
-    `turning` (n, 3) are element, first row of the data and motion of the normals that supports turn, `turning_rest` (n, 3) these
-    normals at rest.
+    Attributes:
+        turning: element, first row of the data and motion (n, 3) of the normals that supports rotate.
+        turning_rest: these normals at rest (n, 3).
     """
 
     def __init__(self, host, worlds: int, device, real, motions: np.ndarray):
@@ -68,12 +69,15 @@ class DeviceSet:
         self.turning_rest = host.data[row[:, None] + np.arange(3), element[:, None]]
 
     def own_data(self) -> wp.array:
-        """Data of every world (rows, W E) at rest."""
+        """Return the data of every world (rows, W E) at rest."""
         return wp.array(np.tile(self.host.data, (1, self.worlds)), dtype=self._real, device=self.device)
 
     def set_parameter(self, name: str, values: np.ndarray) -> bool:
-        """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements); return as of
-        `ParameterTable.set`."""
+        """Replace a parameter; return True if its memory was reallocated.
+
+        Args:
+            values: of shape (), (worlds,), (elements,) or (worlds, elements).
+        """
         if values.ndim == 0:
             new = values.reshape(1, 1)
         elif values.shape == (self.worlds,):
@@ -88,31 +92,35 @@ class DeviceSet:
         return self.parameters.set(**{name: new})
 
     def set_rest(self, first: int, parameters: dict[str, np.ndarray]) -> bool:
-        """Replace what of the elements from `first` on belongs to their rest shape, in every world; stiffness stays.
+        """Replace rest-shape parameters of a run of elements in all worlds; return True if memory was reallocated.
 
-        Returns as of `ParameterTable.set`.
+        Stiffness parameters stay.
 
         Args:
-            first: element.
+            first: first element of the run.
             parameters: all parameters of the term by name, each one number or one an element.
         """
         count, changed = max(np.size(values) for values in parameters.values()), {}
         for name in (parameter.name for parameter in self.term.parameters if parameter.rest):
-            now = self.parameters[name]
-            full = np.repeat(now, self.elements // now.shape[1], axis=1)
+            current = self.parameters[name]
+            full = np.repeat(current, self.elements // current.shape[1], axis=1)
             full[:, first : first + count] = parameters[name]
             changed[name] = full if len(full) > 1 else _short(full[0])[None]
         return self.parameters.set(**changed)
 
 
 class DeviceNet:
-    """A `Net` with all its worlds on a device; `motions` are those that turn the supports of shells and rings, -1 where none does.
+    """Coupled system: a `Net` with all worlds on a device.
+
+    Args:
+        motions: index of the motion that rotates each support of shells and rings, -1 for none.
 
     Attributes:
-        mass: of the dofs of blocks (worlds, N) [kg, kg m^2]; weighed: whether it may be another one than that of `host`.
-        moves: what inertia or drag give a rate, as masses of the dofs of blocks (N,) that are positive there.
-        drag: coefficients of the edges that feel some, world by world (rows, W E), as of `kernels.drag`; None without.
-        touching: numbers of contact by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).
+        mass: of dof blocks (worlds, N) [kg, kg m^2].
+        weighed: whether `mass` may differ from `host`.
+        moves: masses of dof blocks (N,), positive where inertia or drag determine a rate.
+        drag: drag coefficients of edges, world by world (rows, W E), see `kernels.drag`; None without.
+        touching: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).
     """
 
     def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
@@ -123,20 +131,20 @@ class DeviceNet:
         self.edges = host.rod_edges
         self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
         self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
-        self._stiffnesses = None, None  # the last ones and what they are of
+        self._stiffnesses = None, None  # key and values
         self._along = {}  # elements of pieces of rods
-        self.weighed, self.drag, felt = False, None, np.zeros((host.blocks, 3))
+        self.weighed, self.drag, drag_mass = False, None, np.zeros((host.blocks, 3))
         if host.drag:
             ends, angles, coefficients = host.drag
             self.drag = wp.array(np.tile(coefficients, (1, worlds)), dtype=real, device=device)
-            felt[ends] = 1.0
-            felt[angles[angles >= 0], 0] = 1.0
+            drag_mass[ends] = 1.0
+            drag_mass[angles[angles >= 0], 0] = 1.0
         self.touching = {}
         if host.touching:
             for name, values in host.touching.numbers.items():
                 tiled = np.tile(values, (worlds, *[1] * values.ndim))
                 self.touching[name] = wp.array(tiled, dtype=real, device=device)
-        self.moves = wp.array(host.mass + felt, dtype=self.vector, device=device)
+        self.moves = wp.array(host.mass + drag_mass, dtype=self.vector, device=device)
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
@@ -145,13 +153,13 @@ class DeviceNet:
         return wp.zeros((max(1, rows), max(1, columns)), dtype=self.real, device=self.device)
 
     def lagged(self) -> tuple[wp.array, list[wp.array]]:
-        """Arrays of frames, and of the own lagged rows of every set, not yet filled."""
+        """Allocate frames, and the time-lagged rows of every element set."""
         counts = [(len(part.host.lag), part.elements) for part in self.sets]
-        own = [self._zeros(rows, self.worlds * elements if rows else 1) for rows, elements in counts]
-        return self._zeros(6, self.worlds * self.edges), own
+        rows_of_sets = [self._zeros(rows, self.worlds * elements if rows else 1) for rows, elements in counts]
+        return self._zeros(6, self.worlds * self.edges), rows_of_sets
 
     def empty(self) -> NetState:
-        """Arrays of a state, not yet filled."""
+        """Allocate a state."""
         blocks = self.worlds * self.blocks
         q, v, a = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(3))
         state = NetState(q, v, a, *self.lagged())
@@ -170,25 +178,25 @@ class DeviceNet:
         return self.angles(self.mass.flatten())
 
     def dof_masses(self) -> np.ndarray:
-        """Masses of all dofs, world by world (W N 3,)."""
+        """Return masses of all dofs, world by world (W N 3,)."""
         if self.weighed:
             return self.mass.numpy().astype(float).ravel()
         return np.tile(self.host.mass.ravel(), self.worlds)
 
     def points(self, blocks: wp.array) -> wp.array:
-        """Blocks (W N,) as the points of a storage, [block][world]."""
+        """View dof blocks (W N,) as [block][world]."""
         return blocks.reshape((self.worlds, self.blocks)).transpose((1, 0))
 
     def angles(self, blocks: wp.array) -> wp.array:
-        """Blocks (W N,) as the angles of a storage, [block][world]: their first components."""
+        """View the first components (twist angles) of dof blocks (W N,) as [block][world]."""
         size = wp.types.type_size_in_bytes(self.real)
         shape, strides = (self.blocks, self.worlds), (3 * size, 3 * size * self.blocks)
         view = wp.array(ptr=blocks.ptr, dtype=self.real, shape=shape, strides=strides, device=self.device)
-        view._ref = blocks  # what it looks at lives as long
+        view._ref = blocks  # keeps the memory alive
         return view
 
     def components(self, blocks: wp.array) -> wp.array:
-        """Blocks (W N,) as [component][block][world]."""
+        """View dof blocks (W N,) as [component][block][world]."""
         size = wp.types.type_size_in_bytes(self.real)
         shape, strides = (3, self.blocks, self.worlds), (size, 3 * size, 3 * size * self.blocks)
         view = wp.array(ptr=blocks.ptr, dtype=self.real, shape=shape, strides=strides, device=self.device)
@@ -196,19 +204,19 @@ class DeviceNet:
         return view
 
     def frames(self, frame: wp.array) -> wp.array:
-        """Frames (6, W edges) as those of a storage, [component][edge][world]."""
+        """View frames (6, W edges) as [component][edge][world]."""
         return frame.reshape((6, -1, max(1, self.edges))).transpose((0, 2, 1))
 
     def turning_data(self) -> dict[int, wp.array]:
-        """Data of the sets with normals that supports turn, as at rest."""
+        """Return rest data of element sets with normals that supports rotate, by index."""
         return {i: part.own_data() for i, part in enumerate(self.sets) if len(part.turning)}
 
     def field_data(self) -> dict[int, wp.array]:
-        """Data of the sets that are in a magnetic field, in that of the rest state."""
+        """Return rest data of element sets in the magnetic field, by index."""
         return {i: part.own_data() for i, part in enumerate(self.sets) if part.term.measure.field}
 
     def rest(self) -> NetState:
-        """The rest state."""
+        """Return the rest state."""
         state = self.empty()
         state.q.assign(np.tile(self.host.rest, (self.worlds, 1)))
         if self.edges:
@@ -220,14 +228,13 @@ class DeviceNet:
 
     @property
     def version(self) -> int:
-        """Rises with every change of a parameter of its sets."""
+        """Counter of parameter changes in all element sets."""
         return sum(part.parameters.version for part in self.sets)
 
     def rod_stiffnesses(self, s: float) -> np.ndarray:
-        """Stiffnesses of every rod over a step of s [s], by the parameters that it has in every world (3, W rods); one world stands for
-        all where parameters are those of the scene. See `precision.stiffnesses`.
+        """Return stiffnesses of every rod in every world (3, W rods) over a step of s [s]; see `precision.stiffnesses`.
 
-        The last ones are remembered, as of a `Group`.
+        As long as no parameter has changed, one world stands for all (3, rods). The last result is cached.
         """
         key = s, self.version
         if self._stiffnesses[0] != key:
@@ -235,38 +242,38 @@ class DeviceNet:
         return self._stiffnesses[1]
 
     def _find_stiffnesses(self, s: float) -> np.ndarray:
-        found = np.empty((3, self.worlds, len(self.host.rods)))
+        result = np.empty((3, self.worlds, len(self.host.rods)))
         for piece, rods, rows in self.host.pieces:
             if id(piece) not in self._along:
                 indices = np.array([self.host.rods[rod].rod for rod in rods])
                 self._along[id(piece)] = RodElements(self, piece.kind, indices, piece.mass.shape[1])
             mass, length = (np.tile(values[rows], self.worlds) for values in (inert_mass(piece, s), piece.length))
-            own = stiffnesses(piece.kind, mass, length, self._along[id(piece)].parameters(), s)
-            found[:, :, rods] = np.reshape(own, (3, self.worlds, -1))
-        return found.reshape(3, -1)
+            of_piece = stiffnesses(piece.kind, mass, length, self._along[id(piece)].parameters(), s)
+            result[:, :, rods] = np.reshape(of_piece, (3, self.worlds, -1))
+        return result.reshape(3, -1)
 
     def rod_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of these rods over a step of s [s]; see `precision.float32_error`."""
+        """Return the float32 error of every rod over a step of s [s]; see `precision.float32_error`."""
         stretching, _, softest = self.rod_stiffnesses(s)
         return float32_error(stretching, softest)
 
     def split_errors(self, s: float) -> np.ndarray:
-        """As of `Net`, of rods of every world."""
+        """Return float32 errors of the mixed axial-force formulation for the rods of every world."""
         return self.host.split_errors(self.rod_stiffnesses(s))
 
     def elements(self, state: NetState, index: int, q=None, rate=None):
-        """What every kernel of a term reads of set `index` at a state, or at other dofs `q`, at rest or at a rate."""
-        part, given = self.sets[index], elements.elements_type(self.real)()
-        given.q, given.frame = state.q if q is None else q, state.frame
-        given.lag, given.last, given.rate = state.lag[index], state.last[index], self.still if rate is None else rate
-        (given.buffer, given.table), given.slots = part.parameters.arrays, part.slots
-        given.data = state.data.get(index, part.data)
-        given.blocks, given.angle_start, given.edges = self.blocks, self.angle_start, self.edges
-        given.elements = part.elements
-        return given
+        """Return the kernel struct of element set `index` at a state, optionally with other dofs `q` and a rate."""
+        part, inputs = self.sets[index], elements.elements_type(self.real)()
+        inputs.q, inputs.frame = state.q if q is None else q, state.frame
+        inputs.lag, inputs.last, inputs.rate = state.lag[index], state.last[index], self.still if rate is None else rate
+        (inputs.buffer, inputs.table), inputs.slots = part.parameters.arrays, part.slots
+        inputs.data = state.data.get(index, part.data)
+        inputs.blocks, inputs.angle_start, inputs.edges = self.blocks, self.angle_start, self.edges
+        inputs.elements = part.elements
+        return inputs
 
     def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
-        """Strains of a set (strains, W E), and stresses if asked for."""
+        """Compute strains of an element set (strains, W E), and stresses if `stress` is given."""
         part = self.sets[index]
         wp.launch(
             elements.term_kernels(part.term, self.real)[3],
@@ -277,7 +284,7 @@ class DeviceNet:
         )
 
     def update_strains(self, state: NetState) -> None:
-        """Store the strains of a state where strain-rate damping looks for them."""
+        """Store the strains of a state for strain-rate damping."""
         for index, part in enumerate(self.sets):
             if part.term.density.lagged:
                 self.strains(state, index, state.last[index])
@@ -285,21 +292,20 @@ class DeviceNet:
     def carry(
         self, before: NetState, after: NetState, kept: NetState | None = None, moved: wp.array | None = None
     ) -> None:
-        """Lagged data of `after` from those of `before` and the positions of `after`, whose joints then start from zero.
+        """Update time-lagged data of `after` from `before` at the positions of `after`, and zero joint rotations.
 
-        Worlds that have not `moved` take over those of `kept` instead. The states may be the same. Launches alone, so that it
-        can be captured.
+        Worlds that have not `moved` copy the data of `kept` instead. The states may be the same. Only launches: can be captured.
         """
         if self.edges:
             self._carry(before, after, after.q, kept or before, moved or self.every, 1, 0)
             self.reset_spins(after.q)
 
     def renew(self, state: NetState, q: wp.array, todo: wp.array) -> None:
-        """Lagged data of `state` as of dofs q of a solve, in worlds whose `todo` asks for it; strains stay what they are."""
+        """Update frames and time-lagged data of `state` to iterate q in worlds that `todo` marks; strains stay."""
         self._carry(state, state, q, state, todo, RELAG, 1)
 
     def _carry(self, before, after, q: wp.array, kept, moved: wp.array, wanted: int, within: int) -> None:
-        """See `kernels.net.frames`."""
+        """Launch the frame and lag kernels of `kernels.net.frames`."""
         real, serial = self.real, arrays.serial(self.device)
 
         def launch(kernel, count, inputs, outputs):
@@ -313,10 +319,10 @@ class DeviceNet:
         )
         for index, (part, same, old, new) in enumerate(zip(self.sets, kept.lag, before.lag, after.lag, strict=True)):
             if part.term.measure.advance:
-                given = self.elements(after, index, q)
-                given.lag = old
+                element_inputs = self.elements(after, index, q)
+                element_inputs.lag = old
                 kernel = frames.lag_kernel(part.term.measure, real, serial)
-                launch(kernel, part.elements, [given, moved, wanted, within, same], [new])
+                launch(kernel, part.elements, [element_inputs, moved, wanted, within, same], [new])
 
     @property
     def carries(self) -> list:
@@ -336,5 +342,5 @@ class DeviceNet:
 
 
 def _short(values: np.ndarray) -> np.ndarray:
-    """One value where all are alike."""
+    """Return one value if all are equal, else the values."""
     return values[:1] if values.size and np.all(values == values.flat[0]) else values

@@ -1,4 +1,4 @@
-"""The user's order of what a model holds: nodes and edges of rods, meridians and shells, and where groups and the net keep them."""
+"""User order of nodes and edges, and maps from there to storage of rod groups and the coupled system."""
 
 from functools import cached_property
 
@@ -14,14 +14,14 @@ from ddg_warp.scene.material import DRAWN
 
 
 class Order:
-    """Nodes of rods in the order they were added, of meridians, then vertices of shells; edges of rods and meridians likewise."""
+    """User order: nodes of rods as added, of meridians, then vertices of shells; edges likewise."""
 
     def __init__(self, model):
         self.model = model
 
     @cached_property
     def curves(self) -> Curves:
-        """Rods, then meridians of axisymmetric shells, as thick as these."""
+        """Rods, then meridians of axisymmetric shells with the radius of half the thickness."""
         batches, shells = self.model.scene.batches, self.model.scene.axisymmetric_shells
         if not batches and not shells:
             none = np.zeros(0, int)
@@ -47,7 +47,9 @@ class Order:
         points = np.cumsum([0] + [len(shell.nodes) for shell in shells])
         triangles = np.cumsum([0] + [len(shell.surface.triangles) for shell in shells])
         return Surfaces(
-            triangles=np.concatenate([s.surface.triangles + rods + at for s, at in zip(shells, points, strict=False)]),
+            triangles=np.concatenate(
+                [s.surface.triangles + rods + offset for s, offset in zip(shells, points, strict=False)]
+            ),
             first=triangles[:-1],
             names=np.array([shell.name for shell in self.model.scene.shells], dtype=object),
             thickness=np.concatenate([shell.plate.thickness for shell in shells]),
@@ -64,7 +66,7 @@ class Order:
 
     @cached_property
     def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of `State.points` that the net fills, and the blocks that fill them."""
+        """Rows of `State.points` from the coupled system, and the dof blocks that fill them."""
         if self.model.net is None:
             return np.zeros(0, int), np.zeros(0, int)
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
@@ -72,12 +74,12 @@ class Order:
         rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
         first = len(start) - 1 - len(host.meridians)
         rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
-        blocks = [part.nodes for part in (*host.rods, *host.meridians, *host.shells)]
+        blocks = [body.nodes for body in (*host.rods, *host.meridians, *host.shells)]
         vertices = sum(len(shell.nodes) for shell in host.shells)
         return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
 
     def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of a group's nodes: place along the rod with ghosts, column, row of `State.points`."""
+        """Return for the nodes of a rod group: node with ghosts, column, row of `State.points`."""
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         return _user_index(group, group.host.own, start)
 
@@ -89,7 +91,7 @@ class Order:
 
     @cached_property
     def edge_starts(self) -> np.ndarray:
-        """Where the edges of every curve begin among all (curves + 1,)."""
+        """Offsets of the edges of every curve (curves + 1,)."""
         return np.cumsum([0, *(self.curves.counts - np.where(self.curves.closed, 0, 1))])
 
     @property
@@ -99,7 +101,7 @@ class Order:
 
     @cached_property
     def twisted(self) -> np.ndarray:
-        """Which edges have an angle (edges,) bool."""
+        """Mask of the edges that have a twist angle (edges,)."""
         result = np.zeros(self.edges_count, bool)
         for group in self.model.groups:
             if group.kind.twist:
@@ -109,23 +111,27 @@ class Order:
         return result
 
     def elements(self, name: str) -> tuple[int, list[tuple[Group, np.ndarray, np.ndarray]]]:
-        """Elements of rods on their own that have a parameter "term.parameter", counted rod by rod, those of clamped ends included.
+        """Return the elements of uncoupled rods that have a parameter "term.parameter".
+
+        Elements are numbered rod by rod, clamped ends included.
 
         Returns:
-            How many there are in one world; and of every group that has some: itself, where its rods have them (n, R) bool, and
-            their numbers there, 0 elsewhere (n, R).
+            The number of elements in one world, and (group, mask (n, R), numbers (n, R), 0 outside of the mask) of every group with
+            some.
         """
-        counts, found = np.zeros(self.model.scene.rod_count, np.int64), []
+        counts, groups = np.zeros(self.model.scene.rod_count, np.int64), []
         for group in self.model.groups:
             if name in group.parameters.values:
                 term = next(term for term in group.kind.terms if name.startswith(f"{term.name}."))
                 missing = 0 if group.kind.closed else term.measure.span
                 inside = np.arange(group.nodes)[:, None] < group.host.count - missing
                 counts[group.host.rods] = inside.sum(0)
-                found.append((group, inside))
+                groups.append((group, inside))
         first = np.cumsum(counts) - counts
-        places = [first[group.host.rods] + np.arange(group.nodes)[:, None] for group, _ in found]
-        return int(counts.sum()), [(*each, np.where(each[1], own, 0)) for each, own in zip(found, places, strict=True)]
+        numbers_of_groups = [first[group.host.rods] + np.arange(group.nodes)[:, None] for group, _ in groups]
+        return int(counts.sum()), [
+            (*each, np.where(each[1], numbers, 0)) for each, numbers in zip(groups, numbers_of_groups, strict=True)
+        ]
 
     @property
     def meridian_rows(self) -> slice:
@@ -135,64 +141,64 @@ class Order:
         return slice(int(counts[:rods].sum()), int(counts.sum()))
 
     def edge(self, row: int) -> tuple[int, int]:
-        """Edge and curve of a row of `State.angles`."""
+        """Return edge and curve of a row of `State.angles`."""
         curve = int(np.searchsorted(self.edge_starts, row, side="right")) - 1
         return int(row - self.edge_starts[curve]), curve
 
     def edge_places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of a group's edges: place along the rod with ghosts, column, row of `State.angles`."""
-        own = group.host.own - (0 if group.kind.closed else 1)
-        return _user_index(group, own, self.edge_starts)
+        """Return for the edges of a rod group: edge with ghosts, column, row of `State.angles`."""
+        counts = group.host.own - (0 if group.kind.closed else 1)
+        return _user_index(group, counts, self.edge_starts)
 
-    def put_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
-        """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
-        values = self._points(values, what)
+    def put_nodes(self, group: Group, values, out: np.ndarray, label: str) -> None:
+        """Write values in user order (P, 3) to (node, column, dim) of a group."""
+        values = self._points(values, label)
         axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
         k, column, index = self.places(group)
         for world in range(self.model.worlds):
-            own = values if values.ndim == 2 else values[world]
-            out[k, column + world * group.rods] = own[index][:, axes]
+            of_world = values if values.ndim == 2 else values[world]
+            out[k, column + world * group.rods] = of_world[index][:, axes]
 
-    def put_blocks(self, values, blocks: np.ndarray, what: str) -> np.ndarray:
-        """Blocks (worlds N, 3) with values in the user's order (P, 3) put in."""
-        values = self._points(values, what)
+    def put_blocks(self, values, blocks: np.ndarray, label: str) -> np.ndarray:
+        """Return `blocks` (worlds N, 3) with values in user order (P, 3) filled in."""
+        values = self._points(values, label)
         out = blocks.astype(float).reshape(self.model.worlds, -1, 3)
-        rows, places = self.net_rows
-        out[:, places] = (values if values.ndim == 3 else values[None])[:, rows]
+        rows, indices = self.net_rows
+        out[:, indices] = (values if values.ndim == 3 else values[None])[:, rows]
         return out.reshape(-1, 3)
 
-    def _points(self, values, what: str) -> np.ndarray:
-        values, count = _numbers(what, values), self.points_count
+    def _points(self, values, label: str) -> np.ndarray:
+        values, count = _numbers(label, values), self.points_count
         if values.shape not in ((count, 3), (self.model.worlds, count, 3)):
-            raise ValueError(f"{what} have shape {values.shape}; they are ({count}, 3), or one such array a world")
+            raise ValueError(f"{label} have shape {values.shape}; they are ({count}, 3), or one such array a world")
         if not np.isfinite(values).all():
-            raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
+            raise ValueError(f"{label}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
         return values
 
-    def put_edges(self, group: Group, values, out: np.ndarray, what: str = "spins") -> None:
-        values, _ = self.of_edges(values, what)
+    def put_edges(self, group: Group, values, out: np.ndarray, label: str = "spins") -> None:
+        values, _ = self.of_edges(values, label)
         k, column, index = self.edge_places(group)
         for world in range(self.model.worlds):
             out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
 
-    def of_edges(self, values, what: str) -> tuple[np.ndarray, np.ndarray]:
-        """Spins or angles in the user's order, checked, and where the edges of each rod begin."""
-        values, count = _numbers(what, values), self.edges_count
+    def of_edges(self, values, label: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return checked spins or angles in user order, and the edge offsets of rods."""
+        values, count = _numbers(label, values), self.edges_count
         if values.shape not in ((count,), (self.model.worlds, count)):
-            raise ValueError(f"{what} have shape {values.shape}; they are ({count},), or one such array a world")
+            raise ValueError(f"{label} have shape {values.shape}; they are ({count},), or one such array a world")
         if not np.isfinite(values).all():
-            raise ValueError(f"{what}: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
+            raise ValueError(f"{label}: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
         return values, self.edge_starts
 
     def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
-        """From arrays (node, column, dim) of groups and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
+        """Return nodal values in user order (P, 3) from groups (node, column, dim) and dof blocks (worlds N, 3)."""
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         out = np.zeros((self.model.worlds, self.points_count, 3))
         if blocks is not None:
-            rows, places = self.net_rows
+            rows, indices = self.net_rows
             out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(
                 self.model.worlds, -1, 3
-            )[:, places]
+            )[:, indices]
         for group, value in zip(self.model.groups, values, strict=True):
             axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
             k, column, index = _user_index(group, group.host.own, start)
@@ -201,7 +207,7 @@ class Order:
         return out[0] if self.model.worlds == 1 else out
 
     def edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
-        """From arrays (node, column) of every group and values of the net's rod edges (worlds, edges) to the user's order."""
+        """Return edge values in user order from groups (node, column) and coupled rod edges (worlds, edges)."""
         if not any(group.kind.twist for group in self.model.groups) and net is None:
             return None
         out = np.zeros((self.model.worlds, self.edges_count, *([width] if width else [])))
@@ -216,9 +222,9 @@ class Order:
         return out[0] if self.model.worlds == 1 else out
 
 
-def _numbers(what: str, values) -> np.ndarray:
-    values = arguments.array(what, values)
-    arguments.sized(what, values, least=0.0)  # velocities that have died away may be as small as they are
+def _numbers(label: str, values) -> np.ndarray:
+    values = arguments.array(label, values)
+    arguments.sized(label, values, least=0.0)  # decayed velocities may be tiny
     return values
 
 
@@ -229,22 +235,22 @@ def _node_radius(batch) -> np.ndarray:
     return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))
 
 
-def _alike(parts) -> list[int]:
-    """Number of the first part with the same name and stiffness; of shells of revolution their own."""
-    seen: dict = {}
-    keys = [(part.name, _hashable(part.section)) if hasattr(part, "section") else id(part) for part in parts]
-    return [seen.setdefault(key, len(seen)) for key in keys]
+def _alike(batches) -> list[int]:
+    """Return for each batch the first one with the same name and section; shells of revolution are distinct."""
+    first: dict = {}
+    keys = [(batch.name, _hashable(batch.section)) if hasattr(batch, "section") else id(batch) for batch in batches]
+    return [first.setdefault(key, len(first)) for key in keys]
 
 
 def _hashable(section) -> tuple:
-    """The numbers of a section, to be compared."""
+    """Return the values of a section as a hashable key."""
     return tuple(
         np.asarray(value, dtype=object if value is None else float).tobytes() for value in vars(section).values()
     )
 
 
-def _user_index(group: Group, own: np.ndarray, start: np.ndarray):
-    """For nodes or edges of a group's rods: place along the rod with ghosts, column, place in the user's order."""
-    column = np.repeat(np.arange(group.rods), own)
-    at = np.arange(own.sum()) - np.repeat(np.concatenate([[0], np.cumsum(own)[:-1]]), own)
-    return at + group.host.first[column], column, at + start[group.host.rods[column]]
+def _user_index(group: Group, counts: np.ndarray, start: np.ndarray):
+    """Return for nodes or edges (`counts` a rod): node with ghosts, column, index in user order."""
+    column = np.repeat(np.arange(group.rods), counts)
+    index = np.arange(counts.sum()) - np.repeat(np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
+    return index + group.host.first[column], column, index + start[group.host.rods[column]]

@@ -1,4 +1,4 @@
-"""Parameters of terms by name, and their one buffer on a device."""
+"""Named parameters of terms, in one buffer on a device."""
 
 import numpy as np
 import warp as wp
@@ -7,18 +7,19 @@ from ddg_warp import arguments
 
 
 class ParameterTable:
-    """Parameters of elements, in one buffer: row i of `table` is (offset, stride along the elements, stride across) of the i-th.
+    """Parameters of elements in one buffer, with a table of their strides.
 
-    One number, one an element, one a rod or world, or one each are read by the same code.
+    Row i of `table` is (offset, stride along elements, stride across) of parameter i. Kernels read one number, one an element, one a
+    rod or world, or one each by the same code.
 
     Attributes:
-        values: arrays of two dimensions by name, of size 1 along what they do not depend on; `set` changes them.
-        version: rises with every change.
-        foreign: names of parameters whose values on the device are others than these, as tensors are; the host does not know them.
+        values: arrays of two dimensions by name, of size 1 along an axis on which they do not depend; `set` changes them.
+        version: counter of changes.
+        foreign: names of parameters whose device values, such as tensors, the host does not know.
     """
 
     def __init__(self, values: dict[str, np.ndarray], along: int, real, device):
-        """`along` is the dimension of the elements: 0 or 1."""
+        """Upload values by name; `along` is the axis of elements, 0 or 1."""
         self.values, self._along, self._real, self._device = dict(values), along, real, device
         self.version, self.foreign = 0, set()
         self.upload()
@@ -27,7 +28,7 @@ class ParameterTable:
         return self.values[name]
 
     def may_be_other_than_zero(self, name: str) -> bool:
-        """Whether a parameter is other than zero anywhere, or may be, as far as the host knows."""
+        """Return True if a parameter is nonzero anywhere, or unknown to the host."""
         return name in self.foreign or bool(self.values[name].any())
 
     @property
@@ -36,27 +37,27 @@ class ParameterTable:
         return self.buffer, self.table
 
     def set(self, **values: np.ndarray) -> bool:
-        """Replace parameters, in place where they fit their memory; return whether the memory was made anew.
+        """Replace parameters by name; return True if the buffer was reallocated.
 
-        Values that broadcast to those before, one number for one an element, are written as many times. Kernels that were captured
-        read what is written in place, and have to be captured again otherwise.
+        Values that broadcast to the shape before overwrite the buffer, which captured kernels go on reading. After a reallocation
+        kernels have to be captured again.
         """
-        own = {name: _spread(np.asarray(new, float), self.values[name].shape) for name, new in values.items()}
+        updates = {name: _spread(np.asarray(new, float), self.values[name].shape) for name, new in values.items()}
         self.version += 1
-        fits = all(new.shape == self.values[name].shape for name, new in own.items())
-        self.values |= own
+        fits = all(new.shape == self.values[name].shape for name, new in updates.items())
+        self.values |= updates
         if not fits:
             self.upload()
             return True
-        sizes = np.cumsum([0, *(held.size for held in self.values.values())]).tolist()
+        sizes = np.cumsum([0, *(current.size for current in self.values.values())]).tolist()
         for offset, name in zip(sizes, self.values, strict=False):
-            if name in own:
-                flat = wp.array(own[name].ravel(), dtype=self._real, device="cpu")
+            if name in updates:
+                flat = wp.array(updates[name].ravel(), dtype=self._real, device="cpu")
                 wp.copy(self.buffer, flat, dest_offset=offset)
         return False
 
     def upload(self) -> None:
-        """Bring what `values` holds to the device."""
+        """Copy `values` to the device."""
         offset, table = 0, []
         for values in self.values.values():
             first = values.shape[1] if values.shape[0] > 1 else 0
@@ -69,19 +70,19 @@ class ParameterTable:
 
 
 def _spread(new: np.ndarray, shape: tuple) -> np.ndarray:
-    """Values in the shape that they had before, where they broadcast to it, else as they are."""
+    """Return values broadcast to the shape before if possible, else unchanged."""
     spreads = all(size in (1, before) for size, before in zip(new.shape, shape, strict=True))
     return np.ascontiguousarray(np.broadcast_to(new, shape) if spreads else new)
 
 
 def valid_numbers(name: str, values, rule: str, holds) -> np.ndarray:
-    """Values of a parameter as an array of numbers that fulfil a rule.
+    """Return values of a parameter as an array of numbers that fulfil a rule.
 
     Raises:
-        ValueError: they are no numbers, not finite, or do not.
+        ValueError: a value is no number, not finite, or breaks the rule.
     """
     values = np.array(arguments.array(name, values, "give numbers"))
-    bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
-    if bad.size:
-        raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
+    invalid = np.flatnonzero(~(np.isfinite(values) & holds(values)))
+    if invalid.size:
+        raise ValueError(f"{name}: value {invalid[0]} is {values.ravel()[invalid[0]]:g}; it is finite and {rule}")
     return values

@@ -1,4 +1,4 @@
-"""Models built again with the parameters and rest shapes that they have: with other worlds, or in another process."""
+"""Recipe of a model: rebuild it with its parameters and rest shapes, with other worlds or in another process."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from ddg_warp.errors import SceneError
 
 
 class Recipe:
-    """A model of a number of worlds that can be built again elsewhere, with the parameters and rest shapes that it has.
+    """Scene, options, parameters and rest shapes of a model, for rebuilding it with `worlds` worlds.
 
     Raises:
-        SceneError: a parameter differs between the model's worlds, and there are to be others.
+        SceneError: a parameter differs between the model's worlds, and `worlds` is another number.
     """
 
     def __init__(self, model, worlds: int):
@@ -28,14 +28,14 @@ class Recipe:
         self.plates = [shell.plate for shell in _shells(model)]
 
     def build(self):
-        """Return the model."""
+        """Build the model."""
         model = self.scene.build(**self.options)
         if self.version:  # else it is as it was built
             self.put(model)
         return model
 
     def put(self, model) -> None:
-        """Give a model of the same scene and as many worlds these parameters and rest shapes, where it has others."""
+        """Copy parameters and rest shapes to a model of the same scene and number of worlds."""
         remade = False
         for (table, _), values in zip(_tables(model), self.parameters, strict=True):
             changed = {name: new for name, new in values.items() if not np.array_equal(table.values[name], new)}
@@ -46,7 +46,7 @@ class Recipe:
 
 
 def _tables(model) -> list:
-    """Parameters of all groups and of the net, and the axis along which worlds lie."""
+    """Return parameter tables of rod groups and element sets, each with its axis of worlds."""
     sets = model.net.sets if model.net is not None else ()
     return [(group.parameters, 1) for group in model.groups] + [(part.parameters, 0) for part in sets]
 
@@ -56,13 +56,13 @@ def _shells(model) -> list:
 
 
 def _in_worlds(name: str, values: np.ndarray, axis: int, worlds: int, wanted: int) -> np.ndarray:
-    """A parameter of one number of worlds as one of another."""
+    """Convert a parameter of `worlds` worlds to `wanted` worlds."""
     if worlds == wanted or values.shape[axis] == 1:
         return values
-    own = np.stack(np.split(values, worlds, axis))
-    if (own != own[0]).any():
+    of_worlds = np.stack(np.split(values, worlds, axis))
+    if (of_worlds != of_worlds[0]).any():
         raise SceneError(
             f"the parameter {name} differs between the {worlds} worlds of the model, so that those of {wanted} worlds are not known; "
             "give it as a tensor, or build the model with as many worlds"
         )
-    return np.concatenate([own[0]] * wanted, axis)
+    return np.concatenate([of_worlds[0]] * wanted, axis)

@@ -1,8 +1,8 @@
-"""Rest shapes: growth, swelling, bilayers, creases and pre-stress of shells as fundamental forms at rest; rest strains of rods.
+"""Rest shapes: fundamental forms of shells (growth, swelling, bilayers, creases, pre-stress) and rest strains of rods.
 
-A shell at rest has a metric abar and a second fundamental form bbar on every triangle, written (11, 12, 22) in the basis of its
-first two edges, a1 = x1 - x0 and a2 = x2 - x0. They need not be those of any surface: then the shell is strained whatever its shape
-(Efrati, Sharon, Kupferman 2009). `Model.set_rest` puts them into a model; `Scene.add_shell(rest=(abar, bbar))` starts with them.
+A shell at rest has a metric abar and a second fundamental form bbar on every triangle. Both are written (11, 12, 22) in the basis of
+the first two edges, a1 = x1 - x0 and a2 = x2 - x0. The forms may be incompatible, i.e. of no surface: then the shell is strained in
+every shape (Efrati, Sharon, Kupferman 2009). `Model.set_rest` changes them; `Scene.add_shell(rest=(abar, bbar))` starts with them.
 """
 
 from collections.abc import Mapping
@@ -18,11 +18,12 @@ from ddg_warp.model import validate
 
 
 def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
-    """The form with principal values `first` along a direction of the surface and `second` across it.
+    """Return the form with principal values `first` along a direction of the surface and `second` across.
 
-    With d1 the direction, put into the plane of the triangle, and d2 across it, q_ij = first (a_i . d1)(a_j . d1) + second (a_i .
-    d2)(a_j . d2). Principal curvatures [1/m] give a second fundamental form, positive where the surface bends towards its normal;
-    squared stretches a metric (see `grown_metric`).
+        q_ij = first (a_i . d1)(a_j . d1) + second (a_i . d2)(a_j . d2)
+
+    d1: the direction projected to the plane of the triangle, d2: across it. Principal curvatures [1/m] give a second fundamental
+    form, positive where the surface bends towards its normal. Squared stretches give a metric (see `grown_metric`).
 
     Args:
         points: (P, 3) [m].
@@ -45,9 +46,9 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
 
 
 def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
-    """Components (T, 2, 2) [m] of the first two edges of triangles along a direction (first row) and across it; the columns are a1, a2.
+    """Return components (T, 2, 2) [m] of the edges a1, a2 (columns) along a direction and across it (rows).
 
-    Arguments as of `principal_form`.
+    Arguments as in `principal_form`.
 
     Raises:
         ValueError: the direction is normal to a triangle.
@@ -68,9 +69,9 @@ def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
-    """Metric (T, 3) [m^2] of a surface stretched by `first` along a direction and by `second` across it, by default alike.
+    """Return the metric (T, 3) [m^2] of a surface stretched by `first` along a direction and `second` across.
 
-    Arguments as of `principal_form`; a stretch of 1.1 is a growth by a tenth in length.
+    Arguments as in `principal_form`; `second` is by default `first`. A stretch of 1.1 is a growth by a tenth in length.
     """
     second = first if second is None else second
     first, second = (arguments.array(name, values) for name, values in (("first", first), ("second", second)))
@@ -78,16 +79,17 @@ def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0
 
 
 def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0, young2: float = 1.0) -> float:
-    """Curvature [1/m] that two bonded layers take where the first would be longer by `mismatch` [1] when free.
+    """Return the curvature [1/m] of two bonded layers with a mismatch of free strains (Timoshenko 1925).
 
-    kappa = 6 mismatch (1 + m)^2 / (h (3 (1 + m)^2 + (1 + m n)(m^2 + 1 / (m n)))), m = h1 / h2, n = young1 / young2, h = h1 + h2
-    (Timoshenko, J. Opt. Soc. Am. 11, 1925). Layers with the same Poisson's ratio that grow in both directions have it in both; a
-    wide plate that cannot, because a sphere is no bent plane, rolls up with (1 + nu) kappa instead.
+        kappa = 6 mismatch (1 + m)^2 / (h (3 (1 + m)^2 + (1 + m n)(m^2 + 1 / (m n))))
+
+    m = h1 / h2, n = young1 / young2, h = h1 + h2 (J. Opt. Soc. Am. 11). Layers of equal Poisson's ratio that grow in both directions
+    have this curvature in both. A wide plate cannot bend to a sphere: it rolls up with (1 + nu) kappa instead.
 
     Args:
-        mismatch: difference of the free strains.
+        mismatch: difference of the free strains, positive if the first layer is longer.
         h1, h2: thickness of the layers [m].
-        young1, young2: their Young's moduli, in any unit.
+        young1, young2: Young's moduli, in any unit.
     """
     for name, value in (("h1", h1), ("h2", h2), ("young1", young1), ("young2", young2)):
         arguments.positive(f"bilayer_curvature: {name}", value)
@@ -97,14 +99,14 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
 
 
 def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
-    """See `Model.set_rest`; `plate` are values of its `Plate` by name, as they are stored."""
+    """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
     validate.check_model("set_rest", model)
     if model.net is None or not 0 <= arguments.index("set_rest: shell", shell) < len(model.net.host.shells):
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
-    held, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
+    net_shell, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
     membrane = model.scene.shells[shell].membrane
-    surface, changes = held.surface, dict(plate or {})
+    surface, changes = net_shell.surface, dict(plate or {})
     count = len(surface.triangles)
     if not changes and all(values is None for values in (points, metric, curvature, angle)):
         raise ValueError("set_rest: give points, metric, curvature or angle")
@@ -114,8 +116,8 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         points = _shaped("points", points, surface.points.shape)
         _refuse_without_area("points", shell_forms.metric(surface, points))
         changes["abar"] = shell_forms.metric(surface, points)
-        changes["bbar"] = shell_forms.second_form(surface, points, held.kinds)
-        changes["angle"] = shell_forms.edge_angles(surface, points, held.kinds)
+        changes["bbar"] = shell_forms.second_form(surface, points, net_shell.kinds)
+        changes["angle"] = shell_forms.edge_angles(surface, points, net_shell.kinds)
     if metric is not None:
         changes["abar"] = _shaped("metric", metric, (count, 3))
         _refuse_without_area("metric", changes["abar"])
@@ -128,35 +130,37 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
             raise ValueError(f"bending {bending!r} has no rest angles; give a curvature, or the points of a rest shape")
         angle = _shaped("angle", angle, (len(surface.edges),))
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
-    plate = replace(held.plate, **changes)
+    plate = replace(net_shell.plate, **changes)
     sets = {part.term.name: part for part in model.net.sets}
-    elements_of = shell_terms.shell_elements(surface, plate, held.kinds, bending, membrane)
-    places = [(sets[e.term.name], held.first[e.term.name], e.parameters) for e in elements_of if len(e)]
-    held.plate = plate  # from here on nothing can fail
+    elements_of = shell_terms.shell_elements(surface, plate, net_shell.kinds, bending, membrane)
+    places = [(sets[e.term.name], net_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
+    net_shell.plate = plate  # nothing can fail after this
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))
 
 
 def set_rest_strains(model, strains: dict) -> None:
-    """Change the rest stretches, natural curvatures and natural twists of rods on their own, element by element.
+    """Set rest stretches, natural curvatures and natural twists of uncoupled rods, element by element.
 
     Args:
         model: a built scene.
-        strains: values (elements,) or (worlds, elements) by name, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m], of
-            the elements of all rods, rod by rod, those of clamped ends included; `ddg_warp.ask.sag_free.rest_strains` finds some.
+        strains: values (elements,) or (worlds, elements) by name, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m].
+            Elements are of all rods, rod by rod, clamped ends included. `ddg_warp.ask.sag_free.rest_strains` computes some.
 
     Raises:
-        ValueError: no rod on its own has such a rest strain, or rods of the net have it too; values do not fit or are not finite.
+        ValueError: no uncoupled rod has such a rest strain, or coupled rods have it too; values do not fit or are not finite.
             Nothing is changed then.
     """
     validate.check_model("set_rest_strains", model)
-    own = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
-    shared = {part.term.name for part in model.net.sets} if model.net is not None else set()
-    known, found = sorted(name for name in own if name.partition(".")[0] not in shared), []
+    uncoupled = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
+    coupled = {part.term.name for part in model.net.sets} if model.net is not None else set()
+    allowed, updates = sorted(name for name in uncoupled if name.partition(".")[0] not in coupled), []
     if not isinstance(strains, Mapping):
-        raise ValueError(f"set_rest_strains: strains are {arguments.shown(strains)}; give values by name, of {known}")
+        raise ValueError(f"set_rest_strains: strains are {arguments.shown(strains)}; give values by name, of {allowed}")
     for name, values in strains.items():
-        if name not in known:
-            why = "rods that are joined, glued or magnetised have it too" if name in own else f"there is {known}"
+        if name not in allowed:
+            why = (
+                "rods that are joined, glued or magnetised have it too" if name in uncoupled else f"there is {allowed}"
+            )
             raise ValueError(f"set_rest_strains: {name!r} is no rest strain of rods that are all on their own; {why}")
         count, groups = model.order.elements(name)
         values = model.valid_values(*name.rsplit(".", 1), values)
@@ -165,8 +169,8 @@ def set_rest_strains(model, strains: dict) -> None:
                 f"set_rest_strains: {name} has shape {values.shape}; give ({count},) or ({model.worlds}, {count})"
             )
         values = np.broadcast_to(values, (model.worlds, count))
-        found += [(group, name, np.concatenate(values[:, numbers], axis=1)) for group, _, numbers in groups]
-    model.note_change(any([group.parameters.set(**{name: values}) for group, name, values in found]))
+        updates += [(group, name, np.concatenate(values[:, numbers], axis=1)) for group, _, numbers in groups]
+    model.note_change(any([group.parameters.set(**{name: values}) for group, name, values in updates]))
 
 
 def _refuse_without_area(name: str, metric: np.ndarray) -> None:
@@ -185,5 +189,5 @@ def _shaped(name: str, values, shape: tuple) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products along the last axis."""
+    """Return scalar products along the last axis."""
     return np.sum(a * b, -1)

@@ -1,16 +1,20 @@
-"""Parameters that the element sets of a net have along its rods."""
+"""Parameters of element sets along the rods of the coupled system."""
 
 import numpy as np
 
 
 class RodElements:
-    """Where the elements of rods of one kind are among those of a net's sets.
+    """Map from rods of one kind to elements in the element sets of the coupled system.
 
     Args:
-        net: a `DeviceNet`; kind: `ChainKind` of the rods; rods: the scene's indices (R,); nodes: of the longest, with ghosts.
+        net: a `DeviceNet`.
+        kind: `ChainKind` of the rods.
+        rods: the scene's indices (R,).
+        nodes: number of nodes of the longest rod, with ghosts.
 
     Attributes:
-        sets: index of the set of each term, by its span; lists: its elements along every rod, by span.
+        sets: index of the element set of each term, by span.
+        lists: elements along every rod, by span.
     """
 
     def __init__(self, net, kind, rods: np.ndarray, nodes: int):
@@ -20,15 +24,15 @@ class RodElements:
             index = next(i for i, part in enumerate(net.sets) if part.term.law == term.law)
             self.sets[term.measure.span] = index
             self.lists[term.measure.span] = of_rods(net.host.sets[index].owner[0], rods)
-        self._elements = {span: _padded(own, nodes) for span, own in self.lists.items()}
+        self._elements = {span: _padded(elements, nodes) for span, elements in self.lists.items()}
 
     def parameters(self, but: dict | None = None) -> dict[str, np.ndarray]:
         """Return values by "term.parameter", each broadcastable to (nodes, W R).
 
         Args:
-            but: arrays of the sets by "term.parameter", of which those that are still the same are left out; takes those found.
+            but: arrays by "term.parameter" that are left out if unchanged; updated to the current ones.
         """
-        found, worlds = {}, self.net.worlds
+        result, worlds = {}, self.net.worlds
         for term in self._terms:
             table, elements = self.net.sets[self.sets[term.measure.span]].parameters, self._elements[term.measure.span]
             for parameter, values in table.values.items():
@@ -37,21 +41,26 @@ class RodElements:
                     if but.get(name) is values:
                         continue
                     but[name] = values
-                own = values[:, elements] if along > 1 else values.reshape(several, 1, 1)
+                along_rods = values[:, elements] if along > 1 else values.reshape(several, 1, 1)
                 if several > 1 or along > 1:
-                    own = np.broadcast_to(own, (worlds, own.shape[1], self._rods)).transpose(1, 0, 2)
-                found[name] = own.reshape(len(own), -1)
-        return found
+                    along_rods = np.broadcast_to(along_rods, (worlds, along_rods.shape[1], self._rods)).transpose(
+                        1, 0, 2
+                    )
+                result[name] = along_rods.reshape(len(along_rods), -1)
+        return result
 
 
 def of_rods(owner: np.ndarray, rods: np.ndarray) -> list[np.ndarray]:
-    """Elements of every one of some rods, of the rods (E,) that own them, in order."""
+    """Return the elements of each rod in `rods`, in order, from the owner rod of every element (E,)."""
     order = np.argsort(owner, kind="stable")
     starts, ends = (np.searchsorted(owner[order], rods, side) for side in ("left", "right"))
     return [order[start:end] for start, end in zip(starts, ends, strict=True)]
 
 
 def _padded(elements: list[np.ndarray], nodes: int) -> np.ndarray:
-    """Elements of rods (nodes, R), the last one again where a rod has fewer."""
-    pads = [np.pad(own, (0, nodes - len(own)), mode="edge") if len(own) else np.zeros(nodes, int) for own in elements]
+    """Return elements of rods (nodes, R), with the last one repeated in shorter rods."""
+    pads = [
+        np.pad(of_rod, (0, nodes - len(of_rod)), mode="edge") if len(of_rod) else np.zeros(nodes, int)
+        for of_rod in elements
+    ]
     return np.column_stack(pads)

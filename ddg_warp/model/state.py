@@ -1,4 +1,4 @@
-"""State: what a step writes."""
+"""State: positions, velocities, frames and history written by a step."""
 
 from dataclasses import dataclass
 
@@ -9,22 +9,22 @@ from ddg_warp import arguments, arrays
 from ddg_warp.geometry import polyline
 from ddg_warp.threads import launches
 
-EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # what solvers tell of equilibria
+EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # set by static solvers
 VELOCITIES = ("v", "omega", "a", "alpha")
 
 
 @dataclass
 class GroupState:
-    """Device arrays of one group of rods; n nodes, R rods.
+    """Device arrays of one rod group with n nodes and R rods.
 
     Attributes:
         x, v: position [m] and velocity [m/s] of nodes, vectors (n, R).
-        theta, omega: angle [rad] and its rate [rad/s] of edges (n, R); empty without twist.
-        frame: lagged reference frames (7, n, R): first director, tangent, reference twist; empty without twist.
+        theta, omega: twist angle [rad] and rate [rad/s] of edges (n, R); empty without twist.
+        frame: time-lagged reference frames (7, n, R): first director, tangent, reference twist; empty without twist.
         last: strains at this state (strains, n, R); empty without strain-rate damping.
-        a, alpha: what the last solve added to its predictor, over the square of its step (n, R), [m/s^2] and [rad/s^2]; the next one
-            starts from where they lead. Zero where there was none; alpha is empty without twist. By the midpoint rule accelerations of
-            what has drag and no mass, by its mean velocities in the last two steps.
+        a: correction of the last solve to its predictor over the squared step (n, R) [m/s^2], for the warm start. Zero without a
+            last solve. With the midpoint rule, massless nodes with drag have accelerations from mean velocities of two steps.
+        alpha: correction of twist angles likewise (n, R) [rad/s^2]; empty without twist.
     """
 
     x: wp.array
@@ -43,10 +43,10 @@ class GroupState:
 
 @dataclass
 class GripState:
-    """Where the grips of a model are.
+    """Device arrays of the grips (kinematic supports) of a model.
 
     Attributes:
-        pose: translation (3) [m] and rotation vector (3) [rad] of each, relative to rest (6, worlds grips).
+        pose: translation (3) [m] and rotation vector (3) [rad] relative to rest (6, worlds grips).
     """
 
     pose: wp.array
@@ -58,18 +58,18 @@ class GripState:
 
 @dataclass(frozen=True)
 class Sliding:
-    """The way to an equilibrium with friction from the one before.
+    """Load step that led to an equilibrium with friction.
 
     Attributes:
-        velocity: of the blocks of the net (W N,) on that way, by load parameter.
-        increment: of the load parameter, positive.
+        velocity: displacement of dof blocks (W N,) in this load step, per load parameter.
+        increment: increment of the load parameter, positive.
     """
 
     velocity: wp.array
     increment: float
 
     def begun(self, q: wp.array) -> wp.array:
-        """Blocks (W N,) of the equilibrium before, from which slips count, of an equilibrium with blocks q."""
+        """Return dof blocks (W N,) of the previous equilibrium, the origin of slip, from blocks q."""
         return wp.array(q.numpy() - self.increment * self.velocity.numpy(), dtype=q.dtype, device=q.device)
 
 
@@ -78,24 +78,22 @@ class Sliding:
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
 
-    A state stays as it is for as long as something refers to it, or to a part or an array of it. Memory of states that nothing refers
-    to is written again, so that a loop which keeps none needs that of two. A state kept takes a copy of its arrays with it. Who keeps
-    bare arrays of a state that it let go (`state.groups[0].x`, or a view of them) keeps their memory, and steps are captured
-    anew: rather keep the state.
+    A state does not change as long as it, or one of its arrays, is referenced. Memory of unreferenced states is reused: a loop that
+    keeps none needs the memory of two. A state that is kept takes a copy of its arrays. Keep states, not bare arrays
+    (`state.groups[0].x`, or a view): these pin their memory, and steps are captured again.
 
     Attributes:
-        time: [s], which all worlds share.
+        time: [s], common to all worlds.
         grips: poses of the grips of all worlds; None without, see `Grip`.
-        stable: of an equilibrium that a static solver found, whether it is stable; None where that was not asked, as in dynamics, or
-            rounding hides it. See `Equilibrium.solve`.
-        outcome: of an equilibrium, "converged" or "converged_to_rounding"; None of other states.
-        unbalanced: of an equilibrium, what of the loads supports and obstacles do not carry, over the loads; None of other states.
-            With several worlds these three are arrays (worlds,).
-        sliding: of an equilibrium with friction, the `Sliding` by which that acts, though the state is at rest; None where it acts by
-            the velocities of the state.
-        spun: whether it was given spins, or comes from a state that was; see `Integrator`, gyroscopic.
-        lead: half the last step where that was one of the midpoint rule [s], else zero. By so much the state is later than velocities
-            of what has no mass, which are means over that step.
+        stable: whether an equilibrium of a static solver is stable; None where this was not tested, as in dynamics, or is below
+            rounding. See `Equilibrium.solve`.
+        outcome: "converged" or "converged_to_rounding" for an equilibrium; None for other states.
+        unbalanced: loads of an equilibrium that supports and obstacles do not carry, over the loads; None for other states.
+            With several worlds `stable`, `outcome` and `unbalanced` are arrays (worlds,).
+        sliding: the `Sliding` that determines friction in an equilibrium; None where friction acts by the velocities of the state.
+        spun: whether spins were given to this state or an earlier one; see `Integrator`, gyroscopic.
+        lead: half the last step if by the midpoint rule [s], else zero. Velocities of massless dofs are means over that step, and the
+            state is later by `lead`.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
@@ -112,33 +110,33 @@ class State:
         self.lead = 0.0
 
     def __reduce__(self):
-        """Have pickle and torch.save keep the arrays, and the model of these, once for all states that are saved together."""
+        """Have pickle and torch.save keep the arrays, and the model once for all states saved together."""
         return State._loaded, (self.model, self.snapshot(), self._told())
 
     def __copy__(self) -> "State":
         return self.copy()
 
     def __deepcopy__(self, memo) -> "State":
-        """Return a copy, of the same model unless that was copied before."""
+        """Return a copy of the same model, or of the model's copy in `memo`."""
         model = memo.get(id(self.model), self.model)
         return self.copy() if model is self.model else State._loaded(model, self.snapshot(), self._told())
 
     def _told(self) -> dict:
-        """What a state says beside its `snapshot`, as a pickle holds it."""
-        told = {name: getattr(self, name) for name in (*EQUILIBRIUM, "lead")}
+        """Return the attributes that a pickle keeps in addition to `snapshot`."""
+        attributes = {name: getattr(self, name) for name in (*EQUILIBRIUM, "lead")}
         if self.sliding is not None:
-            told["sliding"] = self.sliding.velocity.numpy().copy(), self.sliding.increment
-        return told
+            attributes["sliding"] = self.sliding.velocity.numpy().copy(), self.sliding.increment
+        return attributes
 
     @staticmethod
-    def _loaded(model, snapshot: dict, told: dict) -> "State":
+    def _loaded(model, snapshot: dict, attributes: dict) -> "State":
         state = model.restore(snapshot)
-        if told["sliding"] is not None:
-            velocity, increment = told["sliding"]
-            told = told | {
+        if attributes["sliding"] is not None:
+            velocity, increment = attributes["sliding"]
+            attributes = attributes | {
                 "sliding": Sliding(wp.array(velocity, dtype=state.net.v.dtype, device=state.net.v.device), increment)
             }
-        vars(state).update(told)
+        vars(state).update(attributes)
         return state
 
     def __repr__(self) -> str:
@@ -146,31 +144,37 @@ class State:
         return f"<State at t = {self.time:g} s: {model.worlds} worlds of {model.points_count} points on {model.device}>"
 
     def parts(self) -> dict:
-        """State of every group of rods, and of the net and of the grips if there are any, by name."""
-        others = {"net": self.net, "grips": self.grips}
+        """Return the states of rod groups, the coupled system and grips, by name."""
+        single = {"net": self.net, "grips": self.grips}
         groups = {str(i): group for i, group in enumerate(self.groups)}
-        return groups | {name: part for name, part in others.items() if part is not None}
+        return groups | {name: part for name, part in single.items() if part is not None}
 
     def arrays(self) -> dict[str, wp.array]:
-        """Device arrays "part/name" as they are stored, see `GroupState`; each goes to other libraries without a copy, by DLPack:
-        `torch.from_dlpack(state.arrays()["0/x"])`."""
-        return {f"{part}/{name}": array for part, own in self.parts().items() for name, array in own.arrays().items()}
+        """Return device arrays by "part/name", in storage order; see `GroupState`.
+
+        Other libraries read them without a copy, by DLPack: `torch.from_dlpack(state.arrays()["0/x"])`.
+        """
+        return {
+            f"{part}/{name}": array
+            for part, of_part in self.parts().items()
+            for name, array in of_part.arrays().items()
+        }
 
     @property
     def rubbing(self) -> wp.array:
-        """Velocities of the blocks of the net (W N,) by which friction acts."""
+        """Slip velocities of dof blocks (W N,) for friction."""
         return self.net.v if self.sliding is None else self.sliding.velocity
 
     def points(self) -> np.ndarray:
-        """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""
+        """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices."""
         return self.model.order.nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
 
     def velocities(self) -> np.ndarray:
-        """Velocities of nodes, ordered as `points` [m/s]."""
+        """Return velocities of nodes, ordered as `points` [m/s]."""
         return self.model.order.nodes([arrays.download(group.v) for group in self.groups], self.net and self.net.v)
 
     def obstacle_points(self) -> np.ndarray:
-        """Positions of the nodes of obstacles that something moves (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
+        """Return positions of nodes of moving obstacles (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
         model = self.model
         if model.obstacles is None:
             return np.zeros((0, 3) if model.worlds == 1 else (model.worlds, 0, 3))
@@ -179,7 +183,7 @@ class State:
         return values[0] if model.worlds == 1 else values
 
     def angles(self) -> np.ndarray | None:
-        """Angles theta of edges [rad] (edges,) or (worlds, edges); None if no rod has twist."""
+        """Return twist angles of edges (edges,) or (worlds, edges) [rad]; None if no rod has twist."""
         model = self.model
         net = None
         if model.net is not None and model.net.edges:
@@ -187,7 +191,7 @@ class State:
         return model.order.edges([arrays.download(data.theta) for data in self.groups], net)
 
     def directors(self) -> np.ndarray | None:
-        """First material director of every edge (edges, 3) or (worlds, edges, 3); None if no rod has twist."""
+        """Return the first material director of edges (edges, 3) or (worlds, edges, 3); None without twist."""
         model = self.model
         values, net = [], None
         if model.net is not None and model.net.edges:
@@ -205,22 +209,22 @@ class State:
         return model.order.edges(values, net, 3)
 
     def poses(self) -> np.ndarray | None:
-        """Poses of the grips, in the order of `model.grips` (grips, 6) or (worlds, grips, 6): see `Grip`; None without."""
+        """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""
         if self.grips is None:
             return None
         values = self.grips.pose.numpy().T.reshape(self.model.worlds, -1, 6)
         return values[0] if self.model.worlds == 1 else values
 
     def copy(self) -> "State":
-        """An independent copy."""
-        other = self.model.empty_state()
-        other.assign(self)
+        """Return an independent copy."""
+        result = self.model.empty_state()
+        result.assign(self)
         for name in EQUILIBRIUM:
-            setattr(other, name, getattr(self, name))
-        return other
+            setattr(result, name, getattr(self, name))
+        return result
 
     def assign(self, other: "State") -> None:
-        """Take over everything of another state of the same model."""
+        """Copy arrays and time of another state of the same model."""
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 arrays.copy(array, source)
@@ -228,12 +232,12 @@ class State:
         self.forget_equilibrium()
 
     def forget_equilibrium(self) -> None:
-        """Take this for a state of which no solver has found that it is an equilibrium."""
+        """Reset the attributes that static solvers set."""
         for name in EQUILIBRIUM:
             setattr(self, name, None)
 
     def stop(self) -> None:
-        """Set all velocities to zero, and what the next step would go on from."""
+        """Zero all velocities and the data of the warm start."""
         self.lead, self.spun = 0.0, False
         for part in self.parts().values():
             for name, array in part.arrays().items():
@@ -241,7 +245,7 @@ class State:
                     array.zero_()
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Everything a bitwise restart needs."""
+        """Return the data for a bitwise restart, by name."""
         spun = {"spun": np.bool_(True)} if self.spun else {}
-        own = {name: arrays.download(array) for name, array in self.arrays().items()}
-        return {"time": np.float64(self.time)} | spun | own
+        values = {name: arrays.download(array) for name, array in self.arrays().items()}
+        return {"time": np.float64(self.time)} | spun | values

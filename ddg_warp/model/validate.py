@@ -1,4 +1,4 @@
-"""Refusals of what is no model, or no state of one, and of models that cannot be stepped in time."""
+"""Checks of model and state arguments, and of models for time stepping."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import drag
 
-CARRIED = 1e-40  # least magnitude of which float32, below its normal numbers, keeps four digits
+CARRIED = 1e-40  # smallest magnitude that float32, in its subnormal range, keeps to four digits
 
 
 def check_model(call: str, model) -> None:
-    """Refuse what is no model, where one is asked for."""
+    """Raise SceneError if an argument is no model."""
     from ddg_warp.model.model import Model
 
     if not isinstance(model, Model):
@@ -18,7 +18,7 @@ def check_model(call: str, model) -> None:
 
 
 def check_state(call: str, model, state) -> None:
-    """Refuse what is no state of a model."""
+    """Raise SceneError if an argument is no state of the model."""
     from ddg_warp.model.state import State
 
     if not isinstance(state, State):
@@ -30,13 +30,13 @@ def check_state(call: str, model, state) -> None:
 
 
 def refuse_underflow(model) -> None:
-    """Refuse stiffnesses, and squared areas of triangles, that float32 does not carry, unless rounding is allowed."""
+    """Refuse stiffnesses and squared triangle areas outside of the float32 range, unless rounding is allowed."""
     if model.precision != "float32" or model.allow_rounding:
         return
-    given = {name: values for name, values in model.parameters().items() if "/stiffness" in name}
+    values_by_name = {name: values for name, values in model.parameters().items() if "/stiffness" in name}
     for i, shell in enumerate(model.net.host.shells if model.net is not None else ()):
-        given[f"shell {i}, squared area of a triangle"] = shell.plate.area**2
-    for name, values in given.items():
+        values_by_name[f"shell {i}, squared area of a triangle"] = shell.plate.area**2
+    for name, values in values_by_name.items():
         size = np.abs(values[np.nonzero(values)])
         if size.size and not (CARRIED <= size.min() and size.max() <= np.finfo(np.float32).max):
             worst = size.min() if size.min() < CARRIED else size.max()
@@ -47,7 +47,10 @@ def refuse_underflow(model) -> None:
 
 
 def refuse_curved_membranes(model) -> None:
-    """Its strains turn with the normals, so that the matrix of a time step, which is made positive, is far from the tangent."""
+    """Refuse dynamics of shells with membrane "curved".
+
+    Their strains rotate with the normals, and the projected positive definite matrix of a time step is far from the tangent.
+    """
     for i, shell in enumerate(model.scene.shells):
         if shell.membrane == "curved":
             raise SceneError(
@@ -56,33 +59,33 @@ def refuse_curved_membranes(model) -> None:
 
 
 def refuse_friction(model) -> None:
-    """Refuse contact with friction where something is asked of equilibria that the way there does not decide."""
-    given = model.net.host.touching if model.net is not None else None
-    pairs = zip(*given.meeting, strict=True) if given is not None else ()
-    rough = next(((g, h) for g, h in pairs if given.friction[g, h] > 0.0), None)
+    """Refuse frictional contact in analyses of equilibria that are independent of the load path."""
+    contact = model.net.host.touching if model.net is not None else None
+    pairs = zip(*contact.meeting, strict=True) if contact is not None else ()
+    rough = next(((g, h) for g, h in pairs if contact.friction[g, h] > 0.0), None)
     if rough is None:
         return
-    one, other = (given.names[g] for g in rough)
+    first, second = (contact.names[g] for g in rough)
     raise SceneError(
-        f"contact: stability and paths of equilibria know no friction, and it is {given.friction[rough]:g} between {one!r} "
-        f"and {other!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
+        f"contact: stability and paths of equilibria know no friction, and it is {contact.friction[rough]:g} between {first!r} "
+        f"and {second!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
         "statics.solve, and for their gradients"
     )
 
 
 def require_mass(model) -> None:
-    """Refuse free nodes of rods on their own that nothing gives an equation of motion."""
+    """Refuse free nodes of uncoupled rods that have neither mass nor drag."""
     for group in model.groups:
         host, kind = group.host, group.kind
         positions = (1 << kind.dim) - 1
         k = np.arange(group.nodes)[:, None]
-        own = (k >= host.first) & (k < host.first + host.own)
-        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
+        nodes = (k >= host.first) & (k < host.first + host.own)
+        massless = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & nodes
         if kind.drag:
-            first, last = drag.holds(host.drag)  # of edges; the last node of an open rod starts none
-            bad &= ~(first | np.roll(last, 1, axis=0))
-        if bad.any():
-            k, column = np.argwhere(bad)[0]
+            first, last = drag.holds(host.drag)  # of edges; the last node of an open rod begins none
+            massless &= ~(first | np.roll(last, 1, axis=0))
+        if massless.any():
+            k, column = np.argwhere(massless)[0]
             raise SceneError(
                 f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
                 "give the material a density, the section a mass_per_length, or the rod drag along and across"
