@@ -1,1 +1,1 @@
-"""What is asked of a state: energies, reactions, stresses, fields, modes."""
+"""Post-processing of states: energies, reactions, stresses, fields, modes."""

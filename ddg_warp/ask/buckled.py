@@ -1,20 +1,21 @@
-"""Shapes to look at: an equilibrium, displaced along the mode in which it is least stiff."""
+"""Buckled shapes: an equilibrium displaced along its lowest mode."""
 
 import numpy as np
 
 from ddg_warp.solve.stability import spectrum
 from ddg_warp.solve.tangent import Tangent
 
-SMALL = 1e-4  # of the size asked for, to which a mode is taken as linear
+SMALL = 1e-4  # of the given size: displacement for which the mode is taken as linear
 
 
 def buckled_points(model, state, size: float) -> np.ndarray:
-    """Points (P, 3) [m] of a model of one world, displaced along its lowest mode by `size` [m] at most, on the side of the axis
-    in which it moves most.
+    """Return the points (P, 3) [m] of a state displaced along its lowest mode.
+
+    The largest component of the displacement is positive.
 
     Args:
-        model, state: an equilibrium, at or near its critical load.
-        size: largest displacement.
+        model, state: an equilibrium, at or near its critical load, of one world.
+        size: largest displacement [m].
     """
     tangent = Tangent(model)
     mode = spectrum(model, state, 1, "unit", tangent).modes[:, 0]

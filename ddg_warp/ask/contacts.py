@@ -1,4 +1,4 @@
-"""What touches what at a state."""
+"""Contact query: pairs in contact at a state."""
 
 import numpy as np
 
@@ -9,9 +9,9 @@ from ddg_warp.threads import launches
 
 @launches
 def contacts(model, state) -> Contacts:
-    """What touches what at a state, `Contacts`: all pairs closer than the range of contact, and what rubs by its velocities.
+    """Return all pairs within the activation distance, with contact and friction forces.
 
-    An equilibrium with friction has that of the way there.
+    Friction is that of the state's velocities, or of the load step that led to an equilibrium.
 
     Raises:
         SceneError: the scene has no contact.
@@ -20,20 +20,20 @@ def contacts(model, state) -> Contacts:
     if touch is None:
         raise SceneError("contacts: this scene has no contact; add scene.contact()")
     touch.at(state.net.q, state.net.rate)
-    found = touch.pairs(state.net.q, state.rubbing)
+    pairs = touch.pairs(state.net.q, state.rubbing)
     owners = {size: touch.shapes.things(size)[2] for size in touch.shapes.sizes}
-    objects = np.zeros((len(found["gap"]), 2), int)
-    for size, own in owners.items():
+    objects = np.zeros((len(pairs["gap"]), 2), int)
+    for size, owner in owners.items():
         for side in range(2):
-            here = found["sizes"][:, side] == size
-            objects[here, side] = own[found["things"][here, side]]
-    near = np.flatnonzero(found["force"].any(1))
+            of_size = pairs["sizes"][:, side] == size
+            objects[of_size, side] = owner[pairs["things"][of_size, side]]
+    active = np.flatnonzero(pairs["force"].any(1))
     return Contacts(
-        found["world"][near],
-        objects[near],
+        pairs["world"][active],
+        objects[active],
         touch.shapes.names,
-        found["point"][near].astype(float),
-        found["gap"][near].astype(float),
-        found["force"][near].astype(float),
-        found["friction"][near].astype(float),
+        pairs["point"][active].astype(float),
+        pairs["gap"][active].astype(float),
+        pairs["force"][active].astype(float),
+        pairs["friction"][active].astype(float),
     )

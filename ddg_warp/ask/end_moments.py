@@ -1,8 +1,8 @@
-"""Moments at clamped ends and beside rigid joints, about the directors there.
+"""Moments at clamped ends and next to rigid joints, about the directors there.
 
-The strains of a vertex are about the means of the directors of its two edges. At an end, where one of these is a ghost with the
-directors of the node, the means are a quarter of an edge inside of the node: moments about them differ by terms of first order
-from those about the directors at the node, which are given here.
+Strains of a vertex are about the mean directors of its two edges. At an end, one of these is a ghost edge with the directors of the
+node, so that the mean is taken a quarter of an edge inside. Moments about mean directors differ in first order from moments about
+the directors at the node, which this module computes.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from ddg_warp.geometry import polyline
 
 
 def of_group(group, data, moments: np.ndarray) -> None:
-    """Put the moments (3, nodes, worlds, rods) of a group at clamped ends about the directors of the clamp, in place."""
+    """Refer moments (3, nodes, worlds, rods) at clamped ends of a rod group to the directors of the clamp."""
     host = group.host
     frame = arrays.download(data.frame).astype(np.float64)
     u, t = (np.moveaxis(frame[rows], 0, -1) for rows in (slice(0, 3), slice(3, 6)))
@@ -30,7 +30,7 @@ def of_group(group, data, moments: np.ndarray) -> None:
 
 
 def of_net(net, state, index: int, moments: np.ndarray) -> None:
-    """The same of the moments (3, worlds, elements) of a set of a net's rods or rigid joints."""
+    """Refer moments (3, worlds, elements) of coupled rods or rigid joints to the directors at the node."""
     part, host, worlds = net.sets[index], net.host, net.worlds
     measure, slots = part.term.measure, part.host.slots
     frame = state.frame.numpy().astype(np.float64).reshape(6, worlds, -1)
@@ -39,7 +39,7 @@ def of_net(net, state, index: int, moments: np.ndarray) -> None:
     first = polyline.material_directors(u, t, angle)
     edges = slots[measure.nodes : measure.nodes + measure.angles] - host.nodes
     if measure.spins:
-        # seen from the joint outwards: tangents of edges that end there point back, and the second curvature with them
+        # directed outwards from the joint: edges that end there have reversed tangents and second curvature
         sign = part.host.data[0][:, None]
         lag = np.moveaxis(state.lag[index].numpy().astype(np.float64).reshape(-1, worlds, part.elements), 0, -1)
         for world in range(worlds):
@@ -51,12 +51,12 @@ def of_net(net, state, index: int, moments: np.ndarray) -> None:
             moments[1, world] *= sign[:, 0]
         return
     ends = {rod.rod: (rod.piece.ghosts, len(rod.all_nodes) - 3) for rod in host.rods}
-    owner, place = part.host.owner
+    owner, path_node = part.host.owner
     ghosts = np.array([ends[rod][0] for rod in owner])
     last = np.array([ends[rod][1] for rod in owner])
     for clamped, (ghost, edge) in (
-        ((ghosts[:, 0] == 1) & (place == 0), edges),
-        ((ghosts[:, 1] == 1) & (place == last), edges[::-1]),
+        ((ghosts[:, 0] == 1) & (path_node == 0), edges),
+        ((ghosts[:, 1] == 1) & (path_node == last), edges[::-1]),
     ):
         for world in range(worlds):
             at_node, inside = ((first[world, e[clamped]], t[world, e[clamped]]) for e in (ghost, edge))
@@ -64,10 +64,14 @@ def of_net(net, state, index: int, moments: np.ndarray) -> None:
 
 
 def _about(moments: np.ndarray, node: tuple, edge: tuple) -> np.ndarray:
-    """Moments (3, n) about the mean directors of two edges, each given by director and tangent (n, 3), about those of the first."""
+    """Refer moments (3, n) about the mean directors of two edges to the directors of the first.
+
+    Args:
+        node, edge: director and tangent (n, 3) of each edge.
+    """
     (u0, t0), (u1, t1) = node, edge
     v0, v1 = np.cross(t0, u0), np.cross(t1, u1)
-    # what twist turns about, tilde t of Bergou et al. 2008
+    # axis of twist: tilde t of Bergou et al. 2008
     along = (t0 + t1) / (1.0 + np.sum(t0 * t1, -1, keepdims=True))
     first, second, twist = moments[..., None]
     vector = 0.5 * first * (v0 + v1) - 0.5 * second * (u0 + u1) + twist * along

@@ -1,4 +1,4 @@
-"""Numbers along rods and over surfaces to look at: what a recording can hold beside positions."""
+"""Scalar fields along rods and over surfaces, for display and recordings."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ CELL_FIELDS = {
 
 
 def check_fields(names: Sequence[str]) -> tuple[str, ...]:
-    """The names, refused where one is unknown.
+    """Return field names without repetition.
 
     Raises:
-        ValueError: names what there is.
+        ValueError: a name is unknown; the message lists the known ones.
     """
-    known = (*POINT_FIELDS, *CELL_FIELDS)
+    allowed = (*POINT_FIELDS, *CELL_FIELDS)
     listed = isinstance(names, list | tuple | set | dict)
-    if not listed or not all(isinstance(name, str) and name in known for name in names):
-        raise ValueError(f"fields = {arguments.shown(names)}; it is a list of names out of {', '.join(known)}")
+    if not listed or not all(isinstance(name, str) and name in allowed for name in names):
+        raise ValueError(f"fields = {arguments.shown(names)}; it is a list of names out of {', '.join(allowed)}")
     return tuple(dict.fromkeys(names))
 
 
 @launches
 def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Fields of POINT_FIELDS by name, each (worlds, P) in the order of `State.points`; NaN where a point has none.
+    """Return fields of POINT_FIELDS by name, each (worlds, P) in the order of `State.points`; NaN where undefined.
 
-    Values of edges are means at their nodes. Ends of rods and nodes at rigid joints, which have no vertex of their own, have the
-    values of the vertex beside them.
+    Nodal values are means over adjacent edges. Ends of rods and nodes at rigid joints, which are no vertices, have the values of the
+    adjacent vertex.
     """
     _check("point_fields", model, state, names, POINT_FIELDS)
     sums = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
@@ -54,13 +54,13 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
         values = {"axial_force": stresses[..., 0]} if term.measure.span == 1 else _curvatures(term, strains)
         values["energy_density"] = energy
         mine = {name: [np.zeros_like(sums[name]) for _ in range(2)] for name in values}
-        for at in rows:
-            own = at >= 0
+        for index in rows:
+            defined = index >= 0
             for name, value in values.items():
-                np.add.at(mine[name][0], (slice(None), at[own]), value[:, own])
-                np.add.at(mine[name][1], (slice(None), at[own]), 1.0)
+                np.add.at(mine[name][0], (slice(None), index[defined]), value[:, defined])
+                np.add.at(mine[name][1], (slice(None), index[defined]), 1.0)
         for name, (total, count) in mine.items():
-            if name == "energy_density":  # of edges and of vertices are added, each interpolated by itself
+            if name == "energy_density":  # edges and vertices add up, each interpolated separately
                 part = energies[term.measure.span - 1]
                 part[count > 0] = (total / np.maximum(count, 1.0))[count > 0]
             else:
@@ -76,22 +76,22 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 @launches
 def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Fields of CELL_FIELDS by name, each (worlds, triangles) in the order of `model.surfaces`."""
+    """Return fields of CELL_FIELDS by name, each (worlds, triangles) in the order of `model.surfaces`."""
     _check("cell_fields", model, state, names, CELL_FIELDS)
     if not names:
         return {}
     from ddg_warp.ask.inquiry import triangle_fields
 
-    found = triangle_fields(model, state)
-    return {name: found[name.removeprefix("shell_")] for name in names}
+    values = triangle_fields(model, state)
+    return {name: values[name.removeprefix("shell_")] for name in names}
 
 
-def _check(call: str, model, state, names, known) -> None:
-    """Refuse what is no model, no state of it, or a name of no field."""
+def _check(call: str, model, state, names, allowed) -> None:
+    """Refuse arguments that are no model, no state of the model, or no field name."""
     validate.check_model(call, model)
     validate.check_state(call, model, state)
     for name in check_fields(names):
-        arguments.choice(call, name, known)
+        arguments.choice(call, name, allowed)
 
 
 def _curvatures(term, strains: np.ndarray) -> dict[str, np.ndarray]:
@@ -104,8 +104,12 @@ def _curvatures(term, strains: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _elements(model, state) -> Iterator[tuple]:
-    """Of every term of rods: the term, strains and stresses (worlds, E, strains), energies per length (worlds, E), and the rows of
-    the points that each element counts for, arrays (E,), -1 for ghosts."""
+    """Yield data of every term of rods.
+
+    Yields:
+        The term, strains and stresses (worlds, E, strains), energy per length (worlds, E), and arrays (E,) of rows of the points
+        that an element contributes to, -1 for ghosts.
+    """
     from ddg_warp.ask.inquiry import group_strains, net_strains
 
     start = np.concatenate([[0], np.cumsum(model.curves.counts)])
@@ -123,10 +127,10 @@ def _elements(model, state) -> Iterator[tuple]:
             for rod in range(group.rods):
                 count = int(group.host.count[rod])
                 k = np.arange(count if group.kind.closed else count - span)
-                at = [row[(k + shift) % count, rod] for shift in ((0, 1) if span == 1 else (1,))]
+                rows = [row[(k + shift) % count, rod] for shift in ((0, 1) if span == 1 else (1,))]
                 cut = (k, slice(None), rod, slice(place[3], place[3] + n))
                 strain, stress = (np.moveaxis(values[cut], 0, 1) for values in (strains, stresses))
-                yield term, strain, stress, _energy(strain, stress, np.moveaxis(rest[k, :, rod], 0, 1)), at
+                yield term, strain, stress, _energy(strain, stress, np.moveaxis(rest[k, :, rod], 0, 1)), rows
     for index, part in enumerate(model.net.sets if model.net is not None else ()):
         term = part.term
         if not term.measure.name.startswith(ROD_MEASURES):
@@ -138,15 +142,15 @@ def _elements(model, state) -> Iterator[tuple]:
             rest[..., i] = part.parameters[name]
         rods = {rod.rod: rod for rod in model.net.host.rods}
         owner, k = part.host.owner
-        first, own, every = (
+        first, nodes, all_nodes = (
             np.array([value(rods[rod]) for rod in owner], int)
             for value in (lambda rod: rod.first, lambda rod: len(rod.nodes), lambda rod: len(rod.all_nodes))
         )
-        at = []
+        rows = []
         for shift in (0, 1) if span == 1 else (1,):
-            place = (k + shift) % every - first
-            at.append(np.where((place >= 0) & (place < own), start[owner] + place, -1))
-        yield term, strain, stress, _energy(strain, stress, rest), at
+            place = (k + shift) % all_nodes - first
+            rows.append(np.where((place >= 0) & (place < nodes), start[owner] + place, -1))
+        yield term, strain, stress, _energy(strain, stress, rest), rows
 
 
 ROD_MEASURES = ("edge_stretch", "rod_curvature", "curvature_binormal", "planar_curvature")
@@ -162,28 +166,34 @@ def _need_quadratic(model) -> None:
 
 
 def _energy(strain: np.ndarray, stress: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Elastic energy per length of a quadratic law."""
+    """Return the elastic energy per length of a quadratic law."""
     return 0.5 * (stress * (strain - rest)).sum(-1)
 
 
 def _fill_along_rods(model, values: np.ndarray) -> None:
-    """Gives points without a value that of the nearest of their rod, where it has any; in place."""
+    """Fill undefined values (NaN) from the nearest node of the same rod."""
     ends = np.cumsum(model.curves.counts)
     for first, last in zip(ends - model.curves.counts, ends, strict=True):
         rod = values[:, first:last]
-        known = np.flatnonzero(np.isfinite(rod[0]))
-        if 0 < len(known) < last - first:
-            nearest = known[np.abs(np.arange(last - first)[:, None] - known).argmin(1)]
+        defined = np.flatnonzero(np.isfinite(rod[0]))
+        if 0 < len(defined) < last - first:
+            nearest = defined[np.abs(np.arange(last - first)[:, None] - defined).argmin(1)]
             rod[:] = rod[:, nearest]
 
 
 def directors_at_points(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Directors of edges, (worlds, edges, 3), at the points of frames of shape (worlds, P): (worlds P, 3), of the edge that begins
-    there; the last point of an open rod has that of its last edge, points of surfaces have none, 0."""
+    """Return the director (worlds P, 3) of the edge that begins at each point; 0 at points of surfaces.
+
+    The last point of an open rod has the director of the last edge.
+
+    Args:
+        directors: of edges (worlds, edges, 3).
+        shape: (worlds, P).
+    """
     edges = curves.counts - ~curves.closed
     starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
     along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
-    at = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
+    edge = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
     out = np.zeros((*shape, 3))
-    out[:, : len(at)] = directors.reshape(shape[0], -1, 3)[:, at]
+    out[:, : len(edge)] = directors.reshape(shape[0], -1, 3)[:, edge]
     return out.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""What can be asked of a model at a state: energies, reactions, drag, internal forces, fields of surfaces, link, writhe, twist."""
+"""Post-processing of a state: energies, reactions, drag, stresses, fields of surfaces, writhe, twist."""
 
 from dataclasses import dataclass
 
@@ -14,15 +14,17 @@ from ddg_warp.solve.drag import ChainDrag, NetDrag
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
 
-TWIST = 2  # place of the twist among the strains of rod vertices and of the half cells beside joints
+TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints
 
 
 @dataclass(frozen=True)
 class Reaction:
-    """What one support exerts on all that it holds together; supports given one by one have one each.
+    """Reaction of one support of the scene: resultant force and moment.
 
     Attributes:
-        force: (3,) [N]; moment: (3,) about `point` [N m]; all three (worlds, 3) of several worlds.
+        force: (3,) or (worlds, 3) [N].
+        moment: about `point` (3,) or (worlds, 3) [N m].
+        point: (3,) or (worlds, 3) [m].
     """
 
     force: np.ndarray
@@ -32,7 +34,7 @@ class Reaction:
 
 @launches
 def energies(model, state) -> dict:
-    """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
+    """Return energies by term [J]: elastic terms, kinetic, gravity (zero at the origin); arrays (worlds,) of several worlds."""
     _check("energies", model, state)
     tangent = Tangent(model)
     result, kinetic, potential = tangent.energy(state), np.zeros(model.worlds), np.zeros(model.worlds)
@@ -46,16 +48,16 @@ def energies(model, state) -> dict:
 
 @launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Force and moment of every support of the scene: of rods in the order they were added, then of shells, rings and obstacles.
+    """Return the reaction of every support: of rods in the order they were added, then of shells, rings and obstacles.
 
-    What holds an obstacle takes what is pushed against it and what rubs on it, by the velocities of the state, or of the way to an
-    equilibrium; see `contacts`. They balance the internal forces, without those of strain-rate damping, and the loads on held dofs,
-    and hold the normals of clamped mesh edges and of planes of symmetry; the inertia of a held node itself is left out, and drag on
-    it, which a moving support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the
-    direction of the meridian. A dof that several supports hold counts with the first of them, so that the reactions add up.
+    Reactions balance internal forces and loads on fixed dofs, and the normals of clamped mesh edges and planes of symmetry. Forces of
+    strain-rate damping are left out, as are inertia of and drag on a fixed node, which a moving support would have to add. The
+    support of an obstacle carries its contact and friction forces, see `contacts`. Of a ring, x is the radial force summed around
+    it, and moments do not hold the direction of the meridian. A dof fixed by several supports counts for the first, so that
+    reactions add up.
 
     Args:
-        point: what moments are about (3,); by default the first node that a support holds.
+        point: reference point of moments (3,); by default the first node of a support.
         factor: the load parameter in statics.
     """
     _check("reactions", model, state)
@@ -76,10 +78,10 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
         worlds = []
         for world in range(model.worlds):
             parts = [part for part in tangent.parts if i < len(part.host.held)]
-            found = [_taken(part, Tangent.of(part, q), Tangent.of(part, force), i, world) for part in parts]
-            here, push, twist = (np.concatenate(values) for values in zip(*found, strict=True))
-            about = np.concatenate([here, np.zeros((1, 3))])[0] if point is None else point
-            moment = (np.cross(here - about, push) + twist).sum(0) + turns[world, i]
+            taken = [_taken(part, Tangent.of(part, q), Tangent.of(part, force), i, world) for part in parts]
+            points, push, twist = (np.concatenate(values) for values in zip(*taken, strict=True))
+            about = np.concatenate([points, np.zeros((1, 3))])[0] if point is None else point
+            moment = (np.cross(points - about, push) + twist).sum(0) + turns[world, i]
             worlds.append((push.sum(0), moment, about))
         result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
     return result
@@ -87,14 +89,14 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
 
 @dataclass(frozen=True)
 class Drag:
-    """What the fluid exerts on rods; see `kernels.drag`.
+    """Drag of the fluid on rods; see `kernels.drag`.
+
+    All fields have an axis (worlds, ...) in front for several worlds.
 
     Attributes:
-        force: on points (P, 3) [N], in the order of `State.points`; rows that share a node have equal parts.
+        force: on points (P, 3) [N], in the order of `State.points`; split equally between rows of one node.
         moment: about edges (edges,) [N m], in the order of `State.angles`; None if no rod has twist.
-        power: of both on the rods [W]; in a fluid at rest negative, what it takes out of them.
-
-    All with an axis (worlds, ...) in front of several worlds.
+        power: of force and moment [W]; negative in a fluid at rest.
     """
 
     force: np.ndarray
@@ -104,10 +106,10 @@ class Drag:
 
 @launches
 def drag(model, state) -> Drag:
-    """Drag at a state, by its velocities and the flow at its time: zero at rest in a fluid at rest.
+    """Return the drag at a state, from velocities and flow.
 
-    Rods without mass move as in the last step: by implicit Euler at its end; by the midpoint rule, whose velocities are means over a
-    step, half a step after that, as in the last two steps. A first state has the velocities that it is given.
+    Massless rods have the velocities of the last step: with implicit Euler at its end. With the midpoint rule, velocities are means
+    over a step and are extrapolated by half a step from the last two. An initial state has its given velocities.
     """
     _check("drag", model, state)
     forces, moments, power, blocks, turns = [], [], np.zeros(model.worlds), None, None
@@ -141,42 +143,42 @@ def drag(model, state) -> Drag:
 
 
 def _check(call: str, model, state) -> None:
-    """Refuse what is no model, or no state of it."""
+    """Refuse arguments that are no model, or no state of the model."""
     validate.check_model(call, model)
     validate.check_state(call, model, state)
 
 
 def _each_world(values: np.ndarray) -> np.ndarray:
-    """Values (worlds, ...) as they are given out: without their first axis of one world."""
+    """Return values (worlds, ...), without the axis if there is one world."""
     return values[0] if len(values) == 1 else values
 
 
 def _taken(part, q: np.ndarray, force: np.ndarray, support: int, world: int) -> tuple:
-    """Where a support holds a part in a world (n, 3), and the forces and moments there (n, 3), which are taken from `force`."""
+    """Remove the reaction of a support from `force`; return its points, forces and moments (n, 3) in a world."""
     host = part.host
-    held, x, f = host.held[support], *(values.reshape(part.model.worlds, -1)[world] for values in (q, force))
-    dofs, turns = host.dofs(held.places), held.places >= host.nodes
-    if held.normal is not None:
-        push = np.outer(f[dofs] @ held.normal, held.normal)
+    constraint, x, f = host.held[support], *(values.reshape(part.model.worlds, -1)[world] for values in (q, force))
+    dofs, is_angle = host.dofs(constraint.places), constraint.places >= host.nodes
+    if constraint.normal is not None:
+        push = np.outer(f[dofs] @ constraint.normal, constraint.normal)
         f[dofs] -= push
         return x[dofs], push, 0.0 * push
-    own = dofs[np.arange(len(dofs)), held.components]
-    size, once = np.zeros(len(own)), np.unique(own, return_index=True)[1]
-    size[once] = gathered(f, own[once])
-    f[own[own >= 0]] = 0.0
-    ends = host.dofs(host.edge_ends(held.places[turns]))
-    dofs[turns] = ends[:, 0]
-    directions, edges = np.eye(3)[held.components], gathered(x, ends[:, 1]) - gathered(x, ends[:, 0])
-    directions[turns] = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    fixed = dofs[np.arange(len(dofs)), constraint.components]
+    size, once = np.zeros(len(fixed)), np.unique(fixed, return_index=True)[1]
+    size[once] = gathered(f, fixed[once])
+    f[fixed[fixed >= 0]] = 0.0
+    ends = host.dofs(host.edge_ends(constraint.places[is_angle]))
+    dofs[is_angle] = ends[:, 0]
+    directions, edges = np.eye(3)[constraint.components], gathered(x, ends[:, 1]) - gathered(x, ends[:, 0])
+    directions[is_angle] = edges / np.linalg.norm(edges, axis=1, keepdims=True)
     vectors = size[:, None] * directions
-    return gathered(x, dofs), vectors * ~turns[:, None], vectors * turns[:, None]
+    return gathered(x, dofs), vectors * ~is_angle[:, None], vectors * is_angle[:, None]
 
 
 def _normal_moments(part, state) -> np.ndarray:
-    """Moments that the shell supports exert by the normals they give (worlds, supports, 3).
+    """Return moments (worlds, supports, 3) that shell supports exert on prescribed normals.
 
-    An element's energy does not change if its nodes and these normals turn together: the moment of the normals is minus that of
-    the forces on its nodes. Where several supports share an element, each has the part along its own edge.
+    The energy of an element is invariant under rotation of its nodes and normals. Hence the moment on the normals is minus the
+    moment of its nodal forces. Of several supports at one element, each carries the component along its edge.
     """
     worlds, count = part.net.worlds, len(part.model.scene.shell_supports)
     result, x = np.zeros((worlds, count, 3)), part.back(part.dofs(state)).reshape(worlds, -1, 3)
@@ -195,26 +197,30 @@ def _normal_moments(part, state) -> np.ndarray:
             moments = -np.cross(corners, forces[:, world]).sum(0)
             np.add.at(result[world], least[alone], moments[alone])
             for e in np.flatnonzero(least < most):
-                own = element == e
-                corner = (row[own] - 3) // 3  # opposite to the edge
+                selected = element == e
+                corner = (row[selected] - 3) // 3  # opposite to the edge
                 edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
-                shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
-                np.add.at(result[world], support[own], shares)
+                components = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
+                np.add.at(result[world], support[selected], components)
     return result
 
 
 @launches
 def stresses(model, state) -> dict[str, list[np.ndarray]]:
-    """Conjugate stresses of every rod and shell by term (elements, strains); of several worlds (worlds, elements, strains).
+    """Return conjugate stresses of every rod and shell by term (elements, strains), or (worlds, elements, strains).
 
-    Of rods: axial force [N] of edges, moments [N m] of vertices about the directors there: means of those of both edges, and at
-    clamped ends, which are included, the directors that the clamp holds. Those beside rigid joints are in "rigid_joint", about
-    the directors of the rod at the joint. What edges glued to a shell turn it with, a moment per length [N], is in "glued_edge". Of
-    shells: forces per length [N/m] ("shell_stretch") and moments per length [N] ("shell_bend", "shell_bend_dof") of triangles,
-    components (11, 22, 12) along the first edge at rest and across it, second Piola and Kirchhoff's; a moment is positive where it
-    raises the second fundamental form. Hinges have moments per their weight. Of shells of revolution: the same along and around
-    (11, 22, 12), forces of edges ("axisymmetric_stretch"), moments of inner nodes ("axisymmetric_bend") and of both ends
-    ("axisymmetric_rim"). What a rod or shell has not is None.
+    Rods: axial force [N] of edges, moments [N m] of vertices about their directors. These are means of both edges, and at clamped
+    ends, which are included, the directors of the clamp. Moments next to rigid joints are in "rigid_joint", about the directors of
+    the rod at the joint. Moments per length [N] of edges glued to a shell are in "glued_edge".
+
+    Shells: second Piola-Kirchhoff stress of triangles, components (11, 22, 12) along the first edge at rest and across. Forces per
+    length [N/m] are in "shell_stretch", moments per length [N] in "shell_bend" and "shell_bend_dof". A moment is positive if it
+    raises the second fundamental form. Hinges have moments per weight.
+
+    Shells of revolution: components (11, 22, 12) along and around. Forces of edges are in "axisymmetric_stretch", moments of inner
+    nodes in "axisymmetric_bend", of both ends in "axisymmetric_rim".
+
+    The entry of a rod or shell without a term is None.
     """
     _check("stresses", model, state)
     result: dict[str, list] = {}
@@ -236,7 +242,7 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
 
 
 def group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
-    """Strains and stresses of a group's elements (strains, nodes, worlds, rods)."""
+    """Return strains and stresses of a rod group (strains, nodes, worlds, rods)."""
     shape = (group.kind.strain_rows, group.nodes, group.columns)
     strain, stress = (arrays.allocate(shape, model.types.real, model.wp_device) for _ in range(2))
     model.strains(group, data, strain, stress)
@@ -245,7 +251,7 @@ def group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
 
 
 def net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Strains and stresses of a set of the net (strains, worlds, elements)."""
+    """Return strains and stresses of an element set (strains, worlds, elements)."""
     part = net.sets[index]
     shape = (len(part.term.measure.strains), net.worlds * part.elements)
     strain, stress = (wp.zeros(shape, dtype=net.real, device=net.device) for _ in range(2))
@@ -256,10 +262,11 @@ def net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 @launches
 def triangle_fields(model, state) -> dict[str, np.ndarray]:
-    """Numbers to color surfaces by (worlds, triangles), in the order of `model.surfaces`.
+    """Return scalar fields of triangles (worlds, triangles) by name, in the order of `model.surfaces`.
 
-    "strain": Green's strain, its largest principal value in magnitude. "curvature" [1/m]: the same of the change of curvature, of
-    shells with mid-edge normals. "energy" [J/m^2]: elastic energy of membrane and mid-edge bending per rest area.
+    - "strain": largest principal value in magnitude of Green's strain.
+    - "curvature" [1/m]: likewise of the change of curvature, for shells with mid-edge normals.
+    - "energy" [J/m^2]: elastic energy of membrane and mid-edge bending per rest area.
     """
     _check("triangle_fields", model, state)
     net, surfaces = model.net, model.surfaces
@@ -283,13 +290,13 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
 
 
 def _metric(part, worlds: int) -> list[np.ndarray]:
-    """Components (11, 12, 22) of the rest metric of a set's elements, of all worlds one after the other."""
+    """Return components (11, 12, 22) of the rest metric of an element set, world after world."""
     names = [parameter.name for parameter in part.term.parameters if parameter.family == "metric"]
     return [np.broadcast_to(part.parameters[name], (worlds, part.elements)).ravel() for name in names]
 
 
 def _principal(covariant: np.ndarray, metric) -> np.ndarray:
-    """Largest |eigenvalue| of symmetric tensors (n, 3) in the basis of two edges, relative to their rest metric."""
+    """Return the largest |eigenvalue| of tensors (n, 3) in the basis of two edges, relative to the rest metric."""
     a11, a12, a22 = metric
     e11, e12, e22 = covariant.T
     area = a11 * a22 - a12**2
@@ -299,7 +306,7 @@ def _principal(covariant: np.ndarray, metric) -> np.ndarray:
 
 
 def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None:
-    """Stresses of a set of the net, rod by rod or shell by shell."""
+    """Add the stresses of an element set to `result`, by rod or shell."""
     net, part, scene = model.net, model.net.sets[index], model.scene
     term = part.term
     values = net_strains(net, state, index)[1]
@@ -319,7 +326,7 @@ def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None
 
 
 def _resultants(slope: np.ndarray, metric) -> np.ndarray:
-    """Components (11, 22, 12) in an orthonormal basis of slopes (s11, 2 s12, s22) in that of two edges with this rest metric."""
+    """Transform slopes (s11, 2 s12, s22) in the basis of two edges to orthonormal components (11, 22, 12)."""
     a11, a12, a22 = metric
     basis = np.zeros((len(slope), 2, 2))
     basis[:, 0, 0], basis[:, 0, 1] = np.sqrt(a11), a12 / np.sqrt(a11)
@@ -330,22 +337,20 @@ def _resultants(slope: np.ndarray, metric) -> np.ndarray:
 
 
 def writhe(points: np.ndarray) -> float:
-    """Writhe of a closed polygon (n, 3): the exact Gauss integral over pairs of edges (Klenin and Langowski 2000, method 1a)."""
+    """Return the writhe of a closed polygon (n, 3): exact Gauss integral (Klenin and Langowski 2000, method 1a)."""
     points = arguments.array("writhe: points", points, "give (n, 3)")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
         raise ValueError(f"writhe: points have shape {points.shape}; give three finite points at least, (n, 3)")
     a, b = points, np.roll(points, -1, axis=0)
     i, j = np.triu_indices(len(points), 2)
-    apart = (i > 0) | (
-        j < len(points) - 1
-    )  # the first and last edge meet: their solid angle is zero, up to a sign of rounding
-    i, j = i[apart], j[apart]
+    distant = (i > 0) | (j < len(points) - 1)  # first and last edge are adjacent: their solid angle is 0 up to rounding
+    i, j = i[distant], j[distant]
     r13, r14, r23, r24 = a[j] - a[i], b[j] - a[i], a[j] - b[i], b[j] - b[i]
     normals = [np.cross(r13, r14), np.cross(r14, r24), np.cross(r24, r23), np.cross(r23, r13)]
     lengths = [np.linalg.norm(n, axis=1, keepdims=True) for n in normals]
     n1, n2, n3, n4 = (n / np.where(s > 0.0, s, 1.0) for n, s in zip(normals, lengths, strict=True))
     pairs = ((n1, n2), (n2, n3), (n3, n4), (n4, n1))
-    # arcsin(p . q), without its loss of half the digits where p and q are parallel
+    # arcsin(p . q), without the loss of half the digits for parallel p and q
     solid = sum(np.arctan2((p * q).sum(1), np.linalg.norm(np.cross(p, q), axis=1)) for p, q in pairs)
     sign = np.sign((np.cross(b[j] - a[j], b[i] - a[i]) * r13).sum(1))
     return float((sign * solid).sum() / (2.0 * np.pi))
@@ -353,11 +358,11 @@ def writhe(points: np.ndarray) -> float:
 
 @launches
 def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
-    """Turns of a rod's directors about its centreline: the sum of the angles between neighbours, after parallel transport.
+    """Return the total twist of a rod in revolutions; an array (worlds,) of several worlds.
 
-    Full turns between neighbours count as they were wound. Of a closed rod, this plus `writhe` is the link of its centreline and
-    a first director's edge, a whole number (Calugareanu, White, Fuller), exactly so for polygons. The half cells beside a rigid
-    joint count with the rod they belong to. Of several worlds an array (worlds,).
+    Total twist is the sum of angles between adjacent directors after parallel transport. Full revolutions between neighbours count as
+    they were wound. Total twist plus `writhe` of a closed rod is the linking number of centreline and director, an integer
+    (Calugareanu, White, Fuller), exact for polygons. Half cells at a rigid joint count for their rod.
 
     Raises:
         ValueError: there is no such rod, or it has no twist.
@@ -365,7 +370,7 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
     _check("total_twist", model, state)
     if not 0 <= arguments.index("total_twist: rod", rod) < model.scene.rod_count:
         raise ValueError(f"total_twist: rod {rod} does not exist; the scene has {model.scene.rod_count} rods")
-    turns, found = np.zeros(model.worlds), False
+    turns, has_twist = np.zeros(model.worlds), False
     for group, data in zip(model.groups, state.groups, strict=True):
         (column,) = np.nonzero(group.host.rods == rod)
         if column.size and group.kind.twist:
@@ -375,13 +380,13 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
             weight = np.broadcast_to(measure, (group.nodes, group.columns))[:, column :: group.rods]
             vertices = group.host.count[column] - (0 if group.kind.closed else 2)
             turns += (values * weight)[:vertices].sum(0)
-            found = True
+            has_twist = True
     for index, part in enumerate(model.net.sets if model.net is not None else ()):
         of_rod = part.host.owner[0] == rod
         if part.term.measure.twists and of_rod.any():
             weight = np.broadcast_to(part.parameters["measure"], (model.worlds, part.elements))
             turns += (net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
-            found = True
-    if not found or model.scene.dimension == 2:
+            has_twist = True
+    if not has_twist or model.scene.dimension == 2:
         raise ValueError(f"rod {rod} has no twist")
     return turns / (2.0 * np.pi) if model.worlds > 1 else float(turns[0] / (2.0 * np.pi))

@@ -1,4 +1,4 @@
-"""A state at which nothing overlaps, from one at which something does."""
+"""Overlap resolution: project a state with overlaps to a minimum gap."""
 
 import numpy as np
 import warp as wp
@@ -10,27 +10,27 @@ from ddg_warp.model import glue
 from ddg_warp.threads import launches
 
 ROUNDS = 1000
-PART = 0.1  # of the smallest range of contact, the gap that is made by default
-BEYOND = 1.02  # what is too close is moved to so many times that gap, so that few rounds do
+PART = 0.1  # default gap over the smallest activation distance
+BEYOND = 1.02  # gap that pairs are moved to over the required one, for few rounds
 
 
 @launches
 def pushed_apart(model, state, gap: float | None = None):
-    """A state like another, with nodes moved until no two surfaces are closer than a gap, and the farthest that a node moved.
+    """Return a copy of a state, with nodes moved until no two surfaces are closer than a gap.
 
-    Pairs that are too close are moved apart along the line between their closest points by least squares, round by round; what is
-    supported stays. Rods whose axes cross pass by each other then; what is entangled stays so. Velocities stay as they are, frames
-    are carried along. Lengths change by as much as has to be: look at the distance that is returned.
+    Each round moves close pairs apart along the line between their closest points, by least squares. Fixed dofs stay. Crossing rods
+    pass by each other then; entangled ones stay entangled. Velocities stay, frames are transported. Lengths may change: check the
+    returned distance.
 
     Args:
-        gap: [m]; by default a tenth of the smallest range of contact.
+        gap: smallest surface distance [m]; by default a tenth of the smallest activation distance.
 
     Returns:
-        The state, and the distance [m]; zero where nothing was too close.
+        The state, and the largest displacement of a node [m]; zero if no pair was too close.
 
     Raises:
-        SceneError: the scene has no contact, or the gap is not within its range.
-        SolverError: what is too close cannot be moved apart; names the closest pair.
+        SceneError: the scene has no contact, or the gap exceeds the activation distance.
+        SolverError: pairs cannot be separated; the message names the closest.
     """
     touch = model.touch
     if touch is None:
@@ -49,12 +49,12 @@ def pushed_apart(model, state, gap: float | None = None):
     for _ in range(ROUNDS):
         new.net.q.assign(x)
         touch.find(new.net.q)
-        steps, shares, closest = np.zeros_like(x), np.zeros(len(x)), np.inf
+        steps, weights, closest = np.zeros_like(x), np.zeros(len(x)), np.inf
         for pairs in touch.search.lists:
-            closest = min(closest, _part(pairs, new.net.q, free, least, steps, shares))
+            closest = min(closest, _part(pairs, new.net.q, free, least, steps, weights))
         if closest >= least:
             break
-        x = x + steps / np.maximum(1.0, shares)[:, None]
+        x = x + steps / np.maximum(1.0, weights)[:, None]
     else:
         gap, pair = touch.closest(new.net.q)
         raise SolverError(
@@ -70,41 +70,44 @@ def pushed_apart(model, state, gap: float | None = None):
     return new, moved
 
 
-def _part(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray, shares: np.ndarray) -> float:
-    """Add to `steps` of nodes what takes the pairs of a list apart, and to `shares` how much of it each has; their smallest gap."""
+def _part(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray, weight_sums: np.ndarray) -> float:
+    """Add separating displacements of a pair list to `steps` and weights to `weight_sums`; return the smallest gap."""
     count = int(pairs.count.numpy()[0])
     if not count:
         return np.inf
     real = x.dtype._wp_scalar_type_
     kinds = x.dtype, wp.vec4i, wp.types.vector(4, real), real
-    found = [wp.zeros(count, dtype=kind, device=x.device) for kind in kinds]
-    wp.launch(closest_kernel(pairs.kind, real), count, [pairs.pairs, pairs.sides, x], found, device=x.device)
-    way, nodes, weights, thickness = (array.numpy() for array in found)
-    length = np.linalg.norm(way, axis=1)
+    closest = [wp.zeros(count, dtype=kind, device=x.device) for kind in kinds]
+    wp.launch(closest_kernel(pairs.kind, real), count, [pairs.pairs, pairs.sides, x], closest, device=x.device)
+    distance, nodes, weights, thickness = (array.numpy() for array in closest)
+    length = np.linalg.norm(distance, axis=1)
     gap = length - thickness
     near = np.flatnonzero(gap < least)
     if len(near):
         weights, nodes = weights[near], nodes[near]
-        n = _directions(way[near], length[near], x.numpy()[nodes], pairs.kind.endless)
-        may = free[nodes] * n[:, None]  # (pairs, nodes, 3), what of the direction each node is free to go
-        give = (weights**2 * (may * n[:, None]).sum(2)).sum(1)
-        size = np.where(give > 0.0, (BEYOND * least - gap[near]) / np.where(give > 0.0, give, 1.0), 0.0)
-        np.add.at(steps, nodes, (size[:, None] * weights)[..., None] * may)
-        np.add.at(shares, nodes, np.abs(weights) * (give > 0.0)[:, None])
+        n = _directions(distance[near], length[near], x.numpy()[nodes], pairs.kind.endless)
+        movable = free[nodes] * n[:, None]  # (pairs, nodes, 3), direction on free dofs
+        mobility = (weights**2 * (movable * n[:, None]).sum(2)).sum(1)
+        size = np.where(mobility > 0.0, (BEYOND * least - gap[near]) / np.where(mobility > 0.0, mobility, 1.0), 0.0)
+        np.add.at(steps, nodes, (size[:, None] * weights)[..., None] * movable)
+        np.add.at(weight_sums, nodes, np.abs(weights) * (mobility > 0.0)[:, None])
     return float(gap.min())
 
 
-def _directions(way: np.ndarray, length: np.ndarray, corners: np.ndarray, endless: bool) -> np.ndarray:
-    """Unit vectors (n, 3) along ways; across both sides where closest points are the same. Of `endless` half-spaces their normals."""
+def _directions(distance: np.ndarray, length: np.ndarray, corners: np.ndarray, endless: bool) -> np.ndarray:
+    """Return unit vectors (n, 3) of separation.
+
+    Directions are along `distance`, across both sides if closest points coincide, or normals of half-spaces (`endless`).
+    """
     if endless:
-        way = np.cross(corners[:, 2] - corners[:, 1], corners[:, 3] - corners[:, 1])
-        return way / np.linalg.norm(way, axis=1)[:, None]
+        distance = np.cross(corners[:, 2] - corners[:, 1], corners[:, 3] - corners[:, 1])
+        return distance / np.linalg.norm(distance, axis=1)[:, None]
     sides = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 2]
     size = np.maximum(np.linalg.norm(sides[0], axis=1), np.linalg.norm(sides[1], axis=1))
     across = np.cross(*sides)
-    flat = np.linalg.norm(across, axis=1) <= 1e-9 * size**2  # parallel: any direction across does
+    flat = np.linalg.norm(across, axis=1) <= 1e-9 * size**2  # parallel: any direction across
     some = np.eye(3)[np.abs(sides[0]).argmin(1)]
     across = np.where(flat[:, None], np.cross(np.where(sides[0].any(1)[:, None], sides[0], sides[1]), some), across)
     meet = length <= 1e-9 * size
-    way = np.where(meet[:, None], across, way)
-    return way / np.linalg.norm(way, axis=1)[:, None]
+    distance = np.where(meet[:, None], across, distance)
+    return distance / np.linalg.norm(distance, axis=1)[:, None]

@@ -1,13 +1,16 @@
-"""Rest shapes with which rods are in equilibrium as they are: hair that hangs as it was drawn, a beam that is straight under its load.
+"""Sag-free rest shapes: rest strains for which rods are in equilibrium in a given shape (hair as drawn, a straight loaded beam).
 
-Forces are linear in what is at rest: with strains e, their derivatives J by the dofs, rest measures w and stiffnesses K, the stresses
-s = K (e - e0) of all elements balance the outer forces f where sum w J^T s = f on what is free to move. So stresses follow from the
-shape alone, and rest strains e0 = e - s / K from them. A rod held by one edge is statically determinate: it has as many stresses as
-equations. Where supports leave a choice, stresses are those of least elastic energy: the least squares of y = (w / K)^(1/2) s.
+Stresses s = K (e - e0) of all elements balance the external forces f on free dofs if
 
-The equilibrium need not be stable; `ddg_warp.solve.stability` tells. What is solved here is the problem of Derouet-Jourdan,
-Bertails-Descoubes, Daviet, Thollot, *Inverse dynamic hair modeling with frictional contact*, ACM ToG 32(6), 2013, and of Hsu, Wang,
-Pan, Gao, Yuksel, Wu, *Sag-free initialization for strand-based hybrid hair simulation*, ACM ToG 42(4), 2023.
+    sum w J^T s = f.
+
+e: strains, e0: rest strains, J: derivatives of e by the dofs, w: rest measures, K: stiffnesses. Forces are linear in e0: stresses
+follow from the shape alone, then e0 = e - s / K. A rod clamped by one edge is statically determinate. Otherwise the solution has
+the least elastic energy: least squares in y = (w / K)^(1/2) s.
+
+The equilibrium need not be stable: test it by `ddg_warp.solve.stability`. Sources: Derouet-Jourdan, Bertails-Descoubes, Daviet,
+Thollot, *Inverse dynamic hair modeling with frictional contact*, ACM ToG 32(6), 2013. Hsu, Wang, Pan, Gao, Yuksel, Wu, *Sag-free
+initialization for strand-based hybrid hair simulation*, ACM ToG 42(4), 2023.
 """
 
 from dataclasses import dataclass
@@ -25,30 +28,30 @@ from ddg_warp.solve.stability import lowest_factors
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
 
-RTOL = 1e-8  # of what may be left of the loads of a rod
+RTOL = 1e-8  # largest residual over the loads of a rod
 
 
 @launches
 def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
-    """Rest stretches, natural curvatures and natural twists with which rods are in equilibrium as they are.
+    """Return rest stretches, natural curvatures and natural twists for which a shape is in equilibrium.
 
-        found = rest_strains(model)
-        rest_shapes.set_rest_strains(model, found)  # or Simulator.equilibrium(...), Simulator.step(state, ...) with these as tensors
+        strains = rest_strains(model)
+        rest_shapes.set_rest_strains(model, strains)  # or as tensors: Simulator.equilibrium(...), Simulator.step(state, ...)
 
-    Masses stay, as do the measures of elements (the lengths drawn), over which curvatures are taken.
+    Masses stay, as do the measures of elements (drawn lengths), over which curvatures are taken.
 
     Args:
-        model: open rods on their own, with stretch, and with bending and twist or in a plane; each so held that no load is left over.
-        state: where they are to stay; by default the rest state, as they were drawn. Its velocities do not count, nor does drag.
+        model: open uncoupled rods with stretch and with bending and twist, or planar; supports must balance all loads.
+        state: the shape to keep; by default the rest state. Velocities and drag are ignored.
         load: the load parameter of statics, which scales gravity and loads.
 
     Returns:
-        Of every rest strain, "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m], the values of all elements rod by rod, those of
-        clamped ends included, in each world (worlds, elements).
+        Values (worlds, elements) by rest strain, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m]. Elements are
+        numbered rod by rod, clamped ends included.
 
     Raises:
-        SceneError: a rod is closed, joined, glued or magnetised, has no twist in space, or another law than the quadratic one; there
-            are shells; the model is in float32; or nothing balances the loads of a rod. The message names it.
+        SceneError: a rod is closed, joined, glued or magnetised, has no twist in space, or a law that is not quadratic. Or there are
+            shells, the model is in float32, or the loads of a rod cannot be balanced.
     """
     validate.check_model("rest_strains", model)
     if state is not None:
@@ -58,10 +61,10 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
     tangent, result = Tangent(model), {}
     outer = tangent.loads(load, tangent.dofs(state))
     for part in tangent.parts:
-        found = _of_group(part, state, Tangent.of(part, outer))
-        for name, values in found.items():
+        of_group = _of_group(part, state, Tangent.of(part, outer))
+        for name, values in of_group.items():
             count, groups = model.order.elements(name)
-            inside, numbers = next(own for group, *own in groups if group is part.group)
+            inside, numbers = next(selection for group, *selection in groups if group is part.group)
             every = result.setdefault(name, np.zeros((model.worlds, count)))
             every[:, numbers[inside]] = values.reshape(part.group.nodes, model.worlds, -1).swapaxes(0, 1)[:, inside]
     return result
@@ -69,19 +72,19 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
 
 @launches
 def least_stiffness(model, state) -> np.ndarray:
-    """What all stiffnesses of each rod may be multiplied by, with new rest strains for the same shape, before it is unstable in it.
+    """Return for each rod the smallest stable factor on all stiffnesses, with rest strains that keep the shape.
 
-    The stresses that bear the loads stay, and with them what they do to the tangent, while the rest of it is in proportion to the
-    stiffnesses: K -> f K is stable for f above the largest f with det(f H + G) = 0. Beyond 1 a rod is unstable as it is.
+    Stresses balance the loads and stay, and with them the geometric stiffness G. The Gauss-Newton matrix H scales with f: K -> f K is
+    stable for f above the largest root of det(f H + G) = 0. A rod with a factor above 1 is unstable.
 
     Args:
-        model, state: an equilibrium, such as what has rest strains by `rest_strains`; rods as there.
+        model, state: an equilibrium, such as one of `rest_strains`, of rods as there.
 
     Returns:
-        Factors (worlds, rods); 0, but for rounding, of a rod that is stable however soft it is.
+        Factors (worlds, rods); 0, up to rounding, for a rod that is stable at any stiffness.
 
     Raises:
-        SceneError: as of `rest_strains`, or supports leave a rigid motion.
+        SceneError: as in `rest_strains`, or supports leave a rigid-body mode.
     """
     from scipy import sparse
 
@@ -90,7 +93,7 @@ def least_stiffness(model, state) -> np.ndarray:
     _refuse("least_stiffness", model)
     tangent, result = Tangent(model), np.zeros((model.worlds, model.scene.rod_count))
     forces = [_Elements.of(part, state).forces for part in tangent.parts]
-    strained = sparse.block_diag([own @ own.T for own in forces], format="csr")
+    strained = sparse.block_diag([unit @ unit.T for unit in forces], format="csr")
     loose = np.argwhere(rigid_modes(tangent, state, strained))
     if len(loose):
         raise SceneError(
@@ -102,27 +105,27 @@ def least_stiffness(model, state) -> np.ndarray:
         for column in range(group.columns):
             first = part.offset + column * size
             dofs = first + np.flatnonzero(tangent.free[first : first + size])
-            own, less = (sparse.csc_matrix(matrix[dofs][:, dofs]) for matrix in (strained, softening))
-            found = lowest_factors(own, less, Factorisation(own), 1) if len(dofs) else dofs
+            stiff, less = (sparse.csc_matrix(matrix[dofs][:, dofs]) for matrix in (strained, softening))
+            factors = lowest_factors(stiff, less, Factorisation(stiff), 1) if len(dofs) else dofs
             world, rod = divmod(column, group.rods)
-            result[world, group.host.rods[rod]] = 1.0 / found[0] if len(found) else 0.0
+            result[world, group.host.rods[rod]] = 1.0 / factors[0] if len(factors) else 0.0
     return result
 
 
 def _refuse(call: str, model) -> None:
-    """Refuse a model with other rods than such whose stresses are linear in rest strains that turn with them."""
+    """Refuse models other than uncoupled open rods with quadratic laws and, in space, twist."""
     scene, start = model.scene, f"{call}: "
     if model.precision == "float32":
         raise SceneError(f"{start}float32 leaves too little of forces; build the model in 'mixed' or 'float64'")
     if model.net is not None:
-        host, what = model.net.host, "a shell of revolution"
+        host, body = model.net.host, "a shell of revolution"
         if host.rods:
             rod = min(each.rod for each in host.rods)
-            what = f"rod {rod} ('{model.curves.names[rod]}'), which is joined, glued or magnetised"
+            body = f"rod {rod} ('{model.curves.names[rod]}'), which is joined, glued or magnetised"
         elif scene.shells:
-            what = f"shell 0 ('{scene.shells[0].name}')"
+            body = f"shell 0 ('{scene.shells[0].name}')"
         raise SceneError(
-            f"{start}the scene has {what}; rest strains are those of rods on their own, in a scene of these"
+            f"{start}the scene has {body}; rest strains are those of rods on their own, in a scene of these"
         )
     for group in model.groups:
         rod = int(group.host.rods[0])
@@ -142,13 +145,12 @@ def _refuse(call: str, model) -> None:
 
 @dataclass(frozen=True)
 class _Elements:
-    """Elements of a group of rods at a state, by their strains (strains, n, columns).
+    """Strains, stiffnesses and unit forces of the elements of a rod group at a state.
 
     Attributes:
-        names: of the strains at rest.
-        strains, measures, stiffness: of every element, 0 where a rod has none.
-        forces: of stresses (K / w)^(1/2) on dofs (size, columns n strains), whose product with its transpose is the stiffness of
-            what is strained, without that of stresses.
+        names: names of rest strains.
+        strains, measures, stiffness: (strains, n, columns), 0 outside of a rod.
+        forces: F (size, columns n strains), nodal forces of stresses (K / w)^(1/2). F F^T is the Gauss-Newton matrix.
     """
 
     names: list
@@ -174,21 +176,21 @@ class _Elements:
 
 
 def _of_group(part, state, outer: np.ndarray) -> dict[str, np.ndarray]:
-    """Rest strains by name (n, columns) of a group of rods under outer forces (size,)."""
-    own = _Elements.of(part, state)
-    found = shortest(own.forces[part.free], outer[part.free])
-    inner = own.forces @ found
+    """Return rest strains by name (n, columns) of a rod group under external forces (size,)."""
+    elements = _Elements.of(part, state)
+    scaled_stress = shortest(elements.forces[part.free], outer[part.free])
+    inner = elements.forces @ scaled_stress
     allowed = RTOL * part.allowed(part.body_loads(outer, inner))
     for dof in np.flatnonzero(part.free & ~(np.abs(outer - inner) <= allowed))[:1]:
         raise SceneError(
             f"rest_strains: whatever is at rest, nothing balances the loads at {part.where(dof)}; clamp an edge of the rod, or hold "
             "more of it"
         )
-    root = np.sqrt(own.stiffness * own.measures)
-    beyond = _over(found.reshape(own.strains.T.shape).T, root)
-    return dict(zip(own.names, own.strains - beyond, strict=True))
+    root = np.sqrt(elements.stiffness * elements.measures)
+    beyond = _over(scaled_stress.reshape(elements.strains.T.shape).T, root)
+    return dict(zip(elements.names, elements.strains - beyond, strict=True))
 
 
 def _over(values: np.ndarray, divisors: np.ndarray) -> np.ndarray:
-    """Quotients, 0 where the divisor is."""
+    """Return quotients, 0 where the divisor is 0."""
     return np.divide(values, divisors, out=np.zeros_like(values), where=divisors > 0.0)
