@@ -34,7 +34,10 @@ class Reaction:
 
 @launches
 def energies(model, state) -> dict:
-    """Return energies by term [J]: elastic terms, kinetic, gravity (zero at the origin); arrays (worlds,) of several worlds."""
+    """Return elastic energies by term, kinetic and gravitational energy [J]; arrays (worlds,) of several worlds.
+
+    The potential of gravity is zero at the origin.
+    """
     _check("energies", model, state)
     tangent = Tangent(model)
     result, kinetic, potential = tangent.energy(state), np.zeros(model.worlds), np.zeros(model.worlds)
@@ -48,7 +51,9 @@ def energies(model, state) -> dict:
 
 @launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Return the reaction of every support: of rods in the order they were added, then of shells, rings and obstacles.
+    """Return the reaction of every support of the scene.
+
+    Supports are ordered as added: of rods, then of shells, rings and obstacles.
 
     Reactions balance internal forces and loads on fixed dofs, and the normals of clamped mesh edges and planes of symmetry. Forces of
     strain-rate damping are left out, as are inertia of and drag on a fixed node, which a moving support would have to add. The
@@ -154,7 +159,7 @@ def _each_world(values: np.ndarray) -> np.ndarray:
 
 
 def _taken(part, q: np.ndarray, force: np.ndarray, support: int, world: int) -> tuple:
-    """Remove the reaction of a support from `force`; return its points, forces and moments (n, 3) in a world."""
+    """Remove a support's reaction from `force`; return points, forces and moments (n, 3) in a world."""
     host = part.host
     constraint, x, f = host.held[support], *(values.reshape(part.model.worlds, -1)[world] for values in (q, force))
     dofs, is_angle = host.dofs(constraint.places), constraint.places >= host.nodes
@@ -296,7 +301,7 @@ def _metric(part, worlds: int) -> list[np.ndarray]:
 
 
 def _principal(covariant: np.ndarray, metric) -> np.ndarray:
-    """Return the largest |eigenvalue| of tensors (n, 3) in the basis of two edges, relative to the rest metric."""
+    """Return the largest |eigenvalue| of covariant tensors (n, 3) relative to the rest metric."""
     a11, a12, a22 = metric
     e11, e12, e22 = covariant.T
     area = a11 * a22 - a12**2
@@ -326,7 +331,7 @@ def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None
 
 
 def _resultants(slope: np.ndarray, metric) -> np.ndarray:
-    """Transform slopes (s11, 2 s12, s22) in the basis of two edges to orthonormal components (11, 22, 12)."""
+    """Transform slopes (s11, 2 s12, s22) of two edges to orthonormal components (11, 22, 12)."""
     a11, a12, a22 = metric
     basis = np.zeros((len(slope), 2, 2))
     basis[:, 0, 0], basis[:, 0, 1] = np.sqrt(a11), a12 / np.sqrt(a11)
@@ -337,7 +342,7 @@ def _resultants(slope: np.ndarray, metric) -> np.ndarray:
 
 
 def writhe(points: np.ndarray) -> float:
-    """Return the writhe of a closed polygon (n, 3): exact Gauss integral (Klenin and Langowski 2000, method 1a)."""
+    """Return the writhe of a closed polygon (n, 3) by the exact Gauss integral (Klenin, Langowski 2000, method 1a)."""
     points = arguments.array("writhe: points", points, "give (n, 3)")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
         raise ValueError(f"writhe: points have shape {points.shape}; give three finite points at least, (n, 3)")

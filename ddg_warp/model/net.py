@@ -38,7 +38,7 @@ class NetState:
     rate: wp.array | None = None
 
     def arrays(self) -> dict[str, wp.array]:
-        """All arrays by name."""
+        """Return all arrays by name."""
         named = {"q": self.q, "v": self.v, "a": self.a, "frame": self.frame}
         for i, (lag, last) in enumerate(zip(self.lag, self.last, strict=True)):
             named |= {f"lag_{i}": lag, f"last_{i}": last}

@@ -191,7 +191,7 @@ class Order:
         return values, self.edge_starts
 
     def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
-        """Return nodal values in user order (P, 3) from groups (node, column, dim) and dof blocks (worlds N, 3)."""
+        """Return nodal values in user order from group arrays (node, column, dim) and dof blocks (worlds N, 3)."""
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         out = np.zeros((self.model.worlds, self.points_count, 3))
         if blocks is not None:

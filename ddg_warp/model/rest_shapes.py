@@ -46,7 +46,7 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
 
 
 def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
-    """Return components (T, 2, 2) [m] of the edges a1, a2 (columns) along a direction and across it (rows).
+    """Return components (T, 2, 2) [m] of the edges a1, a2 (columns) along and across a direction (rows).
 
     Arguments as in `principal_form`.
 
@@ -69,7 +69,7 @@ def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
-    """Return the metric (T, 3) [m^2] of a surface stretched by `first` along a direction and `second` across.
+    """Return the metric (T, 3) [m^2] of a surface stretched along and across a direction.
 
     Arguments as in `principal_form`; `second` is by default `first`. A stretch of 1.1 is a growth by a tenth in length.
     """

@@ -37,7 +37,7 @@ class GroupState:
     alpha: wp.array
 
     def arrays(self) -> dict[str, wp.array]:
-        """All arrays by name."""
+        """Return all arrays by name."""
         return dict(self.__dict__)
 
 
@@ -52,7 +52,7 @@ class GripState:
     pose: wp.array
 
     def arrays(self) -> dict[str, wp.array]:
-        """All arrays by name."""
+        """Return all arrays by name."""
         return dict(self.__dict__)
 
 

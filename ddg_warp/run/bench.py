@@ -1,8 +1,7 @@
-"""Speed against error: a scene over a grid of settings, each run timed and compared with a reference.
+"""Work-precision benchmark: run a scene over a grid of settings, each run timed and compared with a reference.
 
-A scene takes part by `benchmark() -> Study`, and by a default study where it has none. Times are of this machine and this moment;
-what carries over is their ratio, so that every row also gives its time relative to that of the scene's defaults, and never without
-its error. `ddg_warp.run.bench_overview` sums up many scenes.
+A scene defines `benchmark() -> Study`, or has a default study. Times depend on the machine, ratios less so: every row also gives its
+time relative to the scene's defaults, next to its error. `ddg_warp.run.bench_overview` sums up many scenes.
 """
 
 import itertools
@@ -21,33 +20,32 @@ from ddg_warp.scene.scene import Dynamics
 
 RUN_SETTINGS = ("dt", "duration", "precision")
 SOLVER_OPTIONS = ("solver", "linear", "rtol", "outliers")
-RESOLUTION = ("n", "cells", "segments", "rings", "around")  # what scenes call their number of edges or cells
-REFINED = 4  # how much finer the reference of a default study is than the scene, where no check has one
+RESOLUTION = ("n", "cells", "segments", "rings", "around")  # names of the number of edges or cells in scenes
+REFINED = 4  # refinement of the reference of a default study, where no check has one
 
 
 @dataclass(frozen=True)
 class Study:
-    """What to vary and what to measure.
+    """Settings to vary and quantity to measure in a benchmark.
 
     Attributes:
         grid: Values by name; every combination is run, and the scene's defaults. A name is a parameter of `build`, a setting of the
             run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol, outliers).
-        measure: What is compared: the beginning of the name of one of the scene's checks, or a function of a result that gives a
+        measure: Quantity to compare: the beginning of the name of a check of the scene, or a function of a result that returns a
             number or an array.
-        reference: What `measure` should give; or settings, by name, that turn a case into its reference run. A check has its own.
+        reference: Expected value of `measure`, or settings, by name, of the reference run of a case. A check has its own.
         fixed: Settings of all runs.
-        series: Names of the grid that tell the lines of the plot apart; a line then joins the cases that no other of its
-            series beats in both error and time, and the table shows these. By default all names but the first, and
-            every case.
-        unit: Of what is measured; that of a check stands in its name.
-        scale: What errors are divided by to be relative ones; by default the size of the reference.
-        one_by_one: Whether a case varies one number and leaves all others as they are by default, instead of every combination; the
-            plot then has a line for each name, and a second one has the error over each setting.
-        whole: Whether the time is that of the run and its check, as it always is in statics, instead of that of the steps: for what
-            the check computes.
+        series: Names of the grid that distinguish the lines of the plot. A line then joins the cases that no other of its series
+            beats in both error and time, and the table shows only them. By default all names but the first, and every case.
+        unit: Unit of the measured quantity; a check has the unit in its name.
+        scale: Divisor of relative errors; by default the size of the reference.
+        one_by_one: Whether a case varies one number and leaves all others at their defaults, instead of every combination. The
+            plot then has a line for each name, and a second plot has the error over each setting.
+        whole: Whether to time the run and its check, as always in statics, instead of the steps; for quantities that the check
+            computes.
 
     Raises:
-        InputError: one_by_one goes with series, or with what is no number.
+        InputError: `one_by_one` is combined with series, or varies a value that is no number.
     """
 
     grid: Mapping[str, tuple]
@@ -72,26 +70,26 @@ class Study:
             )
 
     def cases(self, usual: Mapping = MappingProxyType({})) -> list[dict]:
-        """Every combination of the grid, the last name varying fastest; or, one by one, settings beside the scene's `usual` ones."""
+        """Return all combinations of the grid, the last name fastest; or, one by one, variations of `usual`."""
         if self.one_by_one:
-            others = ((n, v) for n, values in self.grid.items() for v in values if v != usual.get(n))
-            return [{**usual, name: value} for name, value in others]
+            variations = ((n, v) for n, values in self.grid.items() for v in values if v != usual.get(n))
+            return [{**usual, name: value} for name, value in variations]
         return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
 
 
 def study_of(module) -> Study:
-    """The study of a scene: its own, or one of its first check over its resolution, or, without, over the time step.
+    """Return the study of a scene: its own, or its first check over resolution or time step.
 
     Raises:
-        InputError: There is nothing to measure by.
+        InputError: The scene has no check or observation to measure.
     """
     if hasattr(module, "benchmark"):
         return module.benchmark()
     settings = parameters(module, {})
-    found = [name for name in RESOLUTION if isinstance(settings.get(name), int)]
-    if found:
-        value = settings[found[0]]
-        grid, finer = {found[0]: (value // 4, value // 2, value)}, {found[0]: REFINED * value}
+    names = [name for name in RESOLUTION if isinstance(settings.get(name), int)]
+    if names:
+        value = settings[names[0]]
+        grid, finer = {names[0]: (value // 4, value // 2, value)}, {names[0]: REFINED * value}
     else:
         analysis = module.build().analysis
         if not isinstance(analysis, Dynamics):
@@ -123,13 +121,13 @@ def benchmark(
         out: Directory for the results.
         device: Warp device.
         precision: Precision of the cases that set none.
-        given: Parameters of the scene in all cases and references, such as its size; they stand in the names of the files.
+        given: Parameters of the scene in all cases and references, such as its size; they enter the file names.
 
     Returns:
         Whether every run reached its end.
 
     Raises:
-        InputError: The scene has nothing to measure by, or the study varies what is given.
+        InputError: The scene has nothing to measure, or the study varies a given parameter.
     """
     from ddg_warp.run.summary import machine, table, write_table
 
@@ -163,11 +161,11 @@ def benchmark(
 
 
 def measure(module, study: Study, *, device: str | None = None, precision: str | None = None) -> tuple[list[dict], str]:
-    """Run every case of a study and the scene's defaults, and the reference runs they need, each once.
+    """Run all cases of a study, the scene's defaults and their reference runs, each once.
 
     Returns:
-        A row a case: its settings, error, relative_error, ms_per_step, seconds, relative_time (over that of the defaults), steps,
-        newton_iterations, default (whether it is the scene's), failure. And the unit of the error.
+        A row a case, and the unit of the error. Columns: settings, error, relative_error, ms_per_step, seconds, relative_time (over
+        the time of the defaults), steps, newton_iterations, default (whether the case is the scene's), failure.
     """
     shared = dict(study.fixed) | ({} if precision is None else {"precision": precision})
     usual = defaults(module, study, device)
@@ -181,7 +179,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
     for case in cases:
         settings = {**shared, **case}
         kernels = tuple(value for value in settings.values() if isinstance(value, str | bool))
-        if kernels not in loaded:  # once for the kernels, whose loading is no part of what is measured
+        if kernels not in loaded:  # warm up: loading kernels is not timed
             run(module, settings, device)
             loaded.add(kernels)
         began = clock()
@@ -199,12 +197,12 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
                     references[key] = run(module, finer, device)
                 failure = failure or references[key].failure
                 reference = np.nan if failure else study.measure(references[key])
-            # NaN where a run broke off: there is nothing to compare.
+            # NaN if a run failed: no value to compare
             if not failure:
                 reference = np.asarray(reference, float)
                 error = float(np.max(np.abs(np.asarray(study.measure(result)) - reference)))
                 scale = float(np.max(np.abs(reference))) or 1.0
-        # The first two steps compile and capture, one for each of the two buffers.
+        # the first two steps compile and capture, one for each buffer
         steady = result.step_times[2:] or result.step_times
         seconds_per_step = float(np.mean(steady)) if steady else 0.0
         seconds = seconds_per_step * len(result.step_times)
@@ -228,7 +226,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
 
 
 def _of_check(module, study: Study, result: Result) -> tuple[float, float, str]:
-    """Error, size of the reference and unit of the check that a study measures by."""
+    """Return error, reference size and unit of the check that a study measures."""
     checks = [check for check in module.check(result) if check.name.startswith(study.measure)]
     if not checks:
         raise InputError(f"{module.__name__}: no check is named '{study.measure}...' with these settings")
@@ -240,20 +238,20 @@ def _of_check(module, study: Study, result: Result) -> tuple[float, float, str]:
 
 
 def defaults(module, study: Study, device: str | None) -> dict:
-    """What the names of a study's grid are where nobody sets them."""
+    """Return the default values of the names of a study's grid."""
     import warp as wp
 
     from ddg_warp.solve.statics import StaticsOptions
 
-    known = parameters(module, {})
-    analysis = module.build(**{name: value for name, value in study.fixed.items() if name in known}).analysis
+    build_defaults = parameters(module, {})
+    analysis = module.build(**{name: value for name, value in study.fixed.items() if name in build_defaults}).analysis
     usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
     if isinstance(analysis, Dynamics):
         usual |= {name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol", "outliers")}
         usual["precision"] = analysis.precision or usual["precision"]
     else:
         usual |= {"solver": "auto", "rtol": StaticsOptions().rtol}
-    return {name: {**usual, **known}[name] for name in study.grid}
+    return {name: {**usual, **build_defaults}[name] for name in study.grid}
 
 
 def _alike(case: Mapping, usual: Mapping) -> bool:
@@ -264,17 +262,17 @@ def _alike(case: Mapping, usual: Mapping) -> bool:
 
 
 def run(module, settings: Mapping, device: str | None) -> Result:
-    """Run one case without recording it.
+    """Run one case without recording.
 
     Raises:
         InputError: A setting is neither a parameter of the scene, nor of the run, nor of the solver.
     """
-    known = parameters(module, {})
-    unknown = [name for name in settings if name not in (*known, *RUN_SETTINGS, *SOLVER_OPTIONS, "scheme")]
+    build_defaults = parameters(module, {})
+    unknown = [name for name in settings if name not in (*build_defaults, *RUN_SETTINGS, *SOLVER_OPTIONS, "scheme")]
     if unknown:
         raise InputError(f"the benchmark of {module.__name__} sets '{unknown[0]}', which is no setting of a run")
-    scene = module.build(**{name: value for name, value in settings.items() if name in known})
-    if "scheme" in settings and "scheme" not in known:
+    scene = module.build(**{name: value for name, value in settings.items() if name in build_defaults})
+    if "scheme" in settings and "scheme" not in build_defaults:
         scene.analysis = replace(scene.analysis, scheme=settings["scheme"])
     return simulate(
         scene,
@@ -283,21 +281,21 @@ def run(module, settings: Mapping, device: str | None) -> Result:
         options={name: value for name, value in settings.items() if name in SOLVER_OPTIONS},
         clock=clock_of(device),
         progress=False,
-        **{name: value for name, value in settings.items() if name in RUN_SETTINGS and name not in known},
+        **{name: value for name, value in settings.items() if name in RUN_SETTINGS and name not in build_defaults},
     )
 
 
 def clock_of(device: str | None) -> Callable[[], float] | None:
-    """Time of this process on the CPU, which others on the machine leave alone; the run's own clock on CUDA."""
+    """Return a clock of process time on the CPU, unaffected by other processes; None (wall clock) on CUDA."""
     import warp as wp
 
     return None if wp.get_device(device).is_cuda else time.process_time
 
 
 def best(study: Study, rows: list[dict]) -> list[dict]:
-    """The cases that no other of their series beats in both error and time, if the study names series; else all.
+    """Return the cases on the Pareto front of error and time in each series; all cases without series.
 
-    Cases that failed have no error, and are not among the best; they are left out only where there are series.
+    Failed cases have no error and are left out if there are series.
     """
     if not study.series:
         return rows
@@ -313,10 +311,10 @@ def best(study: Study, rows: list[dict]) -> list[dict]:
 
 
 def orders(study: Study, rows: list[dict]) -> dict[str, float]:
-    """Observed orders in the settings that refine: the median of log(error) over log(setting) between neighbouring cases.
+    """Return observed orders of convergence by setting: median slope of log(error) over log(setting).
 
-    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error, or the
-    default one where cases vary one name; where that keeps the error from falling with every refinement, there is no order.
+    For a number of edges, cells or steps, it is the order in their size. Other settings are as in the case of least error, or at
+    their defaults where cases vary one name. No order is given if the error does not fall with every refinement.
     """
     result = {}
     good = [row for row in rows if row["error"] > 0.0]
@@ -336,12 +334,12 @@ def orders(study: Study, rows: list[dict]) -> dict[str, float]:
 
 
 def line_through(study: Study, rows: list[dict], case: Mapping, name: str) -> list[dict]:
-    """Rows that differ from a case in no name of the grid but one."""
-    return [row for row in rows if all(row[other] == case[other] for other in study.grid if other != name)]
+    """Return rows that differ from a case in at most one name of the grid."""
+    return [row for row in rows if all(row[key] == case[key] for key in study.grid if key != name)]
 
 
 def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> None:
-    """Error over time, a line a series, the scene's defaults marked; see `Study.series` and `Study.one_by_one`."""
+    """Plot error over time, a line a series, with defaults marked; see `Study.series` and `Study.one_by_one`."""
     try:
         from ddg_warp.run.figure import error_plot
     except ModuleNotFoundError as error:

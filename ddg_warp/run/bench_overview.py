@@ -1,4 +1,4 @@
-"""One table and one picture of many scenes' studies: what their defaults give, and the time that each accuracy takes."""
+"""Overview of the benchmarks of many scenes: error and time of defaults, and time to each accuracy."""
 
 import json
 from pathlib import Path
@@ -15,8 +15,8 @@ def overview(directory: str | Path) -> list[dict]:
     """Sum up the studies NAME.json in a directory; write overview.csv, overview.json and overview.png there.
 
     Returns:
-        A row a scene: measure and unit, error, relative error and time of the defaults, and the least time [s] of any case whose
-        relative error is at most 1 %, 0.1 % and 0.01 %; None where none is.
+        A row a scene: measure and unit, error, relative error and time of the defaults, and time to each accuracy. The latter is
+        the least time [s] of a case with a relative error of at most 1 %, 0.1 % and 0.01 %, or None.
     """
     from ddg_warp.run.summary import write_table
 
@@ -54,7 +54,7 @@ def _row(name: str, study: dict) -> dict:
 
 
 def picture(rows: list[dict], path: Path) -> None:
-    """Time to each accuracy, a line a scene, and the error and time of the defaults as a cross."""
+    """Draw the time to each accuracy, a line a scene, and the defaults as a cross."""
     try:
         from ddg_warp.run.figure import levels_plot
     except ModuleNotFoundError as error:

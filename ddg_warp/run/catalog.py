@@ -1,4 +1,4 @@
-"""What can be run: the scenes of `ddg_warp.scenes`, or a scene file of the user's own; parameters become flags."""
+"""Catalog of scenes: modules of `ddg_warp.scenes` or a file of the user; parameters become flags."""
 
 import argparse
 import ast
@@ -13,18 +13,18 @@ from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
 
-RUN_SETTINGS = ("dt", "precision", "worlds")  # what a resumed run cannot change, beside the scene's parameters
+RUN_SETTINGS = ("dt", "precision", "worlds")  # fixed in a resumed run, like the scene's parameters
 RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "fields", "help", *RUN_SETTINGS)
 SHARED = ("dt", "duration")  # flags of `run` that a scene's build may take too, to fit its motions to them
 
 
 class InputError(ValueError):
-    """A mistake in what the user asked for; the message says in one line what to do."""
+    """Error in the user's input; the message gives the remedy in one line."""
 
 
 @contextmanager
 def refused(where: str = "") -> Iterator[None]:
-    """Turns what the package says of a bad scene, file or option into an InputError that begins with `where`."""
+    """Convert a ValueError of the package to an InputError that begins with `where`."""
     try:
         yield
     except (InputError, OSError):
@@ -34,7 +34,7 @@ def refused(where: str = "") -> Iterator[None]:
 
 
 def scene_files() -> dict[str, Path]:
-    """Name of each scene -> its file, without importing it."""
+    """Return the files of all scenes by name, without importing them."""
     import ddg_warp.scenes
 
     files = (path for folder in ddg_warp.scenes.__path__ for path in sorted(Path(folder).glob("[!_]*.py")))
@@ -42,12 +42,12 @@ def scene_files() -> dict[str, Path]:
 
 
 def one_liner(path: Path) -> str:
-    """First line of a file's docstring."""
+    """Return the first line of a file's docstring."""
     return (ast.get_docstring(ast.parse(path.read_text())) or "").partition("\n")[0]
 
 
 def load_scene(name: str) -> ModuleType:
-    """The module of a scene, given by name or as the path of a Python file.
+    """Import a scene, given by name or as the path of a Python file.
 
     Raises:
         InputError: There is no such scene, or it has no `build`.
@@ -66,18 +66,18 @@ def load_scene(name: str) -> ModuleType:
     return module
 
 
-def load_file(name: str, what: str = "scene") -> ModuleType:
-    """The module of a Python file.
+def load_file(name: str, kind: str = "scene") -> ModuleType:
+    """Import a Python file.
 
     Raises:
         InputError: There is no such file.
     """
     path = Path(name)
     if not path.is_file():
-        raise InputError(f"there is no {what} file {name}")
+        raise InputError(f"there is no {kind} file {name}")
     folder = str(path.resolve().parent)
     if folder not in sys.path:
-        sys.path.insert(0, folder)  # files beside it can be imported, as beside a script
+        sys.path.insert(0, folder)  # its folder can be imported from, like a script's
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -85,34 +85,32 @@ def load_file(name: str, what: str = "scene") -> ModuleType:
 
 
 def own_term(file: str, name: str):
-    """A user's term from his file, or a law of his, as that of the term of rods whose strains it fits.
+    """Return a user's term from a file, or a term of rods with the user's density.
 
     Raises:
-        InputError: There is no such file or name, or it is something else.
+        InputError: There is no such file or name, or the object is no Term or Density.
     """
     from ddg_warp.kernels.densities import Density
     from ddg_warp.kernels.terms import REGISTRY, Term
 
-    found = getattr(load_file(file, "law's"), name, None)
-    if isinstance(found, Term):
-        return found
-    if not isinstance(found, Density):
+    law = getattr(load_file(file, "law's"), name, None)
+    if isinstance(law, Term):
+        return law
+    if not isinstance(law, Density):
         raise InputError(f"{file} has no term or law {name!r}; give the name of a Term or a Density")
     for term in ("rod_bend_twist", "rod_stretch"):
-        if found.strains in (None, len(REGISTRY[term].measure.strains)):
-            return replace(REGISTRY[term], density=found)
-    raise InputError(
-        f"{file}:{name} is of {found.strains} strains, rods have 3 of bending and 1 of stretch; give a Term"
-    )
+        if law.strains in (None, len(REGISTRY[term].measure.strains)):
+            return replace(REGISTRY[term], density=law)
+    raise InputError(f"{file}:{name} is of {law.strains} strains, rods have 3 of bending and 1 of stretch; give a Term")
 
 
 def scene_name(name: str) -> str:
-    """Name under which a scene's results are filed: that of its file."""
+    """Return the name of a scene for results: the stem of its file."""
     return Path(name).stem
 
 
 def add_parameters(parser: argparse.ArgumentParser, module: ModuleType, leave: tuple[str, ...] = ()) -> None:
-    """Add a flag for every parameter of the scene's `build` but those to `leave`; flags that are not given leave no trace.
+    """Add a flag for every parameter of the scene's `build` except names in `leave`; unset flags are absent.
 
     Raises:
         InputError: A parameter has no default, an unknown type, or the name of an option of `run`.
@@ -136,24 +134,24 @@ def add_parameters(parser: argparse.ArgumentParser, module: ModuleType, leave: t
 
 
 def parameter_texts(build) -> dict[str, str]:
-    """What the `Args:` section of a Google docstring says about each parameter."""
+    """Return the texts of the `Args:` section of a Google docstring by parameter."""
     section = (inspect.getdoc(build) or "").partition("Args:\n")[2].partition("\n\n")[0]
     lines = (line.strip().partition(":") for line in section.splitlines())
-    # argparse fills in what follows a percent sign; two of them are one.
+    # argparse formats percent signs; %% is a literal one
     return {name: text.strip().replace("%", "%%") for name, colon, text in lines if colon and name.isidentifier()}
 
 
-def parameters(module: ModuleType, given: dict) -> dict:
-    """All parameters of a scene's `build`: its defaults, and what is given."""
+def parameters(module: ModuleType, settings: dict) -> dict:
+    """Return all parameters of a scene's `build`: defaults updated by `settings`."""
     defaults = {name: p.default for name, p in inspect.signature(module.build).parameters.items()}
-    return {**defaults, **given}
+    return {**defaults, **settings}
 
 
-def stored_settings(directory: Path, scene: str, given: dict) -> dict:
-    """Parameters of the scene, dt, precision and worlds of the run in `directory`, to resume it.
+def stored_settings(directory: Path, scene: str, settings: dict) -> dict:
+    """Return scene parameters, dt, precision and worlds of the run in `directory`, to resume it.
 
     Raises:
-        InputError: The directory holds no run of this scene, or its settings differ from those given.
+        InputError: The directory holds no run of this scene, or its settings differ from `settings`.
     """
     from ddg_warp.io.hdf5 import TrajectoryReader
 
@@ -167,7 +165,7 @@ def stored_settings(directory: Path, scene: str, given: dict) -> dict:
     if provenance["scene"] != scene:
         raise InputError(f"{directory} holds a run of '{provenance.get('scene')}', not of '{scene}'")
     stored = provenance["parameters"] | {name: provenance[name] for name in RUN_SETTINGS}
-    for name, value in given.items():
+    for name, value in settings.items():
         if stored.get(name) != value:
             raise InputError(f"the run in {directory} has {name} = {stored.get(name)}; resume it without --{name}")
     return stored

@@ -1,4 +1,4 @@
-"""A check: a measured number against its reference, within a tolerance. Every scene ends in some."""
+"""Check of a scene: a measured number against its reference, within a tolerance."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -8,10 +8,10 @@ from typing import ClassVar
 
 @dataclass(frozen=True)
 class Check:
-    """One number that a scene must reproduce.
+    """Number that a scene must reproduce.
 
     Attributes:
-        name: What is compared, with its unit.
+        name: Name of the quantity, with its unit.
         measured: The value found.
         reference: The value it should have.
         tolerance: Largest error that passes, in the unit of the value, or relative to the reference.
@@ -33,7 +33,7 @@ class Check:
 
     @classmethod
     def skip(cls, name: str, why: str) -> "Check":
-        """A check that this run cannot make; it neither passes nor fails."""
+        """Return a check that this run cannot make; it neither passes nor fails."""
         return cls(name, math.nan, math.nan, math.nan, skipped=why)
 
     @property
@@ -46,16 +46,16 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within the tolerance; NaN never is."""
+        """True if the error is within the tolerance; False for NaN."""
         return bool(self.error <= self.tolerance)
 
     @property
     def failed(self) -> bool:
-        """Whether it was made and did not pass."""
+        """True if the check was made and did not pass."""
         return not (self.passed or self.skipped)
 
     def as_dict(self) -> dict:
-        """The entry of `checks` in summary.json."""
+        """Return the entry of `checks` in summary.json."""
         return {
             "name": self.name,
             "measured": float(self.measured),
@@ -68,13 +68,13 @@ class Check:
 
 
 def once_reached(result, t: float, names: Iterable[str], make: Callable[[], list[Check]]) -> list[Check]:
-    """The checks that `make` returns, where the run got to time t; else each of them by name, skipped.
+    """Return the checks of `make` if the run has reached time t, else skipped checks of these names.
 
     Args:
         result: The run.
         t: Time that the checks need [s], or the load parameter in statics.
-        names: What the checks are called.
-        make: Makes them; not called where the run is shorter.
+        names: Names of the checks.
+        make: Returns the checks; not called if the run is shorter.
     """
     if result.times and result.times[-1] >= t - 1e-3 * (result.dt or 1e-6):
         return make()

@@ -1,6 +1,6 @@
 """The command line: `ddg-warp run | sweep | list | check | gradients | bench | export | info`.
 
-Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was asked for; 130 interrupted.
+Exit codes: 0 done, 1 a check or the solver failed, 2 invalid input, 130 interrupted, 141 broken pipe.
 """
 
 import argparse
@@ -31,7 +31,7 @@ PRECISIONS = ("float64", "mixed", "float32")
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """Argument parser that raises an InputError of one line."""
 
     def __init__(self, **options):
         super().__init__(allow_abbrev=False, **options)
@@ -41,14 +41,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns its exit code."""
+    """Run one command; return the exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         chosen = parser(arguments).parse_args(arguments)
         code = chosen.command(chosen)
-        sys.stdout.flush()  # here, where a closed pipe is expected
+        sys.stdout.flush()  # inside the try: a closed pipe is expected
         return code
-    except BrokenPipeError:  # whoever read the output has left, as `head` does
+    except BrokenPipeError:  # the reader, such as `head`, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
     except (InputError, OSError) as error:
@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _of_a_place(error: Exception) -> Exception:
-    """The error, or for one of the system the place that it is about and what to do."""
+    """Return the error, or for an OSError one that names the path and a remedy."""
     if not isinstance(error, OSError) or isinstance(error, ValueError) or error.filename is None:
         return error
     path = Path(os.fsdecode(error.filename))
@@ -74,7 +74,7 @@ def _of_a_place(error: Exception) -> Exception:
 
 
 def parser(arguments: list[str]) -> Parser:
-    """The parser of these arguments; `run SCENE`, `sweep SCENE` and `bench SCENE` add the flags of the scene."""
+    """Build the parser; `run SCENE`, `sweep SCENE` and `bench SCENE` add the flags of the scene."""
     from ddg_warp.learn import command
 
     top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
@@ -148,7 +148,7 @@ def parser(arguments: list[str]) -> Parser:
 
 
 def add_settings(command: argparse.ArgumentParser) -> None:
-    """Add the flags that say where and how accurately to compute."""
+    """Add the flags of device and precision."""
     command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: CUDA if there is one)")
     command.add_argument(
         "--precision", choices=PRECISIONS, help="default: the scene's, else float64 on the CPU, mixed on CUDA"
@@ -156,7 +156,7 @@ def add_settings(command: argparse.ArgumentParser) -> None:
 
 
 def run_scene(chosen: argparse.Namespace) -> int:
-    """`run`: simulate, record, check, summarise."""
+    """Run a scene: simulate, record, check, summarise."""
     module, name = load_scene(chosen.scene), scene_name(chosen.scene)
     settings, run_settings = settings_of(chosen, module, name)
     require_device(chosen.device)
@@ -172,16 +172,16 @@ def run_scene(chosen: argparse.Namespace) -> int:
             print(ended)
             return DONE
     scene = built(module, name, settings)
-    with RunDirectory(directory) as held:
+    with RunDirectory(directory) as run_directory:
         if chosen.resume is None and not chosen.force:
-            refuse_to_replace(held.path)
+            refuse_to_replace(run_directory.path)
         with refused():
             result = simulate(
                 scene,
                 device=chosen.device,
-                out=held,
+                out=run_directory,
                 duration=chosen.duration,
-                resume=held if chosen.resume is not None else None,
+                resume=run_directory if chosen.resume is not None else None,
                 force=chosen.force,
                 fields=[name for name in (chosen.fields or "").split(",") if name],
                 observe=getattr(module, "observe", None),
@@ -200,7 +200,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
 
 
 def finished(directory: Path, duration: float | None) -> str:
-    """What is said of a run that has reached its end, `duration` [s] or by default its own, and of which the summary is written.
+    """Return a message if a run has reached `duration` [s] and has a summary, else "".
 
     Raises:
         InputError: There is no run in the directory.
@@ -212,29 +212,29 @@ def finished(directory: Path, duration: float | None) -> str:
         goal = reader.provenance.get("duration", end) if duration is None else duration
         dt = reader.provenance["dt"]
     try:
-        told_of = json.loads((directory / SUMMARY).read_text())["sim_time"]
+        summarised = json.loads((directory / SUMMARY).read_text())["sim_time"]
     except (OSError, ValueError, LookupError, TypeError):
         return ""
-    if abs(end - goal) > 0.5 * dt or told_of != end:
+    if abs(end - goal) > 0.5 * dt or summarised != end:
         return ""
     return f"the run in {directory} is finished, at {end:g} s, and stays as it is; to go on with it give a longer --duration"
 
 
 def built(module, name: str, settings: dict):
-    """The scene of these parameters; whatever a scene of the package meets on its way comes of those given."""
+    """Build the scene; errors of a scene of the package are reported with the changed parameters."""
     changed = settings.items() - parameters(module, {}).items()
-    given = ", ".join(f"{key} = {value!r}" for key, value in sorted(changed))
-    with refused(f"scene '{name}'{given and f' with {given}'}: "):
+    text = ", ".join(f"{key} = {value!r}" for key, value in sorted(changed))
+    with refused(f"scene '{name}'{text and f' with {text}'}: "):
         try:
             return module.build(**settings)
         except (ArithmeticError, LookupError, TypeError) as error:
             if not (changed and module.__name__.startswith("ddg_warp.")):
-                raise  # a mistake in the scene, which wants its traceback
-            raise InputError(f"scene '{name}' cannot be built with {given} ({error}); change that") from error
+                raise  # an error in the scene: show the traceback
+            raise InputError(f"scene '{name}' cannot be built with {text} ({error}); change that") from error
 
 
 def judged(module, result) -> list:
-    """The checks of a scene; a check whose own solves fail fails the run."""
+    """Return the checks of a scene; a solver failure in a check fails the run."""
     from ddg_warp.errors import SolverError
     from ddg_warp.solve.direct import SingularError
 
@@ -248,24 +248,24 @@ def judged(module, result) -> list:
 
 
 def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, dict]:
-    """Parameters of the scene, and dt, precision and worlds as far as they are given, here or by the run to resume."""
-    known = parameters(module, {})
-    asked = {key: value for key, value in vars(chosen).items() if value is not None}
-    given = {key: value for key, value in asked.items() if key in known or key in RUN_SETTINGS}
-    duration = {"duration": given.pop("duration")} if "duration" in given else {}
+    """Return scene parameters, and dt, precision and worlds if set by flags or the run to resume."""
+    defaults = parameters(module, {})
+    flags = {key: value for key, value in vars(chosen).items() if value is not None}
+    settings = {key: value for key, value in flags.items() if key in defaults or key in RUN_SETTINGS}
+    duration = {"duration": settings.pop("duration")} if "duration" in settings else {}
     if chosen.resume is not None:
         if chosen.out is not None:
             raise InputError("a resumed run stays in its directory: give --resume or --out")
-        given = stored_settings(chosen.resume, name, given)
-    if given.get("worlds", 1) < 1:
+        settings = stored_settings(chosen.resume, name, settings)
+    if settings.get("worlds", 1) < 1:
         raise InputError(f"--worlds {chosen.worlds}: there must be at least one")
-    run_settings = {key: given.pop(key) for key in RUN_SETTINGS if key in given}
-    shared = {"dt": run_settings["dt"]} if "dt" in known and "dt" in run_settings else {}
-    return parameters(module, given | duration | shared), run_settings
+    run_settings = {key: settings.pop(key) for key in RUN_SETTINGS if key in settings}
+    shared = {"dt": run_settings["dt"]} if "dt" in defaults and "dt" in run_settings else {}
+    return parameters(module, settings | duration | shared), run_settings
 
 
 def say(result, content: dict, checks: list, directory: Path) -> None:
-    """Print what a run did."""
+    """Print report, counts, checks and failure of a run."""
     from ddg_warp.run.summary import checks_table, contact_line
 
     print(result.model.report(), end="\n\n")
@@ -296,12 +296,15 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
 
 
 def draw(directory: Path, module, result, shapes: int = 6) -> None:
-    """Draw the rods and surfaces of the first world at a few times into DIR/picture.png, where matplotlib is installed.
+    """Draw rods and surfaces of the first world at a few times into DIR/picture.png, if matplotlib is installed.
 
-    Statics and paths have the load parameter instead of the time; a path of equilibria goes to DIR/path.png, too, load over
-    displacements. A scene may declare `LENGTH_UNIT`, and `picture(result, frames)`, which returns what `figure.rods_picture` is to
-    draw instead of the frames, points by time: `points_by_time` and other arguments of it. One that learns may declare `plot(result)`,
-    arguments of `figure.lines_plot`, which goes to DIR/learned.png once its check has put what it learned into `result.learned`.
+    Statics and paths have the load parameter instead of the time. A path of equilibria is also drawn to DIR/path.png, load over
+    displacements. A scene may define
+
+    - `LENGTH_UNIT`;
+    - `picture(result, frames)`: arguments of `figure.rods_picture`, such as other `points_by_time`, instead of `frames`, the points
+      by time;
+    - `plot(result)`: arguments of `figure.lines_plot`, drawn to DIR/learned.png if its check has set `result.learned`.
     """
     try:
         from ddg_warp.run.figure import lines_plot, path_plot, rods_picture
@@ -312,13 +315,13 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
 
     for path in (directory / name for name in PICTURES):
         if path.is_symlink():
-            path.unlink()  # what it points to is not of this run
+            path.unlink()  # its target is not of this run
     title, unit = one_liner(Path(module.__file__)), getattr(module, "LENGTH_UNIT", "m")
     with TrajectoryReader(directory / "trajectory.h5") as reader:
         chosen = sorted({round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)})
         count = reader.points.shape[-2]
-        at = reader.series["load"] if result.path is not None else reader.time
-        frames = [(float(at[frame]), reader.points[frame].reshape(-1, 3)[:count]) for frame in chosen]
+        abscissa = reader.series["load"] if result.path is not None else reader.time
+        frames = [(float(abscissa[frame]), reader.points[frame].reshape(-1, 3)[:count]) for frame in chosen]
         options = {"points_by_time": frames, "unit": unit}
         if result.dt is None:
             options["label"] = "load parameter"
@@ -326,7 +329,7 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
             last = frames[-1][0]
             options["field"] = partial(applied.over, t=last, otherwise=last if result.dt is None else 1.0)
         if reader.obstacles is not None:
-            options["bodies"] = standing(reader, {frame: float(at[frame]) for frame in chosen})
+            options["bodies"] = standing(reader, {frame: float(abscissa[frame]) for frame in chosen})
         if hasattr(module, "picture") and not result.failure:
             options |= module.picture(result, dict(frames))
         rods_picture(reader, path=directory / "picture.png", title=title, **options)
@@ -337,7 +340,7 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
 
 
 def standing(reader, times: dict[int, float]) -> dict[float, tuple]:
-    """Obstacles of the first world as surfaces, by the times of frames; still ones at the first, behind all else."""
+    """Return obstacles of the first world as surfaces by time; fixed ones only at the first time."""
     obstacles, nodes, shown = reader.obstacles, reader.obstacle_points, {}
     for frame, time in times.items():
         moved = None if nodes is None else nodes[frame].reshape(-1, *nodes.shape[-2:])[0]
@@ -346,7 +349,7 @@ def standing(reader, times: dict[int, float]) -> dict[float, tuple]:
 
 
 def list_all(chosen: argparse.Namespace) -> int:
-    """`list`: scenes and terms with what they are, in one line each."""
+    """Print scenes and terms, each with a description of one line."""
     from ddg_warp.kernels.terms import ALL
 
     listed = {
@@ -362,7 +365,7 @@ def list_all(chosen: argparse.Namespace) -> int:
 
 
 def check_terms(chosen: argparse.Namespace) -> int:
-    """`check`: the derivative table of a term, or of all."""
+    """Print the derivative table of a term, or of all."""
     from ddg_warp.kernels.terms import ALL
     from ddg_warp.run.summary import table
 
@@ -382,7 +385,7 @@ def check_terms(chosen: argparse.Namespace) -> int:
 
 
 def bench_scene(chosen: argparse.Namespace) -> int:
-    """`bench`: a scene's error against its time."""
+    """Run the benchmark of a scene, or of all."""
     from ddg_warp.run.bench import benchmark
     from ddg_warp.run.bench_overview import overview
     from ddg_warp.run.summary import table
@@ -396,16 +399,16 @@ def bench_scene(chosen: argparse.Namespace) -> int:
     done = True
     for name in scene_files() if chosen.all else [chosen.scene]:
         print(f"== {name}", flush=True)
-        known = () if chosen.all else parameters(load_scene(name), {})
-        given = {key: value for key, value in vars(chosen).items() if key in known}
-        done &= benchmark(name, chosen.out, device=chosen.device, precision=chosen.precision, given=given)
+        names = () if chosen.all else parameters(load_scene(name), {})
+        settings = {key: value for key, value in vars(chosen).items() if key in names}
+        done &= benchmark(name, chosen.out, device=chosen.device, precision=chosen.precision, given=settings)
     if chosen.all:
         print(table(overview(chosen.out)))
     return DONE if done else FAILED
 
 
 def export_run(chosen: argparse.Namespace) -> int:
-    """`export`: trajectory.h5 as USD."""
+    """Write trajectory.h5 as USD."""
     from ddg_warp.run.record import export_usd
 
     source = chosen.directory / "trajectory.h5"
@@ -427,7 +430,7 @@ def export_run(chosen: argparse.Namespace) -> int:
 
 
 def show_info(chosen: argparse.Namespace) -> int:
-    """`info`: versions, devices, machine."""
+    """Print versions, devices and machine."""
     from ddg_warp.run.summary import machine
 
     require_device(None)
@@ -438,13 +441,13 @@ def show_info(chosen: argparse.Namespace) -> int:
 
 
 def require_device(name: str | None) -> None:
-    """Start Warp without its chatter; refuse a device that it does not have."""
+    """Start Warp quietly; refuse an unknown device."""
     import warp as wp
 
     import ddg_warp.kernels  # noqa: F401, quietens Warp
 
     if name is None:
         return
-    known = [device.alias for device in wp.get_devices()]
-    if name not in known and name != "cuda":
-        raise InputError(f"there is no device '{name}' here; there is {', '.join(known)}")
+    devices = [device.alias for device in wp.get_devices()]
+    if name not in devices and name != "cuda":
+        raise InputError(f"there is no device '{name}' here; there is {', '.join(devices)}")

@@ -19,20 +19,20 @@ from ddg_warp.io import Shapes
 from ddg_warp.io.colors import SCALE
 
 DPI = 160
-FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
-ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye on solid scenes [degrees]
-WIDEST = 0.72  # that a box is seen, over its diagonal, before a panel beside others cuts it off
+FLAT = 1e-3  # largest thickness over size of flat shapes
+ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye [degrees]
+WIDEST = 0.72  # largest visible width over diagonal of a box in a panel
 MARGIN = 0.06  # of the size, around the rods
 FIELD_COLOR = "#c9bfd6"
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
 GREY = "0.35"
 LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
-CLOSE = 1.45  # how much larger a solid scene is drawn without its axes
+CLOSE = 1.45  # zoom of a solid scene without axes
 TITLE = 11  # letters of a title in an inch
 STABILITY = {"stable": (False, "-"), "unstable": (True, "--")}
 SPECIAL = {"limit point": "o", "bifurcation": "D"}
 LIGHT = np.array([-0.37, -0.56, 0.74])  # unit vector from the surfaces to the light
-DARKEST = 0.55  # brightness of what the light grazes
+DARKEST = 0.55  # brightness at grazing light
 TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
 MARKERS = "osD^vP"
 
@@ -53,23 +53,23 @@ def rods_picture(
     side_by_side: bool = False,
     field: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> None:
-    """Draws rods and surfaces at a few times, the last on top; flat where they stay in a coordinate plane.
+    """Draw rods and surfaces at a few times, the last on top; flat if all lie in a coordinate plane.
 
     Args:
         rods: A model, a `TrajectoryReader`, the curves of either, or a `CurveSet`.
-        points_by_time: Time [s], or what `label` says, and positions, (P, 3) or (worlds, P, 3), of each shape to draw:
-            a mapping, drawn in the order of time, or pairs, drawn in theirs.
+        points_by_time: Time [s], or the quantity of `label`, and positions, (P, 3) or (worlds, P, 3), of each shape. A mapping is
+            drawn in the order of time, pairs in the given order.
         path: The picture to write; its suffix is the format.
         title: A line above.
-        label: What tells the shapes apart, with its unit.
-        names: Names of the shapes, in order, that are shown instead of their times.
-        unit: That of lengths.
-        values: A number at each point, shape (P,) of all worlds, which colors the latest shape; `label` is then its name.
+        label: Name and unit of the quantity that distinguishes the shapes.
+        names: Names of the shapes, in order, shown instead of times.
+        unit: Unit of lengths.
+        values: A number at each point, shape (P,) of all worlds, to color the latest shape; `label` is then its name.
         colors: RGB of each rod, shape (R, 3), instead of a color a time.
-        bodies: What else stands there at each time: points (n, 3) and triangles (t, 3), grey, or with RGB of each (t, 3).
-        lines: Whether rods are drawn, as lines; not where bodies show them as thick as they are.
-        side_by_side: Whether every shape has a panel of its own.
-        field: Vectors (n, 3) at points (n, 3), drawn as arrows behind the latest shape, the largest as long as their distance.
+        bodies: Other surfaces at each time: points (n, 3) and triangles (t, 3), grey, or with RGB of each (t, 3).
+        lines: Whether rods are drawn as lines; False where bodies show them with their thickness.
+        side_by_side: Whether every shape has a panel.
+        field: Vectors (n, 3) at points (n, 3), drawn as arrows behind the latest shape; the largest is as long as the grid spacing.
     """
     curves = getattr(rods, "curves", rods)
     frames = sorted(points_by_time.items()) if isinstance(points_by_time, Mapping) else list(points_by_time)
@@ -116,8 +116,8 @@ def rods_picture(
             if not len(flat):
                 sides = np.ptp([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()], axis=1)
                 plot.set_box_aspect(sides, zoom=CLOSE * min(_to_fit(sides), WIDEST / _seen(sides)[0]))
-            told = f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}"
-            plot.set_title(told if names is None else names[number], fontsize=9, color=GREY)
+            text = f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}"
+            plot.set_title(text if names is None else names[number], fontsize=9, color=GREY)
     if not side_by_side:
         _explain_times(figure, plots[0], times, norm, label, values, names)
     figure.suptitle(textwrap.fill(title, round(TITLE * figure.get_figwidth())), x=0.03, ha="left", fontsize=11)
@@ -127,16 +127,16 @@ def rods_picture(
 def error_plot(
     path, rows: Iterable[Mapping], x: str, y: str, series: str, title: str = "", marked: Iterable[Mapping] = ()
 ) -> None:
-    """Draws a table with logarithmic axes, one line for each value of a column.
+    """Draw a table with logarithmic axes, one line for each value of a column.
 
     Args:
         path: The picture to write; its suffix is the format.
-        rows: Rows of the table; those in which `x` or `y` is not positive are left out.
+        rows: Rows of the table; rows without positive `x` and `y` are left out.
         x: Column along the horizontal axis, and its label.
         y: Column along the vertical axis, and its label.
-        series: Column that tells the lines apart.
+        series: Column that distinguishes the lines.
         title: A line above.
-        marked: Rows of the scene's defaults, which a cross marks.
+        marked: Rows of the scene's defaults, marked by a cross.
     """
     rows = [row for row in rows if (row[x] or 0.0) > 0.0 and (row[y] or 0.0) > 0.0]
     names = list(dict.fromkeys(row[series] for row in rows))
@@ -160,25 +160,25 @@ def error_plot(
 
 
 def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[float], errors: list[float]) -> None:
-    """Draws times on a logarithmic axis, a line a name: a marker for each level reached, a cross for the defaults with its error.
+    """Draw times on a logarithmic axis, a row a name: markers for levels, crosses for defaults.
 
     Args:
         path: The picture to write; its suffix is the format.
-        names: One a line, the first on top.
-        marks: Level -> time [s] of every name; None where it is not reached.
+        names: Names of the rows, the first on top.
+        marks: Level -> time [s] of every name, None if the level is not reached.
         usual: Times of the defaults [s].
-        errors: Their relative errors.
+        errors: Relative errors of the defaults.
     """
     figure = Figure(figsize=(7.5, 1.0 + 0.24 * len(names)), layout="constrained")
-    plot, place = figure.add_subplot(), -np.arange(len(names))
+    plot, height = figure.add_subplot(), -np.arange(len(names))
     for k, (level, times) in enumerate(marks.items()):
         values = np.array([np.nan if time is None else time for time in times])
         color = TIME_COLORS(0.3 + 0.7 * k / max(1, len(marks) - 1))
-        plot.semilogx(values, place, MARKERS[k], color=color, markersize=6 - k, label=level, alpha=0.85)
-    plot.semilogx(usual, place, "x", color="k", markersize=6, label="defaults")
-    for x, y, error in zip(usual, place, errors, strict=True):
+        plot.semilogx(values, height, MARKERS[k], color=color, markersize=6 - k, label=level, alpha=0.85)
+    plot.semilogx(usual, height, "x", color="k", markersize=6, label="defaults")
+    for x, y, error in zip(usual, height, errors, strict=True):
         plot.annotate(f"{error:.0e}", (x, y), xytext=(5, -3), textcoords="offset points", fontsize=7, color=GREY)
-    plot.set_yticks(place, names, fontsize=8)
+    plot.set_yticks(height, names, fontsize=8)
     plot.set_xlabel("time [s]")
     plot.grid(color="0.92", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
@@ -187,12 +187,12 @@ def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[f
 
 
 def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", log: bool = False) -> None:
-    """Draws lines over one axis, those of equal labels alike.
+    """Draw lines over one axis, equal labels in one color.
 
     Args:
         path: The picture to write; its suffix is the format.
-        lines: Label, places along x and y, and style of each: one of matplotlib's lines ("-") or markers ("o").
-        x, y: Labels of the axes, with their units.
+        lines: Label, x values, y values and style of each: one of matplotlib's lines ("-") or markers ("o").
+        x, y: Labels of the axes, with units.
         title: A line above.
         log: Whether the vertical axis is logarithmic.
     """
@@ -202,8 +202,8 @@ def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", lo
     shown = set()
     for label, along, values, style in lines:
         color = TIME_COLORS(0.25 + 0.7 * labels.index(label) / max(1, len(labels) - 1))
-        told = label if label not in shown else None
-        plot.plot(along, values, style, color=color, markersize=3.5, linewidth=1.5, alpha=0.9, label=told)
+        legend = label if label not in shown else None
+        plot.plot(along, values, style, color=color, markersize=3.5, linewidth=1.5, alpha=0.9, label=legend)
         shown.add(label)
     plot.set(xlabel=x, ylabel=y, yscale="log" if log else "linear")
     plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
@@ -214,13 +214,13 @@ def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", lo
 
 
 def path_plot(path, file, title: str = "", unit: str = "m") -> None:
-    """Draws the load parameter over every watched displacement: full where stable, broken where not, special points marked.
+    """Draw the load parameter over watched displacements: full lines stable, broken ones unstable, special points marked.
 
     Args:
         path: A `ddg_warp.scene.path.Path`.
         file: The picture to write; its suffix is the format.
         title: A line above.
-        unit: That of displacements.
+        unit: Unit of displacements.
     """
     figure = Figure(figsize=(6.0, 4.4), layout="constrained")
     plot = figure.add_subplot()
@@ -254,7 +254,7 @@ def path_plot(path, file, title: str = "", unit: str = "m") -> None:
 
 
 def _unstable(path) -> np.ndarray:
-    """Whether each piece between neighbouring points of a path is unstable; special points, where that changes, have no say."""
+    """Return the mask of unstable segments of a path; special points, where stability changes, do not count."""
     regular = np.array([point.kind not in SPECIAL for point in path.points])
     negative = np.asarray(path.negative) > 0
     either = (negative & regular)[:-1] | (negative & regular)[1:]
@@ -262,10 +262,10 @@ def _unstable(path) -> np.ndarray:
 
 
 def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
-    """Adds polylines, in two or three dimensions."""
+    """Add polylines in two or three dimensions."""
     kind = LineCollection if points.shape[-1] == 2 else Line3DCollection
     polylines = _polylines(points, curves.counts, curves.closed)
-    if len(color) == len(points) and np.ndim(color) == 2:  # a color at every point: an edge by itself
+    if len(color) == len(points) and np.ndim(color) == 2:  # a color at every point: draw edge by edge
         shades = _polylines(np.asarray(color), curves.counts, curves.closed)
         color = np.concatenate([0.5 * (shade[1:] + shade[:-1]) for shade in shades])
         polylines = [edge for line in polylines for edge in np.stack([line[:-1], line[1:]], axis=1)]
@@ -277,7 +277,7 @@ def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
 
 
 def _draw_field(plot, axes: list[int], low: np.ndarray, high: np.ndarray, field) -> None:
-    """Adds arrows on a grid that fills the box."""
+    """Add arrows on a grid that fills the box."""
     size = np.max(high - low)
     step = (1.0 + 2.0 * MARGIN) * size / ARROWS[len(axes)]
     middle = 0.5 * (low + high)
@@ -300,7 +300,7 @@ def _draw_field(plot, axes: list[int], low: np.ndarray, high: np.ndarray, field)
 
 
 def _draw_triangles(plot, corners: np.ndarray, color) -> None:
-    """Adds triangles, corners (T, 3, 2), or shaded ones, corners (T, 3, 3); thin lines close the gaps between them."""
+    """Add triangles, corners (T, 3, 2), or shaded ones, corners (T, 3, 3); thin edges close gaps."""
     if corners.shape[-1] == 2:
         each = color if np.ndim(color) == 2 else [color]
         plot.add_collection(PolyCollection(corners, facecolors=each, edgecolors=each, linewidths=0.2))
@@ -313,13 +313,13 @@ def _draw_triangles(plot, corners: np.ndarray, color) -> None:
 
 
 def _polylines(points: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> list[np.ndarray]:
-    """The polyline of each rod; a closed one returns to its first point."""
+    """Return the polyline of each rod; a closed one ends at its first point."""
     lines = np.split(points, np.cumsum(counts)[:-1])
     return [np.vstack([line, line[:1]]) if shut else line for line, shut in zip(lines, closed, strict=True)]
 
 
 def _line_width(rod_count: int, latest: bool) -> float:
-    """Line width in points: thin for many rods, and for shapes of the past."""
+    """Return the line width in points: thin for many rods and for earlier shapes."""
     few = np.interp(np.log10(rod_count), [0.0, 1.0, 3.0], [2.2, 1.4, 0.45])
     return few if latest else 0.7 * few
 
@@ -346,24 +346,24 @@ def _solid_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarr
     plot.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
     sides = limits[:, 1] - limits[:, 0]
     plot.set_box_aspect(sides, zoom=_to_fit(sides))
-    shares = sides / sides.max()
-    for axis, name, share in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", shares, strict=True):
+    lengths = sides / sides.max()
+    for axis, name, relative in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", lengths, strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_label_text(f"{name} [{unit}]", fontsize=9)
         axis.get_major_formatter().set_useOffset(False)
-        axis.set_major_locator(MaxNLocator(nbins=max(2, round(4.0 * share))))  # labels of short axes do not overlap
+        axis.set_major_locator(MaxNLocator(nbins=max(2, round(4.0 * relative))))  # labels of short axes do not overlap
         axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
     plot.tick_params(labelsize=8, colors=GREY)
     return plot
 
 
 def _to_fit(sides: np.ndarray) -> float:
-    """Zoom of a box that is seen higher than the cube that matplotlib makes room for; 1 of others."""
+    """Return the zoom that fits a box into the height of matplotlib's cube, at most 1."""
     return min(1.0, _seen(np.ones(3))[1] / _seen(sides)[1])
 
 
 def _seen(sides: np.ndarray) -> np.ndarray:
-    """Width and height at which a box is seen, over its diagonal, which is what matplotlib keeps."""
+    """Return visible width and height of a box over the diagonal, the length that matplotlib normalises."""
     elevation, azimuth = np.radians([ELEVATION, AZIMUTH])
     wide = [np.sin(azimuth), np.cos(azimuth), 0.0]
     high = [np.cos(azimuth) * np.sin(elevation), np.sin(azimuth) * np.sin(elevation), np.cos(elevation)]
@@ -371,7 +371,7 @@ def _seen(sides: np.ndarray) -> np.ndarray:
 
 
 def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, label: str, values, names) -> None:
-    """A color bar with a tick at each time drawn, or over the values that color the latest shape."""
+    """Add a color bar with a tick at each drawn time, or of the values of the latest shape."""
     if len(times) == 1 and values is None:
         return
     gap = 0.10 if plot.name == "3d" else 0.03  # room for the label of the z axis
@@ -385,7 +385,7 @@ def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, lab
 
 
 def _save(figure: Figure, path) -> None:
-    """Writes a figure without touching pyplot, whose state belongs to the user."""
+    """Write a figure without pyplot, which has global state."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=DPI)

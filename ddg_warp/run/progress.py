@@ -1,12 +1,12 @@
-"""How far a run is: a bar on a terminal, now and then a line elsewhere."""
+"""Progress of a run: a bar on a terminal, a line now and then elsewhere."""
 
 import sys
 
-LINE_EVERY = 10.0  # s between two lines about the progress of a run whose output is no terminal
+LINE_EVERY = 10.0  # [s] between two lines where the output is no terminal
 
 
 class Lines:
-    """A text stream in which what would overwrite a line begins a new one."""
+    """Text stream that begins a new line instead of overwriting one."""
 
     def __init__(self, stream):
         self._stream = stream
@@ -20,11 +20,11 @@ class Lines:
         self._stream.flush()
 
 
-def progress_bar(steps: int, done: int, shown: bool, unit: str = "step", what: str = "compiling, once"):
-    """Units done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
+def progress_bar(steps: int, done: int, shown: bool, unit: str = "step", description: str = "compiling, once"):
+    """Return a progress bar on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
     from tqdm import tqdm
 
-    style = {"total": steps, "initial": done, "desc": what, "unit": unit, "disable": not shown}
+    style = {"total": steps, "initial": done, "desc": description, "unit": unit, "disable": not shown}
     if not sys.stderr.isatty():
         form = f"{{desc}}{{n_fmt}} of {{total_fmt}} {unit}s, {{elapsed}} elapsed, {{remaining}} remaining"
         seldom = {"mininterval": LINE_EVERY, "maxinterval": 2.0 * LINE_EVERY, "delay": LINE_EVERY, "miniters": 1}

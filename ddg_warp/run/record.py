@@ -1,4 +1,4 @@
-"""Records the states of a run: trajectory.h5 to read and resume from, scene.usdc to look at. It only reads states."""
+"""Recording of a run: trajectory.h5 to read and resume from, scene.usdc for display. States are only read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ddg_warp.io.observed import checked_attributes, checked_notes, checked_obse
 from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, VIEW, RecordError, RunDirectory, refuse_to_replace, told
 
 DEFAULT_FPS = 24.0
-LEAST_DT = 1e-300  # s, whose inverse is finite
+LEAST_DT = 1e-300  # [s], with a finite inverse
 COLORS = ("strain", "curvature", "energy")
 TIMES = ("state", "frame")
 
@@ -23,40 +23,40 @@ __all__ = ["RecordError", "Recorder", "export_usd"]
 
 
 class Recorder:
-    """Writes DIR/trajectory.h5 and DIR/scene.usdc, a block of frames at a time.
+    """Recorder of DIR/trajectory.h5 and DIR/scene.usdc, written in blocks of frames.
 
-    A process killed at any time, or a disk that is full, leaves both files readable, up to a complete block.
+    A process killed at any time, or a full disk, leaves both files readable up to a complete block.
 
     Args:
-        model: The model whose states are recorded.
-        directory: DIR; made if there is none. A `RunDirectory` stays held when the recorder closes.
+        model: The model of the recorded states.
+        directory: DIR; made if there is none. A `RunDirectory` stays locked when the recorder closes.
         usd: Whether to write the scene.
         hdf5: Whether to write the trajectory; without it a run cannot be resumed.
-        every: Record every so many calls, the first included.
-        block: Frames written together.
-        fps: Time codes per second of the scene; by default one time code a recorded frame, where the scene has a dt.
+        every: Interval of recorded calls; the first is recorded.
+        block: Number of frames written together.
+        fps: Time codes per second of the scene; by default one time code a recorded frame, if the scene has a dt.
         tube: Whether the scene shows tubes instead of curves.
-        time: What the time of a frame is: "state", that of its state, which grows from call to call; or "frame", its number from 0 on,
-            for equilibria or designs that are recorded one after the other. A resumed run goes on with its own.
-        color_by: What surfaces of the scene are colored by, "strain", "curvature" or "energy" (see `inquiry.triangle_fields`),
-            and its values at the two ends of the scale. Frames replayed from a trajectory, at a resume, stay plain.
+        time: Time of a frame: "state", the increasing time of states; or "frame", its number from 0 on, for a sequence of equilibria
+            or designs. A resumed run keeps its choice.
+        color_by: Field that colors surfaces of the scene, "strain", "curvature" or "energy" (see `inquiry.triangle_fields`), and its
+            values at the two ends of the scale. Frames replayed from a trajectory, at a resume, stay plain.
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
-        fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.ask.fields`.
-        contacts: Whether to record what touches, see `Model.contacts`: pairs, places, gaps and forces; in the scene as points, as
-            wide as forces say.
+        fields: Names of fields along rods and over surfaces to record, see `ddg_warp.ask.fields`.
+        contacts: Whether to record contacts, see `Model.contacts`: pairs, points, gaps and forces; in the scene as points with a
+            width by force.
         attributes: Values of each rod by name, shape (R,), such as the `attributes` of curves that were read: ids, groups.
-        provenance: Attributes of the trajectory, beside version, date and machine.
-        control: How the run is driven, stored in the trajectory.
-        resume: Whether to go on after the last complete block of DIR/trajectory.h5, with the fields that it has; the scene is written
-            anew from it.
-        force: Whether to replace a run that DIR holds already: trajectory, scene, summary and pictures.
-        counts: Asked with every recorded state: what the run has counted up to it, arrays by name, kept with the checkpoint; see
-            `TrajectoryReader.run_counts`.
+        provenance: Attributes of the trajectory, in addition to version, date and machine.
+        control: Description of the controls of the run, stored in the trajectory.
+        resume: Whether to continue after the last complete block of DIR/trajectory.h5, with its fields; the scene is rewritten from
+            it.
+        force: Whether to replace a run in DIR: trajectory, scene, summary and pictures.
+        counts: Function called with every recorded state; returns the counters of the run, arrays by name, kept with the
+            checkpoint. See `TrajectoryReader.run_counts`.
 
     Raises:
-        ValueError: An option is no such option, or the run to resume is of another model or has not the fields asked for.
-        TakenError: DIR holds a run, or another process writes to it; a FileExistsError.
+        ValueError: An option is invalid, or the run to resume is of another model or lacks a requested field.
+        TakenError: DIR has a run, or another process writes to it; a FileExistsError.
         RecordError: The disk is full, or fails; also from `record` and `close`.
     """
 
@@ -144,7 +144,7 @@ class Recorder:
             raise self._told(error) from error
 
     def _open_trajectory(self, resume: bool, block: int, wanted: dict, time: str | None) -> None:
-        """Begins the trajectory, or goes on with it and what it has."""
+        """Begin the trajectory, or continue it with its fields."""
         from ddg_warp.io.hdf5 import TrajectoryReader, TrajectoryWriter
 
         path = self.directory / TRAJECTORY
@@ -160,10 +160,10 @@ class Recorder:
         self._time, self._checkpoint = reader.time_is, self._trajectory.checkpoint
 
     def _refuse_more(self, reader, wanted: dict, time: str | None) -> None:
-        """Raises a ValueError where what a run is to go on with is not what it has."""
-        asked = [name for name in ("velocities", "directors", "contacts") if wanted[name]] + list(self._wanted)
-        found = {*reader.recorded, *reader.fields, *(["contacts"] if reader.contacts is not None else [])}
-        if missing := [name for name in asked if name not in found]:
+        """Raise a ValueError if requested options differ from a run to resume."""
+        requested = [name for name in ("velocities", "directors", "contacts") if wanted[name]] + list(self._wanted)
+        available = {*reader.recorded, *reader.fields, *(["contacts"] if reader.contacts is not None else [])}
+        if missing := [name for name in requested if name not in available]:
             raise ValueError(
                 f"{reader.path} has no {missing[0]}, and a resumed run goes on with what it has: leave {missing[0]} out, or record "
                 "the run anew"
@@ -196,21 +196,21 @@ class Recorder:
 
     def __exit__(self, kind, error, _) -> None:
         if isinstance(error, RecordError):
-            return  # closed already
+            return  # already closed
         self.close()
 
     def record(self, state, observed: Mapping[str, float] | None = None) -> None:
-        """Takes note of a state, to be called once for the first state and once after every step.
+        """Record a state; call it for the first state and after every step.
 
-        The first state of a resumed run may be that of its checkpoint, which is recorded already and passed over.
+        The first state of a resumed run may be its checkpoint, which is skipped.
 
         Args:
             state: The state; it is only read.
-            observed: Finite numbers measured of it, by name; the same names at every call.
+            observed: Finite numbers measured at the state, by name; the same names at every call.
 
         Raises:
-            ValueError: The recorder is closed, the state is of another model or not later than the one before, or what was
-                observed is no finite number or has other names than before. Nothing of the call is recorded then.
+            ValueError: The recorder is closed, the state is of another model or not later than the one before. Or an observed value
+                is no finite number, or the names differ from the last call. The call records nothing then.
             RecordError: The disk is full, or fails; the recorder is closed then.
         """
         if self._held is None:
@@ -242,17 +242,17 @@ class Recorder:
                 if self._directors:
                     shape = (self._model.worlds, np.shape(state.points())[-2])
                     fields = fields | {"director": directors_at_points(self._model.curves, state.directors(), shape)}
-                others = (state.obstacle_points(), contacts)
-                self._show(time, state.points(), velocities, fields | self._colors(state), *others)
+                bodies_and_contacts = (state.obstacle_points(), contacts)
+                self._show(time, state.points(), velocities, fields | self._colors(state), *bodies_and_contacts)
         except OSError as error:
             self._abandon()
             raise self._told(error) from error
 
     def _passes_over(self, state) -> bool:
-        """Whether a state is the checkpoint that a run is resumed from.
+        """Return True if a state is the checkpoint of a resumed run.
 
         Raises:
-            SceneError: It is not later than the last.
+            SceneError: The state is not later than the last.
         """
         if self._time == "frame":
             return False
@@ -274,7 +274,7 @@ class Recorder:
         )
 
     def close(self) -> None:
-        """Writes what is left and closes the files; a second call does nothing."""
+        """Write the last block and close the files; a second call does nothing."""
         try:
             for writer in (self._trajectory, self._scene):
                 if writer is not None:
@@ -285,7 +285,7 @@ class Recorder:
             self._abandon()
 
     def _abandon(self) -> None:
-        """Lets go of the files as they are."""
+        """Close the files without further writes."""
         if self._scene is not None:
             self._scene.abandon()
         self._trajectory = self._scene = None
@@ -294,7 +294,7 @@ class Recorder:
         self._held = None
 
     def _told(self, error: BaseException) -> BaseException:
-        """The error, or for one of the disk what is lost, what is kept and what to do."""
+        """Return the error, or for one of the disk a RecordError with losses and remedy."""
         if not isinstance(error, OSError) or isinstance(error, RecordError) or error.errno is None:
             return error
         kept = "the run cannot be recorded any further. "
@@ -306,7 +306,7 @@ class Recorder:
         return told(self.directory, error, kept)
 
     def _replay(self) -> None:
-        """Brings scene and counters to where the trajectory ends."""
+        """Write the frames of the trajectory to the scene, and set counters to the end."""
         from ddg_warp.io.hdf5 import TrajectoryReader
 
         with TrajectoryReader(self.directory / TRAJECTORY) as reader:
@@ -328,7 +328,7 @@ class Recorder:
                 self._show(reader.time[frame], reader.points[frame], velocities, fields, *_others(reader, frame))
 
     def _fields_of(self, state) -> dict[str, np.ndarray]:
-        """The fields of a state by name, (worlds, points) or (worlds, triangles)."""
+        """Return the fields of a state by name, (worlds, points) or (worlds, triangles)."""
         if not self._wanted:
             return {}
         from ddg_warp.ask.fields import cell_fields, point_fields
@@ -338,7 +338,7 @@ class Recorder:
         )
 
     def _colors(self, state) -> dict[str, np.ndarray]:
-        """What surfaces are colored by, world after world."""
+        """Return the field that colors surfaces, world after world."""
         if self._color_by is None:
             return {}
         from ddg_warp.ask.inquiry import triangle_fields
@@ -355,7 +355,7 @@ class Recorder:
         obstacles: np.ndarray | None = None,
         contacts: Contacts | None = None,
     ) -> None:
-        """Adds a frame of all worlds to the scene; fields that a point has not are 0 there."""
+        """Add a frame of all worlds to the scene; undefined fields are 0."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
         fields = dict(fields or {})
         directors = {"director": fields.pop("director")} if "director" in fields else {}
@@ -373,35 +373,35 @@ class Recorder:
 
 
 def _is(state, checkpoint: Mapping[str, np.ndarray]) -> bool:
-    """Whether a state is that of a checkpoint, bit by bit."""
-    found = {name: np.asarray(value) for name, value in state.snapshot().items()}
-    return found.keys() == checkpoint.keys() and all(
-        found[name].shape == value.shape and found[name].tobytes() == value.tobytes()
+    """Return True if a state equals a checkpoint bit by bit."""
+    values = {name: np.asarray(value) for name, value in state.snapshot().items()}
+    return values.keys() == checkpoint.keys() and all(
+        values[name].shape == value.shape and values[name].tobytes() == value.tobytes()
         for name, value in checkpoint.items()
     )
 
 
-def _same_attributes(one: Mapping, other: Mapping) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+def _same_attributes(first: Mapping, second: Mapping) -> bool:
+    return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
 
 
 def _others(reader, frame: int) -> tuple[np.ndarray | None, Contacts | None]:
-    """Of a frame of a trajectory the nodes of obstacles that something moves, and what touches, where it has them."""
+    """Return nodes of moving obstacles and contacts of a frame, None where not recorded."""
     return tuple(each if each is None else each[frame] for each in (reader.obstacle_points, reader.contacts))
 
 
 def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
-    """Writes the frames of a trajectory.h5 as USD.
+    """Write the frames of a trajectory.h5 as USD.
 
     Args:
         trajectory: The file to read.
         path: The .usdc or .usda file to write.
         fps: Time codes per second; by default one time code a frame.
         tube: Whether to write tubes instead of curves.
-        revolve: Sides of the surfaces that the curves of the first world, meridians, sweep around z; 0 for none.
+        revolve: Sides of the surfaces of revolution around z of the curves (meridians) of the first world; 0 for none.
 
     Raises:
-        ValueError: The trajectory cannot be read or has no frames, or an option is no such option.
+        ValueError: The trajectory cannot be read or has no frames, or an option is invalid.
         RecordError: The file cannot be written.
     """
     if fps is not None:
@@ -432,16 +432,16 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
         shapes = Shapes.of(reader.curves, reader.surfaces, worlds)
         count = int(np.sum(reader.curves.counts))
         first = reader.points[0].reshape(-1, 3)[:count]
-        turned = Revolution(reader.curves, first, revolve) if revolve else None
-        shapes = turned.shapes if turned else shapes
-        given = {"obstacles": reader.obstacles, "touching": reader.touching if reader.contacts is not None else None}
-        given = {} if turned else given | {"attributes": reader.attributes}
-        with CurvesWriter(path, shapes, fps=fps or frame_rate(spacing), tube=tube, **given) as writer:
+        revolved = Revolution(reader.curves, first, revolve) if revolve else None
+        shapes = revolved.shapes if revolved else shapes
+        options = {"obstacles": reader.obstacles, "touching": reader.touching if reader.contacts is not None else None}
+        options = {} if revolved else options | {"attributes": reader.attributes}
+        with CurvesWriter(path, shapes, fps=fps or frame_rate(spacing), tube=tube, **options) as writer:
             shape = (worlds, reader.points.shape[-2])
             for frame, time in enumerate(reader.time):
                 points = reader.points[frame].reshape(-1, 3)
-                if turned:
-                    writer.write(time, turned.points(points[:count]))
+                if revolved:
+                    writer.write(time, revolved.points(points[:count]))
                     continue
                 velocities = None if reader.velocities is None else reader.velocities[frame].reshape(-1, 3)
                 directors = (
@@ -455,11 +455,11 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
 
 
 def frame_rate(dt: float) -> float:
-    """Time codes per second, one a frame of dt [s]: to nine digits, so that frames have whole numbers."""
+    """Return time codes per second, one a frame of dt [s], to nine digits for integer time codes."""
     return float(f"{1.0 / max(dt, LEAST_DT):.9g}")
 
 
 def _fps_of(model, every: int) -> float:
-    """One time code a frame where the scene's analysis has a time step."""
+    """Return the frame rate of the scene's time step, or the default."""
     dt = getattr(getattr(model.scene, "analysis", None), "dt", None)
     return frame_rate(every * dt) if dt else DEFAULT_FPS

@@ -1,4 +1,4 @@
-"""The directory of a run: who writes to it, and whether it holds frames that a new run would destroy."""
+"""Directory of a run: lock it for one writer, and protect recorded frames from a new run."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from pathlib import Path
 from ddg_warp.errors import DataError, SceneError
 
 TRAJECTORY, SCENE, SUMMARY, LOCK = "trajectory.h5", "scene.usdc", "summary.json", "run.lock"
-VIEW = "trajectory.vtkhdf"  # the trajectory by the name that ParaView knows
+VIEW = "trajectory.vtkhdf"  # name of the trajectory for ParaView
 PICTURES = ("picture.png", "path.png", "learned.png")
 
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what a disk may come to while a run writes to it
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a full or failing disk during a run
 
 
 class RecordError(DataError, OSError):
-    """A run could not be written to its disk; what was complete is kept."""
+    """Failure to write a run to disk; complete blocks are kept."""
 
 
 class TakenError(RecordError, FileExistsError):
-    """A directory cannot be given to a run: there is a run, another process or a file."""
+    """Refusal of a directory: a run, another process or a file is in it."""
 
 
 def told(path, error: OSError, kept: str = "") -> RecordError:
-    """What is the matter with a place that cannot be written to, and what to do.
+    """Return an error that names the path, the reason and a remedy.
 
     Args:
-        path: The place, as it was given.
-        error: What the system says.
-        kept: What is said between both.
+        path: The path as given by the user.
+        error: The error of the system.
+        kept: Text between reason and remedy, such as which data are kept.
     """
     reason = error.strerror or str(error)
     if error.errno in FULL:
@@ -64,18 +64,18 @@ def _is_somewhere() -> bool:
 
 
 class RunDirectory(os.PathLike):
-    """A directory that one process at a time writes runs to, for as long as the object is open.
+    """Directory of runs, locked for one process as long as the object is open.
 
-    A process that ends, however it does, holds no directory. Whoever holds one may hand it on in the place of a path: a `Recorder`
-    of a `RunDirectory` leaves it held when it closes.
+    The end of a process releases the lock in any case. A `RunDirectory` can be passed on instead of a path: a `Recorder` leaves it
+    locked when it closes.
 
     Args:
-        path: The directory; made if there is none, and removed at the end of a `with` that has put nothing into it.
+        path: The directory; made if there is none, and removed at the end of a `with` if new and empty.
 
     Raises:
-        SceneError: It is no path.
-        TakenError: Another process, or another recorder of this one, holds the directory, or the path is a file.
-        RecordError: It cannot be made or written to.
+        SceneError: The argument is no path.
+        TakenError: Another process, or another recorder of this one, has locked the directory, or the path is a file.
+        RecordError: The directory cannot be made or written to.
     """
 
     def __init__(self, path):
@@ -91,9 +91,9 @@ class RunDirectory(os.PathLike):
             raise
         except (FileExistsError, NotADirectoryError) as error:
             files = [each for each in (self.path, *self.path.parents) if os.path.lexists(each) and not each.is_dir()]
-            what = "a link that leads nowhere" if files[0].is_symlink() else "a file"
+            kind = "a link that leads nowhere" if files[0].is_symlink() else "a file"
             raise TakenError(
-                f"{self.path}: {files[0]} is {what}, and a run is recorded in a directory of its own; give another one (--out DIR), "
+                f"{self.path}: {files[0]} is {kind}, and a run is recorded in a directory of its own; give another one (--out DIR), "
                 "or move it away"
             ) from error
         except OSError as error:
@@ -108,16 +108,16 @@ class RunDirectory(os.PathLike):
     def __exit__(self, *_) -> None:
         self.close()
         if self._made:
-            with suppress(OSError):  # where there is something in it
+            with suppress(OSError):  # not empty
                 self.path.rmdir()
 
     def clear(self, *kept: str) -> None:
-        """Removes what an earlier run has left, but for the files that the new one has begun already."""
+        """Remove the files of an earlier run, except names in `kept`."""
         for name in {TRAJECTORY, VIEW, SCENE, SUMMARY, *PICTURES} - {*kept}:
             (self.path / name).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Lets other processes in; a second call does nothing."""
+        """Release the lock; a second call does nothing."""
         if self._lock is not None:
             (self.path / LOCK).unlink(missing_ok=True)
             os.close(self._lock)  # which unlocks it
@@ -125,10 +125,12 @@ class RunDirectory(os.PathLike):
 
 
 def lock_directory(directory: Path) -> int:
-    """Descriptor of the lock of a directory, held until it is closed: a process that ends, however it does, holds none.
+    """Lock a directory; return the descriptor of the lock.
+
+    Closing the descriptor, also by the end of the process, releases the lock.
 
     Raises:
-        TakenError: Another process, or another recorder of this one, holds it, or its name is taken by something else.
+        TakenError: Another process, or another recorder of this one, has locked it, or the name of the lock is no file.
     """
     path = directory / LOCK
     while True:
@@ -137,8 +139,8 @@ def lock_directory(directory: Path) -> int:
         except OSError as error:
             if error.errno not in (errno.ELOOP, errno.EISDIR):
                 raise
-            what = "a link" if error.errno == errno.ELOOP else "a directory"
-            raise TakenError(f"{path} is {what}, and no lock of a run; remove it") from None
+            kind = "a link" if error.errno == errno.ELOOP else "a directory"
+            raise TakenError(f"{path} is {kind}, and no lock of a run; remove it") from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if path.exists() and os.path.samestat(os.fstat(lock), os.lstat(path)):
@@ -159,7 +161,7 @@ def lock_directory(directory: Path) -> int:
 
 
 def refuse_to_replace(directory: Path) -> None:
-    """Raises a TakenError where a directory holds frames of a run."""
+    """Raise a TakenError if a directory has frames of a run."""
     from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 
     path = directory / TRAJECTORY

@@ -1,4 +1,4 @@
-"""Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
+"""Run and record the analysis of a scene. The loop is short on purpose: copy it for variants."""
 
 import os
 import time
@@ -21,33 +21,32 @@ from ddg_warp.run.progress import progress_bar
 from ddg_warp.scene.descriptions import Dynamics, Statics
 from ddg_warp.scene.scene import Scene
 
-MOST_STEPS = 2**53  # that are told apart
+MOST_STEPS = 2**53  # consecutive integers that floats distinguish
 
 
 @dataclass(repr=False)
 class Result:
-    """What a run leaves behind; `check(result)` of a scene judges it.
+    """Result of a run, tested by `check(result)` of a scene.
+
+    Values of a resumed run are of the whole run, unless stated otherwise.
 
     Attributes:
-        scene: The scene that was run.
-        model: Its model.
+        scene: The scene.
+        model: The model.
         state: The last good state.
-        times: Time of each recorded state [s], the initial one first; in statics, the load
-            parameter; along a path, the arc length.
+        times: Time of each recorded state [s], the initial one first. In statics the load parameter, along a path the arc length.
         series: Observed values by name, one a recorded state.
-        statistics: `integrator.statistics()`, and the like of a static run; of a resumed run from its first state on.
-        energies: Energies by term [J] at "start" and "end"; None at the start of a run whose counts are not known from there on.
+        statistics: `integrator.statistics()`, or the like of a static run.
+        energies: Energies by term [J] at "start" and "end"; None at the start if `counted_from` is set.
         dt: Time step [s]; None in statics.
-        step_times: Time that each step of this run took [s], by the clock of the run; the first includes compilation. Of a resumed
-            run, of the steps since it was resumed.
-        wall_time: Time from the scene to the end [s]; of a resumed run, of all its parts.
-        compile_time: Time from the scene to the end of the first step, less a steady step [s]; of a resumed run, of all its parts.
-        counted_from: Time [s] from which statistics and times count, where they are not known from the first state on: the run was
-            resumed from a file that does not have them.
-        failure: Why the run ended early; empty where it did not.
+        step_times: Time of each step since the start or resumption [s], by the clock of the run; the first includes compilation.
+        wall_time: Time from the scene to the end [s].
+        compile_time: Time from the scene to the end of the first step, less a steady step [s].
+        counted_from: Time [s] from which statistics and times count, if the run was resumed from a file without counters.
+        failure: Reason of an early end, or "".
         outcome: "converged", or the name of the outcome that ended the run early.
-        path: The path of equilibria that was followed, if that was the analysis (`ddg_warp.scene.path.Path`).
-        learned: What the scene's check learned from the run, for its plot; None where it learns nothing.
+        path: Followed path of equilibria (`ddg_warp.scene.path.Path`), if that was the analysis.
+        learned: Data that the scene's check learned from the run, for its plot; None without.
     """
 
     scene: Scene
@@ -74,17 +73,17 @@ class Result:
         return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
 
     def fail(self, error: SolverError, said: str = "") -> None:
-        """Notes that, and by which outcome, the run ended early."""
+        """Store failure and outcome of an early end."""
         self.failure, self.outcome = f"{said}{error}", error.outcome or "failed"
 
     @property
     def seconds_per_step(self) -> float:
-        """Mean time of a step [s]; without the first two, which compile and capture, unless there are no others."""
+        """Mean time of a step [s], if possible without the first two, which compile and capture."""
         steady = self.step_times[2:] or self.step_times
         return sum(steady) / len(steady) if steady else 0.0
 
     def at(self, t: float, name: str) -> float:
-        """Observed value `name` of the recorded state at time t [s], to a thousandth of a step.
+        """Return the observed value `name` at time t [s], to a thousandth of a step.
 
         Raises:
             KeyError: No state was recorded at that time.
@@ -95,7 +94,7 @@ class Result:
         return self.series[name][index]
 
     def reached(self, t: float) -> bool:
-        """Whether a state was recorded at time t [s]."""
+        """Return True if a state was recorded at time t [s]."""
         return self._index(t) is not None
 
     def _index(self, t: float) -> int | None:
@@ -127,31 +126,31 @@ def simulate(
     """Run the analysis of a scene.
 
     Args:
-        scene: What to run.
+        scene: The scene.
         device: Warp device; by default CUDA if there is one.
-        precision: "float64", "mixed" or "float32"; by default the scene's, else what suits the device.
+        precision: "float64", "mixed" or "float32"; by default the scene's, else by device.
         worlds: Independent copies.
         out: Directory for trajectory.h5 and scene.usdc, or a `RunDirectory`; None records nothing.
         dt: Time step [s] instead of the scene's.
-        duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
-        resume: Directory of an earlier run, which this one continues with its time step, precision, worlds and fields. Nothing is
-            done or written where it has reached its end: then the result is that of the run as it was recorded.
-        force: Whether to replace a run that `out` holds already.
-        fields: What to record beside positions: "velocities", "directors", "contacts" and the names of `ddg_warp.ask.fields`.
+        duration: End of the run [s] instead of the scene's or the resumed run's.
+        resume: Directory of an earlier run to continue, with its time step, precision, worlds and fields. A finished run is not
+            stepped or written: the result is as recorded.
+        force: Whether to replace a run in `out`.
+        fields: Fields to record in addition to positions: "velocities", "directors", "contacts" and names of `ddg_warp.ask.fields`.
         usd: Whether to record scene.usdc, too.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
-        options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol, in place of the scene's, and others.
-        clock: Clock of `step_times` [s]; by default wall time, of finished work on CUDA.
-        progress: Whether to say how far the run is: a bar on a terminal, a line every ten seconds elsewhere.
+        options: Keyword arguments of the `Integrator` or of `StaticsOptions`: rtol, instead of the scene's, and others.
+        clock: Clock of `step_times` [s]; by default wall time, synchronised on CUDA.
+        progress: Whether to show progress: a bar on a terminal, a line every ten seconds elsewhere.
 
     Returns:
-        The result; `failure` says why where the run ended early.
+        The result, with `failure` if the run ended early.
 
     Raises:
-        SceneError: The scene cannot be built, or an argument is no such argument.
-        InputError: The duration is no whole number of steps, a static scene is to move, or the run to resume is another one, or
-            has gone on for longer.
+        SceneError: The scene cannot be built, or an argument is invalid.
+        InputError: The duration is no whole number of steps, or the scene is static but has a time step. Or the run to resume has
+            other settings or is longer.
     """
     began = time.perf_counter()
     if not isinstance(scene, Scene):
@@ -190,7 +189,7 @@ def simulate(
     result = Result(scene, model, model.state(), dt=dt)
     if scene.initial:
         try:
-            result.state = scene.initial(model)  # which may set parameters, of a resumed run, too
+            result.state = scene.initial(model)  # may set parameters, hence also in a resumed run
         except SolverError as error:
             result.fail(error, "the first state could not be found: ")
             return result
@@ -200,12 +199,12 @@ def simulate(
     counted: Callable[[], dict[str, np.ndarray]] | None = None
 
     def clocks() -> dict[str, float]:
-        """Wall time so far, and of it that of building and compiling [s], of all parts of the run."""
-        own = max(0.0, result.compile_time - result.seconds_per_step)
-        return {"wall": earlier["wall"] + time.perf_counter() - began, "compile": earlier["compile"] + own}
+        """Return wall time and compile time so far [s], resumptions included."""
+        compiled = max(0.0, result.compile_time - result.seconds_per_step)
+        return {"wall": earlier["wall"] + time.perf_counter() - began, "compile": earlier["compile"] + compiled}
 
     def tallied() -> dict[str, np.ndarray]:
-        """What the run has counted so far, to be kept with a checkpoint; nothing where that is not known from its start on."""
+        """Return the counters of the run for a checkpoint; {} if unknown since the start."""
         if counted is None or result.counted_from is not None:
             return {}
         start = {f"energy/{name}": np.array(value) for name, value in result.energies["start"].items()}
@@ -215,40 +214,40 @@ def simulate(
     with ExitStack() as stack:
         recorder = None
         if resume is not None and done >= steps:
-            progress = False  # nor is there anything to record
+            progress = False  # and nothing to record
         elif out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
             attributes |= {"duration": duration} if dynamic else {}
-            given = {"provenance": attributes, "force": force, "fields": fields, "usd": usd, "counts": tallied}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, **given))
+            keywords = {"provenance": attributes, "force": force, "fields": fields, "usd": usd, "counts": tallied}
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, **keywords))
         if resume is not None:
-            for callback in scene.callbacks:  # parameters that they set by the time are what they were
+            for callback in scene.callbacks:  # restore parameters that depend on time
                 callback(result.state)
         else:
             result.energies["start"] = energies(model, result.state)
         if recorder is not None and dynamic:
-            options.setdefault("check_every", 1)  # recording waits for every step as it is
+            options.setdefault("check_every", 1)  # recording synchronises every step anyway
         bar = stack.enter_context(progress_bar(steps, done, progress))
 
         def keep(state, observed: Mapping | None = None, counts: Callable | None = None) -> None:
-            """Take note of a state, of what was observed of it, and of what `counts()` returns."""
+            """Record a state, with observed values and the counters of `counts()`."""
             nonlocal counted
             counted = counts
             if len(result.step_times) == 1:
                 result.compile_time = time.perf_counter() - began
                 bar.set_description(refresh=False)
-            found = dict(observed or {}) | checked_observed(None if observe is None else observe(model, state))
-            found = checked_observed(found, result.series.keys() if result.times else None)
+            values = dict(observed or {}) | checked_observed(None if observe is None else observe(model, state))
+            values = checked_observed(values, result.series.keys() if result.times else None)
             result.state = state
             result.times.append(float(state.time))
-            for name, value in found.items():
+            for name, value in values.items():
                 result.series.setdefault(name, []).append(value)
             if recorder is not None:
-                recorder.record(state, observed=found)
+                recorder.record(state, observed=values)
 
         try:
-            given = {"options": options, "clock": clock or wall_clock(model.device), "bar": bar}
-            run(result, steps, keep, **given, **({"counts": counts} if dynamic else {}))
+            keywords = {"options": options, "clock": clock or wall_clock(model.device), "bar": bar}
+            run(result, steps, keep, **keywords, **({"counts": counts} if dynamic else {}))
         except SolverError as error:
             result.fail(error)
             result.state = error.state if error.state is not None else result.state
@@ -258,7 +257,7 @@ def simulate(
 
 
 def _judge(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
-    """Raises an error that names an argument of `simulate` which is no such argument."""
+    """Raise an error that names the first invalid argument of `simulate`."""
     arguments.count("worlds", worlds)
     for name, value in flags.items():
         arguments.flag(name, value)
@@ -279,17 +278,17 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`.
 
     Args:
-        result: Of the run so far.
-        steps: Of the whole run.
+        result: Result so far.
+        steps: Number of steps of the whole run.
         keep, options, clock, bar: See `simulate`.
-        counts: What the run has counted so far, where it goes on; see `counts_of`.
+        counts: Counters of a resumed run, see `counts_of`.
     """
     from ddg_warp.run.counts import counts_of, go_on, statistics
     from ddg_warp.solve.dynamics import Integrator
 
     analysis = result.scene.analysis
-    given = {name: getattr(analysis, name) for name in ("scheme", "rtol", "outliers")}
-    integrator = Integrator(result.model, **given | options)
+    settings = {name: getattr(analysis, name) for name in ("scheme", "rtol", "outliers")}
+    integrator = Integrator(result.model, **settings | options)
     counted = partial(counts_of, integrator)
     if not result.times:
         keep(result.state, counts=counted)
@@ -307,7 +306,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
 
 
 def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
-    """Load step by step and `keep` each equilibrium."""
+    """Solve all load steps and `keep` each equilibrium."""
     from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
     keep(result.state)
@@ -333,7 +332,7 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
 
 
 def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
-    """Follow the path of equilibria and `keep` each point, with its load parameter and what is watched."""
+    """Follow the path of equilibria and `keep` each point, with load parameter and watched values."""
     from ddg_warp.solve.continuation import Continuation
 
     analysis, started, continuation = result.scene.analysis, clock(), None
@@ -356,15 +355,15 @@ def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, cloc
         iterations = [point.iterations for point in points]
         newton = {"mean": sum(iterations) / max(1, len(iterations)), "max": max(iterations, default=0)}
         outcomes = dict(Counter(point.kind for point in points))
-        touched = continuation.statistics(points) if continuation else {}
-        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": outcomes, **touched}
+        contact = continuation.statistics(points) if continuation else {}
+        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": outcomes, **contact}
 
 
 def step_count(dt: float, duration: float) -> int:
-    """Steps of dt [s] in `duration` [s].
+    """Return the number of steps of dt [s] in `duration` [s].
 
     Raises:
-        InputError: One of them is not positive, or they do not fit.
+        InputError: A value is not positive, or the number is not whole.
     """
     for value in (dt, duration):
         number = isinstance(value, Real) and not isinstance(value, bool)
@@ -379,14 +378,14 @@ def step_count(dt: float, duration: float) -> int:
 
 
 def settings_to_resume(directory: Path, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Time step [s], precision, worlds and end [s] of the run in a directory.
+    """Return time step [s], precision, worlds and end [s] of the run in a directory.
 
     Args:
-        directory: Where it was recorded.
-        asked: Of these and of its fields what it is to go on with, by name; None for what it has.
+        directory: Directory of the run.
+        asked: Requested settings and fields by name; None for the recorded ones.
 
     Raises:
-        InputError: The directory holds no run, or one with other settings than those asked for.
+        InputError: The directory has no run, or one with other settings than requested.
     """
     from ddg_warp.io.hdf5 import TrajectoryReader
 
@@ -401,21 +400,23 @@ def settings_to_resume(directory: Path, asked: Mapping[str, Any] | None = None) 
     settings = {name: stored[name] for name in (*RUN_SETTINGS, "duration") if name in stored}
     recorded = {name for name in fields if name not in ("points", "obstacle_points") and "/" not in name}
     for name, value in (asked or {}).items():
-        found = settings.get(name, recorded)
-        if value is not None and value != found:
-            found = ", ".join(sorted(recorded)) or "none" if name == "fields" else found
-            raise InputError(f"the run in {directory} has {name} = {found}; resume it with these, not with others")
+        recorded_value = settings.get(name, recorded)
+        if value is not None and value != recorded_value:
+            recorded_value = ", ".join(sorted(recorded)) or "none" if name == "fields" else recorded_value
+            raise InputError(
+                f"the run in {directory} has {name} = {recorded_value}; resume it with these, not with others"
+            )
     return settings
 
 
 def continue_from(result: Result, directory: Path, duration: float) -> dict[str, np.ndarray]:
-    """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result.
+    """Restore checkpoint and observed values of the run in `directory` to a new result.
 
     Returns:
-        What the run has counted up to there, for `advance`; empty where the file does not have it.
+        Counters of the run for `advance`; {} if the file has none.
 
     Raises:
-        InputError: It has gone on beyond `duration` [s].
+        InputError: The run is longer than `duration` [s].
     """
     from ddg_warp.io.hdf5 import TrajectoryReader
 
@@ -439,11 +440,11 @@ def continue_from(result: Result, directory: Path, duration: float) -> dict[str,
 
 
 def open_recorder(model, out, resume, dt, *, provenance, fields, **options):
-    """The recorder of a run in `out`, or of the run that it resumes."""
+    """Return the recorder of a run in `out`, or of the run to resume."""
     from ddg_warp.run.record import Recorder, frame_rate
 
     again = resume is not None
-    if again:  # where it comes from stays what it was
+    if again:  # provenance stays, except the duration
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
     asked = {name: name in fields for name in ("velocities", "directors", "contacts")}
     fields = [name for name in fields if name not in asked]
@@ -452,7 +453,7 @@ def open_recorder(model, out, resume, dt, *, provenance, fields, **options):
 
 
 def wall_clock(device: str) -> Callable[[], float]:
-    """Wall time [s], read once the device has finished what it was given."""
+    """Return a clock of wall time [s] that synchronises the device first."""
     import warp as wp
 
     if not wp.get_device(device).is_cuda:
@@ -466,6 +467,6 @@ def wall_clock(device: str) -> Callable[[], float]:
 
 
 def energies(model, state) -> dict[str, float]:
-    """Energies by term and their total [J]; lists of one a world where there are several."""
+    """Return energies by term and in total [J]; one value a world if there are several."""
     terms = model.energies(state)
     return {**terms, "total": sum(terms.values())}

@@ -1,4 +1,4 @@
-"""What a run says at its end: summary.json, and the same in a few lines on the terminal."""
+"""Summary of a run: summary.json, and its tables for the terminal."""
 
 import csv
 import json
@@ -17,12 +17,13 @@ PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matp
 
 
 def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
-    """The content of summary.json.
+    """Return the content of summary.json.
 
-    `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked); `contact`, its law and
-    `statistics()["contact"]` of the integrator or the search for equilibria, only of scenes with contact. All is of the whole run,
-    however often it was resumed, but `ms_per_step`, which is of its last part; where the file of a resumed run does not say what was
-    counted before, `counted_from` is the time [s] from which counts and times are, and the energy at the start is null.
+    Optional entries: `failure` if the solver failed, `stable` for equilibria (null: not tested), `contact` for scenes with contact
+    (law and `statistics()["contact"]` of the integrator or static solver).
+
+    All entries are of the whole run, resumptions included, except `ms_per_step`, which is of the run since the last one. If the file
+    of a resumed run has no counters, counts and times begin at `counted_from` [s], and the energy at the start is null.
     """
     statistics = result.statistics
     content = {
@@ -52,7 +53,7 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
 
 
 def contact_line(contact: Mapping) -> str:
-    """The entry `contact` of a summary in a line."""
+    """Return the entry `contact` of a summary as a line."""
     pairs, gap = contact["contacts"], contact["smallest_gap"]
     said = [
         f"contact by {contact['law']}: {pairs['last']} pairs at the end, {pairs['mean']:.3g} in the mean",
@@ -66,10 +67,10 @@ def contact_line(contact: Mapping) -> str:
 
 
 def write_json(path: str | Path, content) -> None:
-    """Write JSON in one piece: a reader finds the old file or the new one. Numbers that are not finite become null.
+    """Write JSON atomically: a reader finds the old file or the new one. Numbers that are not finite become null.
 
     Raises:
-        RecordError: It cannot be written there.
+        RecordError: The file cannot be written.
     """
     path = Path(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
@@ -88,7 +89,7 @@ def write_json(path: str | Path, content) -> None:
 
 
 def write_table(stem: Path, rows: list[Mapping], origin: Mapping) -> None:
-    """Rows as STEM.csv, and with where they come from as STEM.json."""
+    """Write rows to STEM.csv, and with `origin` to STEM.json."""
     write_json(stem.with_suffix(".json"), {**origin, "rows": rows})
     with open(stem.with_suffix(".csv"), "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -97,7 +98,7 @@ def write_table(stem: Path, rows: list[Mapping], origin: Mapping) -> None:
 
 
 def plain(value):
-    """A value made of what JSON knows."""
+    """Convert a value to JSON types; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):  # NumPy arrays and scalars
@@ -110,7 +111,7 @@ def plain(value):
 
 
 def table(rows: list[Mapping]) -> str:
-    """Rows as text in aligned columns, headed by the keys of the first."""
+    """Format rows as text in aligned columns, headed by the keys of the first."""
     if not rows:
         return ""
     columns = list(rows[0])
@@ -121,7 +122,7 @@ def table(rows: list[Mapping]) -> str:
 
 
 def checks_table(checks: Iterable) -> str:
-    """The checks of a scene as a table."""
+    """Format the checks of a scene as a table."""
     return table(
         [
             {
@@ -140,12 +141,12 @@ def checks_table(checks: Iterable) -> str:
 
 
 def machine(commit: str = "") -> dict:
-    """Where results are made: versions, processor, devices and the git commit (or that given), as far as they can be known."""
+    """Return versions, processor, devices and git commit (default: of the source tree)."""
     import warp as wp
 
     return {
         "python": platform.python_version(),
-        "versions": {name: found for name in PACKAGES if (found := _version(name))},
+        "versions": {name: text for name in PACKAGES if (text := _version(name))},
         "system": platform.platform(),
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -174,7 +175,7 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    """Commit of the source tree, with a mark where files differ from it; empty outside of a git checkout."""
+    """Return the commit of the source tree, marked "-dirty" if files differ; empty outside of a git checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
