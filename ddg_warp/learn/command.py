@@ -1,4 +1,4 @@
-"""From the command line: `ddg-warp sweep SCENE`, a scene over ranges of its parameters, and `ddg-warp gradients`, their table."""
+"""Command line: `ddg-warp sweep SCENE` runs a scene over ranges of parameters; `ddg-warp gradients` tabulates gradient checks."""
 
 import argparse
 import inspect
@@ -17,22 +17,22 @@ FLAGS = (
     "workers",
     "ray",
     "gpus",
-)  # a scene's parameter of such a name has a range only
+)  # a scene parameter with one of these names can only be given by --range
 
 
 class Once(argparse.Action):
-    """Store the value of a flag, and refuse the flag where it is given again."""
+    """Action that stores the value of a flag and refuses a repeated flag."""
 
     def __call__(self, parser, namespace, values, option_string=None):
-        given = namespace.__dict__.setdefault("_once", set())
-        if self.dest in given:
+        given_flags = namespace.__dict__.setdefault("_once", set())
+        if self.dest in given_flags:
             raise argparse.ArgumentError(self, "is given twice; give it once")
-        given.add(self.dest)
+        given_flags.add(self.dest)
         setattr(namespace, self.dest, values)
 
 
 def add_flags(command: argparse.ArgumentParser) -> None:
-    """Add the flags of `sweep`; those of the scene give values that all samples share."""
+    """Add the flags of `sweep`; flags of the scene give values common to all samples."""
     command.register("action", None, Once)
     command.add_argument("scene", metavar="SCENE", help="a scene of `ddg-warp list`, or a Python file; comes first")
     command.add_argument(
@@ -55,22 +55,24 @@ def add_flags(command: argparse.ArgumentParser) -> None:
 
 
 def sweep_scene(chosen: argparse.Namespace) -> int:
-    """`sweep`: run the samples, or those that are left of them; fails where every sample failed."""
+    """Run the samples of `sweep` that are not recorded yet; fail if every sample failed."""
     from ddg_warp.learn.sweep import OPTIONS, SweepError, sweep
     from ddg_warp.run.cli import DONE, FAILED, require_device
 
     module, name = load_scene(chosen.scene), scene_name(chosen.scene)
     require_device(chosen.device)
-    asked = {key: value for key, value in vars(chosen).items() if value is not None}
-    options = {key: asked[key] for key in OPTIONS if key in asked}
+    requested = {key: value for key, value in vars(chosen).items() if value is not None}
+    options = {key: requested[key] for key in OPTIONS if key in requested}
     if "fields" in options:
         options["fields"] = [field for field in chosen.fields.split(",") if field]
-    known = inspect.signature(module.build, eval_str=True).parameters
-    ranges = {key: asked[key] for key in parameters(module, {}) if key in asked and key not in (*FLAGS, *SHARED)}
+    signature = inspect.signature(module.build, eval_str=True).parameters
+    ranges = {
+        key: requested[key] for key in parameters(module, {}) if key in requested and key not in (*FLAGS, *SHARED)
+    }
     directory = chosen.out or Path("out/sweep") / name
     with refused():
         for text in chosen.range:
-            key, range_ = _named(text, known)
+            key, range_ = _named(text, signature)
             if key in ranges or key in options:
                 raise InputError(f"--range {text}: {key} is given twice; give it once")
             ranges[key] = range_
@@ -81,7 +83,7 @@ def sweep_scene(chosen: argparse.Namespace) -> int:
                 chosen.samples,
                 out=directory,
                 options=options,
-                **{key: asked[key] for key in ("design", "seed", "workers", "ray", "gpus") if key in asked},
+                **{key: requested[key] for key in ("design", "seed", "workers", "ray", "gpus") if key in requested},
             )
         except ModuleNotFoundError as error:
             if error.name != "ray":
@@ -111,7 +113,7 @@ def add_objects(command: argparse.ArgumentParser) -> None:
 
 
 def gradients_table(chosen: argparse.Namespace) -> int:
-    """`gradients`: which inputs of which objects have gradients; fails where one is wrong, or zero without a reason."""
+    """Print the table of gradient checks; fail if a gradient is wrong, or zero without a reason."""
     from ddg_warp.run.cli import DONE, FAILED, require_device
     from ddg_warp.run.summary import machine, table, write_table
 
@@ -122,27 +124,30 @@ def gradients_table(chosen: argparse.Namespace) -> int:
         if error.name != "torch":
             raise
         raise InputError("gradients needs torch; pip install 'ddg-warp[torch]'") from error
-    asked = {"objects": (chosen.objects, gradients.OBJECTS), "--analysis": (chosen.analysis or [], gradients.ANALYSES)}
-    for what, (names, known) in asked.items():
+    requested = {
+        "objects": (chosen.objects, gradients.OBJECTS),
+        "--analysis": (chosen.analysis or [], gradients.ANALYSES),
+    }
+    for option, (names, choices) in requested.items():
         for name in names:
-            if name not in known:
-                raise InputError(f"gradients: {what}: there is no {name!r}; there are {', '.join(known)}")
+            if name not in choices:
+                raise InputError(f"gradients: {option}: there is no {name!r}; there are {', '.join(choices)}")
             if names.count(name) > 1:
-                raise InputError(f"gradients: {what}: {name!r} is named twice; name it once")
-    objects, analyses = (names or known for names, known in asked.values())
+                raise InputError(f"gradients: {option}: {name!r} is named twice; name it once")
+    objects, analyses = (names or choices for names, choices in requested.values())
     rows = list(gradients.table(objects, analyses, chosen.device))
     print(table(gradients.gathered(rows)))
     if chosen.out:
         write_table(chosen.out, rows, {"command": "ddg-warp gradients", "machine": machine()})
-    bad = [row for row in rows if row["result"] in (gradients.WRONG, gradients.SILENT)]
+    faulty = [row for row in rows if row["result"] in (gradients.WRONG, gradients.SILENT)]
     print(
-        f"{len(rows)} gradients: {len(bad)} wrong; {sum(row['result'] == gradients.REFUSED for row in rows)} refused by name"
+        f"{len(rows)} gradients: {len(faulty)} wrong; {sum(row['result'] == gradients.REFUSED for row in rows)} refused by name"
     )
-    return FAILED if bad else DONE
+    return FAILED if faulty else DONE
 
 
-def _named(text: str, known: Mapping) -> tuple:
-    """Name and range of a `--range`, of one of the `known` parameters."""
+def _named(text: str, signature: Mapping) -> tuple:
+    """Return name and range of a `--range` argument; `signature` maps parameter names to their signatures."""
     from ddg_warp.learn.ranges import parsed
 
     name, sign, range_ = text.partition("=")
@@ -150,4 +155,4 @@ def _named(text: str, known: Mapping) -> tuple:
     if not sign or not name or not range_.strip():
         raise InputError(f"--range {text}: it is NAME=LOW:HIGH, NAME=LOW:HIGH:log, or NAME=A,B,C")
     with refused(f"--range {text}: "):
-        return name, parsed(range_, known[name].annotation if name in known else None)
+        return name, parsed(range_, signature[name].annotation if name in signature else None)

@@ -1,22 +1,22 @@
-"""Masses, rotary inertia, coefficients of drag and numbers of contact as parameters by name.
+"""Named parameters outside terms: masses, rotary inertia, drag coefficients and contact parameters.
 
-    "rod.mass"       [kg] of the points of all rods, with what `Scene.add_mass` has added there
+    "rod.mass"       [kg] of the points of all rods, including point masses of `Scene.add_mass`
     "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
     "shell.mass"     [kg] of the vertices of all shells, "meridian.mass" of the nodes of all shells of revolution
     "drag.tangential", "drag.normal" [N s/m^2], "drag.rotational" [N s]
-                     of the edges of rods with such drag, per length; the last of those with twist
+                     of the edges of rods with viscous drag, per length; rotational drag of those with twist
     "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
                      of the edges of rods in a granular medium
     "drag.first", "drag.last" [N s/m]
-                     of bodies at the first and at the last node of the edges of rods with drag; `Scene.drag(nodes=...)` gives
-                     those of a node to the edge that starts there, and of the last node to the last edge
+                     of bodies at the first and at the last node of the edges of rods with drag; `Scene.drag(nodes=...)` assigns
+                     the coefficient of a node to the edge that starts there, that of the last node to the last edge
     "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
-                     between objects of two names, or of one, that may touch; the last in scenes with friction, by direction the
-                     smallest that is not zero, to which the others keep their ratios
+                     between objects of two names, or of one, that may come into contact. Friction exists in scenes with friction;
+                     if anisotropic it is the smallest nonzero coefficient, to which the others keep their ratios
     "contact.radius" [m] of rods and obstacles that have one, half thicknesses of shells and meshes
 
-What has numbers of contact, and in which order, `contact_places.contact_elements` tells. Points and edges are in the order of
-`State.points` and `State.angles`. Where several are one point of a net, its mass is the sum.
+`contact_places.contact_elements` lists the owners of contact parameters in order. Points and edges are in the order of `State.points`
+and `State.angles`. The mass of several points that are one node of the coupled system is the sum.
 """
 
 from collections.abc import Callable, Iterator
@@ -45,12 +45,12 @@ NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *contact_places.NAMES)
 SIGNED, POSITIVE = (
     ("drag.leading",),
     ("drag.slope", "drag.speed", "contact.range", "contact.radius"),
-)  # others are not negative
+)  # all others must be nonnegative
 
 
 @dataclass
 class _Part:
-    """What one part of a model has of a parameter: arguments of `ArrayPlace`, and the user's rows of its elements."""
+    """Storage of a parameter in one subsystem: arguments of `ArrayPlace`, and the user rows of its elements."""
 
     index: int
     chain: bool
@@ -65,12 +65,12 @@ class _Part:
 
 
 def elements(model, name: str) -> np.ndarray:
-    """Rows of `State.points`, or of `State.angles`, that have such a parameter, in their order (E,)."""
+    """Return the rows of `State.points`, or of `State.angles`, that have a parameter, in ascending order (E,)."""
     return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
 
 
 def array_places(model, name: str) -> tuple[int, list[ArrayPlace | contact_places.ContactPlace]]:
-    """How many elements have such a parameter, and where these are; none where the model has nothing of the kind."""
+    """Return the number of elements that have a parameter, and their storage; an empty list if the model has none."""
     if name in contact_places.NAMES:
         count = len(contact_places.contact_elements(model, name))
         return count, [contact_places.ContactPlace(model, name)] if count else []
@@ -97,18 +97,18 @@ def array_places(model, name: str) -> tuple[int, list[ArrayPlace | contact_place
 
 
 def of_sections(model, name: str) -> np.ndarray:
-    """What sections and thicknesses bring to masses of a name (E,) [kg]: what a density scales."""
+    """Return the masses (E,) [kg] that sections and thicknesses contribute under a name; they scale with density."""
     return point_masses(model)[0][_rows(model, name)]
 
 
 def _rows(model, name: str) -> slice:
-    """Rows of `State.points` with masses of a name."""
+    """Return the rows of `State.points` with masses of a name."""
     rings = model.order.meridian_rows
     return {"rod.mass": slice(0, rings.start), "meridian.mass": rings, "shell.mass": slice(rings.stop, None)}[name]
 
 
 def rule(name: str, usual: np.ndarray) -> tuple[str, Callable]:
-    """What values of a parameter are, in words, and whether numbers are that; `usual` are those of the model."""
+    """Return the rule for values of a parameter in words, and a function that tests values; `usual` are those of the model."""
     if name in SIGNED:
         return "a number", np.isfinite
     if name in POSITIVE or (name in MASSES and (usual > 0.0).all()):
@@ -214,13 +214,13 @@ def _drag(model, name: str) -> Iterator[_Part]:
             )
     if model.net is not None and model.net.host.drag:
         net, (_, angles, coefficients) = model.net, model.net.host.drag
-        places, rows, at = [np.zeros(0, int)], [np.zeros(0, int)], 0
+        places, rows, first_edge = [np.zeros(0, int)], [np.zeros(0, int)], 0
         for rod in net.host.rods:
             if rod.piece.kind.drag:
-                own = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
-                places.append(at + rod.first + own)
-                rows.append(model.order.edge_starts[rod.rod] + own)
-                at += len(rod.piece.drag[rod.row])
+                local_edges = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
+                places.append(first_edge + rod.first + local_edges)
+                rows.append(model.order.edge_starts[rod.rod] + local_edges)
+                first_edge += len(rod.piece.drag[rod.row])
         places, rows, shape = np.concatenate(places), np.concatenate(rows), (net.worlds, coefficients.shape[1], 1)
         chosen = ((coefficients[drag.SPEED, places] > 0.0) == granular) | (row in BODIES.values())
         if row == drag.ROTATIONAL:

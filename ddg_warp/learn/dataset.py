@@ -1,10 +1,9 @@
-"""Windows of recorded runs as a torch data set.
+"""Torch data set of windows of recorded runs.
 
     data = Recordings("data/pulls", window=16, stride=8, split="train")
     loader = torch.utils.data.DataLoader(data, batch_size=32, shuffle=True, num_workers=4)
 
-Files are opened where and when they are first read, by each worker for itself, forked or spawned: what is sent to a worker holds
-paths and numbers only.
+Every worker, forked or spawned, opens files itself at the first read; only paths and numbers are sent to workers.
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ from ddg_warp.learn.splits import SPLITS
 from ddg_warp.run.run_directory import TRAJECTORY
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-OPEN_FILES = 64  # of each worker, the last used
+OPEN_FILES = 64  # most recently used files that each worker keeps open
 VECTORS = ("points", "velocities", "directors")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file of windows.
+    """Recorded file, source of windows.
 
     Attributes:
         path: The file.
-        frames: Frames in it.
-        worlds: Independent copies in every frame, each of which gives windows of its own.
-        parameters: What the run was made of, by name.
+        frames: Number of frames.
+        worlds: Worlds in every frame; each yields windows of its own.
+        parameters: Parameters of the run by name.
     """
 
     path: Path
@@ -56,31 +55,31 @@ class Source:
 
 
 class Recordings(torch.utils.data.Dataset):
-    """Windows of frames of recorded runs, in the order of files, worlds and times.
+    """Windows of frames of recorded runs, ordered by file, world and time.
 
-    An item is a dict of tensors: `time` (W,) [s], each field as recorded, such as `points` (W, P, 3) [m], `velocities` (W, P, 3)
-    [m/s], `directors` (W, E, 3), fields of points (W, P) or triangles (W, T), observed values (W,); `parameters`, the numbers among the
-    parameters that all files have, each (); `file`, the place of its file in `sources`, and `world`. Files of rods with different
-    numbers of points give items that do not stack: collate them yourself, or make a data set of each.
+    An item is a dict of tensors. `time` is (W,) [s]. Fields are as recorded: `points` (W, P, 3) [m], `velocities` (W, P, 3) [m/s],
+    `directors` (W, E, 3), fields of points (W, P) or triangles (W, T), observed values (W,). `parameters` has each number () that
+    all files have, `file` is the index in `sources`, and `world` that of the world. Items of files whose rods have different
+    numbers of points do not stack: collate them yourself, or make a data set of each.
 
     Args:
-        paths: A folder of episodes (`ddg_warp.learn.episodes`), a directory of a run, a trajectory.h5, or several of them.
+        paths: A folder of episodes (`ddg_warp.learn.episodes`), a run directory, a trajectory.h5, or several of these.
         window: Frames in an item, W.
         stride: Recorded frames from the start of a window to that of the next.
         every: Recorded frames from one frame of a window to the next.
-        fields: What to read beside times: "points", "velocities", "directors", names of fields or of observed values.
+        fields: Data to read besides times: "points", "velocities", "directors", names of fields or of observed values.
         split: "train", "validation" or "test" of folders of episodes; None for all.
-        failed: Whether to read also episodes that ended early.
-        short: What becomes of a file with fewer frames than a window spans: "refuse" it, or "skip" it; `skipped` has their paths.
-        dtype: "float32" or "float64", in which everything is recorded.
-        outside: Whether files may lie outside of the folders given, where an index or links lead, and take data from others.
+        failed: True to read also episodes that ended early.
+        short: Treatment of files with fewer frames than a window spans: "refuse" or "skip"; `skipped` has their paths.
+        dtype: "float32" or "float64", the precision of all tensors.
+        outside: True if index entries or links may lead to files outside of the folders.
 
     Attributes:
-        sources: The files that are read, a list of `Source`.
+        sources: Files of the data set, a list of `Source`.
         skipped: Paths of files that are too short.
 
     Raises:
-        SceneError: An option is no such option.
+        SceneError: An option is invalid.
         DataError: There is nothing to read, a file is too short, or a field was not recorded.
         TrajectoryError: A file is damaged.
     """
@@ -115,25 +114,25 @@ class Recordings(torch.utils.data.Dataset):
         self._outside = outside
         arguments.choice("Recordings: short", short, ("refuse", "skip"))
         several = np.iterable(paths) and not isinstance(paths, str | bytes | os.PathLike)
-        given = [as_path("Recordings: paths", path) for path in (paths if several else [paths])]
-        if not given:
+        files = [as_path("Recordings: paths", path) for path in (paths if several else [paths])]
+        if not files:
             raise DataError(
                 "Recordings: paths are empty; give a folder of episodes, a directory of a run, or a trajectory.h5"
             )
-        found = [source for path in given for source in _sources(path, split, failed, outside)]
+        sources = [source for path in files for source in _sources(path, split, failed, outside)]
         span = (self.window - 1) * self.every + 1
-        self.skipped = [source.path for source in found if source.frames < span]
+        self.skipped = [source.path for source in sources if source.frames < span]
         if self.skipped and short == "refuse":
-            first = next(source for source in found if source.frames < span)
+            first = next(source for source in sources if source.frames < span)
             raise DataError(
                 f"{first.path} has {first.frames} frames, a window spans {span}: shorten the window, or leave out such files "
-                f"({len(self.skipped)} of {len(found)}) by short='skip'"
+                f"({len(self.skipped)} of {len(sources)}) by short='skip'"
             )
-        self.sources = [source for source in found if source.frames >= span]
+        self.sources = [source for source in sources if source.frames >= span]
         if not self.sources:
-            told = f"of the split {split!r} " if split else ""
+            of_split = f"of the split {split!r} " if split else ""
             raise DataError(
-                f"{paths}: there is no episode {told}with {span} frames to read; record some, or choose others"
+                f"{paths}: there is no episode {of_split}with {span} frames to read; record some, or choose others"
             )
         self._per_world = [(source.frames - span) // self.stride + 1 for source in self.sources]
         counts = (n * source.worlds for n, source in zip(self._per_world, self.sources, strict=True))
@@ -145,7 +144,7 @@ class Recordings(torch.utils.data.Dataset):
         self._readers: OrderedDict[int, TrajectoryReader] = OrderedDict()
         self._owner = os.getpid()
         self._reader(0)
-        self.close()  # for workers to fork from
+        self.close()  # workers fork from this process
 
     def __len__(self) -> int:
         return self._ends[-1]
@@ -154,59 +153,59 @@ class Recordings(torch.utils.data.Dataset):
         """Return a window.
 
         Raises:
-            SceneError: `index` is no whole number.
+            SceneError: `index` is not an integer.
             IndexError: There is no such window.
         """
-        place, world, start = self.place(index)
-        source, reader = self.sources[place], self._reader(place)
+        file, world, start = self.place(index)
+        source, reader = self.sources[file], self._reader(file)
         frames = slice(start, start + (self.window - 1) * self.every + 1, self.every)
         item = {"time": self._tensor(reader.time[frames])}
         for name in self.fields:
             item[name] = self._tensor(self._read(reader, source, name, frames, world))
         item["parameters"] = {name: self._tensor(source.parameters[name]) for name in self._parameters}
-        return item | {"file": place, "world": world}
+        return item | {"file": file, "world": world}
 
     def place(self, index: int) -> tuple[int, int, int]:
-        """Of an item the place of its file in `sources`, its world and its first frame.
+        """Return file index in `sources`, world and first frame of an item.
 
         Raises:
-            SceneError: `index` is no whole number.
+            SceneError: `index` is not an integer.
             IndexError: There is no such item.
         """
         index = arguments.index("Recordings: item", index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"item {index}: there are {len(self)} windows")
         index %= len(self)
-        place = bisect_right(self._ends, index)
-        index -= self._ends[place - 1] if place else 0
-        world, window = divmod(index, self._per_world[place])
-        return place, world, window * self.stride
+        file = bisect_right(self._ends, index)
+        index -= self._ends[file - 1] if file else 0
+        world, window = divmod(index, self._per_world[file])
+        return file, world, window * self.stride
 
     def __getstate__(self) -> dict:
         return vars(self) | {"_readers": OrderedDict()}
 
     def close(self) -> None:
-        """Closes the files that this process has open; they are opened again when they are read."""
+        """Close the files that this process has open; the next read opens them again."""
         if self._owner == os.getpid():
             for reader in self._readers.values():
                 reader.close()
         self._readers = OrderedDict()
 
-    def _reader(self, place: int) -> TrajectoryReader:
-        """The open file of a source, one of this process."""
+    def _reader(self, file: int) -> TrajectoryReader:
+        """Return the open file of a source in this process."""
         if self._owner != os.getpid():  # forked: the files of the parent are left to it
             self._readers, self._owner = OrderedDict(), os.getpid()
-        if place not in self._readers:
-            path = self.sources[place].path
-            reader = self._readers[place] = TrajectoryReader(path, outside=self._outside)
-            self._check_fields(reader, self.sources[place])
-        self._readers.move_to_end(place)
+        if file not in self._readers:
+            path = self.sources[file].path
+            reader = self._readers[file] = TrajectoryReader(path, outside=self._outside)
+            self._check_fields(reader, self.sources[file])
+        self._readers.move_to_end(file)
         if len(self._readers) > OPEN_FILES:
             self._readers.popitem(last=False)[1].close()
-        return self._readers[place]
+        return self._readers[file]
 
     def _check_fields(self, reader: TrajectoryReader, source: Source) -> None:
-        """Refuse a file that lacks fields, or has other frames or worlds than an index says."""
+        """Refuse a file that lacks fields, or whose frames or worlds differ from the index."""
         path, worlds = source.path, reader.points.shape[1] if reader.points.ndim == 4 else 1
         if len(reader) < source.frames or worlds != source.worlds:
             raise DataError(
@@ -220,25 +219,27 @@ class Recordings(torch.utils.data.Dataset):
                 raise DataError(f"{path}: {name!r} was not recorded; there is {', '.join(sorted(recorded))}")
 
     def _read(self, reader: TrajectoryReader, source: Source, name: str, frames: slice, world: int) -> np.ndarray:
-        """Frames of a field in one world."""
+        """Return frames of a field in one world."""
         if name in VECTORS:
             values = getattr(reader, name)[frames]
             return values[:, world] if values.ndim == 4 else values
         if name in reader.series:
             return reader.series[name][frames]
         values = reader.fields[name][frames]
-        if f"at_cells/{name}" in reader.recorded:  # behind the rods of all worlds, which have none
+        if (
+            f"at_cells/{name}" in reader.recorded
+        ):  # triangles follow the rods of all worlds, which are cells without values
             values = values[:, source.worlds * len(reader.counts) :]
         return values.reshape(len(values), source.worlds, -1)[:, world]
 
     def _tensor(self, values) -> torch.Tensor:
         return torch.tensor(
             values, dtype=DTYPES[self._dtype], device="cpu"
-        )  # as loaders hand on, whatever the default is
+        )  # on the CPU for data loaders, whatever the default device is
 
 
 def _sources(path: Path, split: str | None, failed: bool, outside: bool) -> list[Source]:
-    """The files of a path: of the episodes in a folder, or that of one run."""
+    """Return the files of a path: the episodes of a folder, or the trajectory of one run."""
     if is_file(path / INDEX):
         episodes = Episodes(path, outside=outside)
         return [

@@ -1,4 +1,4 @@
-"""Reverse of drag in the steps of a group of rods and of a net; see `kernels.adjoint.drag`."""
+"""VJP of drag in the steps of a rod group and of the coupled system; see `kernels.adjoint.drag`."""
 
 from types import SimpleNamespace
 
@@ -16,10 +16,10 @@ from ddg_warp.solve.net.system import lists
 
 
 class ChainDragAdjoint:
-    """Of a group of rods.
+    """VJP of drag on a rod group.
 
     Attributes:
-        by_coefficients: derivatives by the coefficients of edges (rows of `kernels.drag`, n, R), written by `pull`.
+        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.drag`, n, R), written by `pull`.
     """
 
     def __init__(self, model, group, midpoint: bool):
@@ -39,12 +39,12 @@ class ChainDragAdjoint:
         return [self._edges, self._nodes, *self.drag.kernels]
 
     def resist(self, before, tangents: wp.array, solver, islands) -> None:
-        """Write inertia and drag of a solve from the state `before` to a solver, with the tangents that it took; launches alone."""
+        """Write inertia and drag of a solve from the state `before` to a solver, with the tangents of that solve; launches only."""
         target = SimpleNamespace(x=tangents, mass=solver.mass, rotary=solver.rotary, target_angle=solver.target_angle)
         self.drag.resist(before, target, islands)
 
     def matrix(self, before, tangents: wp.array, rate: float) -> sparse.csc_matrix:
-        """The resistance over a solve, as the dofs of a `ChainTangent` lie."""
+        """Return the drag matrix of a solve, in the dof order of a `ChainTangent`."""
         group, kind, real, device = self.group, self.group.kind, self.model.types.real, self.model.wp_device
         if self._islands is None:
             shape = group.nodes, group.columns
@@ -57,23 +57,45 @@ class ChainDragAdjoint:
             )
         self._islands.rate.fill_(rate)
         self.resist(before, tangents, self._inertia, self._islands)
-        found = arrays.download(self._inertia.mass).T.ravel()
-        blocks = np.zeros((len(found), kind.block, kind.block))
-        blocks[:, : kind.dim, : kind.dim] = found["resistance"].reshape(-1, kind.dim, kind.dim)
+        inertia = arrays.download(self._inertia.mass).T.ravel()
+        blocks = np.zeros((len(inertia), kind.block, kind.block))
+        blocks[:, : kind.dim, : kind.dim] = inertia["resistance"].reshape(-1, kind.dim, kind.dim)
         if kind.twist:
-            blocks[:, kind.dim, kind.dim] = found["spin"]
+            blocks[:, kind.dim, kind.dim] = inertia["spin"]
         return sparse.block_diag(blocks, format="csc")
 
     def pull(
-        self, before, tangents: wp.array, kept, w: wp.array, rate: wp.array, held, start, by_rate, by_tangents=None
+        self,
+        before,
+        tangents: wp.array,
+        kept,
+        w: wp.array,
+        rate: wp.array,
+        by_fixed,
+        start,
+        by_rate,
+        by_tangents=None,
     ) -> None:
-        """Add derivatives by the state before the step to `start`, by held dofs to `held`, by the rate to `by_rate`, by the tangents
-        to `by_tangents`, or without it to those by the positions before the step."""
+        """Add the gradients of drag.
+
+        Args:
+            by_fixed: gradient with respect to fixed dofs, added to.
+            start: gradient with respect to the state before the step, added to.
+            by_rate: gradient with respect to the inverse step, added to.
+            by_tangents: gradient with respect to the tangents, added to; if None these terms are added to the positions of `start`.
+        """
         group = self.group
         read = [tangents, before.x, before.v, before.theta, kept.x, kept.theta, group.drag, self.drag.flow, w]
         read += [group.count, rate]
         self._launch(self._edges, read, [self._by_edge, self._by_velocity, self.by_coefficients])
-        outputs = [self._nowhere if by_tangents is None else by_tangents, held, start.x, start.v, start.theta, by_rate]
+        outputs = [
+            self._nowhere if by_tangents is None else by_tangents,
+            by_fixed,
+            start.x,
+            start.v,
+            start.theta,
+            by_rate,
+        ]
         self._launch(self._nodes, [*read, group.fixed, self._by_edge, self._by_velocity], outputs)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
@@ -81,10 +103,13 @@ class ChainDragAdjoint:
 
 
 class NetDragAdjoint:
-    """Of a net. `gather` adds what slots of edges bring to blocks; attributes as of `ChainDragAdjoint`.
+    """VJP of drag on the coupled system; further attributes as `ChainDragAdjoint`.
+
+    Args:
+        gather: kernel that assembles contributions of edges to dof blocks.
 
     Attributes:
-        inertia: inertia and drag of the blocks in the solve at hand (worlds, N), written by `resist`.
+        inertia: inertia and drag of the dof blocks in the current solve (worlds, N), written by `resist`.
     """
 
     def __init__(self, model, net, midpoint: bool, gather):
@@ -109,29 +134,39 @@ class NetDragAdjoint:
         return [self._edges, self._nodes, *self.drag.kernels]
 
     def resist(self, before, tangents: wp.array, rate: float) -> None:
-        """Write `inertia` of a solve from the state `before`, with the tangents that it took."""
+        """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""
         self._islands.rate.fill_(rate)
         target = SimpleNamespace(q=tangents, outer=self.net.still, mass=self.inertia)
         self.drag.resist(before, target, self._islands)
 
     @property
     def matrix(self) -> sparse.csc_matrix:
-        """The resistance in `inertia`, of blocks in space."""
+        """Drag matrix of `inertia`, in dof blocks of space components."""
         return sparse.block_diag(self.inertia.numpy()["resistance"].reshape(-1, 3, 3), format="csc")
 
     def pull(
-        self, before, tangents: wp.array, q: wp.array, w: wp.array, rate: float, held, start, by_rate, by_tangents
+        self,
+        before,
+        tangents: wp.array,
+        q: wp.array,
+        w: wp.array,
+        rate: float,
+        by_fixed,
+        start,
+        by_rate,
+        by_tangents,
     ):
-        """As of `ChainDragAdjoint`, of a solve with the solution q; derivatives by tangents are added to `by_tangents`, those by
-        coefficients to `by_coefficients`."""
+        """Add gradients as `ChainDragAdjoint.pull`, for a solve with the solution q; `by_tangents` is required."""
         net, drag = self.net, self.drag
         read = [tangents, before.q, before.v, q, self._ends, self._angles, net.drag, drag.flow, w, rate]
         outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]
         self._launch(self._edges, self.by_coefficients.shape[1], [*read, net.blocks], outputs)
-        for slots, by in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):
-            self._launch(self._gather, len(q), [self._starts, self._items, self._edge_count, net.blocks, slots], [by])
+        for slots, target in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):
+            self._launch(
+                self._gather, len(q), [self._starts, self._items, self._edge_count, net.blocks, slots], [target]
+            )
         inputs = [self.inertia, before.q, q, w, rate, net.blocks]
-        self._launch(self._nodes, len(q), inputs, [held, start.q, by_rate])
+        self._launch(self._nodes, len(q), inputs, [by_fixed, start.q, by_rate])
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.net.device)
