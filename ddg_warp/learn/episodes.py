@@ -1,11 +1,11 @@
-"""Episodes: recorded runs in one folder, each with its parameters, seed and outcome, and in a split of its own.
+"""Episodes: recorded runs in one folder, each with parameters, seed, outcome and split.
 
-    DIR/NAME.h5       what was recorded of an episode, see `ddg_warp.io.hdf5`; one that failed early may have none
+    DIR/NAME.h5       recording of an episode, see `ddg_warp.io.hdf5`; may be missing if the episode failed early
     DIR/index.json    the fractions of the splits, and an entry for each episode
 
-A split follows from the name of an episode and the seed of the folder by a hash, so that an episode stays where it is when
-others are added. Files are written aside and renamed: a writer killed at any time leaves complete episodes, and an index that
-lacks at most the last of them.
+The split is a hash of the name of an episode and the seed of the folder, so that it does not change when episodes are added. Files
+are written under a temporary name and renamed: a writer killed at any time leaves complete episodes, and an index that lacks at
+most the last of them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ddg_warp.run.summary import write_json
 INDEX, SCRATCH = "index.json", ".partial"
 DONE = "converged"  # outcome of an episode that ran to its end
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
-SHARE = 0.05  # of the time of a writer that saving the index may take
+SHARE = 0.05  # largest fraction of a writer's time spent on saving the index
 
 
 @dataclass(frozen=True)
@@ -40,16 +40,16 @@ class Episode:
     """One recorded run.
 
     Attributes:
-        name: Its name, also of its file.
+        name: Name of the episode and of its file.
         split: "train", "validation" or "test".
         outcome: "converged", or the name of the outcome that ended it early.
-        failure: Why it ended early; empty where it did not.
-        seed: What random numbers it was made with; None where there were none.
-        parameters: What it was made of, by name.
-        seconds: Wall time that it took [s].
+        failure: Reason of an early end; else empty.
+        seed: Seed of its random numbers; None if there were none.
+        parameters: Parameters by name.
+        seconds: Wall time [s].
         frames: Recorded frames.
-        worlds: Independent copies in every frame.
-        file: Name of its file in the folder; empty where nothing was recorded.
+        worlds: Worlds in every frame.
+        file: Name of its file in the folder; empty if nothing was recorded.
     """
 
     name: str
@@ -65,19 +65,19 @@ class Episode:
 
     @property
     def failed(self) -> bool:
-        """Whether it ended early."""
+        """True if the episode ended early."""
         return self.outcome != DONE
 
 
 class Episodes:
-    """The episodes of a folder, as its index has them, in the order of their names.
+    """Episodes listed in the index of a folder, ordered by name.
 
     Args:
         directory: The folder.
-        outside: Whether files of episodes may lie outside of the folder, where its index or a link leads.
+        outside: True if index entries or links may lead to files outside of the folder.
 
     Raises:
-        DataError: The folder has no index, or it is damaged.
+        DataError: The folder has no index, or the index is damaged.
     """
 
     def __init__(self, directory, *, outside: bool = False):
@@ -112,11 +112,11 @@ class Episodes:
         return self._episodes[name]
 
     def select(self, split: str | None = None, failed: bool = False) -> list[Episode]:
-        """Episodes with frames to read.
+        """Return the episodes with frames to read.
 
         Args:
             split: "train", "validation" or "test"; None for all.
-            failed: Whether to take also what was recorded of episodes that ended early.
+            failed: True to include recordings of episodes that ended early.
         """
         if split is not None:
             arguments.choice("split", split, SPLITS)
@@ -128,7 +128,7 @@ class Episodes:
         """Return the file of an episode.
 
         Raises:
-            DataError: It is none, has no file, or its file lies outside of the folder.
+            DataError: The argument is no episode, has no file, or its file lies outside of the folder.
         """
         if not isinstance(episode, Episode):
             raise DataError(f"{self.directory}: {episode!r} is no episode; give one of those that it holds")
@@ -138,7 +138,7 @@ class Episodes:
 
 
 class EpisodeWriter:
-    """Adds episodes to a folder, one process at a time.
+    """Writer that adds episodes to a folder, one process at a time.
 
         with EpisodeWriter("data/pulls") as writer:
             with writer.episode("pull_000", parameters={"force": 0.5}) as directory:
@@ -146,18 +146,18 @@ class EpisodeWriter:
 
     Args:
         directory: The folder; made if there is none.
-        fractions: Shares of train, validation and test; by default those of the folder, or 0.8, 0.1 and 0.1.
-        seed: What splits are drawn with; by default that of the folder, or 0.
+        fractions: Fractions of train, validation and test; by default from the folder, or 0.8, 0.1 and 0.1.
+        seed: Seed of the splits; by default that of the folder, or 0.
 
     Raises:
-        DataError: The fractions are no shares of one, the folder has others, or it is no folder that can be made.
+        DataError: The fractions do not sum to one, the folder has others, or it is no folder that can be made.
         FileExistsError: Another process writes to the folder.
     """
 
     def __init__(self, directory, *, fractions: tuple[float, float, float] | None = None, seed: int | None = None):
         self.directory = as_path("EpisodeWriter: directory", directory)
-        given = {} if fractions is None else {"fractions": checked_fractions(fractions)}
-        given |= {} if seed is None else {"seed": arguments.count("EpisodeWriter: seed", seed, 0)}
+        options = {} if fractions is None else {"fractions": checked_fractions(fractions)}
+        options |= {} if seed is None else {"seed": arguments.count("EpisodeWriter: seed", seed, 0)}
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
@@ -169,16 +169,16 @@ class EpisodeWriter:
         self._lock = lock_directory(self.directory)
         try:
             old = Episodes(self.directory) if (self.directory / INDEX).exists() else None
-            for name, value in given.items() if old is not None else ():
+            for name, value in options.items() if old is not None else ():
                 if getattr(old, name) != value:
                     kept = getattr(old, name)
                     raise DataError(
                         f"{self.directory} has {name} = {kept}, not {value}; leave {name} out, or take another folder"
                     )
-            self.fractions = old.fractions if old is not None else given.get("fractions", FRACTIONS)
-            self.seed = old.seed if old is not None else given.get("seed", 0)
+            self.fractions = old.fractions if old is not None else options.get("fractions", FRACTIONS)
+            self.seed = old.seed if old is not None else options.get("seed", 0)
             self._episodes = {episode.name: episode for episode in old or ()}
-            shutil.rmtree(self.directory / SCRATCH, ignore_errors=True)  # of a writer that was killed
+            shutil.rmtree(self.directory / SCRATCH, ignore_errors=True)  # left by a killed writer
             self._cost, self._saved = 0.0, 0.0
             self._save()
         except BaseException:
@@ -199,14 +199,14 @@ class EpisodeWriter:
 
     @contextmanager
     def episode(self, name: str, *, parameters: Mapping | None = None, seed: int | None = None) -> Iterator[Path]:
-        """Gives a directory to record a run in, such as that of a `Recorder`, and adds the run when the block ends.
+        """Yield a directory to record a run in, such as that of a `Recorder`, and add the run when the block ends.
 
-        A SolverError ends the episode with its outcome, and goes on to the caller. After any other error nothing is added.
+        A SolverError ends the episode with its outcome and is raised again. After any other error nothing is added.
 
         Args:
             name: The episode's name.
-            parameters: What it is made of, by name: numbers, texts, lists of them.
-            seed: What its random numbers are made with.
+            parameters: Parameters by name: numbers, texts, lists of them.
+            seed: Seed of its random numbers.
         """
         entry = _described(name, parameters, seed)
         directory, began = self.scratch(name), time.perf_counter()
@@ -223,7 +223,7 @@ class EpisodeWriter:
             shutil.rmtree(directory, ignore_errors=True)
 
     def scratch(self, name: str) -> Path:
-        """An empty directory beside the episodes to record one in; what is left in it is lost with the next writer."""
+        """Return an empty directory next to the episodes to record one in; the next writer removes it."""
         self._check_new(name)
         directory = self.directory / SCRATCH / name
         shutil.rmtree(directory, ignore_errors=True)
@@ -241,23 +241,23 @@ class EpisodeWriter:
         failure: str = "",
         seconds: float = 0.0,
     ) -> Episode:
-        """Adds an episode.
+        """Add an episode.
 
         Args:
-            name: Its name.
-            trajectory: The file that was recorded; it is moved into the folder. One that failed may have none.
+            name: The episode's name.
+            trajectory: The recorded file; it is moved into the folder. Failed episodes may have none.
             parameters, seed, outcome, failure, seconds: See `Episode`.
 
         Raises:
-            DataError: There is an episode of that name, one that converged has no frames, or the index cannot hold what is given.
-            SceneError: An option is no such option.
+            DataError: The name exists, a converged episode has no frames, or the index cannot hold a value.
+            SceneError: An option is invalid.
         """
         self._check_new(name)
         made = _described(name, parameters, seed)
         made["seconds"] = arguments.number(f"episode {name!r}: seconds", seconds, "a time [s]", lambda v: v >= 0.0)
-        for what, text in (("outcome", outcome), ("failure", failure)):
-            if not isinstance(text, str) or (what == "outcome" and not text):
-                raise SceneError(f"episode {name!r}: {what} = {text!r}; give a text")
+        for attribute, text in (("outcome", outcome), ("failure", failure)):
+            if not isinstance(text, str) or (attribute == "outcome" and not text):
+                raise SceneError(f"episode {name!r}: {attribute} = {text!r}; give a text")
         if trajectory is not None:
             trajectory = as_path(f"episode {name!r}: trajectory", trajectory)
             if trajectory.is_symlink():
@@ -273,13 +273,13 @@ class EpisodeWriter:
         split = split_of(name, self.fractions, self.seed)
         episode = Episode(name, split, outcome, failure, **made, frames=frames, worlds=worlds, file=file)
         self._episodes[name] = episode
-        # An index of very many episodes is not written anew for each of them; what a kill then costs is run again.
+        # A large index is not saved after every episode; unsaved episodes are run again after a kill.
         if time.perf_counter() - self._saved > self._cost / SHARE:
             self._save()
         return episode
 
     def close(self) -> None:
-        """Writes the index; a second call does nothing."""
+        """Write the index; a second call does nothing."""
         if self._lock is not None:
             try:
                 self._save()
@@ -290,14 +290,16 @@ class EpisodeWriter:
         if self._lock is None:
             raise DataError(f"the writer of {self.directory} is closed: open another, which goes on with the folder")
         if not (isinstance(name, str) and NAME.fullmatch(name)):
-            told = "a name is made of letters, digits, and . _ - after the first, 200 at most"
-            raise DataError(f"episode {name!r:.60}: {told}")
+            rule = "a name is made of letters, digits, and . _ - after the first, 200 at most"
+            raise DataError(f"episode {name!r:.60}: {rule}")
         if name in self._episodes:
             raise DataError(f"{self.directory} has an episode {name!r} already; choose another name")
 
     def _save(self) -> None:
         began = time.perf_counter()
-        entries = [vars(self._episodes[name]) for name in sorted(self._episodes)]  # in whatever order they were made
+        entries = [
+            vars(self._episodes[name]) for name in sorted(self._episodes)
+        ]  # independent of the order of creation
         write_json(self.directory / INDEX, {"fractions": self.fractions, "seed": self.seed, "episodes": entries})
         self._saved = time.perf_counter()
         self._cost = self._saved - began
@@ -310,15 +312,15 @@ class EpisodeWriter:
 
 
 def inside(folder: Path, path: Path, outside: bool) -> Path:
-    """Return a path, refused where it leads out of a folder.
+    """Return a path, refused if it leads out of a folder.
 
     Args:
         folder: The folder.
         path: A path below it.
-        outside: Whether the path may lead out of the folder.
+        outside: True if the path may lead out of the folder.
 
     Raises:
-        DataError: It leads out of the folder, by its parts or by a link, and may not.
+        DataError: The path leads out of the folder, by `..` or by a link, and may not.
     """
     if not outside and not path.resolve().is_relative_to(folder.resolve()):
         raise DataError(
@@ -328,7 +330,7 @@ def inside(folder: Path, path: Path, outside: bool) -> Path:
 
 
 def _described(name: str, parameters: Mapping | None, seed: int | None) -> dict:
-    """Parameters and seed of an episode, as the index holds them."""
+    """Return parameters and seed of an episode in index form."""
     if parameters is not None and not isinstance(parameters, Mapping):
         raise SceneError(f"episode {name!r}: parameters = {parameters!r:.60}; give a dict of values by name")
     if seed is not None:
@@ -337,7 +339,7 @@ def _described(name: str, parameters: Mapping | None, seed: int | None) -> dict:
 
 
 def _checked(episode: Episode) -> Episode:
-    """An episode of an index whose values are of the types that they have."""
+    """Return an episode of an index after a check of types."""
     name, file = episode.name, episode.file
     if not (isinstance(name, str) and NAME.fullmatch(name)):
         raise ValueError(f"name {name!r:.60}")
@@ -353,7 +355,7 @@ def _checked(episode: Episode) -> Episode:
 
 
 def _size(trajectory) -> tuple[int, int]:
-    """Frames and worlds of a recorded file; none where there is no file."""
+    """Return frames and worlds of a recorded file; (0, 1) without a file."""
     from ddg_warp.io.hdf5_read import TrajectoryReader
 
     if trajectory is None or not Path(trajectory).exists():
@@ -363,7 +365,7 @@ def _size(trajectory) -> tuple[int, int]:
 
 
 def _move(source: Path, target: Path) -> None:
-    """Renames a file, or across disks copies it aside first."""
+    """Rename a file; across disks copy it to a temporary name first."""
     try:
         os.replace(source, target)
     except OSError as error:

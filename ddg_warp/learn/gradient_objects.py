@@ -1,4 +1,4 @@
-"""Small scenes of every kind of object, which `ddg-warp gradients` asks for their gradients."""
+"""Small scenes of every kind of object, for the gradient checks of `ddg-warp gradients`."""
 
 from collections.abc import Callable
 
@@ -19,12 +19,12 @@ SIDE = (0.3, 0.2)  # of sheets [m]
 
 
 def soft(scale: float = 1.0) -> Material:
-    """What all are made of, so many times as dense."""
+    """Return the material of all objects, with density multiplied by `scale`."""
     return Material(young=1e6, density=1000.0 * scale, viscosity=0.01)
 
 
 def _rod(points=CURVE, section=None, hold: Callable | None = None, more: Callable | None = None, **options) -> Callable:
-    """A rod that is clamped at its first edge, or held by `hold(scene, rod)`, with `more(scene, rod)`."""
+    """Return a function that adds a rod, clamped at its first edge or supported by `hold(scene, rod)`, with `more(scene, rod)`."""
 
     def add(scene: Scene, material: Material) -> None:
         rod = scene.add_rod(points, section=section or Ellipse(0.004, 0.003), material=material, **options)
@@ -36,7 +36,7 @@ def _rod(points=CURVE, section=None, hold: Callable | None = None, more: Callabl
 
 
 def _joined(rigid: bool = True, flat: bool = False, more: Callable | None = None) -> Callable:
-    """Three rods that meet in a point; hinged ones are held at their far ends, too; with `more(scene, rods)`."""
+    """Return a function that adds three rods joined at a point, the hinged ones clamped at the far ends; with `more(scene, rods)`."""
 
     def add(scene: Scene, material: Material) -> None:
         keep, last = np.array([1.0, not flat, 1.0]), len(CURVE) - 1
@@ -56,12 +56,12 @@ def _joined(rigid: bool = True, flat: bool = False, more: Callable | None = None
 
 
 def _sheet(bending: str, hold: Callable | None = None, more: Callable | None = None, **options) -> Callable:
-    """A wavy sheet held at its first vertices, or by `hold(scene, shell, points)`."""
+    """Return a function that adds a wavy sheet, fixed at its first vertices or supported by `hold(scene, shell, points)`."""
 
     def add(scene: Scene, material: Material) -> None:
         points, triangles = meshes.rectangle(3, 2, SIDE)
         points = np.array(points, float)
-        if bending != "isometric":  # which is flat at rest
+        if bending != "isometric":  # isometric bending needs a flat rest shape
             points[:, 2] = 0.02 * np.sin(9.0 * points[:, 0])
         shell = scene.add_shell(points, triangles, thickness=0.004, material=material, bending=bending, **options)
         first = np.flatnonzero(points[:, 0] <= 0.0 if hold or bending != "isometric" else points[:, 0] <= 0.11)
@@ -73,7 +73,7 @@ def _sheet(bending: str, hold: Callable | None = None, more: Callable | None = N
 
 
 def _turned_sheet(scene: Scene, material: Material) -> None:
-    """A sheet along the diagonal of space, on a symmetry plane across it."""
+    """Add a sheet along a diagonal, with a skew symmetry plane across it."""
     points, triangles = meshes.rectangle(3, 2, SIDE)
     points = np.array(points, float)
     along, across = np.array([0.8, 0.6, 0.0]), np.array([-0.6, 0.8, 0.0])
@@ -120,19 +120,19 @@ def _sand(scene: Scene, rods) -> None:
 
 
 def _some_drag(scene: Scene, rods) -> None:
-    """Of two rods, each of another kind, and a mass."""
+    """Add viscous drag to one rod, granular drag to another, and a mass to the third."""
     _drag(scene, rods[0])
     _sand(scene, rods[1])
     scene.add_mass(rods[2], -1, 0.002)
 
 
 def _touch(scene: Scene, law: str, **options) -> None:
-    """Contact that begins far off, with friction."""
+    """Add contact with friction, with a large activation distance."""
     scene.contact(law=law, range=0.02, stiffness=5.0, friction=0.3, velocity=0.5, **options)
 
 
 def _crossing(scene: Scene, material: Material, motion: Grip | None = None, **options) -> None:
-    """Rods that cross, one of them held, with friction that is lagged twice in a step."""
+    """Add two crossing rods, one clamped, with two friction iterations a step."""
     rods = [scene.add_rod(CURVE, section=Circle(0.004), material=material, name="lower")]
     points = CURVE[3] + np.stack([0.1 * T - 0.05, 0.3 * T - 0.15, 0.014 + 0.03 * (T - 0.5) ** 2], axis=1)
     rods.append(scene.add_rod(points, section=Circle(0.003), material=material, name="upper"))
@@ -141,14 +141,14 @@ def _crossing(scene: Scene, material: Material, motion: Grip | None = None, **op
 
 
 def _on_ball(scene: Scene, material: Material) -> None:
-    """A rod on a ball that a grip moves."""
+    """Add a rod on a ball that a grip moves."""
     scene.add_rod(CURVE, section=Circle(0.004), material=material)
     scene.add_obstacle(Sphere((0.18, 0.05, -0.352), 0.3), motion=Grip(pivot=(0.1, 0.0, -0.2)))
     _touch(scene, "penalty")
 
 
 def _held_on_ball(**friction) -> Callable:
-    """Its end rests on a ball that a grip moves."""
+    """Return a function that clamps a rod and supports the far end by a ball on a grip."""
 
     def hold(scene: Scene, rod: int) -> None:
         scene.clamp(rod)
@@ -171,7 +171,7 @@ SWING = Motion(
     translation=lambda t: (0.05 * np.sin(9.0 * t), 0.1 * t, 0.0), angle=lambda t: 4.0 * t, axis=(0.3, 1.0, 0.2)
 )
 
-# name -> dimension of the scene, and what is added to it
+# name -> dimension of the scene, and the function that adds the object
 OBJECTS: dict[str, tuple[int, Callable]] = {
     "rod": (3, _rod()),
     "rod clamped at its end": (3, _rod(section=Circle(0.004), hold=lambda s, r: s.clamp_end(r))),
@@ -243,13 +243,13 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
 
 
 def scene_of(name: str, gravity=(0.5, 0.0, -9.81), mass_damping: float = 0.7, density: float = 1.0) -> Scene:
-    """The scene of an object; `density` is a factor.
+    """Return the scene of an object; `density` is a factor.
 
     Args:
         gravity, mass_damping: as of `Scene`.
     """
     dimension, add = OBJECTS[name]
-    if add is _dome:  # turns about the direction of gravity
+    if add is _dome:  # gravity acts along the axis of revolution
         gravity = (0.0, 0.0, gravity[2])
     scene = Scene(gravity=tuple(gravity), mass_damping=mass_damping, dimension=dimension)
     add(scene, soft(density))

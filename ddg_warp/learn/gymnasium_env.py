@@ -1,10 +1,10 @@
-"""An `Environment` as a vector environment of gymnasium.
+"""Adapter of an `Environment` to the vector environments of gymnasium.
 
     envs = VectorEnvironment(environment)
     observations, infos = envs.reset(seed=0)
     observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
 
-Episodes that end begin anew in the same step.
+Ended episodes restart in the same step.
 """
 
 import numpy as np
@@ -25,14 +25,14 @@ from ddg_warp.learn.environment import Environment, check_environment
 
 
 class VectorEnvironment(VectorEnv):
-    """Worlds as sub-environments: those that end start anew in the same step (`AutoresetMode.SAME_STEP`).
+    """Worlds as sub-environments restarted in the step that ends an episode (`AutoresetMode.SAME_STEP`).
 
-    The observation after such a step is the first of the next episode; `infos["final_obs"]` has the last of the one that ended, and
-    `infos["final_info"]["outcome"]` how its last step ended: "converged", or why it could not be solved, as `Integrator.outcomes` says.
-    Whatever seed is given, every world draws from a stream of its own.
+    The observation after such a step is the first of the next episode. `infos["final_obs"]` has the last of the ended one, and
+    `infos["final_info"]["outcome"]` the outcome of its last step: "converged", or a failure named as in `Integrator.outcomes`.
+    Every world draws from a stream of its own, whatever the seed.
 
     Args:
-        environment: what it steps. Actions are float32, and observations as `observe` gives them.
+        environment: the environment to step. Actions are float32, observations of the type that `observe` returns.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 - as of gymnasium
@@ -41,18 +41,18 @@ class VectorEnvironment(VectorEnv):
         check_environment("VectorEnvironment", environment)
         self.environment, self.num_envs = environment, environment.worlds
         bounds = environment.bounds.cpu().numpy().astype(np.float32)
-        seen = torch.zeros(0, dtype=environment.observation_dtype).numpy().dtype
+        dtype = torch.zeros(0, dtype=environment.observation_dtype).numpy().dtype
         self.single_action_space = gymnasium.spaces.Box(-bounds, bounds, dtype=np.float32)
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (environment.observations,), seen)
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (environment.observations,), dtype)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._generators = self._now = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """First observations of new episodes in all worlds, of streams that go on where no seed is given.
+        """Begin new episodes in all worlds and return the first observations; without a seed random streams continue.
 
         Raises:
-            SceneError: there are options, or the seed is no whole number.
+            SceneError: there are options, or the seed is not an integer.
         """
         if options:
             raise SceneError(f"reset: options are {options}; there are none")
@@ -66,28 +66,32 @@ class VectorEnvironment(VectorEnv):
             return _numpy(self.environment.observe(self._now)), {}
 
     def step(self, actions):
-        """Observations, rewards, terminations, truncations and infos after actions (B, actions).
+        """Return observations, rewards, terminations, truncations and infos after actions (B, actions).
 
         Raises:
             SceneError: nothing has been reset, or actions do not fit.
         """
         if self._now is None:
             raise SceneError("step: no episode has begun; call reset first")
-        own = self.environment
+        environment = self.environment
         with torch.no_grad():
-            now = own.step(self._now, actions)
-            observations, rewards, ended = own.observe(now), own.reward(now), own.ended(now)
+            state = environment.step(self._now, actions)
+            observations, rewards, ended = (
+                environment.observe(state),
+                environment.reward(state),
+                environment.ended(state),
+            )
             over, infos = ended[0] | ended[1], {}
             if over.any():
                 for world in torch.nonzero(over).flatten().tolist():
-                    final = {"final_obs": _numpy(observations[world]), "final_info": {"outcome": now.outcomes[world]}}
+                    final = {"final_obs": _numpy(observations[world]), "final_info": {"outcome": state.outcomes[world]}}
                     infos = self._add_info(infos, final, world)
-                now = own.begin(self._generators, now, over)
-                observations = own.observe(now)
-        self._now = now
+                state = environment.begin(self._generators, state, over)
+                observations = environment.observe(state)
+        self._now = state
         return _numpy(observations), _numpy(rewards).astype(float), _numpy(ended[0]), _numpy(ended[1]), infos
 
 
 def _numpy(values: torch.Tensor) -> np.ndarray:
-    """An array of its own."""
+    """Return a copy as an array."""
     return values.cpu().numpy().copy()

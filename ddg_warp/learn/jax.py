@@ -6,7 +6,7 @@
     tip = from_torch(tip, (2, 3))
     gradient = jax.grad(lambda stiffness: tip(stiffness).sum())(3e-4)
 
-JAX asks the host for them (`jax.pure_callback`): they stand in jitted functions, and are of one order of derivatives, in reverse.
+They are host callbacks (`jax.pure_callback`), work inside jitted functions, and have first derivatives in reverse mode.
 """
 
 from collections.abc import Callable
@@ -24,17 +24,17 @@ from ddg_warp.errors import SceneError
 
 
 def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callable:
-    """A function of torch tensors as one of JAX arrays, with the gradient that torch finds.
+    """Wrap a function of torch tensors as one of JAX arrays, with the gradient that torch computes.
 
-    Values pass through the host's memory, in float64 where JAX has that: set `jax_enable_x64`, as its gradients are float32 else.
+    Values pass through host memory, in float64 if JAX has `jax_enable_x64`; set it, since gradients are float32 otherwise.
 
     Args:
-        function: of tensors, all of floating point, that gives one tensor.
-        shape: of what it gives.
-        dtype: of what it gives; by default JAX's own, float32 or float64.
+        function: from tensors, all of floating point, to one tensor.
+        shape: of the result.
+        dtype: of the result; by default JAX's own, float32 or float64.
 
     Raises:
-        SceneError: the function gives something of another shape, when it is called.
+        SceneError: the function returns another shape, when called.
     """
     if not callable(function):
         raise SceneError(f"from_torch: {function!r} is no function; give one of torch tensors")
@@ -46,19 +46,23 @@ def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callab
         with torch.no_grad():
             return found([_tensor(array) for array in arrays]).cpu().numpy().astype(kind)
 
-    def gradients(arrays, by) -> tuple[np.ndarray, ...]:
+    def gradients(arrays, cotangent) -> tuple[np.ndarray, ...]:
         inputs = [_tensor(array).requires_grad_() for array in arrays]
         with torch.enable_grad():
             output = found(inputs)
-        given = torch.autograd.grad(output, inputs, _tensor(by).to(output), allow_unused=True, materialize_grads=True)
-        return tuple(own.cpu().numpy().astype(array.dtype) for own, array in zip(given, arrays, strict=True))
+        returned = torch.autograd.grad(
+            output, inputs, _tensor(cotangent).to(output), allow_unused=True, materialize_grads=True
+        )
+        return tuple(
+            gradient.cpu().numpy().astype(array.dtype) for gradient, array in zip(returned, arrays, strict=True)
+        )
 
     def found(inputs: list) -> torch.Tensor:
         output = function(*inputs)
         if not isinstance(output, torch.Tensor) or tuple(output.shape) != shape:
-            given = tuple(output.shape) if isinstance(output, torch.Tensor) else repr(output)
+            returned = tuple(output.shape) if isinstance(output, torch.Tensor) else repr(output)
             raise SceneError(
-                f"from_torch: the function gives {given}; give a tensor of shape {shape}, or say another shape"
+                f"from_torch: the function gives {returned}; give a tensor of shape {shape}, or say another shape"
             )
         return output
 
@@ -69,14 +73,14 @@ def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callab
     def forward(*arrays):
         return call(*arrays), arrays
 
-    def backward(arrays, by):
+    def backward(arrays, cotangent):
         alike = tuple(jax.ShapeDtypeStruct(jax.numpy.shape(array), jax.numpy.result_type(array)) for array in arrays)
-        return jax.pure_callback(gradients, alike, arrays, by, vmap_method="sequential")
+        return jax.pure_callback(gradients, alike, arrays, cotangent, vmap_method="sequential")
 
     call.defvjp(forward, backward)
     return call
 
 
 def _tensor(array) -> torch.Tensor:
-    """A tensor of its own, in float64."""
+    """Return a copy as a tensor in float64."""
     return torch.tensor(np.asarray(array), dtype=torch.float64)

@@ -1,15 +1,18 @@
-"""Recordings of real cables by motion capture, read from the user's own clone of a public repository.
+"""Motion-capture recordings of real cables, read from the user's own clone of a public repository.
 
-Markers along a cable that two robots hold and move, every hundredth of a second. In the recordings of Chen, Zhang, Brei, Zhang,
-Chen, Wu, Vasudevan, *Differentiable Discrete Elastic Rods for Real-Time Modeling of Deformable Linear Objects*, 2024
-(arXiv 2406.05931), a file data_set/DLO1/train/101.pkl holds frames, each of (3, M) coordinates with z up, of 13 markers (12 on other
-cables), of which the first two and the last two are held. Those of the branched cables of Chen et al., *DEFT*, 2025
-(arXiv 2502.15037), hold coordinates first, with y up: `read(path, axes="cfm", markers=20, up="y")`.
+Cameras record markers along a cable that two robots hold and move, 100 times a second. In the DER recordings [1] a file
+data_set/DLO1/train/101.pkl has frames, each of (3, M) coordinates with z up, of 13 markers (12 on other cables). The grips hold the
+first two and the last two. Recordings of branched cables [2] have coordinates first, with y up:
+`read(path, axes="cfm", markers=20, up="y")`.
 
     for path in recordings("data_set/DLO1/train"):  # below the folder that DDG_WARP_RECORDINGS names
         recording = read(path)
 
 Files are pickles, and are read as arrays of numbers only (`ddg_warp.learn.plain_pickle`).
+
+[1] Chen, Zhang, Brei, Zhang, Chen, Wu, Vasudevan, *Differentiable Discrete Elastic Rods for Real-Time Modeling of Deformable Linear
+Objects*, 2024, arXiv 2406.05931.
+[2] Chen et al., *DEFT*, 2025, arXiv 2502.15037.
 """
 
 from __future__ import annotations
@@ -31,8 +34,8 @@ from ddg_warp.learn.episodes import inside
 
 VARIABLE = "DDG_WARP_RECORDINGS"
 RATE = 100.0  # frames per second
-HELD = (0, 1, -2, -1)  # markers that the two grips hold
-# Axes of the file, in the order that makes the one that points up the last, and keeps the frame right-handed.
+HELD = (0, 1, -2, -1)  # markers of the two grips
+# Permutations of file axes that put the up axis last and keep the frame right-handed.
 UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 
 
@@ -41,9 +44,9 @@ class Grip:
     """One grip over time.
 
     Attributes:
-        position: Of the outermost marker that it holds [m], shape (F, 3).
-        frame: Rotations, shape (F, 3, 3), whose columns are the tangent, from the first marker of the cable to the last, and two
-            directors. Markers say nothing of the turn about the tangent: it is carried along in time without twist.
+        position: Of the outermost marker of the grip [m], shape (F, 3).
+        frame: Rotations, shape (F, 3, 3), with columns tangent, from the first marker of the cable to the last, and two
+            directors. Markers do not determine the rotation about the tangent: directors are transported in time without twist.
     """
 
     position: np.ndarray
@@ -55,10 +58,10 @@ class Recording:
     """Markers of a cable over time, with z up.
 
     Attributes:
-        name: Its file, as seen from the folder of recordings.
+        name: File, relative to the folder of recordings.
         times: Times of the frames [s], shape (F,), from 0.
         markers: Positions [m], shape (F, M, 3), NaN where the cameras lost one.
-        held: The markers of both grips, two each, the outermost outside; empty where nothing is held.
+        held: Markers of both grips, two each, outermost markers first and last; empty without grips.
     """
 
     name: str
@@ -68,26 +71,26 @@ class Recording:
 
     @property
     def complete(self) -> bool:
-        """Whether every marker is seen in every frame."""
+        """True if every marker is visible in every frame."""
         return bool(np.isfinite(self.markers).all())
 
     def grips(self) -> tuple[Grip, Grip]:
-        """The first grip and the last.
+        """Return the first grip and the last.
 
         Raises:
-            DataError: Nothing is held, or a marker of a grip is lost, or two are in one place.
+            DataError: No markers are gripped, or a marker of a grip is lost, or two coincide.
         """
         if not self.held:
             raise DataError(f"{self.name}: no markers are held; read it with held=(first, second, last but one, last)")
         first, second, third, last = self.held
         return self._grip(first, first, second), self._grip(last, third, last)
 
-    def _grip(self, outermost: int, behind: int, ahead: int) -> Grip:
-        edges = self.markers[:, ahead] - self.markers[:, behind]
-        bad = ~(length(edges) > 0.0)
-        if bad.any():
+    def _grip(self, outermost: int, start: int, end: int) -> Grip:
+        edges = self.markers[:, end] - self.markers[:, start]
+        lost = ~(length(edges) > 0.0)
+        if lost.any():
             raise DataError(
-                f"{self.name}: frame {np.argmax(bad)}: markers {behind} and {ahead} of a grip are lost, or in one place; "
+                f"{self.name}: frame {np.argmax(lost)}: markers {start} and {end} of a grip are lost, or in one place; "
                 "take other frames, or other markers as held"
             )
         tangents = unit(edges)
@@ -96,11 +99,11 @@ class Recording:
         return Grip(self.markers[:, outermost].copy(), frame)
 
     def resampled(self, times, degree: int = 3) -> Recording:
-        """The recording at other times, between frames by a spline through them.
+        """Return the recording at other times, by spline interpolation.
 
         Args:
-            times: Times [s], shape (n,), increasing, within those of the recording.
-            degree: 1 for straight lines between frames, 3 for a cubic spline.
+            times: Times [s], shape (n,), increasing, within the recording.
+            degree: 1 for linear interpolation, 3 for a cubic spline.
 
         Raises:
             SceneError: There is no such degree.
@@ -126,39 +129,39 @@ class Recording:
         return replace(self, times=times, markers=make_interp_spline(self.times, self.markers, k=degree)(times))
 
     def filled(self, longest: float) -> Recording:
-        """The recording with markers that were lost for a while put where straight lines between the frames around have them.
+        """Return the recording with short gaps of lost markers filled by linear interpolation.
 
         Args:
-            longest: Between frames where a marker is seen [s]; what is lost for longer, or at either end, stays lost.
+            longest: Longest time between frames with the marker visible [s]; longer gaps, and gaps at either end, stay.
 
         Raises:
             SceneError: `longest` is not positive.
         """
         longest = arguments.positive("filled: longest", longest, "s")
         markers = self.markers.copy()
-        for place in np.ndindex(markers.shape[1:]):
-            seen = np.flatnonzero(np.isfinite(self.markers[(slice(None), *place)]))
-            if not len(seen):
+        for marker_axis in np.ndindex(markers.shape[1:]):
+            visible = np.flatnonzero(np.isfinite(self.markers[(slice(None), *marker_axis)]))
+            if not len(visible):
                 continue
             before, after = (
-                np.searchsorted(seen, np.arange(len(markers)), "right") - 1,
-                np.searchsorted(seen, np.arange(len(markers))),
+                np.searchsorted(visible, np.arange(len(markers)), "right") - 1,
+                np.searchsorted(visible, np.arange(len(markers))),
             )
-            inside = (before >= 0) & (after < len(seen))
-            before, after = seen[np.maximum(before, 0)], seen[np.minimum(after, len(seen) - 1)]
+            inside = (before >= 0) & (after < len(visible))
+            before, after = visible[np.maximum(before, 0)], visible[np.minimum(after, len(visible) - 1)]
             inside &= self.times[after] - self.times[before] <= longest * (1.0 + 1e-9)
-            own = np.interp(self.times, self.times[seen], self.markers[(seen, *place)])
-            markers[(inside, *place)] = own[inside]
+            interpolated = np.interp(self.times, self.times[visible], self.markers[(visible, *marker_axis)])
+            markers[(inside, *marker_axis)] = interpolated[inside]
         return replace(self, markers=markers)
 
     def between(self, first: int, last: int) -> Recording:
-        """The frames from `first` up to, but without, `last`; times go on from 0.
+        """Return the frames from `first` up to, but without, `last`; times start from 0.
 
         Args:
-            first, last: Whole numbers; negative ones count from the end.
+            first, last: Integers; negative ones count from the end.
 
         Raises:
-            SceneError: They are no whole numbers.
+            SceneError: The arguments are not integers.
             DataError: There are no such frames.
         """
         first, last = (arguments.index(f"between: {name}", k) for name, k in (("first", first), ("last", last)))
@@ -169,12 +172,12 @@ class Recording:
 
 
 def recordings(folder: str = "", *, root=None, outside: bool = False) -> list[Path]:
-    """The pickles below a folder of recordings, in the order of the numbers in their names.
+    """Return the pickles below a folder of recordings, ordered by the numbers in file names.
 
     Args:
-        folder: Where below the root to look, such as "data_set/DLO1/train".
+        folder: Folder below the root, such as "data_set/DLO1/train".
         root: The clone; by default the folder that the environment variable DDG_WARP_RECORDINGS names.
-        outside: Whether recordings may lie outside of the clone, where parts of a path or links lead.
+        outside: True if paths or links may lead outside of the clone.
 
     Raises:
         DataError: There is no such folder, no recording in it, or one lies outside of the clone.
@@ -183,13 +186,13 @@ def recordings(folder: str = "", *, root=None, outside: bool = False) -> list[Pa
     path = inside(
         root, root / as_path("recordings: folder", "." if isinstance(folder, str) and not folder else folder), outside
     )
-    found = [each for each in path.rglob("*") if each.suffix in (".pkl", ".pickle")]
-    if not found:
+    paths = [each for each in path.rglob("*") if each.suffix in (".pkl", ".pickle")]
+    if not paths:
         raise DataError(f"{path} holds no recordings (*.pkl); name a folder of them, of a clone that is complete")
-    for each in found:
+    for each in paths:
         inside(root, each, outside)
     return sorted(
-        found, key=lambda each: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(each))]
+        paths, key=lambda each: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(each))]
     )
 
 
@@ -204,22 +207,22 @@ def read(
     held: tuple[int, ...] = HELD,
     outside: bool = False,
 ) -> Recording:
-    """A recording.
+    """Read a recording.
 
     Args:
-        path: The file, as `recordings` gives it, or as seen from the root.
+        path: The file, as returned by `recordings`, or relative to the root.
         root: See `recordings`.
-        axes: What the axes of its array are: frames, coordinates and markers, by their first letters.
-        markers: How many there are. A file with axes "cfm" may have frames and markers on one axis, frame after frame: (3, F M).
+        axes: Axes of the array: frames, coordinates and markers, by initial letters.
+        markers: Number of markers. A file with axes "cfm" may have frames and markers on one axis, frame after frame: (3, F M).
         rate: Frames per second.
-        up: The axis of the file that points up, "x", "y" or "z"; the recording has z up.
-        held: The markers of both grips, from the first of the cable to the last; empty where nothing is held.
-        outside: Whether a path as seen from the root, or one given with it, may lead out of it, by its parts or by links.
+        up: Axis of the file that points up, "x", "y" or "z"; the recording has z up.
+        held: Markers of both grips, from the first of the cable to the last; empty without grips.
+        outside: True if a relative path, or one given with a root, may lead out of the root, by `..` or by links.
 
     Raises:
-        SceneError: An option is no such option.
-        DataError: The file does not exist, or holds no markers over time.
-        UnsafePickleError: The file asks for more than arrays of numbers.
+        SceneError: An option is invalid.
+        DataError: The file does not exist, or has no markers over time.
+        UnsafePickleError: The pickle needs more than arrays of numbers.
     """
     path, outside = as_path("read: path", path), arguments.flag("read: outside", outside)
     if root is not None or not path.is_absolute():
@@ -256,20 +259,20 @@ def read(
 
 
 def _root(root) -> Path:
-    """The folder of recordings."""
-    given = root if root is not None else os.environ.get(VARIABLE)
-    if given is None or (isinstance(given, str) and not given):
+    """Return the folder of recordings."""
+    folder = root if root is not None else os.environ.get(VARIABLE)
+    if folder is None or (isinstance(folder, str) and not folder):
         raise DataError(
             f"where are the recordings? Give root, or set {VARIABLE} to your clone of them; none come with ddg_warp"
         )
-    root = as_path("the folder of recordings", given)
+    root = as_path("the folder of recordings", folder)
     if not root.is_dir():
         raise DataError(f"the folder of recordings {root} does not exist; clone them, and give root or set {VARIABLE}")
     return root
 
 
 def _array(content, path: Path) -> np.ndarray:
-    """What a file holds as one array of real numbers."""
+    """Return the content of a file as one array of real numbers."""
     try:
         values = np.asarray(content)
     except (ValueError, OverflowError):  # frames of different shapes
@@ -281,21 +284,21 @@ def _array(content, path: Path) -> np.ndarray:
     return values.astype(np.float64)
 
 
-def _checked_held(held, count: int, path: Path) -> tuple[int, ...]:
-    """Four markers of those that there are, or none.
+def _checked_held(markers, count: int, path: Path) -> tuple[int, ...]:
+    """Return four markers of the grips, or none.
 
     Raises:
-        DataError: Something else, or a marker that there is not.
+        DataError: The argument is neither, or a marker does not exist.
     """
-    given = held
-    held = tuple(held) if np.iterable(held) and not isinstance(held, str | bytes | dict | set) else (None,)
+    original = markers
+    markers = tuple(markers) if np.iterable(markers) and not isinstance(markers, str | bytes | dict | set) else (None,)
     fits = all(
         isinstance(marker, numbers.Integral) and not isinstance(marker, bool) and -count <= marker < count
-        for marker in held
+        for marker in markers
     )
-    if held and not (fits and len({int(marker) % count for marker in held}) == len(held) == 4):
+    if markers and not (fits and len({int(marker) % count for marker in markers}) == len(markers) == 4):
         raise DataError(
-            f"{path} has {count} markers; held = {given!r} is not four of them, two of each grip; give four whole numbers, or "
+            f"{path} has {count} markers; held = {original!r} is not four of them, two of each grip; give four whole numbers, or "
             "() where nothing is held"
         )
-    return tuple(int(marker) % count for marker in held)
+    return tuple(int(marker) % count for marker in markers)

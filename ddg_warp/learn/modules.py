@@ -1,4 +1,4 @@
-"""Parameters as modules: positive ones are learned as logarithms."""
+"""Modules of learned parameters; positive ones are learned as logarithms."""
 
 from collections.abc import Mapping
 
@@ -9,13 +9,13 @@ from ddg_warp.errors import SceneError
 
 
 class PositiveParameters(torch.nn.Module):
-    """Parameters "term.parameter" that are positive, each learned as its logarithm; called, it gives what `Simulator.step` takes.
+    """Positive parameters "term.parameter", each learned as a logarithm; calling the module returns input of `Simulator.step`.
 
     Args:
-        values: first values by name, tensors that broadcast to (B, E).
+        values: initial values by name, tensors that broadcast to (B, E).
 
     Raises:
-        SceneError: they are no dict of positive finite real numbers by names; names the parameter.
+        SceneError: `values` is no dict of positive finite real numbers by names; names the parameter.
     """
 
     def __init__(self, values: dict[str, torch.Tensor]):
@@ -28,42 +28,42 @@ class PositiveParameters(torch.nn.Module):
         )
 
     def forward(self) -> dict[str, torch.Tensor]:
-        """Their values."""
+        """Return the parameter values by name."""
         return {name: value.exp() for name, value in zip(self._names, self.logarithms, strict=True)}
 
 
 def _positive(name, value) -> torch.Tensor:
-    """Positive finite numbers of floating point."""
+    """Return positive finite numbers as a floating-point tensor."""
     try:
-        found = torch.as_tensor(value)
+        numbers = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError):
-        found = torch.zeros(0, dtype=torch.bool)
-    found = found.to(torch.get_default_dtype()) if found.dtype in (torch.int32, torch.int64) else found
-    if not isinstance(name, str) or not found.is_floating_point() or not found.numel():
+        numbers = torch.zeros(0, dtype=torch.bool)
+    numbers = numbers.to(torch.get_default_dtype()) if numbers.dtype in (torch.int32, torch.int64) else numbers
+    if not isinstance(name, str) or not numbers.is_floating_point() or not numbers.numel():
         raise SceneError(
             f"PositiveParameters: {name!r} is {value!r:.60}; give names of parameters, and numbers for each"
         )
-    if not (torch.isfinite(found) & (found > 0.0)).all():
+    if not (torch.isfinite(numbers) & (numbers > 0.0)).all():
         raise SceneError(f"PositiveParameters: {name!r} is not positive and finite; give positive numbers")
-    return found.detach()
+    return numbers.detach()
 
 
 def parameter_key(name: str) -> str:
-    """Of a parameter, as a buffer."""
+    """Return the buffer name of a parameter."""
     return f"_{name.replace('.', '_')}"
 
 
 def usual_values(simulator, name: str) -> torch.Tensor:
-    """The values that a model has of a parameter (1, E), or (B, E) where its worlds differ."""
-    found = simulator.parameter(name)
-    return (found[:1] if (found == found[:1]).all() else found).clone()
+    """Return the values of a parameter in a model (1, E), or (B, E) if its worlds differ."""
+    values = simulator.parameter(name)
+    return (values[:1] if (values == values[:1]).all() else values).clone()
 
 
 def asked(call: str, simulator, names, batch: int | None) -> tuple[tuple[str, ...], int]:
-    """Names and batch size (1 by default) that a module of a simulator's parameters is asked for.
+    """Return the names and batch size (1 by default) requested from a module of a simulator's parameters.
 
     Raises:
-        SceneError: what is given is no simulator, names are no texts, or there is none; names the call.
+        SceneError: the simulator is none, names are no texts, or there is none; names the call.
     """
     if not hasattr(simulator, "initial_state"):
         raise SceneError(f"{call}: {arguments.shown(simulator)} is no simulator; give Simulator(model, dt)")

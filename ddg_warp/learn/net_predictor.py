@@ -1,4 +1,4 @@
-"""As `ddg_warp.learn.predictor`, of a net."""
+"""VJP of the predictor of the coupled system; see `ddg_warp.learn.predictor`."""
 
 import copy
 from dataclasses import replace
@@ -16,11 +16,12 @@ from ddg_warp.solve.net.turns import Turns
 
 
 class NetPredictor:
-    """Of a net; see `ChainPredictor`.
+    """Predictor of the coupled system, with a VJP; see `ChainPredictor`.
 
     Attributes:
-        state: predicted blocks `q` with lagged data; frame: by the midpoint rule those carried there.
-        by_q: derivatives by predicted blocks, scratch.
+        state: predicted blocks `q` with lagged data.
+        frame: transported frames, in the midpoint rule.
+        by_q: gradient by predicted blocks, scratch.
     """
 
     def __init__(self, model, net, motion, midpoint: bool):
@@ -38,20 +39,20 @@ class NetPredictor:
         self._unplace, self._pass_on, self._turn, self._pull = net_predictor.net_kernels(real, midpoint)
         plan, loops = host.outwards, np.array([rod.piece.kind.closed for rod in host.rods], int)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
-        nodes, ahead = plan.nodes, plan.nodes[plan.ahead(loops)]
-        self._nodes, self._ahead = self._put(nodes), self._put(ahead)
+        nodes, next_nodes = plan.nodes, plan.nodes[plan.ahead(loops)]
+        self._nodes, self._ahead = self._put(nodes), self._put(next_nodes)
         anchored = arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
         self._rods = [self._put(plan.start), self._nodes, anchored, self._put(plan.last_anchors()), self._put(loops)]
         placed = np.zeros(net.blocks, np.uint8)
         placed[nodes[~plan.anchored]] = 1
         self._placed = arrays.upload(placed, wp.uint8, device)
-        self._levels = []  # from the last one on: its rods, and the nodes where they are anchored with the places of each
+        self._levels = []  # last level first: rods, and their anchor nodes with the path nodes of each
         for level in reversed(plan.levels):
-            places = np.flatnonzero(plan.anchored & np.isin(rod, level))
-            meets, index = np.unique(nodes[places], return_inverse=True)
+            path_nodes = np.flatnonzero(plan.anchored & np.isin(rod, level))
+            meets, index = np.unique(nodes[path_nodes], return_inverse=True)
             starts, items = lists(index.ravel(), len(meets))
-            self._levels.append((self._put(level), *map(self._put, (meets, starts, places[items]))))
-        self._meets = [self._put(values) for values in lists(np.concatenate([nodes, ahead]), net.blocks)]
+            self._levels.append((self._put(level), *map(self._put, (meets, starts, path_nodes[items]))))
+        self._meets = [self._put(values) for values in lists(np.concatenate([nodes, next_nodes]), net.blocks)]
         self._excess, self._added, self._by_base, self._by_step = (
             wp.zeros((net.worlds, len(nodes)), dtype=net.vector, device=device) for _ in range(4)
         )
@@ -59,34 +60,34 @@ class NetPredictor:
 
     @classmethod
     def of(cls, model, net, motion, scheme: str | None) -> "NetPredictor | None":
-        """As of `ChainPredictor`."""
+        """Return the predictor of a scheme; None if its solves lag nothing at the predicted configuration."""
         midpoint = scheme == "implicit_midpoint"
         needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
         return cls(model, net, motion, midpoint) if needed else None
 
     @property
     def kernels(self) -> list:
-        """Kernels to load before a capture, once a solver was suited."""
-        own = [self._begin, self._unplace, self._pass_on, self._turn, self._pull, *self.net.carries]
+        """Kernels to load before a capture, after `suit`."""
+        kernels_of_predictor = [self._begin, self._unplace, self._pass_on, self._turn, self._pull, *self.net.carries]
         parts = (self.motion, self._solver.turns)
-        return own + [kernel for part in parts if part for kernel in part.kernels]
+        return kernels_of_predictor + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float) -> bool:
-        """From now on find those of a `NetStep` that solves over s [s]; whether that is another one."""
+        """Prepare for solves of a `NetStep` over s [s]; return True if kernels or arrays have changed."""
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
             self._islands.turn.assign(step.limits(s)["turn"])
         if self._solver is not None and self._solver.linear is step.newton.linear:
             return False
-        self._solver = solver = copy.copy(step.newton)  # which turns what is its own
+        self._solver = solver = copy.copy(step.newton)  # with arrays of its own
         solver.q, solver.base, solver.target, solver.islands = self._q, self._base, self._target, self._islands
         solver.direction = wp.zeros_like(solver.direction)
         solver.turns = Turns(solver) if self._levels else None
         return True
 
     def find(self, before: NetState) -> None:
-        """As of `ChainPredictor`."""
+        """Compute the predictor of a step from the state `before`; launches only."""
         net, solver, islands = self.net, self._solver, self._islands
         islands.todo.zero_()
         inputs = [before.q, before.v, solver.held, net.moves, self._dt, self._none, self._none, *islands.arrays]
@@ -101,12 +102,14 @@ class NetPredictor:
             self.state = replace(self.state, frame=self.frame, lag=self._lag)
             net.carry(before, self.state)
 
-    def pull(self, before: NetState, held: wp.array, start: NetState, by_rate: wp.array) -> None:
-        """From derivatives `by_q` to those by the state before the step; adds, and destroys `by_q`.
+    def pull(self, before: NetState, by_fixed: wp.array, start: NetState, by_rate: wp.array) -> None:
+        """Add the gradient by the state before the step, given `by_q`, which is overwritten.
 
         Args:
-            before: as of `find`, which has to be the last one found.
-            held: derivatives by where held dofs are; by_rate: those by the rate.
+            before: as of the last `find`.
+            by_fixed: gradient by fixed dofs.
+            start: gradient by the state before the step.
+            by_rate: gradient by the inverse step.
         """
         net, islands, worlds = self.net, self._islands, self.net.worlds
         for array in (self._along, self._excess, self._added, self._by_base, self._by_step):
@@ -122,7 +125,7 @@ class NetPredictor:
         self._launch(self._turn, (len(self._nodes), worlds), read, [self._by_base, self._by_step])
         read = [self.by_q, self._along, self._placed, *self._meets, len(self._nodes), self._by_base, self._by_step]
         read += [before.v, *held_mass, islands.todo, islands.rate, net.blocks]
-        self._launch(self._pull, len(self._q), read, [held, start.q, start.v, by_rate])
+        self._launch(self._pull, len(self._q), read, [by_fixed, start.q, start.v, by_rate])
 
     def _put(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.net.device)

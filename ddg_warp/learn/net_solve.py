@@ -1,4 +1,4 @@
-"""The linear system of the reverse of a net, by what suits it."""
+"""Adjoint linear solve of the coupled system."""
 
 from functools import cached_property
 from types import SimpleNamespace
@@ -15,17 +15,19 @@ from ddg_warp.solve.net.tangent import NetTangent
 
 
 class NetSolve:
-    """(H + c M - dL/dq)^T w = g: of steps on the device; of equilibria, whose loads L follow, by sparse factors on the host.
+    """Solver of (H + c M - dL/dq)^T w = g, on the device for steps, on the host for equilibria.
+
+    Host solves use sparse factors; dL/dq is the load stiffness of equilibria.
 
     Args:
         drag: `NetDragAdjoint`, None without drag.
-        contact: `ExactContact`, which is where the solution of a step is; None without contact.
-        steps: whether of steps.
+        contact: `ExactContact`, evaluated at the solution of a step; None without contact.
+        steps: True for steps.
 
     Attributes:
-        system: `ExactSystem`; None of equilibria.
-        failed: as of that; None of equilibria.
-        held: of the last solve on the host, what loads that follow held dofs add to derivatives by these (W N,); None where none do.
+        system: `ExactSystem`; None for equilibria.
+        failed: failure flags of `system`; None for equilibria.
+        held: of the last host solve, the load-stiffness term of the gradient by fixed dofs (W N,); None without follower loads.
     """
 
     def __init__(self, model, drag, contact, steps: bool):
@@ -40,7 +42,7 @@ class NetSolve:
 
     @cached_property
     def tangent(self) -> NetTangent:
-        """Of solves on the host."""
+        """Tangent of host solves."""
         return NetTangent(self.model, 0)
 
     @cached_property
@@ -55,18 +57,17 @@ class NetSolve:
     def __call__(
         self, state, rate: float, time: float, right: wp.array, w: wp.array, factors: bool = False, rubbing=None
     ) -> None:
-        """Write w (W N,), zero at held dofs.
+        """Write w (W N,), zero at fixed dofs.
 
         Args:
             state: the solution with its lagged data and the strains of the last step.
-            rate: of the implicit Euler step [1/s], zero for an equilibrium, of which `time` is the load parameter.
+            rate: inverse step of implicit Euler [1/s], zero for an equilibrium with the load parameter `time`.
             right: g (W N,).
-            factors: solve on the host, as conjugate gradients have failed.
-            rubbing: what friction adds to H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.rubbing`; None without.
+            factors: True to solve on the host, after conjugate gradients have failed.
+            rubbing: friction term of H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.rubbing`; None without.
 
         Raises:
-            SolverError: H is singular; on the host alone, see `failed`. Or it is of a step in contact, which
-                the host knows not.
+            SolverError: H is singular (host only; see `failed`), or the host is to solve a step in contact, which it cannot.
         """
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if self.system and not factors:
@@ -80,26 +81,29 @@ class NetSolve:
             )
         tangent, host = self.tangent, self._host
         more = self.drag.matrix if self.drag else None
-        given = tangent.into(right.numpy().astype(float).ravel())
-        found = host(SimpleNamespace(net=state), rate, coefficient, None if rate else time, given, more, rubbing)
-        w.assign(tangent.back(found).reshape(-1, 3))
+        rhs = tangent.into(right.numpy().astype(float).ravel())
+        solution = host(SimpleNamespace(net=state), rate, coefficient, None if rate else time, rhs, more, rubbing)
+        w.assign(tangent.back(solution).reshape(-1, 3))
         if host.held is not None:
             self.held = wp.empty_like(w)
             self.held.assign(tangent.back(host.held).reshape(-1, 3))
 
     def chain(self, by_lagged: wp.array, by_q: wp.array) -> None:
-        """Turn derivatives by a solution (W N,) into g of the solve that led to what it lags, by which they are `by_lagged`: zeroed."""
+        """Overwrite free entries of `by_q` (W N,) with the gradient `by_lagged`, and add `by_lagged` to its fixed entries.
+
+        The result is the right-hand side g of the friction iteration before; `by_lagged` is zeroed.
+        """
         wp.launch(
             self._chain, len(by_q), [self.system.fixed, self.net.blocks], [by_lagged, by_q], device=self.net.device
         )
 
     def stays(self, by_q: wp.array, out: wp.array) -> None:
-        """Write the part of derivatives by held dofs (W N,) that goes to where a step starts: of those that no motion moves."""
+        """Write the entries of a gradient by fixed dofs (W N,) that belong to the start of a step: dofs without prescribed motion."""
         self.system.part(by_q, self._left_out, out)
 
 
 def _moved(host) -> np.ndarray:
-    """Which dofs of a world motions put in place (blocks, 3)."""
+    """Return the dofs of a world with prescribed motion (blocks, 3)."""
     moved = np.zeros((host.blocks, 3), bool)
     moved[host.moving[:, 0]] = host.moving[:, 1:] > FREE
     moved[host.turning[:, 0], 0] = True

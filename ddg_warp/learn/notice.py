@@ -1,16 +1,16 @@
-"""A flag that kernels raise and the host reads without a wait."""
+"""Flag that kernels raise and the host reads without synchronisation."""
 
 import warp as wp
 
 
 class Notice:
-    """An integer in memory of the host that kernels of a device can write to.
+    """Integer in host memory that kernels of a device can write.
 
-    On CUDA it is pinned, and the device writes there by the address that the host has for it (unified addressing), so that the host
-    sees what kernels have done so far and waits for none.
+    On CUDA it is pinned, and the device writes to the host's address (unified addressing), so that the host sees writes of finished
+    kernels without waiting.
 
     Attributes:
-        array: the integer (1,), as kernels take it; zero at first.
+        array: the integer (1,), as kernels take it; initially zero.
     """
 
     def __init__(self, device):
@@ -21,5 +21,5 @@ class Notice:
 
     @property
     def given(self) -> bool:
-        """Whether a kernel has raised the flag."""
+        """True if a kernel has raised the flag."""
         return bool(self._values[0])
