@@ -60,7 +60,7 @@ class NetPredictor:
 
     @classmethod
     def of(cls, model, net, motion, scheme: str | None) -> "NetPredictor | None":
-        """Return the predictor of a scheme; None if its solves lag nothing at the predicted configuration."""
+        """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         midpoint = scheme == "implicit_midpoint"
         needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
         return cls(model, net, motion, midpoint) if needed else None

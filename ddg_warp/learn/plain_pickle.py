@@ -1,10 +1,10 @@
 """Pickles of numbers: NumPy arrays in lists, tuples and dicts, and nothing else.
 
-A pickle is a program, and `pickle.load` runs it. Here an interpreter reads the instructions that numbers, texts, lists, tuples, dicts
-and arrays of numbers are pickled with, by any NumPy and protocol. Names stand for five functions of this file that note shape, type
+A pickle is a program, and `pickle.load` runs it. This interpreter reads only the instructions for numbers, texts, lists, tuples,
+dicts and arrays of numbers, as written by any NumPy and protocol. Names map to five functions of this file that record shape, type
 and bytes of an array. Any other name or instruction is refused.
-Memory and time are bounded by the size of the file: a file that refers to one object many times unfolds to at most `UNFOLDED` values a
-byte, and lists are nested at most `DEEPEST` times.
+Memory and time are bounded by the size of the file: shared objects expand to at most `UNFOLDED` values a byte, and lists are nested
+at most `DEEPEST` times.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from ddg_warp.io import as_path, is_file
 
 KINDS = "biufc"  # truth values, whole numbers, real and complex ones
 DEEPEST = 64  # lists in lists; arrays have as many axes at most
-UNFOLDED, FREE = 16, 10_000  # values that a file may unfold to: for each of its bytes, and in any case
+UNFOLDED, FREE = 16, 10_000  # limit of expanded values: per byte of the file, and allowance of every file
 SHOWN = 120  # letters of a name or a reason in an error
 
 
 class UnsafePickleError(DataError):
-    """A pickle asks for more than arrays of numbers; the message names the file and the request. Nothing of it has run."""
+    """Error for a pickle that needs more than arrays of numbers; names file and request. No code of the pickle has run."""
 
 
 def load(path):
     """Return the content of a pickle: numbers, texts, arrays of numbers, and lists, tuples and dicts of them.
 
     Raises:
-        UnsafePickleError: The file asks for anything else.
-        DataError: There is no such file, it is no pickle, is cut short, or unfolds to far more than its size.
+        UnsafePickleError: The file needs anything else.
+        DataError: The file does not exist, is no pickle, is truncated, or expands to far more than its size.
     """
     path = as_path("plain_pickle.load: path", path)
     try:
@@ -60,13 +60,13 @@ def load(path):
 
 
 def _short(text) -> str:
-    """A text in one line of bounded length."""
+    """Return a text in one line of bounded length."""
     text = " ".join(str(text).split())
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 class _Type:
-    """A NumPy type of numbers."""
+    """NumPy type of numbers."""
 
     def __init__(self, code: str, *_):
         if not isinstance(code, str):
@@ -83,7 +83,7 @@ class _Type:
 
 
 class _Array:
-    """An array, empty until its state is set; `value` is a view of bytes of the file."""
+    """Array, empty until its state is set; `value` is a view of bytes of the file."""
 
     def __init__(self, *_):
         self.value = np.zeros(0)
@@ -94,7 +94,7 @@ class _Array:
 
 
 def _made(content, kind: _Type, shape: tuple, order: str = "C") -> _Array:
-    """An array of given bytes."""
+    """Return an array of given bytes."""
     if not isinstance(kind, _Type):
         raise ValueError("the type of an array is none")
     made = _Array()
@@ -107,14 +107,14 @@ def _scalar(kind: _Type, content: bytes):
 
 
 def _bytes(text: str, encoding: str) -> bytes:
-    """Bytes, as protocols before 3 write them."""
+    """Return bytes as encoded by protocols before 3."""
     if not isinstance(text, str) or not isinstance(encoding, str) or encoding not in ("latin1", "latin-1"):
         raise ValueError("bytes are written in another way than as a text in latin1")
     return text.encode("latin1")
 
 
 def _no_bytes() -> bytes:
-    """Bytes of an empty array, as protocols before 3 write them."""
+    """Return the bytes of an empty array as encoded by protocols before 3."""
     return b""
 
 
@@ -138,7 +138,7 @@ TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 class _Name:
-    """A name that arrays are pickled with, and its function."""
+    """Allowed name in pickles of arrays, and the function it maps to."""
 
     def __init__(self, function):
         self.function = function
@@ -149,7 +149,7 @@ class _Reader:
 
     Args:
         content: The file.
-        path: Its path, for messages.
+        path: Path of the file, for messages.
     """
 
     def __init__(self, content: bytes, path: Path):
@@ -161,7 +161,7 @@ class _Reader:
         self._memo: dict[int, object] = {}
 
     def run(self):
-        """Return the object that the pickle ends with; arrays in it are `_Array`."""
+        """Return the object at the end of the pickle; arrays in it are `_Array`."""
         for code, argument, _ in pickletools.genops(self._content):
             name = code.name
             if name in VALUES:
@@ -206,8 +206,8 @@ class _Reader:
         elif name == "GLOBAL":
             stack.append(self._named(*argument.split(" ", 1)))
         elif name == "STACK_GLOBAL":
-            found, module = stack.pop(), stack.pop()
-            stack.append(self._named(module, found))
+            attribute, module = stack.pop(), stack.pop()
+            stack.append(self._named(module, attribute))
         elif name == "REDUCE":
             arguments, called = stack.pop(), stack.pop()
             stack.append(self._called(called, arguments))
@@ -221,14 +221,14 @@ class _Reader:
         else:
             raise self._unsafe(f"the instruction {name}")
 
-    def _unsafe(self, asked: str) -> UnsafePickleError:
+    def _unsafe(self, request: str) -> UnsafePickleError:
         return UnsafePickleError(
-            f"{self._path}: the pickle asks for {asked}, which arrays of numbers do not need; nothing of it has run. "
+            f"{self._path}: the pickle asks for {request}, which arrays of numbers do not need; nothing of it has run. "
             "Load it where you trust it, and save its arrays"
         )
 
     def _collect(self, name: str, items: list) -> None:
-        """Use the objects since the last mark."""
+        """Process the objects since the last mark."""
         if name == "LIST":
             self._stack.append(items)
         elif name == "TUPLE":
@@ -249,7 +249,7 @@ class _Reader:
     def _update(self, items: list) -> None:
         if not isinstance(self._stack[-1], dict):
             raise ValueError("items are set in what is no dict")
-        for key in items[::2]:  # others take long to hash, or are made to collide
+        for key in items[::2]:  # other keys may be slow to hash or crafted to collide
             if not isinstance(key, str) and not (isinstance(key, int) and abs(key) < 2**32):
                 raise ValueError("the keys of a dict are no texts or whole numbers below 2^32")
         self._stack[-1].update(zip(items[::2], items[1::2], strict=True))
@@ -257,10 +257,10 @@ class _Reader:
     def _named(self, module, name) -> _Name:
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a name is no text")
-        asked = f"{module}.{name}".replace("numpy._core", "numpy.core")  # its name from NumPy 2 on
-        if asked not in ALLOWED:
-            raise self._unsafe(_short(asked))
-        return _Name(ALLOWED[asked])
+        full_name = f"{module}.{name}".replace("numpy._core", "numpy.core")  # its name from NumPy 2 on
+        if full_name not in ALLOWED:
+            raise self._unsafe(_short(full_name))
+        return _Name(ALLOWED[full_name])
 
     def _called(self, called, arguments):
         if not isinstance(called, _Name) or called.function is ARRAY_TYPE:
@@ -274,7 +274,7 @@ class _Reader:
         return called.function(*arguments)
 
     def finished(self, value):
-        """Return an object with arrays for each `_Array`, after a check of the size that it unfolds to."""
+        """Return an object with arrays for each `_Array`, after a check of its expanded size."""
         count = self._count(value, {}, 0)
         if count > self._limit:
             raise DataError(
@@ -283,8 +283,8 @@ class _Reader:
             )
         return _converted(value, {})
 
-    def _count(self, value, known: dict[int, int], depth: int) -> int:
-        """Number of values in an object, with those that it refers to several times counted as often."""
+    def _count(self, value, counts: dict[int, int], depth: int) -> int:
+        """Return the number of values in an object, with shared objects counted at every reference."""
         if isinstance(value, _Array):
             return 1 + value.value.size
         if isinstance(value, _Type | _Name):
@@ -295,22 +295,22 @@ class _Reader:
             raise DataError(
                 f"{self._path}: lists of the pickle hold themselves, or are nested more than {DEEPEST} times; save its arrays"
             )
-        if id(value) not in known:
+        if id(value) not in counts:
             parts = value.values() if isinstance(value, dict) else value
-            known[id(value)] = 1 + len(value) + sum(self._count(part, known, depth + 1) for part in parts)
-        return known[id(value)]
+            counts[id(value)] = 1 + len(value) + sum(self._count(part, counts, depth + 1) for part in parts)
+        return counts[id(value)]
 
 
-def _converted(value, known: dict[int, object]):
-    """An object with arrays of its own for each `_Array`; what is referred to several times stays one object."""
+def _converted(value, results: dict[int, object]):
+    """Return an object with a copy of each `_Array` as an array; shared objects stay shared."""
     if not isinstance(value, _Array | list | tuple | dict):
         return value
-    if id(value) not in known:
+    if id(value) not in results:
         if isinstance(value, _Array):
             made = value.value.copy(order="K")
         elif isinstance(value, dict):
-            made = {key: _converted(item, known) for key, item in value.items()}
+            made = {key: _converted(item, results) for key, item in value.items()}
         else:
-            made = type(value)(_converted(item, known) for item in value)
-        known[id(value)] = made
-    return known[id(value)]
+            made = type(value)(_converted(item, results) for item in value)
+        results[id(value)] = made
+    return results[id(value)]

@@ -1,6 +1,6 @@
-"""Where a step predicts rods to be, found again for the reverse of what its solve lags there, and the reverse of that.
+"""Predictor of rod groups in the backward pass: recomputed for terms lagged at the predicted configuration, with a VJP.
 
-Loads that follow are those on the predicted configuration; so are, by the midpoint rule, frames and drag.
+Follower loads are evaluated on the predicted configuration; in the midpoint rule frames and drag are, too.
 """
 
 import warp as wp
@@ -12,14 +12,16 @@ from ddg_warp.kernels.islands import Islands
 
 
 class ChainPredictor:
-    """Of a group of rods, for whole steps that are solved at the first attempt.
+    """Predictor of a rod group with a VJP, for whole steps solved at the first attempt.
 
     Args:
-        motion: of the supports, None where they rest.
+        motion: prescribed motion of the supports, None if fixed.
 
     Attributes:
-        x: predicted nodes; frame: lagged frames, by the midpoint rule carried there.
-        by_x: derivatives by predicted nodes (block, n, R), scratch; by_frame: by carried frames.
+        x: predicted nodes.
+        frame: lagged frames, transported to `x` in the midpoint rule.
+        by_x: gradient by predicted nodes (block, n, R), scratch.
+        by_frame: gradient by transported frames.
     """
 
     def __init__(self, model, group, motion, midpoint: bool):
@@ -46,18 +48,18 @@ class ChainPredictor:
 
     @classmethod
     def of(cls, model, group, motion, scheme: str | None) -> "ChainPredictor | None":
-        """That of a group's steps by a scheme; None where their solves lag nothing at the predicted configuration."""
+        """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         kind, midpoint = group.kind, scheme == "implicit_midpoint"
         needed = scheme and (group.host.followers or (midpoint and (kind.twist or kind.drag)))
         return cls(model, group, motion, midpoint) if needed else None
 
     @property
     def kernels(self) -> list:
-        """Kernels to load before a capture, once it suits."""
+        """Kernels to load before a capture, after `suit`."""
         return [self._begin, self._predict, self._pull, *([self._carry] if self._carry else [])]
 
     def suit(self, solved, s: float) -> bool:
-        """From now on find those of solves over s [s] by a `ChainStep`; whether that takes other kernels or arrays than before."""
+        """Prepare for solves of a `ChainStep` over s [s]; return True if kernels or arrays have changed."""
         linear = solved.newton.linear
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
@@ -71,7 +73,7 @@ class ChainPredictor:
         return True
 
     def find(self, before) -> None:
-        """Those of a step from the state `before` of the group; launches alone."""
+        """Compute the predictor of a step from the state `before` of the group; launches only."""
         group, islands = self.group, self._islands
         islands.bent.zero_()
         wp.launch(
@@ -92,13 +94,15 @@ class ChainPredictor:
             device=self.model.wp_device,
         )
 
-    def pull(self, before, gather, window: wp.array, held: wp.array, start, by_rate: wp.array) -> None:
-        """Add derivatives `by_x`, and those `by_frame` of carried frames, to those by the state before the step, `start`.
+    def pull(self, before, gather, window: wp.array, by_fixed: wp.array, start, by_rate: wp.array) -> None:
+        """Add the gradients `by_x` and `by_frame` to `start`, the gradient by the state before the step.
 
         Args:
-            before: as of `find`, which has to be the last one found.
-            gather: kernel that adds what windows bring to nodes; window: scratch.
-            held: derivatives by where held dofs are, which are added to; by_rate: those by the rate, too.
+            before: as of the last `find`.
+            gather: kernel that assembles element windows to nodes.
+            window: scratch.
+            by_fixed: gradient by fixed dofs, added to.
+            by_rate: gradient by the inverse step, added to.
         """
         group = self.group
         if self.carries:
@@ -108,7 +112,7 @@ class ChainPredictor:
             self._pull,
             group.columns,
             [self.x, before.x, before.v, group.fixed, group.anchor, group.count, *self._islands.arrays, self.by_x],
-            [self._excess, self._added, held, start.x, start.v, by_rate],
+            [self._excess, self._added, by_fixed, start.x, start.v, by_rate],
             device=self.model.wp_device,
         )
 

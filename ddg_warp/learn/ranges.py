@@ -1,7 +1,7 @@
-"""Ranges of parameters, and samples from them: independent, by Latin hypercubes, by Sobol's sequence or on a grid.
+"""Parameter ranges and samples: independent, Latin hypercube, Sobol or grid.
 
-A sample depends on the seed and its index alone (in a Latin hypercube, on their number, too), whatever the order of the ranges
-and of the work, so that samples are the same bit by bit wherever and whenever they are drawn.
+A sample depends only on the seed and its index (in a Latin hypercube, on the number of samples, too), not on the order of ranges or
+of execution. Samples are reproducible bit for bit on any machine.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 DESIGNS = ("random", "latin_hypercube", "sobol", "grid")
-GROWING = ("random", "sobol")  # designs whose first samples stay when there are to be more
+GROWING = ("random", "sobol")  # designs in which a larger number of samples keeps the first ones
 MOST = 10_000_000  # samples of a sweep
 KINDS = {int: "a whole number", float: "a number", bool: "True or False", str: "a text"}
 """Types of parameters, and their names in errors."""
@@ -26,10 +26,10 @@ KINDS = {int: "a whole number", float: "a number", bool: "True or False", str: "
 
 @dataclass(frozen=True)
 class Uniform:
-    """Numbers between two, all equally likely; on a grid equally spaced, both ends included.
+    """Range of numbers with uniform probability; on a grid equally spaced, both ends included.
 
     Raises:
-        SceneError: They are not finite, not in order, or too far apart.
+        SceneError: The ends are not finite, not in order, or too far apart.
     """
 
     low: float
@@ -41,16 +41,16 @@ class Uniform:
             raise SceneError(f"Uniform({self.low}, {self.high}): the ends are too far apart; give a smaller range")
 
     def at(self, share: float) -> float:
-        """The number below which a share of them lies."""
+        """Return the `share`-quantile."""
         return self.low + share * (self.high - self.low)
 
 
 @dataclass(frozen=True)
 class LogUniform:
-    """Positive numbers between two, whose logarithms are equally likely; on a grid in a geometric series.
+    """Range of positive numbers with log-uniform probability; on a grid a geometric series.
 
     Raises:
-        SceneError: They are not positive and finite, not in order, or too far apart.
+        SceneError: The ends are not positive and finite, not in order, or too far apart.
     """
 
     low: float
@@ -63,16 +63,16 @@ class LogUniform:
             raise SceneError(f"LogUniform({self.low}, {self.high}): the ends are too far apart; give a smaller range")
 
     def at(self, share: float) -> float:
-        """The number below which a share of them lies."""
+        """Return the `share`-quantile."""
         return min(self.high, self.low * (self.high / self.low) ** share)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values, all equally likely, such as `Choice([10, 20, 40])` or `Choice(range(5, 50))`.
+    """One of several values with equal probability, such as `Choice([10, 20, 40])` or `Choice(range(5, 50))`.
 
     Raises:
-        SceneError: There is none, they have no order, or one is no value that files hold.
+        SceneError: There is no value, values have no order, or one cannot be stored in files.
     """
 
     values: Sequence
@@ -85,7 +85,7 @@ class Choice:
         object.__setattr__(self, "values", [storable(f"Choice: value {k}", each) for k, each in enumerate(values)])
 
     def at(self, share: float):
-        """The value below which a share of them lies, in their order."""
+        """Return the `share`-quantile, in the order of values."""
         return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
 
 
@@ -93,14 +93,14 @@ Range = Uniform | LogUniform | Choice
 
 
 def draw(ranges: Mapping[str, object], samples: int, design: str = "random", seed: int = 0) -> list[dict]:
-    """Values of all parameters, sample after sample.
+    """Draw values of all parameters for every sample.
 
     Args:
-        ranges: Range of each parameter by name; anything else is a value that all samples share.
-        samples: How many; with design "grid" how many along each range, of which the product is taken. A `Choice` gives all its values
-            to a grid.
+        ranges: Range of each parameter by name; anything else is a value of all samples.
+        samples: Number of samples; with design "grid" the number along each range, of which the product is taken. A `Choice` gives
+            all values to a grid.
         design: "random", "latin_hypercube", "sobol" or "grid".
-        seed: What they are drawn with; a grid has no use for it.
+        seed: Seed of the samples; unused on a grid.
 
     Raises:
         SceneError: Ranges are no mapping of names, there are no samples or more than `MOST`, or there is no such design.
@@ -126,10 +126,10 @@ def draw(ranges: Mapping[str, object], samples: int, design: str = "random", see
 
 
 def seed_of(seed: int, index: int) -> int:
-    """A seed of 32 bits for the random numbers inside of a sample, independent of those that the sample itself was drawn with.
+    """Return a 32-bit seed for random numbers within a sample, independent of the draw of the sample.
 
     Raises:
-        SceneError: They are no whole numbers that are not negative.
+        SceneError: The arguments are not nonnegative integers.
     """
     seed, index = arguments.count("seed_of: seed", seed, 0), arguments.count("seed_of: index", index, 0)
     return int(np.random.SeedSequence([seed, index], spawn_key=(1,)).generate_state(1)[0])
@@ -140,10 +140,10 @@ def parsed(text: str, kind: type | None = None) -> Range:
 
     Args:
         text: The range.
-        kind: Type of the parameter, where it is known: of a `str` every value is a text.
+        kind: Type of the parameter, if known; values of a `str` are texts.
 
     Raises:
-        SceneError: The text is none, or the ends of a range are no numbers.
+        SceneError: The text is no range, or the ends are no numbers.
     """
     if not isinstance(text, str):
         raise SceneError(f"range {text!r}: give a text, LOW:HIGH, or LOW:HIGH:log, or values A,B,C")
@@ -159,25 +159,25 @@ def parsed(text: str, kind: type | None = None) -> Range:
 
 
 def plain_value(value):
-    """A value without NumPy, as it is kept in files and given to functions."""
+    """Return a value without NumPy types, for files and function arguments."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
-def storable(what: str, value):
-    """Return a value without NumPy that JSON holds: a number, text, truth value, None, or lists and dicts of them.
+def storable(label: str, value):
+    """Return a value without NumPy that JSON can store: a number, text, truth value, None, or lists and dicts of values.
 
     Raises:
-        SceneError: It is none; names `what`.
+        SceneError: The value is none of these; names `label`.
     """
     value = plain_value(value)
     if value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
     if isinstance(value, list | tuple):
-        return type(value)(storable(f"{what}[{k}]", each) for k, each in enumerate(value))
+        return type(value)(storable(f"{label}[{k}]", each) for k, each in enumerate(value))
     if isinstance(value, Mapping) and all(isinstance(name, str) for name in value):
-        return {name: storable(f"{what}[{name!r}]", each) for name, each in value.items()}
+        return {name: storable(f"{label}[{name!r}]", each) for name, each in value.items()}
     raise SceneError(
-        f"{what} is {value!r:.60}; give a finite number, a text, True, False, None, or lists and dicts of them"
+        f"{label} is {value!r:.60}; give a finite number, a text, True, False, None, or lists and dicts of them"
     )
 
 
@@ -185,7 +185,7 @@ def check_names(ranges) -> None:
     """Refuse ranges that are no mapping of names.
 
     Raises:
-        SceneError: names what was given.
+        SceneError: names the argument.
     """
     if not isinstance(ranges, Mapping):
         raise SceneError(f"ranges = {ranges!r:.60}; give a dict of ranges by the names of parameters")
@@ -195,12 +195,12 @@ def check_names(ranges) -> None:
 
 
 def check_kind(name: str, range_, kind: type) -> None:
-    """Refuse a range, or a value for all samples, that gives a parameter values of another type.
+    """Refuse a range, or a common value, with values of another type than the parameter.
 
     Args:
         name: Name of the parameter.
         range_: Its range or value.
-        kind: Its type; anything but `KINDS` is not checked.
+        kind: Its type; checked if in `KINDS`.
 
     Raises:
         SceneError: names parameter and value.
@@ -222,7 +222,7 @@ def check_kind(name: str, range_, kind: type) -> None:
 
 
 def _shares(columns: int, samples: int, design: str, seed: int) -> list[list[float]]:
-    """Points of the unit cube, (samples, columns)."""
+    """Return points of the unit cube, (samples, columns)."""
     if not columns:
         return [[] for _ in range(samples)]
     if design == "random":
@@ -232,30 +232,30 @@ def _shares(columns: int, samples: int, design: str, seed: int) -> list[list[flo
     sampler = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol}[design](
         columns, rng=np.random.default_rng(seed)
     )
-    if design == "sobol":  # a power of two of them is balanced; the first of more points are the same
+    if design == "sobol":  # balanced for powers of two; more points extend the sequence
         return sampler.random_base2(math.ceil(math.log2(samples)))[:samples].tolist()
     return sampler.random(samples).tolist()
 
 
 def _levels(values: Range, count: int) -> list:
-    """The values of a range on a grid."""
+    """Return the values of a range on a grid."""
     if isinstance(values, Choice):
         return list(values.values)
     return [values.at(share) for share in (np.linspace(0.0, 1.0, count).tolist() if count > 1 else [0.5])]
 
 
 def _check_ends(range_) -> None:
-    """Refuse ends that are no finite numbers or not in order, and take them without NumPy."""
-    what = type(range_).__name__
-    low, high = (arguments.number(f"{what}: {name}", getattr(range_, name)) for name in ("low", "high"))
+    """Refuse ends that are no finite numbers or not in order, and convert them from NumPy."""
+    kind = type(range_).__name__
+    low, high = (arguments.number(f"{kind}: {name}", getattr(range_, name)) for name in ("low", "high"))
     if low > high:
-        raise SceneError(f"{what}({low}, {high}): the low end comes first")
+        raise SceneError(f"{kind}({low}, {high}): the low end comes first")
     for name in ("low", "high"):
         object.__setattr__(range_, name, plain_value(getattr(range_, name)))
 
 
 def _value(text: str):
-    """A whole number, a number, a truth value, or the text itself."""
+    """Return an integer, a number, a truth value, or the text itself."""
     for kind in (int, float, {"true": True, "false": False}.__getitem__):
         try:
             return kind(text.strip())

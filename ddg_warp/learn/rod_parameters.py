@@ -1,4 +1,4 @@
-"""What rods are made of, as a module that learns it."""
+"""Module of learned rod material and section parameters."""
 
 from math import pi
 
@@ -15,23 +15,24 @@ NAMES = ("stretching", "bending", "twisting", "density", "radius")
 
 
 class RodParameters(torch.nn.Module):
-    """What a simulator's rods are made of over what they were built with: positive factors c, learned as logarithms; called, it gives
-    what `Simulator.step` takes.
+    """Learned factors of rod stiffnesses, density and radius; calling the module returns input of `Simulator.step`.
+
+    Factors c multiply the values of the built model, are positive and learned as logarithms:
 
         stretching, bending, twisting   c EA; c EI in both directions; c GJ
-        density                         c rho: masses and rotary inertia; those of `Scene.add_mass` stay
-        radius                          all lengths of the section: c^2 EA, c^4 EI, c^4 GJ, c^2 of masses, c^4 of rotary inertia, drag
-                                        as `Viscous` has it of a radius, c of the radius in contact, 1 / c of the curvature at
+        density                         c rho: masses and rotary inertia; masses of `Scene.add_mass` stay
+        radius                          all lengths of the section: c^2 EA, c^4 EI, c^4 GJ, c^2 of masses, c^4 of rotary inertia,
+            drag
+                                        by the radius in `Viscous`, c of the radius in contact, 1 / c of the curvature at
                                         which the law of a `Ribbon` changes
 
-    The size of a section does not tell coefficients of drag and radii in contact that are given outright, which stay, nor
-    stiffnesses: rods whose section is a `Stiffness`, or that have laws of their own, have no radius; nor have magnetised rods. Glue
-    to shells stays as it is.
+    Drag coefficients and contact radii that were set explicitly stay. Rods have no radius to learn if the section is a `Stiffness`,
+    if they have constitutive laws of their own, or if they are magnetised. Rod-shell coupling stays unchanged.
 
     Args:
-        simulator: whose rods they are.
-        batch: worlds that have factors of their own; by default all share one.
-        names: which are learned, among those above.
+        simulator: the simulator of the rods.
+        batch: number of worlds with factors of their own; by default all worlds use the same.
+        names: the factors to learn, from the list above.
 
     Raises:
         SceneError: the model has no rods, or none with such a quantity.
@@ -44,71 +45,78 @@ class RodParameters(torch.nn.Module):
         names, batch = asked("RodParameters", simulator, names, batch)
         model = simulator.model
         powers = _powers(model)
-        known = [name for name in NAMES if any(name in power for power in powers.values())]
+        available = [name for name in NAMES if any(name in power for power in powers.values())]
         for name in names:
-            if name not in known:
-                raise SceneError(f"RodParameters: no rod has {name!r}; there is {', '.join(known) or 'no rod'}")
+            if name not in available:
+                raise SceneError(f"RodParameters: no rod has {name!r}; there is {', '.join(available) or 'no rod'}")
         if "radius" in names:
             _require_sizes(model.scene)
         made = {"dtype": torch.float64, "device": str(wp.device_to_torch(model.wp_device))}
         self.logarithms = torch.nn.ParameterDict(
             {name: torch.nn.Parameter(torch.zeros((batch, 1), **made)) for name in names}
         )
-        # in one order, as DistributedDataParallel tells buffers of its processes apart by that
-        self._powers = {own: power for own, power in powers.items() if not power.keys().isdisjoint(names)}
-        for own in self._powers:
-            self.register_buffer(parameter_key(own), usual_values(simulator, own))
+        # in a fixed order, by which DistributedDataParallel matches buffers across processes
+        self._powers = {parameter: power for parameter, power in powers.items() if not power.keys().isdisjoint(names)}
+        for parameter in self._powers:
+            self.register_buffer(parameter_key(parameter), usual_values(simulator, parameter))
         if "rod.mass" in self._powers:
             self.register_buffer("_sections", torch.tensor(constants.of_sections(model, "rod.mass"), **made))
-        for own in ("drag.tangential", "drag.normal", "drag.rotational", contact_places.RADIUS):
-            if own in self._powers:
-                self.register_buffer(f"{parameter_key(own)}_share", torch.tensor(_share(model, own), **made))
+        for parameter in ("drag.tangential", "drag.normal", "drag.rotational", contact_places.RADIUS):
+            if parameter in self._powers:
+                self.register_buffer(
+                    f"{parameter_key(parameter)}_share", torch.tensor(_share(model, parameter), **made)
+                )
 
     def forward(self) -> dict[str, torch.Tensor]:
-        """Their values, as `Simulator.step` takes them."""
+        """Return parameter values for `Simulator.step`."""
         result = {}
-        for own, powers in self._powers.items():
-            usual, logarithms = getattr(self, parameter_key(own)), self.logarithms
+        for parameter, powers in self._powers.items():
+            usual, logarithms = getattr(self, parameter_key(parameter)), self.logarithms
             exponent = sum(power * logarithms[name] for name, power in powers.items() if name in logarithms)
-            if own == "rod.mass":
-                result[own] = usual + self._sections * torch.expm1(exponent)
-            elif own in ("drag.rotational", contact_places.RADIUS):  # 4 pi mu a^2, and a
-                result[own] = usual * (1.0 + getattr(self, f"{parameter_key(own)}_share") * torch.expm1(exponent))
-            elif own.startswith("drag."):  # k mu / (ln(S / a) + constant)
-                result[own] = usual / (1.0 - usual * getattr(self, f"{parameter_key(own)}_share") * exponent)
+            if parameter == "rod.mass":
+                result[parameter] = usual + self._sections * torch.expm1(exponent)
+            elif parameter in ("drag.rotational", contact_places.RADIUS):  # 4 pi mu a^2, and a
+                result[parameter] = usual * (
+                    1.0 + getattr(self, f"{parameter_key(parameter)}_share") * torch.expm1(exponent)
+                )
+            elif parameter.startswith("drag."):  # k mu / (ln(S / a) + constant)
+                result[parameter] = usual / (
+                    1.0 - usual * getattr(self, f"{parameter_key(parameter)}_share") * exponent
+                )
             else:
-                result[own] = usual * exponent.exp()
+                result[parameter] = usual * exponent.exp()
         return result
 
 
 def _powers(model) -> dict[str, dict[str, int]]:
-    """Of every parameter of a model's rods, the powers of the factors that it depends on."""
+    """Return {parameter: {factor: power}} for all parameters of a model's rods."""
     terms = [term for group in model.groups for term in group.kind.terms]
     net = [part.term for part in (model.net.sets if model.net is not None else ())]
     terms += [term for term in net if term.name.startswith("rod") or term.name == "rigid_joint"]
-    found: dict[str, dict[str, int]] = {}
+    powers: dict[str, dict[str, int]] = {}
     for term in dict.fromkeys(terms):
-        for own, strain in zip(term.stiffness, term.measure.strains, strict=False):
+        for parameter, strain in zip(term.stiffness, term.measure.strains, strict=False):
             kind = {"stretch": "stretching", "twist": "twisting"}.get(strain.partition(" ")[0], "bending")
-            found[f"{term.name}.{own}"] = {kind: 1, "radius": 2 if kind == "stretching" else 4}
+            powers[f"{term.name}.{parameter}"] = {kind: 1, "radius": 2 if kind == "stretching" else 4}
         if "crossover" in term.parameter_names:
-            found[f"{term.name}.crossover"] = {"radius": -1}
+            powers[f"{term.name}.crossover"] = {"radius": -1}
     if constants.of_sections(model, "rod.mass").any():
-        found["rod.mass"] = {"density": 1, "radius": 2}
+        powers["rod.mass"] = {"density": 1, "radius": 2}
         if constants.array_places(model, "rod.inertia")[1]:
-            found["rod.inertia"] = {"density": 1, "radius": 4}
-    for own, power in (("drag.tangential", 1), ("drag.normal", 1), ("drag.rotational", 2)):
-        if constants.array_places(model, own)[1] and _share(model, own).any():
-            found[own] = {"radius": power}
+            powers["rod.inertia"] = {"density": 1, "radius": 4}
+    for parameter, power in (("drag.tangential", 1), ("drag.normal", 1), ("drag.rotational", 2)):
+        if constants.array_places(model, parameter)[1] and _share(model, parameter).any():
+            powers[parameter] = {"radius": power}
     if contact_places.sized(model, shells=False):
-        found[contact_places.RADIUS] = {"radius": 1}
-    return found
+        powers[contact_places.RADIUS] = {"radius": 1}
+    return powers
 
 
 def _share(model, name: str) -> np.ndarray:
-    """Of every edge with such drag, how it depends on the radius a: of its 1 / zeta by -ln(a) [m^2 / N s], or whether it is as a^2.
+    """Return the sensitivity of drag coefficients of edges, or contact radii of bodies, to the section radius a.
 
-    Zero of drag that is given outright. Of radii in contact, whether it is one of rods that is not.
+    Axial and normal drag: d(1 / zeta) / d(-ln a) [m^2 / N s]. Rotational drag, proportional to a^2, and contact radii: 1.
+    Values that were set explicitly: 0.
     """
     if name == contact_places.RADIUS:
         return np.isin(
@@ -116,15 +124,15 @@ def _share(model, name: str) -> np.ndarray:
         )
     laws = Laws(model.scene)
     rods = [model.order.edge(row)[1] for row in constants.elements(model, name)]
-    found = [laws.given[laws.of_rods[rod]] for rod in rods]
+    laws_of_edges = [laws.given[laws.of_rods[rod]] for rod in rods]
     k = {"drag.tangential": 2.0 * pi, "drag.normal": 4.0 * pi}.get(name)
-    sized = (law for law in found if isinstance(law, Viscous) and law.radius is None)
-    share = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in sized}
-    return np.array([share.get(law, 0.0) for law in found])
+    sized = (law for law in laws_of_edges if isinstance(law, Viscous) and law.radius is None)
+    sensitivity = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in sized}
+    return np.array([sensitivity.get(law, 0.0) for law in laws_of_edges])
 
 
 def _require_sizes(scene) -> None:
-    """Refuse rods of which a radius does not say all."""
+    """Refuse rods with stiffnesses or magnetic moments that a radius does not determine."""
     magnetised = {rod for magnet in scene.magnets for rod in np.ravel(magnet.rods).tolist()}
     for batch in scene.batches:
         if not batch.sized:

@@ -1,4 +1,4 @@
-"""What shells are made of and how they are at rest, as a module that learns it."""
+"""Module of learned shell materials and rest shapes."""
 
 from dataclasses import dataclass
 
@@ -14,44 +14,43 @@ from ddg_warp.learn.modules import asked, parameter_key, usual_values
 from ddg_warp.learn.places import meeting
 from ddg_warp.model.rest_shapes import edges_along
 
-STIFF, HEAVY = ("young", "thickness", "poisson"), ("density", "thickness")  # what stiffnesses and masses depend on
-NUMBERS, FORMS = (*STIFF, "density"), ("metric", "curvature")  # of one component, and of three
+STIFF, HEAVY = ("young", "thickness", "poisson"), ("density", "thickness")  # quantities in stiffnesses and in masses
+NUMBERS, FORMS = (*STIFF, "density"), ("metric", "curvature")  # quantities with one component and with three
 COMPONENTS = ("11", "12", "22")
 
 
 @dataclass(frozen=True)
 class _ShellTerm:
-    """A term of one shell whose parameters are learned: what each is, by "term.parameter", and whether it resists bending."""
+    """Term of one shell with learned parameters: quantity by "term.parameter", and True if it is a bending term."""
 
     parameters: dict[str, str]
     bends: bool
 
 
 class ShellParameters(torch.nn.Module):
-    """What shells are made of, and their forms at rest, over what a simulator's were built with; called, it gives what
-    `Simulator.step` takes.
+    """Learned shell materials and rest forms; calling the module returns input of `Simulator.step`.
 
-    Learned are numbers c, zero at first, of whole shells, of triangles, or of what else `by` says:
+    Learned are changes c of the built model, initially zero, of whole shells, of triangles, or of a basis given by `by`:
 
         young       E exp(c)
-        thickness   h exp(c), of the stiffness of membrane and bending, of masses, and of what touches, where contact was not
-                    given another one: as everywhere that of the thickest triangle
-        density     rho exp(c), of masses, which a metric at rest does not change
+        thickness   h exp(c), of membrane and bending stiffness, of masses, and of the contact thickness unless set explicitly;
+                    the contact thickness of a shell is that of the thickest triangle
+        density     rho exp(c), of masses, which a rest metric does not change
         poisson     -1/4 + 3/4 tanh(artanh((4 nu + 1) / 3) + c), between -1 and 1/2
-        metric      F^T exp(2 c) F, c a strain of logarithms
+        metric      F^T exp(2 c) F, c a logarithmic strain
         curvature   bbar + F^T c F / L, c / L a curvature [1/m]
 
-    where abar = F^T F is the metric that the shell was built with, the rows of F (2, 2) are components along `direction` and across
-    it, L is the root of the area of all triangles, and c of forms are the components 11, 12, 22 along these directions. See van
-    Rees, Vouga and Mahadevan, PNAS 114, 2017, 11597, for both forms as growth of two layers.
+    Here abar = F^T F is the metric of the built shell. The rows of F (2, 2) are components along `direction` and across it.
+    L is the root of the area of all triangles. The c of forms are the components 11, 12, 22 along these directions. See van Rees, Vouga
+    and Mahadevan, PNAS 114, 2017, 11597, for both forms as growth of two layers.
 
     Args:
-        simulator: whose shells they are.
-        names: which are learned, among those above.
-        shells: which, all by default; in what follows their triangles are counted one shell after the other.
-        by: "shell", "element", or an array (T, K) that gives every triangle its share of K numbers, such as values of functions
-            at their centres.
-        batch: worlds that have numbers of their own; by default all share them.
+        simulator: the simulator of the shells.
+        names: the quantities to learn, from the list above.
+        shells: the shells, by default all; triangles are numbered shell by shell.
+        by: "shell", "element", or an array (T, K) of weights of K numbers in every triangle, such as values of functions
+            at triangle centres.
+        batch: number of worlds with numbers of their own; by default all worlds use the same.
         direction: (3,) of forms, not normal to any triangle as drawn.
 
     Attributes:
@@ -81,19 +80,21 @@ class ShellParameters(torch.nn.Module):
         counts = [len(plate.abar) for plate in plates]
         self._names = tuple(names)
         self._terms, values = _shell_terms(model, chosen, self._names)
-        for own in dict.fromkeys(own for term in self._terms for own in term.parameters):
-            values[parameter_key(own)] = usual_values(simulator, own)
-        shares = _shares(by, counts)
+        for parameter in dict.fromkeys(parameter for term in self._terms for parameter in term.parameters):
+            values[parameter_key(parameter)] = usual_values(simulator, parameter)
+        weights = _shares(by, counts)
         edges = [edges_along(shell.surface.points, shell.surface.triangles, direction) for _, shell, _ in chosen]
         values |= {
-            "_shares": None if shares is None else torch.as_tensor(shares, dtype=torch.float64),
+            "_shares": None if weights is None else torch.as_tensor(weights, dtype=torch.float64),
             "_basis": torch.tensor(_basis(np.concatenate(edges), np.concatenate([p.abar for p in plates]))),
             "_size": torch.tensor(np.sqrt(sum(plate.area.sum() for plate in plates))),
         }
         for name in ("young", "thickness", "poisson", "abar", "bbar", "bending_stiffness"):
             values[f"_{name}"] = torch.tensor(np.concatenate([getattr(plate, name) for plate in plates]))
         densities = [model.scene.shells[i].material.density for i, *_ in chosen]
-        values["_density"] = torch.tensor(np.concatenate([np.full(*of) for of in zip(counts, densities, strict=True)]))
+        values["_density"] = torch.tensor(
+            np.concatenate([np.full(*count_and_density) for count_and_density in zip(counts, densities, strict=True)])
+        )
         self._weighs = bool(set(HEAVY) & set(names) and (values["_density"] > 0.0).any())
         if self._weighs:
             values["_mass"] = usual_values(simulator, "shell.mass")
@@ -105,7 +106,7 @@ class ShellParameters(torch.nn.Module):
             values["_half_thickness"] = usual_values(simulator, contact_places.RADIUS)
         for name, value in values.items():
             self.register_buffer(name, value if value is None else value.detach().to(device).clone())
-        count = sum(counts) if shares is None else shares.shape[1]
+        count = sum(counts) if weights is None else weights.shape[1]
         self.changes = torch.nn.ParameterDict(
             {
                 name: torch.nn.Parameter(
@@ -116,78 +117,80 @@ class ShellParameters(torch.nn.Module):
         )
 
     def quantities(self) -> dict[str, torch.Tensor]:
-        """All of them as they are now: young [Pa], thickness [m], poisson and density [kg/m^3] (B, T), metric [m^2] and curvature [m]
-        (B, T, 3) as `Scene.add_shell` takes them as `rest`.
+        """Return the current values of all quantities.
+
+        They are young [Pa], thickness [m], poisson and density [kg/m^3] (B, T), metric [m^2] and curvature [m] (B, T, 3) in the
+        form of `rest` of `Scene.add_shell`.
         """
         c = {name: self._spread(value) for name, value in self.changes.items()}
-        found = {name: getattr(self, f"_{name}")[None] for name in NUMBERS}
-        found |= {"metric": self._abar[None], "curvature": self._bbar[None]}
+        result = {name: getattr(self, f"_{name}")[None] for name in NUMBERS}
+        result |= {"metric": self._abar[None], "curvature": self._bbar[None]}
         for name in ("young", "thickness", "density"):
             if name in c:
-                found[name] = found[name] * c[name].exp()
+                result[name] = result[name] * c[name].exp()
         if "poisson" in c:
-            found["poisson"] = 0.75 * torch.tanh(torch.atanh((4.0 * self._poisson + 1.0) / 3.0) + c["poisson"]) - 0.25
+            result["poisson"] = 0.75 * torch.tanh(torch.atanh((4.0 * self._poisson + 1.0) / 3.0) + c["poisson"]) - 0.25
         if "metric" in c:
             stretch = torch.linalg.matrix_exp(2.0 * _matrices(c["metric"]))
-            found["metric"] = _form(self._basis.mT @ stretch @ self._basis)
+            result["metric"] = _form(self._basis.mT @ stretch @ self._basis)
         if "curvature" in c:
             change = self._basis.mT @ _matrices(c["curvature"] / self._size) @ self._basis
-            found["curvature"] = found["curvature"] + _form(change)
-        return found
+            result["curvature"] = result["curvature"] + _form(change)
+        return result
 
     def forward(self) -> dict[str, torch.Tensor]:
-        """Values by "term.parameter"."""
-        now, result = self.quantities(), {}
-        stiffer = now["young"] / self._young * now["thickness"] / self._thickness
-        stiffer = stiffer * (1.0 - self._poisson**2) / (1.0 - now["poisson"] ** 2)
-        plate = stiffer * (now["thickness"] / self._thickness) ** 2 * self._bending_stiffness
+        """Return values by "term.parameter"."""
+        quantities, result = self.quantities(), {}
+        stiffer = quantities["young"] / self._young * quantities["thickness"] / self._thickness
+        stiffer = stiffer * (1.0 - self._poisson**2) / (1.0 - quantities["poisson"] ** 2)
+        plate = stiffer * (quantities["thickness"] / self._thickness) ** 2 * self._bending_stiffness
         for i, term in enumerate(self._terms):
             rows, triangles = getattr(self, f"_rows_{i}"), getattr(self, f"_triangles_{i}")
-            for own, what in term.parameters.items():
-                usual = getattr(self, parameter_key(own))
-                if what == "stiffness" and term.bends:
+            for parameter, quantity in term.parameters.items():
+                usual = getattr(self, parameter_key(parameter))
+                if quantity == "stiffness" and term.bends:
                     mean = plate[:, triangles].mean(-1) / self._bending_stiffness[triangles].mean(-1)
                     values = usual[:, rows] * mean
-                elif what == "stiffness":
+                elif quantity == "stiffness":
                     values = usual[:, rows] * stiffer[:, triangles[:, 0]]
                 else:
-                    values = _of_triangles(what, now)[:, triangles[:, 0]]
-                base = result.get(own, usual).to(values.dtype)
+                    values = _of_triangles(quantity, quantities)[:, triangles[:, 0]]
+                base = result.get(parameter, usual).to(values.dtype)
                 worlds = max(len(base), len(values))
                 base, values = base.expand(worlds, -1), values.expand(worlds, -1)
-                result[own] = base.index_copy(1, rows, values)
+                result[parameter] = base.index_copy(1, rows, values)
         if self._weighs:
             more = torch.expm1(sum(self._spread(self.changes[name]) for name in HEAVY if name in self.changes))
             more = torch.nn.functional.pad(more * self._corner_mass, (0, 1))[:, self._corners]
             result["shell.mass"] = self._mass + more.sum(-1)
         if self._touching:
-            half = [0.5 * now["thickness"][:, triangles].amax(-1) for triangles in self._touching.values()]
+            half = [0.5 * quantities["thickness"][:, triangles].amax(-1) for triangles in self._touching.values()]
             usual = self._half_thickness.expand(len(half[0]), -1)
             rows = torch.as_tensor(list(self._touching), device=usual.device)
             result[contact_places.RADIUS] = usual.index_copy(1, rows, torch.stack(half, -1).to(usual.dtype))
         return result
 
     def _spread(self, change: torch.Tensor) -> torch.Tensor:
-        """Of all triangles (B, T, ...)."""
+        """Return the numbers c of all triangles (B, T, ...)."""
         return change if self._shares is None else torch.einsum("tk,bk...->bt...", self._shares, change)
 
 
 def _shells(model, names, shells) -> list[tuple]:
-    """Shells that are learned: their numbers, what the net has of them, and their bending.
+    """Return learned shells: index, coupled shell and bending.
 
     Raises:
         SceneError: there is no such shell, or it has no such quantity.
     """
-    held = model.net.host.shells if model.net is not None else []
-    if not held:
+    model_shells = model.net.host.shells if model.net is not None else []
+    if not model_shells:
         raise SceneError("ShellParameters: the model has no shell of triangles; add one with Scene.add_shell")
     for name in names:
         if name not in NUMBERS + FORMS:
             raise SceneError(f"ShellParameters: there is no {name!r}; there are {', '.join(NUMBERS + FORMS)}")
-    chosen = range(len(held)) if shells is None else np.atleast_1d(shells).tolist()
+    chosen = range(len(model_shells)) if shells is None else np.atleast_1d(shells).tolist()
     for shell in chosen:
-        if not 0 <= arguments.index("ShellParameters: shell", shell) < len(held):
-            raise SceneError(f"ShellParameters: shell {shell} does not exist; the model has {len(held)} shells")
+        if not 0 <= arguments.index("ShellParameters: shell", shell) < len(model_shells):
+            raise SceneError(f"ShellParameters: shell {shell} does not exist; the model has {len(model_shells)} shells")
         bending = model.scene.shells[shell].bending
         for name in names:
             if name in FORMS and bending in ("hinge", "isometric"):
@@ -195,96 +198,102 @@ def _shells(model, names, shells) -> list[tuple]:
                     f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') with bending {bending!r} has no {name} of "
                     "triangles that could be learned; take 'midedge_dof', or learn the parameters of its hinges"
                 )
-        if "poisson" in names and held[shell].plate.poisson.max() >= 0.5:
+        if "poisson" in names and model_shells[shell].plate.poisson.max() >= 0.5:
             raise SceneError(
                 f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') has a Poisson's ratio of 0.5, the end of its "
                 "range; start with less"
             )
-        if "density" in names and not np.any(held[shell].corner_mass):
+        if "density" in names and not np.any(model_shells[shell].corner_mass):
             raise SceneError(
                 f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') has no density that a factor could change; "
                 "give its material one"
             )
-    return [(shell, held[shell], model.scene.shells[shell].bending) for shell in chosen]
+    return [(shell, model_shells[shell], model.scene.shells[shell].bending) for shell in chosen]
 
 
 def _shell_terms(model, chosen: list[tuple], names: tuple) -> tuple[list[_ShellTerm], dict]:
-    """Terms that depend on what is learned; the rows of their elements, and the triangles (., 1 or 2) of each, as buffers."""
+    """Return the terms with learned parameters, and buffers of element rows and triangles (., 1 or 2)."""
     terms, buffers, start = [], {}, 0
     sets = {part.term.name: part.term for part in model.net.sets}
     for _, shell, bending in chosen:
         count = len(shell.surface.triangles)
-        beside = triangles_beside(shell.surface, shell.kinds, bending) if bending in ("hinge", "isometric") else {}
+        hinge_triangles = (
+            triangles_beside(shell.surface, shell.kinds, bending) if bending in ("hinge", "isometric") else {}
+        )
         for name, first in shell.first.items():
             bends = "stretch" not in name
-            what = {own: "stiffness" for own in sets[name].stiffness if set(names) & set(STIFF)}
-            if name not in beside:
-                what |= {"poisson": "poisson"} if "poisson" in names else {}
+            quantity_of = {parameter: "stiffness" for parameter in sets[name].stiffness if set(names) & set(STIFF)}
+            if name not in hinge_triangles:
+                quantity_of |= {"poisson": "poisson"} if "poisson" in names else {}
                 if "metric" in names:
-                    what |= {"measure": "measure"} | {f"metric_{k}": f"metric_{k}" for k in COMPONENTS}
-                    what |= {} if bends else {f"rest_{k}": f"half_{k}" for k in COMPONENTS}
+                    quantity_of |= {"measure": "measure"} | {f"metric_{k}": f"metric_{k}" for k in COMPONENTS}
+                    quantity_of |= {} if bends else {f"rest_{k}": f"half_{k}" for k in COMPONENTS}
                 if "curvature" in names and bends:
-                    what |= {f"rest_{k}": f"curvature_{k}" for k in COMPONENTS}
-            triangles = beside.get(name, np.arange(count)[:, None])
-            if what and len(triangles):
+                    quantity_of |= {f"rest_{k}": f"curvature_{k}" for k in COMPONENTS}
+            triangles = hinge_triangles.get(name, np.arange(count)[:, None])
+            if quantity_of and len(triangles):
                 buffers[f"_rows_{len(terms)}"] = torch.as_tensor(first + np.arange(len(triangles)))
                 buffers[f"_triangles_{len(terms)}"] = torch.as_tensor(start + triangles)
-                terms.append(_ShellTerm({f"{name}.{own}": kind for own, kind in what.items()}, bends))
+                terms.append(
+                    _ShellTerm({f"{name}.{parameter}": kind for parameter, kind in quantity_of.items()}, bends)
+                )
         start += count
     return terms, buffers
 
 
 def _vertices(model, chosen: list[int]) -> dict[str, torch.Tensor]:
-    """Of every vertex of a model's shells the corners that meet there, by their triangles among those of the chosen shells, the number
-    of these where there are fewer; and the mass of a corner of each [kg]."""
-    held, at = model.net.host.shells, 0
-    total = sum(len(held[i].surface.triangles) for i in chosen)
+    """Return buffers of corners at every vertex and of corner masses [kg].
+
+    Corners are triangle indices among the chosen shells, padded with the number of triangles.
+    """
+    model_shells, first = model.net.host.shells, 0
+    total = sum(len(model_shells[i].surface.triangles) for i in chosen)
     vertex, triangle = [], []
-    starts = np.cumsum([0, *(len(shell.nodes) for shell in held)])
+    starts = np.cumsum([0, *(len(shell.nodes) for shell in model_shells)])
     for i in chosen:
-        corners = held[i].surface.triangles
+        corners = model_shells[i].surface.triangles
         vertex.append(starts[i] + corners.ravel())
-        triangle.append(at + np.repeat(np.arange(len(corners)), 3))
-        at += len(corners)
-    found = meeting(np.concatenate(vertex), np.concatenate(triangle), int(starts[-1]), total)
-    mass = np.concatenate([held[i].corner_mass for i in chosen])
-    return {"_corners": torch.as_tensor(found), "_corner_mass": torch.as_tensor(mass)}
+        triangle.append(first + np.repeat(np.arange(len(corners)), 3))
+        first += len(corners)
+    corner_lists = meeting(np.concatenate(vertex), np.concatenate(triangle), int(starts[-1]), total)
+    mass = np.concatenate([model_shells[i].corner_mass for i in chosen])
+    return {"_corners": torch.as_tensor(corner_lists), "_corner_mass": torch.as_tensor(mass)}
 
 
 def _half_thicknesses(model, chosen: list[int], counts: list[int]) -> dict[int, slice]:
-    """Of the values of "contact.radius" those of chosen shells, and the triangles of each among those of all chosen."""
+    """Return {row of "contact.radius": triangles} of the chosen shells."""
     starts = np.cumsum([0, *counts])
     triangles = {shell: slice(*starts[k : k + 2].tolist()) for k, shell in enumerate(chosen)}
-    told = contact_places.sized(model, shells=True)
-    return {row: triangles[shell] for row, shell in told.items() if shell in triangles}
+    shell_of_row = contact_places.sized(model, shells=True)
+    return {row: triangles[shell] for row, shell in shell_of_row.items() if shell in triangles}
 
 
-def _of_triangles(what: str, now: dict[str, torch.Tensor]) -> torch.Tensor:
-    """A parameter of terms of triangles (B, T) from the quantities of shells."""
-    name, _, component = what.partition("_")
+def _of_triangles(quantity: str, quantities: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Return a parameter of triangle terms (B, T) from the quantities of shells."""
+    name, _, component = quantity.partition("_")
     if name == "poisson":
-        return now["poisson"]
+        return quantities["poisson"]
     if name == "measure":
-        a11, a12, a22 = now["metric"].unbind(-1)
+        a11, a12, a22 = quantities["metric"].unbind(-1)
         return 0.5 * torch.sqrt(a11 * a22 - a12**2)
-    found = 0.5 * now["metric"] if name == "half" else now[name]
-    return found[..., COMPONENTS.index(component)]
+    form = 0.5 * quantities["metric"] if name == "half" else quantities[name]
+    return form[..., COMPONENTS.index(component)]
 
 
-def _shares(by, counts: list[int]) -> np.ndarray | None:
-    """What triangles have of every number (T, K); None for one each."""
-    if isinstance(by, str) and by in ("shell", "element"):
-        return np.repeat(np.eye(len(counts)), counts, axis=0) if by == "shell" else None
-    shares = arguments.floats(by)
-    if shares.ndim != 2 or len(shares) != sum(counts) or not np.isfinite(shares).all():
+def _shares(spread, counts: list[int]) -> np.ndarray | None:
+    """Return weights of numbers in triangles (T, K); None for one number per triangle."""
+    if isinstance(spread, str) and spread in ("shell", "element"):
+        return np.repeat(np.eye(len(counts)), counts, axis=0) if spread == "shell" else None
+    weights = arguments.floats(spread)
+    if weights.ndim != 2 or len(weights) != sum(counts) or not np.isfinite(weights).all():
         raise SceneError(
-            f"ShellParameters: by = {by!r}; it is 'shell', 'element' or finite numbers (T, K) of the {sum(counts)} triangles"
+            f"ShellParameters: by = {spread!r}; it is 'shell', 'element' or finite numbers (T, K) of the {sum(counts)} triangles"
         )
-    return shares
+    return weights
 
 
 def _basis(edges: np.ndarray, abar: np.ndarray) -> np.ndarray:
-    """F (T, 2, 2) with abar = F^T F: the edges as drawn, stretched without rotation to the metric at rest."""
+    """Return F (T, 2, 2) with abar = F^T F: the edges as drawn, stretched without rotation to the rest metric."""
     inverse = np.linalg.inv(edges)
     metric = abar[:, [[0, 1], [1, 2]]]
     square = np.swapaxes(inverse, 1, 2) @ metric @ inverse
@@ -294,11 +303,11 @@ def _basis(edges: np.ndarray, abar: np.ndarray) -> np.ndarray:
 
 
 def _matrices(components: torch.Tensor) -> torch.Tensor:
-    """Symmetric matrices (..., 2, 2) of components (..., 3)."""
+    """Return symmetric matrices (..., 2, 2) of components (..., 3)."""
     c11, c12, c22 = components.unbind(-1)
     return torch.stack([torch.stack([c11, c12], -1), torch.stack([c12, c22], -1)], -1)
 
 
 def _form(matrices: torch.Tensor) -> torch.Tensor:
-    """The components (..., 3) of symmetric matrices."""
+    """Return the components (..., 3) of symmetric matrices."""
     return torch.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], -1)
