@@ -1,1 +1,1 @@
-"""Learning with the simulator: gradients of steps and equilibria, torch, data."""
+"""Gradients of steps and equilibria, the torch interface, data sets and environments."""

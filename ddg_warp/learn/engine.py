@@ -43,8 +43,7 @@ class Engine:
         scheme, options: see `Integrator`.
 
     Attributes:
-        codes: outcomes of the last step per world (worlds,), see `kernels.outcome`; 0 if converged and, where requested,
-            differentiable.
+        codes: outcomes of the last step per world (worlds,), see `kernels.outcome`; 0 if converged and, if requested, differentiable.
         layout, fields: layout of the tensors of a state.
         tables, controls: parameters and controls of steps.
         before, after: states at the ends of a step.

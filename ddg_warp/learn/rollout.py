@@ -26,8 +26,8 @@ def plan(bytes_of_step: int, controls: int, steps: int, save: int, every: int | 
     """Choose checkpoints of a roll-out.
 
     Without checkpoints all `steps` states are kept, and the controls, which are always kept. With checkpoints kept states are the first
-    of every block, all of the current block, and the returned ones. Blocks of the square root of the number of
-    steps need least (Griewank and Walther, Evaluating Derivatives, 2008, section 12.2: one checkpoint level).
+    of every block, all of the current block, and the returned ones. Blocks of the square root of the number of steps need least (Griewank
+    and Walther, Evaluating Derivatives, 2008, section 12.2: one checkpoint level).
 
     Args:
         bytes_of_step: memory of a step [bytes].

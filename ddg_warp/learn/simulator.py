@@ -1,4 +1,4 @@
-"""Simulator: a model as a torch module. States go in and come out; nothing is kept between calls."""
+"""Simulator: a model as a torch module of pure functions from states to states."""
 
 import warnings
 from collections.abc import Mapping
@@ -23,12 +23,13 @@ from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.dynamics import SCHEMES, Integrator
 from ddg_warp.threads import alone
 
-SETTLED = {"failures", "check_every", "energy_bound"}  # of the arguments of `Integrator`, by the engine
+SETTLED = {"failures", "check_every", "energy_bound"}  # arguments of `Integrator` that the engine sets
 
 
 class Simulator(torch.nn.Module):
-    """Steps of a model as a differentiable module, by the parameters and rest shapes that the model has when they are made
-    (`Model.set_parameter`, `Model.set_rest`).
+    """Differentiable steps of a model, with the parameters and rest shapes of the model at the time of the call.
+
+    `Model.set_parameter` and `Model.set_rest` change these.
 
         simulator = Simulator(model, dt=0.01)
         state = simulator.initial_state(batch=8)
@@ -37,21 +38,23 @@ class Simulator(torch.nn.Module):
         loss.backward()
 
     Args:
-        model: what to step. Worlds of a batch are copies of it: it is built anew with as many as a state has.
+        model: the model to step. Worlds of a batch are copies: the model is rebuilt with the number of worlds of a state.
         dt: length of the steps [s].
-        scheme, options: as of `Integrator`. A world in which a step fails is not a number from there on; gradients that go through a
-            step that failed, was made in parts or renewed its frames (as edges turned by more than 90 degrees) are not, in these worlds
-            alone. Both are told by `outcomes`, by `WorldState.differentiable`, and the first time by a `GradientWarning`, which on CUDA
-            comes with a later call, as nothing waits for the device.
+        scheme, options: as of `Integrator`.
 
-    Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`), or names of masses and of coefficients of drag (see
-    `ddg_warp.learn.constants`), to tensors (), (B, 1), (1, E) or (B, E), E the elements that have it. Controls are dictionaries
-    of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see
-    `Controls`. A world that is given a value which `set_parameter` would refuse, or a control that is not finite, is not stepped: its
-    outcome is "invalid_input".
+    States of a world are NaN from a failed step on. Gradients through a step are NaN, in its world only, if the step failed, was
+    split into substeps or updated frames (edges rotated by more than 90 degrees). Both are reported by `outcomes`, by
+    `WorldState.differentiable`, and once by a `GradientWarning`, which on CUDA comes with a later call, since nothing waits for the
+    device.
+
+    Parameters are tensors (), (B, 1), (1, E) or (B, E) by name, E the number of elements with the parameter. Names are
+    "term.parameter" (see `Model.set_parameter`), or listed in `ddg_warp.learn.constants`. Controls are dictionaries of "forces"
+    (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see `Controls`. A world
+    with a value that `set_parameter` would refuse, or with a control that is not finite, is not stepped. The outcome is then
+    "invalid_input".
 
     Raises:
-        SceneError: the model has something that no gradient goes through, once one is asked for.
+        SceneError: the model has a feature without gradients, once one is requested.
     """
 
     def __init__(self, model, dt: float, *, scheme: str = "implicit_euler", **options):
@@ -61,16 +64,16 @@ class Simulator(torch.nn.Module):
         self.dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         for name in SETTLED & options.keys():
             raise SceneError(f"Simulator: {name} is settled, as worlds that fail are told by outcomes(); leave it out")
-        others = set(arguments.names(Integrator)) - SETTLED - {"model", "scheme"}
-        given = {name: value for name, value in options.items() if name not in others}
-        arguments.options("Simulator", NewtonOptions, given, others)
+        integrator_names = set(arguments.names(Integrator)) - SETTLED - {"model", "scheme"}
+        newton_options = {name: value for name, value in options.items() if name not in integrator_names}
+        arguments.options("Simulator", NewtonOptions, newton_options, integrator_names)
         self.model, self.scheme, self.options = model, scheme, options
         self._engines: dict[int, Engine] = {}
-        self._last: Engine | torch.Tensor | None = None  # what tells the outcomes of the last step
+        self._last: Engine | torch.Tensor | None = None  # source of the outcomes of the last step
         self._warned = False
 
     def engine(self, worlds: int) -> Engine:
-        """What steps so many worlds, by the parameters that the model has; made when it is first asked for."""
+        """Return the engine for a number of worlds, with the current parameters of the model; made at the first request."""
         engine = self._engines.get(worlds)
         if engine is None:
             with alone(self):
@@ -91,24 +94,24 @@ class Simulator(torch.nn.Module):
 
     @torch.compiler.disable
     def initial_state(self, batch: int | None = None, positions=None, velocities=None) -> WorldState:
-        """The first state of so many worlds: at rest, or elsewhere.
+        """Return the first state of all worlds, at rest or with given positions and velocities.
 
         Args:
-            batch: worlds; by default those of positions or velocities, else of the model.
-            positions, velocities: (P, 3) or (B, P, 3); gradients go through both. Frames stay those of the rest state and are carried
-                along by the first step: no edge may be further than 90 degrees from there. Strain-rate damping resists what led there
-                from rest, within that step; states without that come from `world_state`.
+            batch: worlds; by default the number in positions or velocities, else in the model.
+            positions, velocities: (P, 3) or (B, P, 3). Gradients go through both. Rest frames are transported by the first step: no
+                edge may be further than 90 degrees from there. Strain-rate damping resists the motion from rest within that step;
+                `world_state` makes states without it.
 
         Raises:
-            SceneError: shapes do not fit, or surfaces overlap that touch; under transforms of torch steps tell.
+            SceneError: shapes do not fit, or surfaces in contact overlap (under transforms of torch, reported by steps).
         """
         moved = {"positions": positions, "velocities": velocities}
         for name, values in moved.items():
             if not (values is None or isinstance(values, torch.Tensor) or np.isfinite(arguments.floats(values)).all()):
                 raise SceneError(f"initial_state: {name} are {arguments.shown(values)}; give finite numbers")
         moved = {name: self._tensor(name, values) for name, values in moved.items() if values is not None}
-        given = [len(values) for values in moved.values() if values.ndim == 3]
-        worlds = given[0] if given else self.model.worlds
+        batch_sizes = [len(values) for values in moved.values() if values.ndim == 3]
+        worlds = batch_sizes[0] if batch_sizes else self.model.worlds
         worlds = worlds if batch is None else arguments.count("batch", batch)
         engine = self.engine(worlds)
         values = [tensor.clone() for tensor in tensors(engine.model.state(), engine.fields)]
@@ -119,14 +122,14 @@ class Simulator(torch.nn.Module):
         return WorldState.begun(values, 0.0, engine)
 
     def world_state(self, state) -> WorldState:
-        """A `State` as one that steps start from, such as `model.state(points, velocities)` or a checkpoint; gradients begin there.
+        """Convert a `State`, such as `model.state(points, velocities)` or a checkpoint, to a start state; gradients begin there.
 
-        Unlike by `initial_state`, frames are those of the state, and dampers have its strains behind them, not those at rest. A
-        `WorldState` that was loaded (`torch.load`, pickle), or is of another simulator of the same scene, goes on in this one.
+        Unlike in `initial_state`, frames and the last strains of damping are taken from the state, not from rest. A `WorldState` that
+        was loaded (`torch.load`, pickle), or that belongs to another simulator of the same scene, is bound to this one.
 
         Raises:
-            SceneError: it is no state of this simulator's model, which has as many worlds; or surfaces overlap that touch; or it was
-                given spins, and `gyroscopic` does not say whether these resist turns of their axes.
+            SceneError: the state has another model or number of worlds, surfaces in contact overlap, or the state was given spins
+                and `gyroscopic` is not set.
         """
         if isinstance(state, WorldState):
             return self._bound(state)
@@ -139,7 +142,7 @@ class Simulator(torch.nn.Module):
         return WorldState.begun(values, state.time, engine)
 
     def _bound(self, state: WorldState) -> WorldState:
-        """A `WorldState` from elsewhere as one of this simulator."""
+        """Return a `WorldState` from elsewhere bound to this simulator."""
         engine = self.engine(len(state.codes))
         wanted = tensors(engine.before, engine.fields)
         if [tuple(value.shape) for value in wanted] != [tuple(value.shape) for value in state.values]:
@@ -152,12 +155,12 @@ class Simulator(torch.nn.Module):
         codes = state.codes.to(engine.device)
         return WorldState(tuple(values), state.time, engine, codes, torch.ones_like(codes, dtype=torch.bool))
 
-    @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
+    @torch.compiler.disable  # a graph break: the compiler cannot trace Warp launches
     def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:
-        """The state after a step of dt.
+        """Return the state after a step of dt.
 
         Raises:
-            SceneError: a name or shape does not fit, or a shell has a curved membrane, which is for equilibria alone.
+            SceneError: a name or shape does not fit, or a shell has a curved membrane, which only equilibria support.
         """
         engine = self._own(state)
         return self._step(state, self._full(engine, parameters), self._controls(engine, controls))
@@ -176,20 +179,20 @@ class Simulator(torch.nn.Module):
         checkpoint_every: int | None = None,
         memory: float | None = None,
     ) -> list[WorldState]:
-        """States after every `save` steps of so many.
+        """Return states after every `save` steps.
 
         Args:
-            controls: of all steps, or a function of the number of the step that gives them.
-            steps: how many.
-            save: of which every so many are returned.
-            checkpoint_every: keep only every so many states for gradients, and step again from there when they are asked for.
-            memory: what may be kept for gradients [bytes]: checkpoints are set as it asks for; see `plan`.
+            controls: of all steps, or a function from step number to controls.
+            steps: number of steps.
+            save: steps per returned state.
+            checkpoint_every: steps per state kept for gradients; a backward pass recomputes the steps between.
+            memory: limit of memory for gradients [bytes], from which checkpoints are chosen; see `plan`.
 
         Returns:
-            Trajectory, without the state that it began with.
+            Trajectory, without the initial state.
 
         Raises:
-            SceneError: a name or shape does not fit; so much memory is too little.
+            SceneError: a name or shape does not fit, or the memory limit is too small.
         """
         engine = self._own(state)
 
@@ -216,14 +219,16 @@ class Simulator(torch.nn.Module):
         checkpoint_every: int | None = None,
         memory: float | None = None,
     ) -> Plan:
-        """What such a roll-out keeps for gradients, and how; arguments are those of `rollout`. A function of controls is called once,
-        for the first step."""
+        """Return the checkpointing plan of a roll-out; arguments as of `rollout`.
+
+        A function of controls is called once, for the first step.
+        """
         several = callable(controls)
-        own = self._controls(self._own(state), controls(0) if several else controls)
-        return self._plan(state, own, arguments.count("steps", steps), save, checkpoint_every, memory, several)
+        first = self._controls(self._own(state), controls(0) if several else controls)
+        return self._plan(state, first, arguments.count("steps", steps), save, checkpoint_every, memory, several)
 
     def _plan(self, state: WorldState, controls: dict, steps: int, save: int, every, memory, several: bool) -> Plan:
-        """See `plan`; `several`: whether each step has controls of its own, which are kept all."""
+        """Return the plan; `several` is True if each step has controls of its own, which are all kept."""
         if arguments.count("save", save) > steps:
             raise SceneError(f"rollout: save = {save} of {steps} steps returns no state; give {steps} at most")
         if every is not None:
@@ -231,9 +236,11 @@ class Simulator(torch.nn.Module):
         if memory is not None:
             arguments.number("memory", memory, "bytes, more than none", lambda value: value > 0.0)
         flags = sum(len(part.islands) for part in state.engine.integrator._parts) * state.values[0].element_size()
-        told = flags + 5 * len(state.codes) + sum(values.capacity for values in state.engine.solutions)
+        other_bytes = flags + 5 * len(state.codes) + sum(values.capacity for values in state.engine.solutions)
         shared = bytes_of(controls.values())
-        return plan(bytes_of(state.values) + told, steps * shared if several else shared, steps, save, every, memory)
+        return plan(
+            bytes_of(state.values) + other_bytes, steps * shared if several else shared, steps, save, every, memory
+        )
 
     @torch.compiler.disable
     def equilibrium(
@@ -245,24 +252,24 @@ class Simulator(torch.nn.Module):
         batch: int | None = None,
         **options,
     ) -> WorldState:
-        """The equilibrium of every world, with gradients by parameters and controls.
+        """Return the equilibrium of every world, with gradients by parameters and controls.
 
-        Angles are measured from frames that the search carries along, so that they depend on its way; their gradients are those of
-        a search that begins in the equilibrium. Positions do not. With friction, gradients go through all increments of the load
-        parameter, of which states are kept.
+        Twist angles are measured from frames transported along the search path. Their gradients assume a search that starts in
+        the equilibrium; positions do not depend on the path. With friction, gradients go through all increments of the load
+        parameter, and their states are kept.
 
         Args:
             parameters: as of `step`.
-            controls: the same; the load parameter scales loads as it does those of the scene, poses are those at the end.
-            state: where the search begins; by default the first state of so many worlds (`batch`).
+            controls: as of `step`. The load parameter scales loads as in the scene; poses are reached at its end.
+            state: start of the search; by default the first state of `batch` worlds.
             options: as of `ddg_warp.statics.solve`.
 
         Raises:
-            SolverError: there is none, in one of the worlds.
-            SceneError: the state has a history of gradients, which would end here; a name or shape does not fit.
+            SolverError: no equilibrium was found in one of the worlds.
+            SceneError: the state has a gradient history, which would end here; a name or shape does not fit.
         """
-        given = {name: value for name, value in options.items() if name not in LOAD}
-        arguments.options("Simulator.equilibrium", statics.StaticsOptions, given, LOAD)
+        solver_options = {name: value for name, value in options.items() if name not in LOAD}
+        arguments.options("Simulator.equilibrium", statics.StaticsOptions, solver_options, LOAD)
         if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
             raise SceneError(
                 "equilibrium: no gradient goes to the state where the search begins, which places what is held, yet; give "
@@ -274,12 +281,12 @@ class Simulator(torch.nn.Module):
         engine, end = self._own(state), arguments.number("end", options.get("end", 1.0))
         full, controls = self._full(engine, parameters), self._controls(engine, controls)
         call = self._call(engine, end, full, controls)
-        values = [*(value for _, own in full for value in own), *controls.values()]
-        found = Balance.apply(call, tuple(options.items()), *(value.detach() for value in state.values), *values)
-        return WorldState.begun(found[: len(engine.fields)], end, engine)
+        values = [*(value for _, group in full for value in group), *controls.values()]
+        results = Balance.apply(call, tuple(options.items()), *(value.detach() for value in state.values), *values)
+        return WorldState.begun(results[: len(engine.fields)], end, engine)
 
     def outcomes(self) -> np.ndarray:
-        """What became of the last step of every world of the batch that was stepped last (B,); see `WorldState.outcomes`.
+        """Return outcomes of the last step of every world in the batch stepped last (B,); see `WorldState.outcomes`.
 
         Raises:
             SceneError: no step was made yet.
@@ -289,15 +296,15 @@ class Simulator(torch.nn.Module):
         return outcome_names(self._last.codes if isinstance(self._last, Engine) else self._last)
 
     def parameter(self, name: str, batch: int | None = None) -> torch.Tensor:
-        """The values that the model has of a parameter (B, E)."""
+        """Return the values of a parameter in the model (B, E)."""
         worlds = self.model.worlds if batch is None else arguments.count("batch", batch)
         return self.engine(worlds).tables.value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
-        """Parameters as `Tables.full` has them; of plain numbers values are checked, as tensors may be on their way."""
+        """Return parameters as `Tables.full`; only plain numbers are checked, since tensors may still be in computation."""
         result = []
         for name, values in _named("parameters", "term.parameter", parameters).items():
-            engine.tables.of(name)  # which refuses what there is not
+            engine.tables.of(name)  # refuses unknown names
             if isinstance(values, torch.Tensor):
                 result.append((name, engine.tables.full_of(name, self._tensor(f"parameters: {name}", values))))
                 continue
@@ -309,7 +316,7 @@ class Simulator(torch.nn.Module):
         return result
 
     def _tensor(self, name: str, values) -> torch.Tensor:
-        """Numbers as a tensor, in the precision of states where they have none of their own."""
+        """Return numbers as a tensor, by default in the precision of states."""
         if isinstance(values, torch.Tensor):
             if values.layout != torch.strided or values.is_meta or values.is_complex() or values.dtype == torch.bool:
                 kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
@@ -320,11 +327,11 @@ class Simulator(torch.nn.Module):
         )
 
     def _own(self, state: WorldState) -> Engine:
-        """The engine of a state, of this simulator."""
+        """Return the engine of a state of this simulator."""
         if not isinstance(state, WorldState) or state.engine not in self._engines.values():
-            what = "loaded, or another simulator's" if isinstance(state, WorldState) else f"{state!r:.80}"
+            origin = "loaded, or another simulator's" if isinstance(state, WorldState) else f"{state!r:.80}"
             raise SceneError(
-                f"the state is {what}; take one that initial_state, step or equilibrium of this one gave, or that world_state(...) "
+                f"the state is {origin}; take one that initial_state, step or equilibrium of this one gave, or that world_state(...) "
                 "makes of it"
             )
         return self.engine(state.engine.model.worlds)
@@ -333,38 +340,38 @@ class Simulator(torch.nn.Module):
         model, worlds = engine.model, engine.model.worlds
         controls = _named("controls", "forces", controls)
         real = wp.dtype_to_torch(model.types.real)
-        result, known = {}, shapes(model)
+        result, shape_of = {}, shapes(model)
         for name, values in controls.items():
-            if name not in known:
-                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(known)}")
-            own, shape = self._tensor(f"controls: {name}", values), known[name]
-            if tuple(own.shape) not in (shape, (worlds, *shape)):
+            if name not in shape_of:
+                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shape_of)}")
+            tensor, shape = self._tensor(f"controls: {name}", values), shape_of[name]
+            if tuple(tensor.shape) not in (shape, (worlds, *shape)):
                 raise SceneError(
-                    f"controls: {name} have shape {tuple(own.shape)}; they are {shape} or {(worlds, *shape)}"
+                    f"controls: {name} have shape {tuple(tensor.shape)}; they are {shape} or {(worlds, *shape)}"
                 )
             require_acting(model, (name,))
-            if not isinstance(values, torch.Tensor):  # finite, and on what it can act on
-                Controls(**{name: own.cpu().numpy()}).checked(model)
-            result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
+            if not isinstance(values, torch.Tensor):  # check that values are finite and act on existing dofs
+                Controls(**{name: tensor.cpu().numpy()}).checked(model)
+            result[name] = tensor.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
         return result
 
     def _step(self, state: WorldState, full: list, controls: dict, version: int | None = None) -> WorldState:
-        """A step, of a roll-out that began with a `version` of the model."""
+        """Make a step; `version` is that of the model at the start of a roll-out."""
         engine = state.engine
         call = self._call(engine, state.time, full, controls)
         if version is not None:
             call = replace(call, version=version)
             call.engine_as_then()
-        values = [value for _, own in full for value in own]
-        found = Step.apply(call, *state.values, *values, *controls.values())
-        count, codes = len(engine.fields), found[len(engine.fields) + engine.parts]
+        values = [value for _, group in full for value in group]
+        results = Step.apply(call, *state.values, *values, *controls.values())
+        count, codes = len(engine.fields), results[len(engine.fields) + engine.parts]
         self._last = engine if torch._C._are_functorch_transforms_active() else codes
         self._tell(engine)
         differentiable = state.differentiable & (codes == 0) if call.graded else state.differentiable
-        return WorldState(tuple(found[:count]), state.time + self.dt, engine, codes, differentiable)
+        return WorldState(tuple(results[:count]), state.time + self.dt, engine, codes, differentiable)
 
     def _tell(self, engine: Engine) -> None:
-        """Warn, once, of worlds that have no gradient."""
+        """Warn once if worlds have no gradient."""
         if engine.lost and not self._warned:
             self._warned = True
             warnings.warn(
@@ -389,8 +396,8 @@ class Simulator(torch.nn.Module):
         )
 
 
-def _named(what: str, example: str, values) -> dict:
-    """A dictionary by names; nothing for None."""
+def _named(label: str, example: str, values) -> dict:
+    """Return a dictionary by names; empty for None."""
     if not (values is None or (isinstance(values, Mapping) and all(isinstance(name, str) for name in values))):
-        raise SceneError(f"{what} are {arguments.shown(values)}; give a dictionary such as {{{example!r}: ...}}")
+        raise SceneError(f"{label} are {arguments.shown(values)}; give a dictionary such as {{{example!r}: ...}}")
     return dict(values or {})

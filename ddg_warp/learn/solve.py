@@ -1,4 +1,4 @@
-"""The linear systems of adjoints: the exact Hessian of a solve, transposed, without anything that makes it definite."""
+"""Linear systems of adjoints: the transposed exact Hessian of a solve, without any projection to SPD."""
 
 from types import SimpleNamespace
 
@@ -20,18 +20,18 @@ from ddg_warp.solve.direct import SingularError, regular
 from ddg_warp.solve.reduction import CyclicReduction, Elimination
 from ddg_warp.solve.rigid import rigid_modes
 
-CLOSE = 1e-5  # relative error of w up to which gradients take what float32 solutions, refined, leave; roll-outs amplify it ...
-PASSES = 2  # ... so that no more than these serve: with 3, an error of 1e-2 each, gradients erred by 1e-3
+CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
+PASSES = 2  # ... which limits refinement. Measured: with 3 passes, an error of 1e-2 each, gradients erred by 1e-3
 LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner
-MISSED = 1e-6  # what they may have left in truth, for rounding
-SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
+MISSED = 1e-6  # their largest true relative residual, for rounding
+SINGULAR = 1e-6  # accepted relative residual; a singular matrix that was regularised leaves more
 
 
 class HostSolve:
-    """(H + c M - dL/dq)^T w = g of a part of a model, by sparse factors on the host.
+    """Solver of (H + c M - dL/dq)^T w = g of a subsystem, by sparse factors on the host.
 
     Attributes:
-        held: of the last solution, what loads that follow held dofs add to derivatives by these (size,); None where none do.
+        held: load-stiffness term of the gradient by fixed dofs (size,), of the last solution; None without follower loads.
     """
 
     def __init__(self, tangent):
@@ -39,23 +39,23 @@ class HostSolve:
         self.held = None
 
     def __call__(
-        self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray, more=None, rubbing=None
+        self, state, rate: float, coefficient: float, factor: float | None, rhs: np.ndarray, more=None, rubbing=None
     ) -> np.ndarray:
-        """w (size,), zero at held dofs.
+        """Return w (size,), zero at fixed dofs.
 
         Args:
-            state: the solution with its lagged frames, as a state has its parts.
-            rate: of the implicit Euler step [1/s], zero for an equilibrium, over which strain-rate damping counts.
+            state: the solution with its lagged frames, in the layout of a state.
+            rate: inverse step of implicit Euler [1/s], used in strain-rate damping; zero for an equilibrium.
             coefficient: c, zero for an equilibrium [1/s^2].
-            factor: load parameter of an equilibrium, whose loads L follow the dofs q; None in a step, where they do not.
-            given: g (size,).
-            more: matrix that H has beside these, of drag; None for none.
-            rubbing: the same of friction in an equilibrium, which is not symmetric; None without.
+            factor: load parameter of an equilibrium, which has load stiffness dL/dq; None in a step, where loads are lagged.
+            rhs: g (size,).
+            more: additional matrix, of drag; None without.
+            rubbing: additional matrix, unsymmetric, of friction in an equilibrium; None without.
 
-        A singular matrix, of what can move without stiffness, serves a loss that does not depend on that motion.
+        A singular matrix, with zero stiffness along a motion, is accepted if g has no component along the motion.
 
         Raises:
-            SolverError: the loss does.
+            SolverError: g has such a component.
         """
         tangent, following = self.tangent, None
         tangent.rate = wp.full(len(tangent.rate), rate, dtype=tangent.rate.dtype, device=tangent.rate.device)
@@ -71,45 +71,48 @@ class HostSolve:
             spun = self._spun(state, factor, rubbing is not None)
             following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), spun)
         free = np.flatnonzero(tangent.free)
-        own, given = sparse.csc_matrix(matrix if following is None else matrix + following)[free][:, free], given[free]
+        free_matrix, rhs = (
+            sparse.csc_matrix(matrix if following is None else matrix + following)[free][:, free],
+            rhs[free],
+        )
         try:
             symmetric = following is None and rubbing is None
-            solve = regular(own, tangent.mass[free])[0].solve if symmetric else _transposed(own)
-            found = solve(given)
+            solve = regular(free_matrix, tangent.mass[free])[0].solve if symmetric else _transposed(free_matrix)
+            solution = solve(rhs)
         except (SingularError, RuntimeError) as error:
             raise self._singular(free) from error
-        missed = np.abs(own.T @ found - given)
-        if not missed.max(initial=0.0) <= SINGULAR * np.abs(given).max(initial=0.0):
+        missed = np.abs(free_matrix.T @ solution - rhs)
+        if not missed.max(initial=0.0) <= SINGULAR * np.abs(rhs).max(initial=0.0):
             raise self._singular(free[int(np.argmax(missed))])
         w = np.zeros(tangent.size)
-        w[free] = found
+        w[free] = solution
         self.held = None if following is None else np.where(tangent.free, 0.0, -(following.T @ w))
         return w
 
     def _require_stiff(self, state, hessian: sparse.csc_matrix) -> None:
-        """Refuse an equilibrium that leaves a rigid motion neutral, as the spin of a rod that nothing holds.
+        """Refuse an equilibrium with a neutral rigid-body mode, such as the spin of a rod without torsional support.
 
-        Where parameters push along such a motion the equilibrium jumps, however little they change; nothing of the loss tells.
+        Loads along the mode make the equilibrium jump under any change of parameters, which g does not reveal.
         """
         tangent = self.tangent
         neutral = rigid_modes(tangent, state, hessian)
         if neutral.shape[1]:
             mode = neutral[:, 0]
             spins = np.abs(mode[~tangent.angle]).max(initial=0.0) <= 1e-6 * np.abs(mode).max() / tangent.edge_length()
-            what = "the spin of" if spins else "a motion of"
-            place = tangent.where(int(np.argmax(np.abs(mode))))
+            kind = "the spin of" if spins else "a motion of"
+            where = tangent.where(int(np.argmax(np.abs(mode))))
             raise SolverError(
-                f"no gradient goes through the equilibrium: {what} {place} is neutral, as nothing holds it, so that it would jump with "
+                f"no gradient goes through the equilibrium: {kind} {where} is neutral, as nothing holds it, so that it would jump with "
                 f"parameters; {'hold it by scene.fix_twist(...)' if spins else 'hold it'}",
                 outcome="neutral",
             )
 
     def _spun(self, state, factor: float, rubs: bool) -> sparse.csc_matrix | None:
-        """What frames that an equilibrium carries along do, where the tangent holds them still; None where nothing twists an edge.
+        """Return the stiffness from transport of frames, which the tangent keeps fixed; None if no moment acts on an edge.
 
-        A moment M on the angle of an edge e turns with its frame, which spins about t by t . (t x de) / 2 |e| less than one that is
-        held still: it adds the force M [t] de / 2 |e|^2 across the edge, [t] the matrix of t x. M is what loads and supports put there,
-        and friction where it `rubs`: of all together, what is elastic.
+        A moment M on the twist angle of an edge e rotates with its frame. The transported frame spins about the tangent t by
+        t . (t x de) / 2 |e| less than a fixed one. This adds the force M [t] de / 2 |e|^2 across the edge, with [t] the matrix of t
+        x. M is the sum of loads, reactions and, if `rubs`, friction; together they balance the elastic moment.
         """
         tangent, rows, columns, values = self.tangent, [], [], []
         q = tangent.dofs(state)
@@ -117,8 +120,8 @@ class HostSolve:
         for body in tangent.bodies():
             if len(body.angles) and (body.nodes >= 0).all():
                 ends = body.nodes[body.ends]  # (edges, 2, 3)
-                felt = moments[body.angles] * tangent.free[ends].any((1, 2)) != 0.0
-                ends, moment = ends[felt], moments[body.angles][felt]
+                acting = moments[body.angles] * tangent.free[ends].any((1, 2)) != 0.0
+                ends, moment = ends[acting], moments[body.angles][acting]
                 e = q[ends[:, 1]] - q[ends[:, 0]]
                 size = moment / (2.0 * np.linalg.norm(e, axis=1) ** 3)
                 across = size[:, None, None] * np.swapaxes(np.cross(e[:, None], np.eye(3)), 1, 2)
@@ -129,31 +132,31 @@ class HostSolve:
                 values.append((sign[None, :, :, None, None] * across[:, None, None]).ravel())
         if not sum(map(len, values)):
             return None
-        data, *places = (np.concatenate(parts) for parts in (values, rows, columns))
-        return sparse.csc_matrix((data, places), shape=(tangent.size, tangent.size))
+        data, *indices = (np.concatenate(parts) for parts in (values, rows, columns))
+        return sparse.csc_matrix((data, indices), shape=(tangent.size, tangent.size))
 
     def _singular(self, dof: np.ndarray | int) -> SolverError:
-        place = self.tangent.where(int(np.ravel(dof)[0]))
+        where = self.tangent.where(int(np.ravel(dof)[0]))
         return SolverError(
-            f"no gradient goes through the solution: {place} can move without any stiffness, along what the loss depends on; hold it, "
+            f"no gradient goes through the solution: {where} can move without any stiffness, along what the loss depends on; hold it, "
             "or stay off limit points and bifurcations",
             outcome="singular",
         )
 
 
 def _total(*matrices: sparse.csc_matrix | None) -> sparse.csc_matrix | None:
-    """Sum of the matrices that there are."""
+    """Return the sum of the matrices that are not None; None if all are."""
     return sum(m for m in matrices if m is not None) if any(m is not None for m in matrices) else None
 
 
 def _transposed(matrix: sparse.csc_matrix):
-    """The solution of the transposed system, for a matrix that is not symmetric."""
+    """Return the solver of a transposed system, for unsymmetric matrices."""
     factors = splu(matrix)
-    return lambda given: factors.solve(given, trans="T")
+    return lambda rhs: factors.solve(rhs, trans="T")
 
 
 class ClosedChains:
-    """Closed rods by conjugate gradients, which their open parts precondition; by the calls of `CyclicReduction`."""
+    """Solver of closed rods by conjugate gradients, preconditioned by the opened rods; interface of `CyclicReduction`."""
 
     def __init__(self, system: PcgNewton):
         self.system = system
@@ -165,34 +168,36 @@ class ClosedChains:
         system = self.system
         return [system._factor, system._start, system._product, system._advance, self._check]
 
-    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
-        """As `CyclicReduction.solve`; `bad` are those of which a residual is left."""
+    def solve(self, matrix, right, count, wanted, solution: wp.array, failed: wp.array, again: bool = False) -> None:
+        """Solve as `CyclicReduction.solve`; `failed` marks rods with a residual left."""
         system = self.system
         wp.copy(system.islands.wanted, wanted)
         system.factorise()
         system.right, system.direction = right, solution
         system.direct()
-        bad.zero_()
+        failed.zero_()
         read = [system.rho, system.rho_first, MISSED]
-        wp.launch(self._check, system.group.columns, read, [bad], device=system.device)
+        wp.launch(self._check, system.group.columns, read, [failed], device=system.device)
 
 
 class DirectSolve:
-    """H w = g of a group of rods, on the device: by the sweep, or by factors in another precision than the state's, node by node or by
-    cyclic reduction, and refinement; of closed rods by conjugate gradients.
+    """Device solver of H w = g of a rod group.
+
+    Factors come from the sweep, or, in another precision than the state's, from block elimination or cyclic reduction with
+    iterative refinement. Closed rods are solved by conjugate gradients.
 
     Args:
-        linear: precision of the factors; that of the state by default.
+        linear: precision of the factors; by default that of the state.
 
     Attributes:
-        failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing.
-        passes: solutions by factors in another precision than the state's that are summed up; 0 where there are none.
+        failed: nonzero for rods with an H that is not positive definite (columns,), where w is meaningless.
+        passes: number of solutions summed in iterative refinement; 0 without.
     """
 
     def __init__(self, model, group, linear=None):
         self.group, self.passes = group, 0
         kind, device, real = group.kind, model.wp_device, model.types.real
-        given, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
+        arguments, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
         self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
         if kind.closed:
             options = NewtonOptions(psd="none", linear_rtol=LINEAR_RTOL)
@@ -201,16 +206,16 @@ class DirectSolve:
             return
         few = automatic(group) == "partitioned"
         if not few and linear is None:
-            self.solver, self.system = None, ChainNewton(*given)
-            self._moved = self.system.x, self.system.theta  # what the sweep moves along w
+            self.solver, self.system = None, ChainNewton(*arguments)
+            self._moved = self.system.x, self.system.theta  # arrays that the sweep moves along w
             self.failed = self.system.islands.status
             return
-        self.system = AssembledNewton(*given, stored=linear)
-        own = linear or real
+        self.system = AssembledNewton(*arguments, stored=linear)
+        precision_of_factors = linear or real
         if few:
-            self.solver = CyclicReduction(kind.block, *size, own, device, repeated=linear is not None)
+            self.solver = CyclicReduction(kind.block, *size, precision_of_factors, device, repeated=linear is not None)
         else:
-            self.solver = Elimination(kind, *size, own, device)
+            self.solver = Elimination(kind, *size, precision_of_factors, device)
         self.failed = self.system.islands.bad
         if linear is not None:
             self._product = refine.product_kernel(kind, real)
@@ -228,19 +233,19 @@ class DirectSolve:
         return [*around, self.system._assemble, *self.solver.kernels, *refined]
 
     def __call__(self, solved, last: wp.array, rate: float, coefficient: float, right: wp.array, w: wp.array, resisted):
-        """Write w; launches alone. Arguments as of `ChainSolve`, `coefficient` that of inertia [1/s^2]."""
+        """Write w; launches only. Arguments as of `ChainSolve`, `coefficient` that of inertia [1/s^2]."""
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
         islands = system.islands
         islands.arrays[0].zero_()
         islands.coefficient.fill_(coefficient)
         islands.rate.fill_(rate)
-        islands.unbalanced.fill_(1)  # every rod wants its matrix
+        islands.unbalanced.fill_(1)  # assemble the matrices of all rods
         if resisted:
             resisted[0].resist(*resisted[1:], system, islands)
         system.evaluate(last)
         if self.solver is None:
-            islands.stale.zero_()  # frames are as they were in the step
+            islands.stale.zero_()  # keep the frames of the step
             (system.x, system.theta), system.right, system.direction = self._moved, right, w
             arrays.copy(system.x, solved.x)
             arrays.copy(system.theta, solved.theta)
@@ -259,22 +264,25 @@ class DirectSolve:
             self._solve(self._right, self._found, again=done > 0)
             self._launch(self._add, w.shape, [self._found], [w])
 
-    def _solve(self, right: wp.array, found: wp.array, again: bool = False) -> None:
+    def _solve(self, right: wp.array, solution: wp.array, again: bool = False) -> None:
         system = self.system
-        self.solver.solve(system.blocks, right, self.group.count, self._wanted, found, system.islands.bad, again)
+        self.solver.solve(system.blocks, right, self.group.count, self._wanted, solution, system.islands.bad, again)
 
     def _launch(self, kernel, shape: tuple, inputs: list, outputs: list) -> None:
         wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
 
 
 class ChainSolve:
-    """H w = g of a group of rods, in the precision of its state: directly, by factors in the precision of the model's linear algebra
-    where these serve; on the host of equilibria.
+    """Solver of H w = g of a rod group, in the precision of its state; of equilibria on the host.
+
+    Factors have the precision of the model's linear algebra if accurate enough.
 
     Attributes:
-        tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
-        system: the `DirectSolve`; exact: one in the precision of the state, which is taken instead where
-            parameters that the device holds ask for it; None where they are the model's, or `system` is that.
+        tangent: tangent of host solves.
+        held: see `HostSolve`, of the last host solve, in the layout of w.
+        system: the `DirectSolve`.
+        exact: a `DirectSolve` in the precision of the state, selected on the device by the values of parameter tensors; None if
+            parameters are the model's or `system` has that precision.
         failed: of the last direct solve, see `DirectSolve`.
     """
 
@@ -285,12 +293,11 @@ class ChainSolve:
         self.system, self.exact, self._for = DirectSolve(model, group), None, None
         self.failed = self.system.failed
 
-    def suit(self, s: float, given: bool = False) -> bool:
-        """From now on solve by what suits steps of s [s]: by as many passes in the precision of the model's linear algebra as leave w
-        right to `CLOSE`, or without any; whether that is anything else than before.
+    def suit(self, s: float, other_parameters: bool = False) -> bool:
+        """Select precision and refinement passes for steps of s [s], so that the error of w is below `CLOSE`; return True if changed.
 
         Args:
-            given: whether parameters may be others than the model's; which these are the device finds out.
+            other_parameters: True if parameters may differ from the model's; the device then checks the values.
         """
         model, kind = self.model, self.group.kind
         if model.types.linear is model.types.real:
@@ -305,7 +312,7 @@ class ChainSolve:
                 self.system, self.exact = DirectSolve(model, self.group, model.types.linear if passes else None), None
                 self.failed = self.system.failed
             self.system.passes = passes
-        if given and self.exact is None and self.system.passes:
+        if other_parameters and self.exact is None and self.system.passes:
             self._watch()
             changed = True
         return changed
@@ -327,16 +334,16 @@ class ChainSolve:
         return [*self.system.kernels, *watch]
 
     def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
-        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
+        """Write w (block, n, R), zero at fixed dofs, for a right-hand side that is zero there.
 
         Args:
             solved: the solution `x`, `theta` and its lagged `frame`.
             last: strains of the last step.
-            s: length of the implicit Euler step [s]; infinite for an equilibrium, of which `solved.time` is the load parameter.
-            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes that tangents were taken from.
+            s: length of the implicit Euler step [s]; infinite for an equilibrium with the load parameter `solved.time`.
+            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes of the tangents.
 
         Raises:
-            SolverError: H is singular; on the host alone, see `failed`.
+            SolverError: H is singular (host only; see `failed`).
         """
         rate = 1.0 / s
         coefficient = rate * (rate + self.model.scene.mass_damping)
@@ -344,9 +351,9 @@ class ChainSolve:
             more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
             self._on_host(solved, last, rate, coefficient, right, w, more)
             return
-        given = solved, last, rate, coefficient, right, w, resisted
+        arguments = solved, last, rate, coefficient, right, w, resisted
         if self.exact is None:
-            self.system(*given)
+            self.system(*arguments)
             return
         group, device = self.group, self.model.wp_device
         self._poor.zero_()
@@ -355,10 +362,10 @@ class ChainSolve:
         wp.launch(self._measure, self._found.shape[1:], read, [self._found], device=device)
         read = [self._found, group.length, group.count, self._rate, CLOSE ** (1.0 / self.system.passes)]
         wp.launch(self._judge, group.columns, read, [self._poor], device=device)
-        wp.capture_if(self._poor, lambda: self._by(self.exact, given), lambda: self._by(self.system, given))
+        wp.capture_if(self._poor, lambda: self._by(self.exact, arguments), lambda: self._by(self.system, arguments))
 
-    def _by(self, direct: DirectSolve, given: tuple) -> None:
-        direct(*given)
+    def _by(self, direct: DirectSolve, arguments: tuple) -> None:
+        direct(*arguments)
         wp.copy(self.failed, direct.failed)
 
     def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array, more) -> None:
@@ -366,7 +373,7 @@ class ChainSolve:
         groups = [data if each is self.group else None for each in self.model.groups]
         factor = None if rate else solved.time
         b = arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
-        found = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
-        arrays.assign(w, self.tangent.blocks(found).transpose(2, 1, 0))
-        held = self.host.held
-        self.held = None if held is None else self.tangent.blocks(held).transpose(2, 1, 0)
+        solution = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
+        arrays.assign(w, self.tangent.blocks(solution).transpose(2, 1, 0))
+        by_fixed = self.host.held
+        self.held = None if by_fixed is None else self.tangent.blocks(by_fixed).transpose(2, 1, 0)

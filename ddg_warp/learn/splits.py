@@ -1,4 +1,4 @@
-"""Splits of data: for training, validation and test."""
+"""Splits of data into training, validation and test sets."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ FRACTIONS = (0.8, 0.1, 0.1)
 
 
 def split_of(name: str, fractions: tuple[float, float, float] = FRACTIONS, seed: int = 0) -> str:
-    """The split of an episode: of its name and the seed alone, so that it does not depend on the other episodes.
+    """Return the split of an episode, a hash of name and seed, independent of other episodes.
 
     Raises:
-        DataError: The fractions are no shares of one.
+        DataError: The fractions do not sum to one.
     """
     fractions = checked_fractions(fractions)
     digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
-    place = int.from_bytes(digest[:8], "big") / 2.0**64
-    for split, share in zip(SPLITS, fractions, strict=True):
-        place -= share
-        if place < 0.0:
+    remainder = int.from_bytes(digest[:8], "big") / 2.0**64
+    for split, fraction in zip(SPLITS, fractions, strict=True):
+        remainder -= fraction
+        if remainder < 0.0:
             return split
-    return next(split for split, share in reversed([*zip(SPLITS, fractions, strict=True)]) if share > 0.0)
+    return next(split for split, fraction in reversed([*zip(SPLITS, fractions, strict=True)]) if fraction > 0.0)
 
 
 def checked_fractions(fractions) -> tuple[float, float, float]:
-    """Shares of train, validation and test that are none of them negative and are one together."""
+    """Return fractions of train, validation and test, refused if negative or of another sum than one."""
     values = arguments.floats(fractions)
     if values.shape != (3,) or not (values >= 0.0).all() or abs(values.sum() - 1.0) > 1e-9:
         raise DataError(

@@ -1,4 +1,4 @@
-"""Reverse of what puts supports in place during a step."""
+"""VJP of prescribed motion of supports during a step."""
 
 import numpy as np
 import warp as wp
@@ -11,16 +11,16 @@ from ddg_warp.solve.net.prescribed import NetMotion
 
 
 class Supports:
-    """Of a group of rods or of a net, whose motions are functions of time or grips.
+    """VJP of the supports of a rod group or of the coupled system, with motions by time functions or grips.
 
     Args:
         part: `Group` or `DeviceNet`.
 
     Attributes:
-        islands: that are at the start of a step and solve all of it.
+        islands: islands at the start of a whole step.
 
     Raises:
-        SceneError: a motion turns an edge that it does not hold at both ends.
+        SceneError: a motion rotates an edge with a free end.
     """
 
     def __init__(self, model, part, midpoint: bool):
@@ -47,20 +47,20 @@ class Supports:
         return [self._angles, *self.motion.kernels]
 
     def upload(self, t0: float, t1: float) -> None:
-        """Poses of the motions that are functions of time."""
+        """Upload poses of motions that are functions of time."""
         self.motion.upload(t0, t1)
 
     def follow(self, before, after) -> None:
-        """Poses of grips between the states of the model at both ends of the step; launches alone."""
+        """Compute grip poses between the states of the model at both ends of the step; launches only."""
         self.motion.follow(before, after)
 
-    def pull(self, x: wp.array, frame: wp.array, held: wp.array, angle: wp.array, by_frame: wp.array) -> None:
-        """Take derivatives by turned angles to those by directors (`by_director`), by the nodes of their edges and by lagged frames.
+    def pull(self, x: wp.array, frame: wp.array, by_node: wp.array, angle: wp.array, by_frame: wp.array) -> None:
+        """Convert gradients by prescribed angles to gradients by directors (`by_director`), edge nodes and lagged frames.
 
         Args:
             x, frame: nodes at the solution [node][column], and the lagged frames [component][edge][column].
-            held, angle: derivatives by nodes [component][node][column], which are added to, and by angles [edge][column].
-            by_frame: derivatives by the lagged frames, which are added to.
+            by_node, angle: gradients by nodes [component][node][column], added to, and by angles [edge][column].
+            by_frame: gradient by the lagged frames, added to.
         """
         motion = self.motion
         if len(motion.angles):
@@ -69,6 +69,6 @@ class Supports:
                 self._angles,
                 (len(motion.angles), self.model.worlds),
                 [*read, self.part.world_columns, x, frame, angle],
-                [held, by_frame, self.by_director],
+                [by_node, by_frame, self.by_director],
                 device=self.model.wp_device,
             )

@@ -1,10 +1,10 @@
-"""Runs over ranges of parameters, each an episode of one folder: here, in several processes, or on a Ray cluster.
+"""Parameter sweeps: runs over ranges of parameters as episodes of one folder, in this process, in several, or on a Ray cluster.
 
     sweep("tip_load", {"load": LogUniform(0.1, 10.0), "n": 40}, samples=100, out="out/loads")
 
-Samples and their seeds follow from the seed of the sweep and their index (`ddg_warp.learn.ranges`). What is finished is kept: the
-same call goes on where one that was killed has stopped, and ends with the same episodes. One that fails keeps the outcome of its
-SolverError, and what was recorded until then.
+Samples and their seeds follow from the seed of the sweep and their index (`ddg_warp.learn.ranges`). Finished episodes are kept: the
+same call resumes a killed sweep and ends with the same episodes. A failed sample keeps the outcome of its SolverError, and the
+recording until then.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ OPTIONS = ("device", "precision", "dt", "duration", "fields", "options")  # of `
 
 @dataclass(frozen=True)
 class Sample:
-    """What one episode is made of, and where it is recorded."""
+    """Parameters, seed and directory of one episode."""
 
     name: str
     parameters: dict
@@ -52,7 +52,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class SceneRun:
-    """Simulates a scene whose `build` takes the parameters, and the seed if it has one; `options` are those of `simulate`."""
+    """Simulation of a scene; `build` takes the parameters, and the seed if accepted. `simulate` takes `options`."""
 
     scene: str
     options: dict
@@ -61,24 +61,24 @@ class SceneRun:
         from ddg_warp.run.simulate import simulate
 
         module = _loaded(self.scene)
-        known = inspect.signature(module.build).parameters
+        signature = inspect.signature(module.build).parameters
         times = {name: value for name, value in (self.options | sample.parameters).items() if name in SHARED}
-        given = {"seed": sample.seed} | times | sample.parameters
-        given = {name: value for name, value in given.items() if name in known}
+        arguments_of_build = {"seed": sample.seed} | times | sample.parameters
+        arguments_of_build = {name: value for name, value in arguments_of_build.items() if name in signature}
         return simulate(
-            module.build(**given),
+            module.build(**arguments_of_build),
             out=sample.directory,
             usd=False,
             progress=False,
             observe=getattr(module, "observe", None),
-            provenance={"scene": scene_name(self.scene), "parameters": parameters(module, given)},
+            provenance={"scene": scene_name(self.scene), "parameters": parameters(module, arguments_of_build)},
             **(self.options | times),
         )
 
 
 @dataclass(frozen=True)
 class FunctionRun:
-    """Calls a function of the user's with a directory, the parameters, and the seed if it takes one."""
+    """Call of a user function with a directory, the parameters, and the seed if accepted."""
 
     function: Callable
 
@@ -89,17 +89,17 @@ class FunctionRun:
 
 @dataclass(frozen=True)
 class Run:
-    """Runs a sample and says how it ended, as `EpisodeWriter.add` takes it.
+    """Run of a sample, with the outcome in the form of `EpisodeWriter.add`.
 
     Raises:
-        SweepError: Whatever is no outcome of a solver.
+        SweepError: An error is no outcome of a solver.
     """
 
     run: SceneRun | FunctionRun
 
     def __call__(self, sample: Sample) -> dict:
         began = time.perf_counter()
-        # Ray may run a sample again whose worker was lost.
+        # Ray may repeat a sample after a lost worker.
         shutil.rmtree(sample.directory, ignore_errors=True)
         sample.directory.mkdir(parents=True)
         try:
@@ -110,8 +110,8 @@ class Run:
         except SceneError as error:
             outcome, failure = REFUSED, str(error)
         except Exception as error:
-            told = f"sample {sample.name} of {sample.parameters}: {type(error).__name__}: {error}"
-            raise SweepError(f"{told}; {KEPT}") from error
+            message = f"sample {sample.name} of {sample.parameters}: {type(error).__name__}: {error}"
+            raise SweepError(f"{message}; {KEPT}") from error
         return {"outcome": outcome, "failure": failure, "seconds": time.perf_counter() - began}
 
 
@@ -130,34 +130,34 @@ def sweep(
     gpus: float = 0.0,
     progress: bool = True,
 ) -> Episodes:
-    """Runs samples over ranges of parameters, as far as `out` does not hold them yet.
+    """Run the samples over ranges of parameters that `out` does not have yet.
 
     Args:
         what: A scene of `ddg-warp list`, or the path of a scene file; or a function `run(directory, **parameters)` that records
-            directory/trajectory.h5, and may return the `Result` of `simulate`. A parameter `seed` of the function, or of the scene's
-            `build`, takes the seed of the sample, unless it has a range.
+            directory/trajectory.h5, and may return the `Result` of `simulate`. A parameter `seed` of the function, or of the
+            scene's `build`, takes the seed of the sample, unless it has a range.
         ranges: Range of each parameter by name, `Uniform`, `LogUniform` or `Choice`; anything else is a value for all samples.
-        samples: How many; with design "grid" how many along each range.
+        samples: Number of samples; with design "grid" the number along each range.
         out: Folder of the episodes, see `ddg_warp.learn.episodes`. On a cluster all machines must see it.
         design: "random", "latin_hypercube", "sobol" or "grid".
-        seed: What samples, their seeds and the splits are drawn with.
-        fractions: Shares of train, validation and test; by default 0.8, 0.1 and 0.1.
+        seed: Seed of samples, of seeds in samples, and of splits.
+        fractions: Fractions of train, validation and test; by default 0.8, 0.1 and 0.1.
         options: Of `simulate`, for scenes: device, precision, dt, duration, fields, options.
-        workers: How many processes work at once, by default this one alone; on Ray how many samples are under way at once, by default
-            as many as its cluster has room for.
-        ray: Whether to work on Ray, in the cluster that this process has joined (`ray.init`) or in one of this machine.
-        gpus: Share of a GPU that a sample takes on Ray, which shows it no other.
-        progress: Whether to say how far the sweep is.
+        workers: Number of processes, by default this one alone; on Ray the number of concurrent samples, by default as many as the
+            cluster has room for.
+        ray: True to work on Ray, in the cluster that this process has joined (`ray.init`) or in one of this machine.
+        gpus: Fraction of a GPU for a sample on Ray, which hides all others.
+        progress: True to show progress.
 
     Returns:
         The episodes.
 
     Raises:
-        SceneError: A range is none, gives values of another type than the parameter has, or the scene has no such parameter.
-        DataError: `out` is no folder, holds the episodes of another sweep, or its index or sweep.json is damaged.
+        SceneError: A range is invalid, has values of another type than the parameter, or the scene has no such parameter.
+        DataError: `out` is no folder, has the episodes of another sweep, or its index or sweep.json is damaged.
         InputError: There is no such scene.
         SweepError: A sample met an error that is no outcome of a solver, or workers were lost.
-        ModuleNotFoundError: `ray` is wanted, but not installed.
+        ModuleNotFoundError: `ray` is True, but not installed.
     """
     out, options = as_path("sweep: out", out), {} if options is None else options
     check_names(ranges)
@@ -181,7 +181,7 @@ def sweep(
         write_json(out / ABOUT, about)
         names = [f"{index:06d}" for index in range(len(values))]
         todo = [index for index, name in enumerate(names) if name not in writer]
-        # A scratch directory is made when its sample is handed out, by a path that other processes understand.
+        # A scratch directory is made when its sample is submitted; its absolute path is valid in other processes.
         samples_to_run = (
             Sample(names[index], values[index], seed_of(seed, index), writer.scratch(names[index]).resolve())
             for index in todo
@@ -199,60 +199,62 @@ def sweep(
 
 
 def _finished(run: Run, samples: Iterator[Sample], workers: int | None, ray: bool, gpus: float) -> Iterator[tuple]:
-    """(sample, how it ended) of all samples, as they are finished."""
+    """Yield (sample, outcome) of all samples, as they finish."""
     if ray:
         return on_ray(run, samples, workers, gpus)
     return in_processes(run, samples, min(workers, MOST)) if workers and workers > 1 else in_turn(run, samples)
 
 
-def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun | FunctionRun:
-    """What runs a sample; refuses ranges and options that it does not know."""
-    if callable(what):
+def _runner(subject: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun | FunctionRun:
+    """Return the run of a sample; refuse unknown ranges and options."""
+    if callable(subject):
         if options:
             raise SceneError(f"options = {options!r} are of `simulate`, for scenes; a function gives them itself")
         try:
-            known = [*inspect.signature(what).parameters.items()]
+            signature = [*inspect.signature(subject).parameters.items()]
         except ValueError:
             raise SceneError(
-                f"sweep: {what!r} tells no parameters; write a function run(directory, **parameters)"
+                f"sweep: {subject!r} tells no parameters; write a function run(directory, **parameters)"
             ) from None
-        found = dict(known[1:])
-        if not known:
+        signature_parameters = dict(signature[1:])
+        if not signature:
             raise SceneError(
-                f"{_name_of(what)} takes no directory to record in; write it as run(directory, **parameters)"
+                f"{_name_of(subject)} takes no directory to record in; write it as run(directory, **parameters)"
             )
     else:
-        what = _scene(what)
-        found = inspect.signature(_loaded(what).build, eval_str=True).parameters
-    names = {*found, *(() if callable(what) else SHARED)}
-    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values()):
+        subject = _scene(subject)
+        signature_parameters = inspect.signature(_loaded(subject).build, eval_str=True).parameters
+    names = {*signature_parameters, *(() if callable(subject) else SHARED)}
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature_parameters.values()):
         for name in ranges:
             if name not in names:
                 raise SceneError(
                     f"ranges: there is no parameter {name!r}; there are {', '.join(sorted(names)) or 'none'}"
                 )
     for name, range_ in ranges.items():
-        kind = getattr(found.get(name), "annotation", None)
+        kind = getattr(signature_parameters.get(name), "annotation", None)
         kind = NAMED.get(kind) if isinstance(kind, str) else kind
-        check_kind(name, range_, float if name in SHARED and not callable(what) else kind)
-    for name, parameter in found.items():
+        check_kind(name, range_, float if name in SHARED and not callable(subject) else kind)
+    for name, parameter in signature_parameters.items():
         several = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
         if parameter.default is parameter.empty and not several and name not in ranges and name != "seed":
             raise SceneError(f"ranges: {name} has neither a range nor a default; give it either")
     _check_options(options, ranges)
-    return FunctionRun(what) if callable(what) else SceneRun(what, options)
+    return FunctionRun(subject) if callable(subject) else SceneRun(subject, options)
 
 
-def _scene(what) -> str:
-    """A scene by its name or the absolute path of its file."""
-    if not isinstance(what, str | os.PathLike):
-        raise SceneError(f"sweep: {what!r} is no scene; give the name of a scene, the path of its file, or a function")
-    what = os.fspath(what)
-    return str(Path(what).resolve()) if what.endswith(".py") else what
+def _scene(subject) -> str:
+    """Return a scene's name, or the absolute path of a scene file."""
+    if not isinstance(subject, str | os.PathLike):
+        raise SceneError(
+            f"sweep: {subject!r} is no scene; give the name of a scene, the path of its file, or a function"
+        )
+    subject = os.fspath(subject)
+    return str(Path(subject).resolve()) if subject.endswith(".py") else subject
 
 
 def _check_options(options: Mapping, ranges: Mapping) -> None:
-    """Refuse options that `simulate` does not have, or that a range gives, too."""
+    """Refuse options that `simulate` does not have, or that have a range."""
     if unknown := options.keys() - set(OPTIONS):
         raise SceneError(f"options: {', '.join(sorted(map(str, unknown)))}: there are {', '.join(OPTIONS)}")
     for name in SHARED:
@@ -268,19 +270,19 @@ def _check_options(options: Mapping, ranges: Mapping) -> None:
 
 @cache
 def _loaded(scene: str):
-    """The module of a scene, loaded once a process."""
+    """Return the module of a scene, loaded once a process."""
     return load_scene(scene)
 
 
-def _name_of(what: str | Callable) -> str:
-    """What is swept, as the folder remembers it."""
-    if not callable(what):
-        return scene_name(what)
-    return f"{what.__module__}.{getattr(what, '__qualname__', type(what).__name__)}"
+def _name_of(subject: str | Callable) -> str:
+    """Return the name of the subject of a sweep, for its folder."""
+    if not callable(subject):
+        return scene_name(subject)
+    return f"{subject.__module__}.{getattr(subject, '__qualname__', type(subject).__name__)}"
 
 
 def _written(ranges: Mapping) -> dict:
-    """Ranges as JSON has them."""
+    """Return ranges in JSON form."""
     return {
         name: {type(range_).__name__: asdict(range_)} if isinstance(range_, Range) else range_
         for name, range_ in ranges.items()
@@ -288,10 +290,12 @@ def _written(ranges: Mapping) -> dict:
 
 
 def _refuse_other(path: Path, about: dict, episodes: int) -> int:
-    """How many samples a folder was made for, 0 for a new one; more or fewer of some designs belong to the same sweep.
+    """Return the number of samples that a folder was made for, 0 for a new one.
+
+    For designs in `GROWING`, more or fewer samples belong to the same sweep.
 
     Raises:
-        DataError: It holds the episodes of another sweep, or of none.
+        DataError: The folder has the episodes of another sweep, or of none.
     """
     if not path.exists():
         if episodes:
@@ -306,6 +310,6 @@ def _refuse_other(path: Path, about: dict, episodes: int) -> int:
         raise DataError(f"{path} is damaged ({error}); take a copy of it, or another folder") from error
     for name, value in about.items():
         if old.get(name) != value and not (name == "samples" and about["design"] in GROWING):
-            found = f"{path.parent} holds a sweep with {name} = {old.get(name)}, not {value}"
-            raise DataError(f"{found}; go on with that, or take another folder")
+            difference = f"{path.parent} holds a sweep with {name} = {old.get(name)}, not {value}"
+            raise DataError(f"{difference}; go on with that, or take another folder")
     return old["samples"]

@@ -1,4 +1,4 @@
-"""Parameters of a model as tensors, and what its kernels read."""
+"""Parameters of a model as tensors: values, storage that kernels read, and gradients."""
 
 import numpy as np
 import torch
@@ -12,10 +12,10 @@ from ddg_warp.model.parameters import valid_numbers
 
 
 class Tables:
-    """Of a model: what its parameters are, how tensors are put in their place, and derivatives by them.
+    """Parameters of a model: names and values, writes of tensors to storage, and gradients.
 
     Attributes:
-        invalid: of every world the code of the outcome that one of its parameters is refused by, 0 where all are good (worlds,).
+        invalid: per world, the outcome code of a refused parameter; 0 if all are valid (worlds,).
     """
 
     def __init__(self, model):
@@ -24,10 +24,10 @@ class Tables:
         self.invalid = torch.zeros(model.worlds, dtype=torch.int32, device=self.device)
 
     def of(self, name: str) -> tuple[int, list[TermPlace | ArrayPlace]]:
-        """How many elements have a parameter, and where it lies.
+        """Return the number of elements with a parameter, and its storage.
 
-        Of "term.parameter" elements are counted rod by rod, those of clamped ends included, then through the element sets of the net;
-        of others see `constants`.
+        Elements of "term.parameter" are counted rod by rod, clamped ends included, then through the element sets of the coupled
+        system; for others see `constants`.
 
         Raises:
             SceneError: nothing has it.
@@ -35,24 +35,24 @@ class Tables:
         if not isinstance(name, str):
             raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}")
         if name not in self._found:
-            found = constants.array_places(self.model, name) if name in constants.NAMES else self._of_terms(name)
-            if not found[1]:
+            storage = constants.array_places(self.model, name) if name in constants.NAMES else self._of_terms(name)
+            if not storage[1]:
                 raise SceneError(f"parameters: nothing has {name!r}; this model has {', '.join(self.names())}")
-            self._found[name] = found
+            self._found[name] = storage
         return self._found[name]
 
     def _of_terms(self, name: str) -> tuple[int, list[TermPlace]]:
-        model, own = self.model, name.rpartition(".")
+        model, name_parts = self.model, name.rpartition(".")
         start, groups = model.order.elements(name)
-        found = [TermPlace(model, model.groups.index(g), True, name, rows, inside) for g, inside, rows in groups]
+        storage = [TermPlace(model, model.groups.index(g), True, name, rows, inside) for g, inside, rows in groups]
         for i, part in enumerate(model.net.sets if model.net is not None else ()):
-            if part.term.name == own[0] and own[2] in part.parameters.values:
-                found.append(TermPlace(model, i, False, name, start + np.arange(part.elements), None))
+            if part.term.name == name_parts[0] and name_parts[2] in part.parameters.values:
+                storage.append(TermPlace(model, i, False, name, start + np.arange(part.elements), None))
                 start += part.elements
-        return start, found
+        return start, storage
 
     def names(self) -> list[str]:
-        """Names of all parameters, those of terms first."""
+        """Return the names of all parameters, term parameters first."""
         model = self.model
         result = {name for group in model.groups for name in group.parameters.values}
         for part in model.net.sets if model.net is not None else ():
@@ -60,7 +60,7 @@ class Tables:
         return sorted(result) + [name for name in constants.NAMES if constants.array_places(model, name)[1]]
 
     def full_of(self, name: str, values: torch.Tensor) -> list[torch.Tensor]:
-        """As `full`; of a constant tensor that was handed in last as it is, what was found then."""
+        """Return `full`, cached for a constant tensor passed unchanged again."""
         if values.requires_grad or torch._C._are_functorch_transforms_active():
             return self.full(name, values)
         kept = self._full.get(name)
@@ -68,15 +68,15 @@ class Tables:
             kept = self._full[name] = values, values._version, self.full(name, values)
         return kept[2]
 
-    def full(self, name: str, values: torch.Tensor, judged: bool = False) -> list[torch.Tensor]:
-        """A parameter of shape (), (B,), (E,) or (B, E) as each place has it with one number an element and world.
+    def full(self, name: str, values: torch.Tensor, checked: bool = False) -> list[torch.Tensor]:
+        """Return a parameter of shape (), (B,), (E,) or (B, E) for each storage, with one number per element and world.
 
-        Unless values have been `judged`, those that the parameter may not have are not numbers there; see `invalid`.
+        Invalid values become NaN, unless `checked`; see `invalid`.
         """
-        count, found = self.of(name)
+        count, storage = self.of(name)
         worlds, real = self.model.worlds, wp.dtype_to_torch(self.model.types.real)
         shape = tuple(values.shape)
-        values = values if judged else torch.where(self._good(name, values), values, torch.nan)
+        values = values if checked else torch.where(self._good(name, values), values, torch.nan)
         if shape == ():
             wide = values.expand(worlds, count)
         elif shape in ((worlds, 1), (1, count), (worlds, count), (1, 1)):
@@ -91,12 +91,12 @@ class Tables:
                 f"({worlds}, {count})"
             )
         wide = wide.to(device=self.device, dtype=real)
-        # whether all elements are alike
+        # True if all elements have one value
         alike = values.shape[-1:] in ((), (1,)) or shape == (worlds,) != (count,)
-        return [place.full(wide, alike) for place in found]
+        return [place.full(wide, alike) for place in storage]
 
     def _good(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        """Whether values are finite and such as a parameter may have, each; nothing is read from the device."""
+        """Return a mask of values that are finite and valid for a parameter; nothing is read from the device."""
         _, holds = self.rule(name)
         values, finite = values.detach(), torch.isfinite(values)
         if holds is np.isfinite:
@@ -104,7 +104,7 @@ class Tables:
         return finite & torch.as_tensor(holds(values), device=values.device)
 
     def rule(self, name: str) -> tuple:
-        """What values of a parameter are, in words, and whether numbers are that."""
+        """Return the rule for values of a parameter in words, and a function that tests values."""
         if name not in self._rules:
             if name in constants.NAMES:
                 self._rules[name] = constants.rule(name, self._usual(name))
@@ -114,63 +114,63 @@ class Tables:
         return self._rules[name]
 
     def valid(self, name: str, values) -> np.ndarray:
-        """Values of a parameter that there is as an array of numbers.
+        """Return values of an existing parameter as an array of numbers.
 
         Raises:
-            ValueError: they are no numbers, not finite, or none that the parameter may have.
+            ValueError: values are no numbers, not finite, or invalid for the parameter.
         """
         return valid_numbers(name, values, *self.rule(name))
 
     def value(self, name: str) -> torch.Tensor:
-        """The values that the model has of a parameter (worlds, elements)."""
+        """Return the values of a parameter in the model (worlds, elements)."""
         real = wp.dtype_to_torch(self.model.types.real)
         return torch.tensor(self._usual(name), dtype=real, device=self.device)
 
     def _usual(self, name: str) -> np.ndarray:
-        count, found = self.of(name)
+        count, storage = self.of(name)
         result = np.zeros((self.model.worlds, count))
-        for place in found:
+        for place in storage:
             elements, values = place.values()
             result[:, elements] = values
         return result
 
     def write(self, names: tuple, values: list[torch.Tensor]) -> None:
-        """Put full parameters in place; what is there already stays, and others are as the model has them."""
-        values, given, anew = iter(values), {}, False
+        """Write full parameters to storage; skip unchanged ones and restore all others to the values of the model."""
+        values, entries_by_key, changed = iter(values), {}, False
         for name in names:
             for place in self.of(name)[1]:
-                given.setdefault(place.key, []).append((place, next(values)))
-        for (place, _), *_ in given.values():  # first, as this makes their memory anew
+                entries_by_key.setdefault(place.key, []).append((place, next(values)))
+        for (place, _), *_ in entries_by_key.values():  # first, since this may reallocate memory
             if place.widen():
                 self.model.layout += 1
-                # with what it holds; other tables still hold what was written
+                # forget values in the reallocated memory; other memory still has them
                 self._written = {
                     key: kept for key, kept in self._written.items() if kept[0][0].memory is not place.memory
                 }
-        for key in self._written.keys() - given.keys():  # back to what the model has
+        for key in self._written.keys() - entries_by_key.keys():  # back to the values of the model
             self._written.pop(key)[0][0].restore()
-            anew = True
-        for key, entries in given.items():
-            # the places and tensors that it holds, so that nothing else gets their ids
+            changed = True
+        for key, entries in entries_by_key.items():
+            # keep storage and tensors alive, so that their ids are not reused
             kept = [(place, value, value._version) for place, value in entries]
             if not _alike(self._written.get(key, ()), kept):
                 entries[0][0].put(entries)
-                self._written[key], anew = kept, True
-        if anew:
+                self._written[key], changed = kept, True
+        if changed:
             self._judge()
 
     def restore(self) -> None:
-        """Put back what the model has of all that was written."""
+        """Restore all written parameters to the values of the model."""
         for (place, *_), *_ in self._written.values():
             place.restore()
         self._written = {}
         self.invalid.zero_()
 
     def refuse_invalid(self) -> None:
-        """Read from the device whether parameters are good.
+        """Refuse invalid parameters. Reads from the device.
 
         Raises:
-            SceneError: one is not finite in a world, or none that it may be; names it.
+            SceneError: names a parameter that is not finite or invalid in a world.
         """
         for entries in self._written.values() if bool(self.invalid.any()) else ():
             for place, value, _ in entries:
@@ -181,41 +181,41 @@ class Tables:
                     )
 
     def _name_of(self, place) -> str:
-        return next(name for name, (_, places) in self._found.items() if any(own is place for own in places))
+        return next(name for name, (_, places) in self._found.items() if any(storage is place for storage in places))
 
     def _judge(self) -> None:
-        """Find the worlds in which a parameter that was written is not a number."""
+        """Find the worlds with NaN in a written parameter."""
         self.invalid.zero_()
         for entries in self._written.values():
             for place, value, _ in entries:
                 self.invalid.masked_fill_(self._bad(place, value), outcome.INVALID_INPUT)
 
     def _bad(self, place, value: torch.Tensor) -> torch.Tensor:
-        """Whether what was written to a place is not a number, in every world (worlds,)."""
-        bad = torch.isnan(value)
-        return bad.view(len(bad), self.model.worlds, -1).any(2).any(0) if place.chain else bad.any(1)
+        """Return a mask of worlds with NaN in the values written to a storage (worlds,)."""
+        is_nan = torch.isnan(value)
+        return is_nan.view(len(is_nan), self.model.worlds, -1).any(2).any(0) if place.chain else is_nan.any(1)
 
     @property
     def given(self) -> bool:
-        """Whether anything is another than that of the model."""
+        """True if any parameter differs from the model."""
         return bool(self._written)
 
     @property
     def weighs(self) -> bool:
-        """Whether masses are other ones than those of the model."""
+        """True if masses differ from the model."""
         return any(place.weighs for (place, *_), *_ in self._written.values())
 
     def axes(self, names: tuple) -> list[int]:
-        """Axes along which the worlds of full parameters lie."""
+        """Return the world axes of full parameters."""
         return [int(place.chain) for name in names for place in self.of(name)[1]]
 
     def pull(self, names: tuple, inputs: list, flags) -> list[torch.Tensor]:
-        """Derivatives by full parameters, in the order of `write`."""
+        """Return the gradients by full parameters, in the order of `write`."""
         return [place.pull(inputs, flags) for name in names for place in self.of(name)[1]]
 
 
-def _alike(before: list, now: list) -> bool:
-    """Whether tensors are those that were put in place, as they were then."""
-    return len(before) == len(now) and all(
-        a is x and b is y and version == z for (a, b, version), (x, y, z) in zip(before, now, strict=True)
+def _alike(before: list, after: list) -> bool:
+    """Return True if tensors and versions equal the record of the last write."""
+    return len(before) == len(after) and all(
+        a is x and b is y and version == z for (a, b, version), (x, y, z) in zip(before, after, strict=True)
     )

@@ -1,10 +1,10 @@
-"""An `Environment` as one of TorchRL.
+"""Adapter of an `Environment` to TorchRL.
 
     env = TorchRLEnvironment(environment, differentiable=True)
     rollout = env.rollout(40, policy)
     rollout["next", "reward"].sum().backward()
 
-goes back through the policy and all steps.
+Gradients go through the policy and all steps.
 """
 
 try:
@@ -24,13 +24,15 @@ ENDS = ("done", "terminated", "truncated")
 
 
 class TorchRLEnvironment(EnvBase):
-    """Worlds as a batch: "observation" (B, n), "action" (B, actions) [m/s, rad/s], "reward" (B, 1), and "failed" (B, 1): whether a
-    world was terminated because its step could not be solved; see `EpisodeState`.
+    """TorchRL environment with the worlds as batch.
+
+    Keys are "observation" (B, n), "action" (B, actions) [m/s, rad/s], "reward" (B, 1), and "failed" (B, 1), True for a world
+    terminated by a failed step; see `EpisodeState`.
 
     Args:
-        environment: what it steps.
-        differentiable: whether observations and rewards keep their history back to the last reset of all worlds. Gradients of worlds
-            that failed are not numbers, see `Simulator`.
+        environment: the environment to step.
+        differentiable: True if observations and rewards keep their history back to the last reset of all worlds. Gradients of
+            failed worlds are NaN, see `Simulator`.
     """
 
     def __init__(self, environment: Environment, differentiable: bool = False):
@@ -40,10 +42,10 @@ class TorchRLEnvironment(EnvBase):
         super().__init__(**where, batch_size=[worlds])
         self.environment, self.differentiable = environment, differentiable
         real = {"dtype": environment.dtype, **where}
-        seen = {"dtype": environment.observation_dtype, **where}
+        observation_options = {"dtype": environment.observation_dtype, **where}
         flag = {"n": 1, "shape": (worlds, 1), "dtype": torch.bool, **where}
         bounds = environment.bounds.expand(worlds, -1)
-        observed = Unbounded(shape=(worlds, environment.observations), **seen)
+        observed = Unbounded(shape=(worlds, environment.observations), **observation_options)
         self.observation_spec = Composite(observation=observed, failed=Binary(**flag), shape=(worlds,), **where)
         self.action_spec = Bounded(low=-bounds, high=bounds, shape=bounds.shape, **real)
         self.reward_spec = Unbounded(shape=(worlds, 1), **real)
@@ -54,27 +56,27 @@ class TorchRLEnvironment(EnvBase):
         self._generators = self.environment.generators(seed)
 
     def _reset(self, tensordict=None, **_):
-        """New episodes, in all worlds or those of the mask "_reset"."""
+        """Begin new episodes, in all worlds or in the worlds of the mask "_reset"."""
         mask = tensordict.get("_reset", None) if tensordict is not None else None
-        own = self.environment
+        environment = self.environment
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
             if mask is None or mask.all():
-                self._now = own.begin(self._generators)
+                self._now = environment.begin(self._generators)
             else:
-                self._now = own.begin(self._generators, self._now, mask.reshape(-1))
-            none = torch.zeros((own.worlds, 1), dtype=torch.bool, device=self.device)
+                self._now = environment.begin(self._generators, self._now, mask.reshape(-1))
+            none = torch.zeros((environment.worlds, 1), dtype=torch.bool, device=self.device)
             return self._seen({name: none.clone() for name in ENDS})
 
     def _step(self, tensordict):
-        own = self.environment
+        environment = self.environment
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
-            self._now = own.step(self._now, tensordict["action"])
-            terminated, truncated = own.ended(self._now)
+            self._now = environment.step(self._now, tensordict["action"])
+            terminated, truncated = environment.ended(self._now)
             ends = zip(ENDS, (terminated | truncated, terminated, truncated), strict=True)
-            reward = own.reward(self._now).to(own.dtype)
+            reward = environment.reward(self._now).to(environment.dtype)
             return self._seen({name: value[:, None] for name, value in ends} | {"reward": reward[:, None]})
 
     def _seen(self, more: dict):
-        own = self.environment
-        found = {"observation": own.observe(self._now), "failed": self._now.failed[:, None]}
-        return TensorDict(found | more, batch_size=self.batch_size, device=self.device)
+        environment = self.environment
+        observed = {"observation": environment.observe(self._now), "failed": self._now.failed[:, None]}
+        return TensorDict(observed | more, batch_size=self.batch_size, device=self.device)

@@ -1,7 +1,7 @@
-"""Tasks done in turn by this process, by several, or by a Ray cluster; results come as they are finished.
+"""Executors of tasks: serial, by several processes, or by a Ray cluster.
 
-Each way takes a function and tasks, one after the other, and yields (task, result). It holds few tasks at a time, so that there may
-be very many. An error of the function goes on to the caller; tasks under way are then given up.
+Each executor takes a function and an iterable of tasks, and yields (task, result) as tasks finish. Only a few tasks are in flight,
+so that there may be very many. An error of the function is raised; tasks in flight are then cancelled.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from functools import partial
 from ddg_warp.errors import SceneError
 
 KEPT = "what is finished is kept, and the same call goes on from there"
-AHEAD = 2  # tasks handed out for each worker, so that none waits for the next
+AHEAD = 2  # tasks in flight per worker, so that none is inactive between tasks
 
 
 class SweepError(RuntimeError):
-    """A sweep ended early: a sample met an error that is no outcome of a solver, or workers were lost. What is finished is kept."""
+    """Error that ends a sweep early: a sample failed for no reason of a solver, or workers were lost. Finished episodes are kept."""
 
 
 def in_turn(function: Callable, tasks: Iterable) -> Iterator[tuple]:
-    """Done here, one after the other."""
+    """Execute tasks in this process, one after the other."""
     for task in tasks:
         yield task, function(task)
 
 
 def in_processes(function: Callable, tasks: Iterable, workers: int) -> Iterator[tuple]:
-    """Done by processes of this machine; a script that calls it needs `if __name__ == "__main__":`.
+    """Execute tasks by processes of this machine; a calling script needs `if __name__ == "__main__":`.
 
     Raises:
         SceneError: The function cannot be sent to another process.
@@ -43,7 +43,7 @@ def in_processes(function: Callable, tasks: Iterable, workers: int) -> Iterator[
         raise SceneError(
             f"{function} cannot be sent to another process ({error}): define it at the top of a module, or leave workers out"
         ) from error
-    # Processes are spawned: a copy of this one would share its CUDA context and the threads of its libraries.
+    # Processes are spawned, since a fork would inherit the CUDA context and threads of libraries.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         submit, wait_for = partial(pool.submit, function), partial(wait, return_when=FIRST_COMPLETED)
         try:
@@ -51,15 +51,15 @@ def in_processes(function: Callable, tasks: Iterable, workers: int) -> Iterator[
             for task, future in finished:
                 yield task, future.result()
         except BrokenProcessPool as error:
-            told = 'A process was killed, or could not start (memory? a script needs `if __name__ == "__main__":`)'
-            raise SweepError(f"{told}; {KEPT}") from error
+            message = 'A process was killed, or could not start (memory? a script needs `if __name__ == "__main__":`)'
+            raise SweepError(f"{message}; {KEPT}") from error
 
 
 def require_ray():
-    """The module `ray`.
+    """Import and return the module `ray`.
 
     Raises:
-        ModuleNotFoundError: It is not installed.
+        ModuleNotFoundError: Ray is not installed.
     """
     try:
         import ray
@@ -71,18 +71,18 @@ def require_ray():
 
 
 def on_ray(function: Callable, tasks: Iterable, workers: int | None = None, gpus: float = 0.0) -> Iterator[tuple]:
-    """Done by a Ray cluster: the one that this process has joined, or one of this machine, which ends with the work.
+    """Execute tasks by a Ray cluster: the one that this process has joined, or a temporary one of this machine.
 
     Args:
-        workers: Tasks under way at once; by default as many as the cluster has processors, and as many waiting.
-        gpus: Share of a GPU for each task.
+        workers: Tasks in flight; by default as many as the cluster has processors, and as many waiting.
+        gpus: Fraction of a GPU for each task.
 
     Raises:
-        SweepError: Ray lost its workers, or they lack a module.
+        SweepError: Ray lost its workers, or a module is missing on a worker.
     """
     ray = require_ray()
-    own = not ray.is_initialized()
-    if own:
+    is_temporary = not ray.is_initialized()
+    if is_temporary:
         ray.init(include_dashboard=False, log_to_driver=False)
     try:
         remote = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=1)(lambda function, task: function(task))
@@ -94,16 +94,16 @@ def on_ray(function: Callable, tasks: Iterable, workers: int | None = None, gpus
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", error)
         if not isinstance(cause, ray.exceptions.RayError):
-            raise cause from error  # as the function has raised it
-        told = f"Ray cannot go on: {str(error).strip().splitlines()[-1]}"
-        raise SweepError(f"{told} (its machines need ddg_warp and the module of the function); {KEPT}") from error
+            raise cause from error  # the error of the function
+        message = f"Ray cannot go on: {str(error).strip().splitlines()[-1]}"
+        raise SweepError(f"{message} (its machines need ddg_warp and the module of the function); {KEPT}") from error
     finally:
-        if own:
+        if is_temporary:
             ray.shutdown()
 
 
 def _flow(tasks: Iterable, submit: Callable, wait: Callable, give_up: Callable, limit: int) -> Iterator[tuple]:
-    """Hands out tasks, at most `limit` at a time, and yields (task, what `submit` returned) as they are finished."""
+    """Submit tasks, at most `limit` at a time, and yield (task, future) as they finish."""
     under_way: dict = {}
     try:
         for task in tasks:

@@ -13,16 +13,16 @@ from ddg_warp.learn.layout import Layout
 
 @dataclass(frozen=True)
 class WorldState:
-    """A state of B worlds as tensors, which lie as the device likes it; `positions` and the like are in the user's order.
+    """State of B worlds as tensors in storage layout; properties such as `positions` are in user order.
 
     Attributes:
-        values: the arrays of a `State` by the order of `Layout.fields`; of worlds whose step failed, not numbers.
+        values: arrays of a `State`, ordered as `Layout.fields`; NaN in failed worlds.
         time: [s], of all worlds.
-        engine: what knows their meaning; None of a state that was copied or loaded, see `Simulator.world_state`.
-        codes: outcomes of the step that led here (B,), see `kernels.outcome`; 0 of good ones, and where none did.
-        differentiable: bools (B,), whether a gradient goes through all steps that led here, as far as they were made for gradients.
-            Gradients of the others are not numbers, unless nothing is asked of these worlds: leave them out of a loss by this mask, and
-            take `torch.nan_to_num` of what is computed from worlds that failed.
+        engine: engine with the layout; None for a copied or loaded state, see `Simulator.world_state`.
+        codes: outcomes of the step to this state (B,), see `kernels.outcome`; 0 if good, or without a step.
+        differentiable: bools (B,), True if a gradient goes through all steps to this state, as far as made for gradients. Gradients
+            of other worlds are NaN, unless their cotangent is zero: mask them in a loss, and apply `torch.nan_to_num` to
+            values computed from failed worlds.
     """
 
     values: tuple
@@ -33,16 +33,16 @@ class WorldState:
 
     @classmethod
     def begun(cls, values, time: float, engine: Engine) -> "WorldState":
-        """Return a state to which no step has led."""
+        """Return a state without a step before."""
         codes = torch.zeros(engine.model.worlds, dtype=torch.int32, device=engine.device)
         return cls(tuple(values), time, engine, codes, codes == 0)
 
     @property
     def layout(self) -> Layout:
-        """What the tensors of a state are.
+        """Layout of the tensors of the state.
 
         Raises:
-            SceneError: the state was loaded, and belongs to no simulator.
+            SceneError: the state was loaded, and is not bound to a simulator.
         """
         if self.engine is None:
             raise SceneError(
@@ -59,32 +59,34 @@ class WorldState:
     @property
     @torch.compiler.disable
     def velocities(self) -> torch.Tensor:
-        """Their velocities (B, P, 3) [m/s]."""
+        """Velocities of points (B, P, 3) [m/s]."""
         return self.layout.points(self.values, "v", "v")
 
     @property
     @torch.compiler.disable
     def angles(self) -> torch.Tensor:
-        """Angles of edges (B, edges) [rad], zero where there is no twist."""
+        """Twist angles of edges (B, edges) [rad], zero without twist."""
         return self.layout.edges(self.values)
 
     @property
     def failed(self) -> torch.Tensor:
-        """Worlds whose last step could not be made (B,)."""
+        """Mask of worlds that failed in the last step (B,)."""
         return (self.codes != 0) & (self.codes != outcome.NO_GRADIENT)
 
     def outcomes(self) -> np.ndarray:
-        """Names of what became of the last step of every world (B,), as of `Integrator.outcomes`; "no_gradient" where it converged and
-        no gradient goes through it, though gradients were asked for. Reads from the device."""
+        """Return outcome names of the last step of every world (B,), as `Integrator.outcomes`. Reads from the device.
+
+        "no_gradient" marks worlds that converged but have no gradient, though gradients were requested.
+        """
         return outcome_names(self.codes)
 
     def detach(self) -> "WorldState":
-        """The same without history."""
+        """Return the state without gradient history."""
         values = tuple(value.detach() for value in self.values)
         return replace(self, values=values, differentiable=torch.ones_like(self.differentiable))
 
     def __getstate__(self):
-        return {own.name: getattr(self, own.name) for own in fields(self)} | {"engine": None}
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | {"engine": None}
 
     def __deepcopy__(self, memo):
         return replace(self.detach(), values=tuple(value.detach().clone() for value in self.values))
@@ -98,5 +100,5 @@ torch.utils._pytree.register_pytree_node(
 
 
 def outcome_names(codes: torch.Tensor) -> np.ndarray:
-    """Names of outcomes by their codes."""
+    """Return outcome names by code."""
     return np.array([outcome.NAMES[code or outcome.CONVERGED] for code in codes.tolist()])
