@@ -43,7 +43,7 @@ class Engine:
         scheme, options: see `Integrator`.
 
     Attributes:
-        codes: outcomes of the last step per world (worlds,), see `kernels.outcome`; 0 if converged and, if requested, differentiable.
+        codes: outcomes of the last step per world (worlds,), see `kernels.outcome`. Zero if good.
         layout, fields: layout of the tensors of a state.
         tables, controls: parameters and controls of steps.
         before, after: states at the ends of a step.
@@ -250,22 +250,22 @@ class Engine:
         """Compute the flags of a backward pass; launches only."""
         lost = self._lost
         lost.zero_()
-        for adjoint, flags, solved, requested in zip(self.adjoint.parts, *self._flags, strict=True):
+        for adjoint, flags, result_flags, requested in zip(self.adjoint.parts, *self._flags, strict=True):
             failed = adjoint.solve.failed
-            outputs = [solved, requested, lost, self._told_of.array]
+            outputs = [result_flags, requested, lost, self._told_of.array]
             wp.launch(self._solves, failed.shape, [failed, flags], outputs, device=failed.device)
         wp.capture_if(lost, self._ask)
 
     def _ask(self) -> None:
-        """Clear the flags of islands with zero cotangent."""
+        """Reset to 1 the flags of islands with zero cotangent."""
         cotangents = [part for name, part in self._given.parts().items() if name != "grips"]
-        for part, solved, requested in zip(cotangents, *self._flags[1:], strict=True):
+        for part, result_flags, requested in zip(cotangents, *self._flags[1:], strict=True):
             for name, array in part.arrays().items():
-                if name.rstrip("_0123456789") in GRADIENTS and array.shape[-1] % len(solved) == 0:
+                if name.rstrip("_0123456789") in GRADIENTS and array.shape[-1] % len(result_flags) == 0:
                     cube, kernel = cubed(array), asked_kernel(array.dtype, self.model.types.real)
-                    inputs = [solved, cube, cube.shape[-1] // len(solved)]
+                    inputs = [result_flags, cube, cube.shape[-1] // len(result_flags)]
                     wp.launch(kernel, cube.shape, inputs, [requested], device=array.device)
-            wp.launch(self._excuse, len(solved), [requested], [solved], device=solved.device)
+            wp.launch(self._excuse, len(result_flags), [requested], [result_flags], device=result_flags.device)
 
     def _adjoint(self) -> Adjoint:
         if self.adjoint is None:
@@ -306,7 +306,7 @@ class Engine:
             [wp.zeros(count, dtype=dtype, device=device) for count in counts]
             for dtype in (model.types.real, model.types.real, int)
         ]
-        self._flag_tensors = [view(solved) for solved in self._flags[1]]
+        self._flag_tensors = [view(result_flags) for result_flags in self._flags[1]]
         kept = self._net.lagged if self.adjoint.net else []
         self._told_places = [view(place) for place in (*self._flags[0], self._codes_then, *kept)]
 

@@ -118,9 +118,10 @@ class ContactAdjoint:
         """Add the gradients by dof blocks and by contact parameters, after `find` of `system` with the same arguments.
 
         Args:
-            at: dof blocks at the friction lag, at the start and at the solution (W N,) each.
+            positions: dof blocks at the friction lag, at the start and at the solution (W N,) each.
             w: solution of the adjoint system (W N,).
-            by: gradients by these three.
+            rate: inverse step of each world [1/s].
+            gradients: gradients by these `positions`, added to.
         """
         terms, (_, before, q), (by_lagged, by_before, by_q) = self.system.terms, positions, gradients
         for array in (*self._things.values(), *self._spun_things.values()):
@@ -136,8 +137,8 @@ class ContactAdjoint:
                 items = self._rub_items[i]
                 items.list(rub.count, rub.factor)
                 written = self.rubbing.pull(i, (rub.factor.nodes, rub.factor.angles), positions, w, rate, self._numbers)
-                for values, by_found in zip(written, (by_q, by_before, by_lagged), strict=True):
-                    self._add_up(items, rub, values, by_found)
+                for values, gradient in zip(written, (by_q, by_before, by_lagged), strict=True):
+                    self._add_up(items, rub, values, gradient)
                 self._sum(i, items, rub)
                 self._lead(i, rub, by_lagged)
                 if rub.rolls:

@@ -106,15 +106,15 @@ class Poses:
         by_shift = torch.zeros((worlds, count, 3), dtype=after.dtype, device=after.device)
         by_turn, by_turned, by_end = (by_shift.new_zeros((worlds, count, 3, 3)) for _ in range(3))
         parts = (*self.model.groups, *([self.model.net] if self.model.net is not None else []))
-        for subsystem, nodes, weights, arms, turned, directors in self._owned:
-            part = subsystem.supports.part
+        for entry, nodes, weights, arms, turned, directors in self._owned:
+            part = entry.supports.part
             read = inputs[next(i for i, each in enumerate(parts) if each is part)]
             by_fixed = self._held(part, read.held, nodes)  # (worlds, nodes, 3)
             by_gripped = weights[None] * by_fixed[:, None]  # (worlds, grips, nodes, 3)
             by_shift = by_shift + by_gripped.sum(2)
             by_turn = by_turn + torch.einsum("wgnc,gnd->wgcd", by_gripped, arms)
             if len(directors):
-                gradients = view(subsystem.supports.by_director)
+                gradients = view(entry.supports.by_director)
                 by_turned = by_turned + torch.einsum("gi,iwc,id->wgcd", turned, gradients, directors)
         if self._normals:
             by_turned = by_turned + self._by_normals(inputs[-1].data, worlds)
@@ -129,8 +129,7 @@ class Poses:
                 total = total + (start * (share * by_turn)).sum()
             gradients = torch.autograd.grad(total, ends, allow_unused=True)
         by_start, by_rotation = (
-            torch.zeros_like(r) if subsystem is None else subsystem
-            for subsystem, r in zip(gradients, ends, strict=True)
+            torch.zeros_like(r) if entry is None else entry for entry, r in zip(gradients, ends, strict=True)
         )
         shift = (1.0 - share) * by_shift, share * by_shift
         return torch.cat([shift[0], by_start], -1), torch.cat([shift[1], by_rotation], -1)

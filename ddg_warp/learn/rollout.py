@@ -25,9 +25,9 @@ class Plan:
 def plan(bytes_of_step: int, controls: int, steps: int, save: int, every: int | None, memory: float | None) -> Plan:
     """Choose checkpoints of a roll-out.
 
-    Without checkpoints all `steps` states are kept, and the controls, which are always kept. With checkpoints kept states are the first
-    of every block, all of the current block, and the returned ones. Blocks of the square root of the number of steps need least (Griewank
-    and Walther, Evaluating Derivatives, 2008, section 12.2: one checkpoint level).
+    The controls are always kept. Without checkpoints all `steps` states are kept; with checkpoints the first state of every block,
+    all states of the current block, and the returned ones. Blocks of the square root of the number of steps need least memory
+    (Griewank and Walther, Evaluating Derivatives, 2008, section 12.2: one checkpoint level).
 
     Args:
         bytes_of_step: memory of a step [bytes].
