@@ -192,9 +192,7 @@ class Environment:
         )
         if self._draw is not None and len(chosen):
             drawn = [self._drawn(generators[world]) for world in chosen]
-            sizes = {len(numbers_of_world) for numbers_of_world in drawn} | (
-                {goals.shape[1]} if now is not None else set()
-            )
+            sizes = {len(row) for row in drawn} | ({goals.shape[1]} if now is not None else set())
             if len(sizes) > 1:
                 given_sizes = " and ".join(map(str, sorted(sizes)))
                 raise SceneError(

@@ -87,9 +87,9 @@ class ContactAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        kernels_of_terms = [*self._pull, *self.rubbing.kernels, self._add, *self._group, self._bodies, *self._direct]
+        first = [*self._pull, *self.rubbing.kernels, self._add, *self._group, self._bodies, *self._direct]
         return [
-            *kernels_of_terms,
+            *first,
             *(k for pair in self._sides for k in pair),
             *(k for items in {*self._items, *self._rub_items} for k in items.kernels),
         ]

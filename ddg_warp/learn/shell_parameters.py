@@ -93,7 +93,7 @@ class ShellParameters(torch.nn.Module):
             values[f"_{name}"] = torch.tensor(np.concatenate([getattr(plate, name) for plate in plates]))
         densities = [model.scene.shells[i].material.density for i, *_ in chosen]
         values["_density"] = torch.tensor(
-            np.concatenate([np.full(*count_and_density) for count_and_density in zip(counts, densities, strict=True)])
+            np.concatenate([np.full(*pair) for pair in zip(counts, densities, strict=True)])
         )
         self._weighs = bool(set(HEAVY) & set(names) and (values["_density"] > 0.0).any())
         if self._weighs:

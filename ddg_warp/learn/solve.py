@@ -23,8 +23,8 @@ from ddg_warp.solve.rigid import rigid_modes
 CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
 PASSES = 2  # ... which limits refinement. Measured: with 3 passes, an error of 1e-2 each, gradients erred by 1e-3
 LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner.
-MISSED = 1e-6  # largest true relative residual left by conjugate gradients, for rounding.
-SINGULAR = 1e-6  # accepted relative residual; a singular matrix that was regularised leaves more
+MISSED = 1e-6  # Largest true relative residual left by conjugate gradients, for rounding.
+SINGULAR = 1e-6  # Accepted relative residual; a singular matrix that was regularised leaves more
 
 
 class HostSolve:
