@@ -1,10 +1,10 @@
-"""Layouts of many rods that do not overlap: placed at random, or pushed apart."""
+"""Layouts of many rods without overlap: random sequential addition and overlap resolution."""
 
 import numpy as np
 
 
 def random(seed: int):
-    """Random numbers of a seed.
+    """Return the random generator of a seed.
 
     Raises:
         ValueError: the seed is negative.
@@ -14,21 +14,21 @@ def random(seed: int):
     return np.random.default_rng(seed)
 
 
-def placed_apart(rng, count: int, length: float, apart: float, size, height: float) -> np.ndarray:
-    """Straight rods of random places and directions in a box, none closer to another than `apart` (random sequential addition).
+def placed_apart(rng, count: int, length: float, separation: float, size, height: float) -> np.ndarray:
+    """Return straight rods at random positions and directions in a box without overlap (random sequential addition).
 
     Args:
-        rng: random numbers.
-        count: rods.
-        length: of a rod [m].
+        rng: random generator.
+        count: number of rods.
+        length: length of a rod [m].
         apart: least distance of two axes, and half of it of an axis and the box [m].
-        size: of the box, 0 <= x <= size[0] and 0 <= y <= size[1] [m].
-        height: that the box begins with [m]; it grows where there is no room left.
+        size: the box is 0 <= x <= size[0], 0 <= y <= size[1] [m].
+        height: initial height of the box [m]; it grows where no room is left.
 
     Returns:
-        First and last points (count, 2, 3) [m], the lowest 0 or more above the ground.
+        First and last points (count, 2, 3) [m], at heights of 0 or more.
     """
-    placed, half = np.empty((count, 2, 3)), 0.5 * apart
+    placed, half = np.empty((count, 2, 3)), 0.5 * separation
     slabs: dict[int, list[int]] = {}
     done, tried = 0, 0
     while done < count:
@@ -44,7 +44,7 @@ def placed_apart(rng, count: int, length: float, apart: float, size, height: flo
         end = start + direction
         slab = int(0.5 * (start[2] + end[2]) // length)
         near = [i for k in (slab - 1, slab, slab + 1) for i in slabs.get(k, ())]
-        if near and distances(start, end, placed[near]).min() < apart:
+        if near and distances(start, end, placed[near]).min() < separation:
             continue
         placed[done] = start, end
         slabs.setdefault(slab, []).append(done)
@@ -52,15 +52,15 @@ def placed_apart(rng, count: int, length: float, apart: float, size, height: flo
     return placed
 
 
-def distances(start: np.ndarray, end: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Distances (n,) of a segment, or of n, from others (n, 2, 3); none is a point."""
-    return np.linalg.norm(_between(start, end, *np.moveaxis(others, 1, 0))[0], axis=1)
+def distances(start: np.ndarray, end: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """Return distances (n,) of a segment, or of n segments, from segments (n, 2, 3); none is a point."""
+    return np.linalg.norm(_between(start, end, *np.moveaxis(segments, 1, 0))[0], axis=1)
 
 
 def _between(a, b, c, d) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """From segments c-d to segments a-b (n, 3), and shares (n,) of both at which they are closest.
+    """Return vectors from segments c-d to segments a-b (n, 3) and the parameters (n,) of both closest points.
 
-    Ericson, Real-Time Collision Detection, 5.1.9.
+    Source: Ericson, Real-Time Collision Detection, 5.1.9.
     """
     u, v, r = b - a, d - c, a - c
     uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
@@ -72,12 +72,12 @@ def _between(a, b, c, d) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def pushed_apart(points: np.ndarray, apart: float, held: int = 0, rounds: int = 400) -> np.ndarray:
-    """Rods (rods, nodes, 3) with nodes moved until edges of two rods are not closer than `apart` [m]; the first `held` nodes stay.
+    """Move nodes of rods (rods, nodes, 3) until edges of two rods are `apart` [m] apart; the first `held` nodes are fixed.
 
-    What is too close is pushed apart along the line between, by equal parts; so rods that cross become rods that pass by.
+    Edges that are too close move by equal amounts along the line between closest points, so that crossing rods separate.
 
     Raises:
-        ValueError: they still overlap after so many rounds.
+        ValueError: rods still overlap after `rounds` rounds.
     """
     rods, nodes, _ = points.shape
     flat = points.reshape(-1, 3).copy()
@@ -85,22 +85,22 @@ def pushed_apart(points: np.ndarray, apart: float, held: int = 0, rounds: int = 
     free = np.tile(np.arange(nodes) >= held, rods)
     since, near = np.inf, None
     for _ in range(rounds):
-        if since > apart:  # two edges may both have moved by so much
+        if since > apart:  # each edge of a pair may have moved by this much
             near, since = _near(flat, first, nodes, 4.0 * apart), 0.0
-        one, other = near.T
-        away, s, t = _between(flat[one], flat[one + 1], flat[other], flat[other + 1])
+        first_edge, second = near.T
+        away, s, t = _between(flat[first_edge], flat[first_edge + 1], flat[second], flat[second + 1])
         distance = np.linalg.norm(away, axis=1)
         close = np.flatnonzero(distance < apart)
         if not len(close):
             return flat.reshape(points.shape)
-        way = away[close] / np.maximum(distance[close], 1e-12)[:, None]
-        way *= 0.5 * (1.02 * apart - distance[close])[:, None]
-        moved, shares = np.zeros_like(flat), np.full(len(flat), 1e-12)
-        for edge, share, push in ((one, s, way), (other, t, -way)):
-            for node, part in ((edge[close], 1.0 - share[close]), (edge[close] + 1, share[close])):
-                np.add.at(moved, node, part[:, None] * push)
-                np.add.at(shares, node, part**2)
-        moved *= (free / np.maximum(1.0, shares))[:, None]
+        correction = away[close] / np.maximum(distance[close], 1e-12)[:, None]
+        correction *= 0.5 * (1.02 * apart - distance[close])[:, None]
+        moved, weights = np.zeros_like(flat), np.full(len(flat), 1e-12)
+        for edge, parameter, shift in ((first_edge, s, correction), (second, t, -correction)):
+            for node, weight in ((edge[close], 1.0 - parameter[close]), (edge[close] + 1, parameter[close])):
+                np.add.at(moved, node, weight[:, None] * shift)
+                np.add.at(weights, node, weight**2)
+        moved *= (free / np.maximum(1.0, weights))[:, None]
         flat += moved
         since += np.linalg.norm(moved, axis=1).max()
     raise ValueError(
@@ -109,19 +109,19 @@ def pushed_apart(points: np.ndarray, apart: float, held: int = 0, rounds: int = 
 
 
 def _near(flat: np.ndarray, first: np.ndarray, nodes: int, within: float) -> np.ndarray:
-    """Pairs (n, 2) of edges of two rods, each by its first node, that are not farther than `within` from each other [m]."""
+    """Return pairs (n, 2) of edges of two rods, each by its first node, within a distance [m]."""
     from scipy.spatial import cKDTree
 
     middle = 0.5 * (flat[first] + flat[first + 1])
-    tree, found = cKDTree(middle), []
+    tree, pairs = cKDTree(middle), []
     reach = np.linalg.norm(flat[first + 1] - flat[first], axis=1).max() + within
-    for part in np.array_split(np.arange(len(first)), -(-len(first) // 20000)):
-        each = tree.query_ball_point(middle[part], reach)
-        one, other = np.repeat(part, list(map(len, each))), np.concatenate(each).astype(int)
-        one, other = first[one], first[other]
-        kept = (one < other) & (one // nodes != other // nodes)
-        one, other = one[kept], other[kept]
-        away, *_ = _between(flat[one], flat[one + 1], flat[other], flat[other + 1])
+    for chunk in np.array_split(np.arange(len(first)), -(-len(first) // 20000)):
+        each = tree.query_ball_point(middle[chunk], reach)
+        first_edge, second = np.repeat(chunk, list(map(len, each))), np.concatenate(each).astype(int)
+        first_edge, second = first[first_edge], first[second]
+        kept = (first_edge < second) & (first_edge // nodes != second // nodes)
+        first_edge, second = first_edge[kept], second[kept]
+        away, *_ = _between(flat[first_edge], flat[first_edge + 1], flat[second], flat[second + 1])
         kept = np.linalg.norm(away, axis=1) < within
-        found.append(np.stack([one[kept], other[kept]], axis=1))
-    return np.concatenate(found)
+        pairs.append(np.stack([first_edge[kept], second[kept]], axis=1))
+    return np.concatenate(pairs)

@@ -1,4 +1,4 @@
-"""What scenes that learn share: a quasi-Newton search, error bars, and what is said where torch is missing."""
+"""Shared pieces of scenes that fit parameters: optimisers, Jacobians, Hessians, and checks for torch."""
 
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -9,16 +9,16 @@ import ddg_warp as ddg
 
 
 def skipped(names) -> list[ddg.Check]:
-    """Checks of what is learned, skipped where torch is not installed; none where it is."""
+    """Return skipped checks of fitted quantities where torch is not installed; none where it is."""
     missing = () if find_spec("torch") else names
     return [ddg.Check.skip(name, "needs torch: `pip install ddg-warp[torch]`") for name in missing]
 
 
 def require_torch(scene: str) -> None:
-    """Refuse to build a scene of what is learned where torch is not installed.
+    """Refuse to build a scene with fitted parameters without torch.
 
     Raises:
-        ValueError: it is not.
+        ValueError: torch is not installed.
     """
     if not find_spec("torch"):
         raise ValueError(f"{scene} is learned when it is built, by torch: `pip install ddg-warp[torch]`")
@@ -26,7 +26,7 @@ def require_torch(scene: str) -> None:
 
 @contextmanager
 def one_thread():
-    """Have torch work on one thread: its tensors are small here, and others would wait for each other longer than they work."""
+    """Run torch on one thread: on its small tensors here, several threads wait longer than they work."""
     import torch
 
     threads = torch.get_num_threads()
@@ -38,22 +38,22 @@ def one_thread():
 
 
 def minimise(loss, start, iterations: int = 40, tolerance: float = 1e-9):
-    """L-BFGS with a strong Wolfe line search (Nocedal and Wright, Numerical Optimization, 2006, section 7.2).
+    """Minimise a loss by L-BFGS with a strong Wolfe line search (Nocedal and Wright, Numerical Optimization, 2006, section 7.2).
 
     Args:
-        loss: of a tensor like `start`; of order one.
-        start: the first guess.
-        iterations: at most.
-        tolerance: of the change of the loss, and of its gradient, at which it ends.
+        loss: function of a tensor like `start`, of order one.
+        start: initial guess.
+        iterations: largest number of iterations.
+        tolerance: tolerance of the change of the loss and of its gradient.
 
     Returns:
-        The tensor found, and the loss at every evaluation.
+        Minimiser, and the loss at every evaluation.
     """
     import torch
 
-    found, losses = start.clone().requires_grad_(), []
+    minimiser, losses = start.clone().requires_grad_(), []
     search = torch.optim.LBFGS(
-        [found],
+        [minimiser],
         max_iter=iterations,
         tolerance_grad=tolerance,
         tolerance_change=tolerance,
@@ -62,81 +62,85 @@ def minimise(loss, start, iterations: int = 40, tolerance: float = 1e-9):
 
     def closure():
         search.zero_grad()
-        value = loss(found)
+        value = loss(minimiser)
         value.backward()
         losses.append(value.item())
         return value
 
     search.step(closure)
-    return found.detach(), losses
+    return minimiser.detach(), losses
 
 
-def jacobian(residuals, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (m,) and their derivatives (m, n) by n numbers, in one backward pass: every residual has a world of its own.
+def jacobian(residuals, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (m,) and the Jacobian (m, n) in one backward pass, with one world a residual.
 
     Args:
-        residuals: of numbers (worlds, n), those of every world (worlds, m).
-        at: where (n,).
+        residuals: function of parameters (worlds, n) that returns residuals (worlds, m).
+        at: parameters (n,).
     """
     import torch
 
     with torch.no_grad():
-        count = residuals(torch.tensor(at)[None]).shape[1]
-    worlds = torch.tensor(np.tile(at, (count, 1)), requires_grad=True)
-    own = residuals(worlds).diagonal()
-    (rows,) = torch.autograd.grad(own.sum(), worlds)
-    return own.detach().numpy(), rows.numpy()
+        count = residuals(torch.tensor(parameters)[None]).shape[1]
+    worlds = torch.tensor(np.tile(parameters, (count, 1)), requires_grad=True)
+    diagonal = residuals(worlds).diagonal()
+    (rows,) = torch.autograd.grad(diagonal.sum(), worlds)
+    return diagonal.detach().numpy(), rows.numpy()
 
 
 def least_squares(
     residuals, start: np.ndarray, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, list]:
-    """Levenberg's method (Nocedal and Wright, section 10.3): damping grows tenfold where a step is no gain.
+    """Minimise a sum of squares by Levenberg's method (Nocedal and Wright, section 10.3).
+
+    Damping grows tenfold after a step without decrease.
 
     Args:
-        residuals: as of `jacobian`.
-        start: the first guess (n,).
-        iterations: Jacobians at most.
-        tolerance: of the relative gain in the sum of squares, at which it ends.
+        residuals: see `jacobian`.
+        start: initial guess (n,).
+        iterations: largest number of Jacobians.
+        tolerance: relative decrease of the sum of squares at which iterations end.
 
     Returns:
-        The numbers found (n,), the Jacobian there or one step before (m, n), and the residuals after every step, the guess's first.
+        Parameters (n,), the Jacobian (m, n) there or one step before, and the residuals of the guess and after every step.
     """
     import torch
 
-    at, damping, passed = np.array(start, float), 1e-3, []
+    parameters, damping, passed = np.array(start, float), 1e-3, []
     for _ in range(iterations):
-        found, rows = jacobian(residuals, at)
-        passed.append(found)
-        normal, now = rows.T @ rows, found @ found
+        values, rows = jacobian(residuals, parameters)
+        passed.append(values)
+        normal, square = rows.T @ rows, values @ values
         while damping < 1e6:
-            step = np.linalg.solve(normal + damping * normal.diagonal().max() * np.eye(len(at)), -rows.T @ found)
+            step = np.linalg.solve(
+                normal + damping * normal.diagonal().max() * np.eye(len(parameters)), -rows.T @ values
+            )
             with torch.no_grad():
-                tried = residuals(torch.tensor(at + step)[None])[0].numpy()
-            if tried @ tried < now:
+                tried = residuals(torch.tensor(parameters + step)[None])[0].numpy()
+            if tried @ tried < square:
                 break
             damping *= 10.0
         else:
-            return at, rows, passed
-        at, damping = at + step, 0.1 * damping
-        if now - tried @ tried < tolerance * now:
+            return parameters, rows, passed
+        parameters, damping = parameters + step, 0.1 * damping
+        if square - tried @ tried < tolerance * square:
             break
-    return at, rows, [*passed, tried]
+    return parameters, rows, [*passed, tried]
 
 
-def hessian(losses, at, step: float = 1e-3) -> np.ndarray:
-    """Second derivatives (n, n) of a loss by n numbers: central differences of its gradients, all of them worlds of one batch.
+def hessian(losses, parameters, step: float = 1e-3) -> np.ndarray:
+    """Return second derivatives (n, n) of a loss by central differences of gradients, all worlds in one batch.
 
     Args:
-        losses: of numbers (worlds, n), the loss of every world (worlds,).
-        at: where (n,).
-        step: of every number.
+        losses: function of parameters (worlds, n) that returns losses (worlds,).
+        at: parameters (n,).
+        step: difference of every parameter.
     """
     import torch
 
-    displaced = step * torch.eye(len(at), dtype=at.dtype)
-    worlds = torch.cat([at + displaced, at - displaced]).requires_grad_()
+    displaced = step * torch.eye(len(parameters), dtype=parameters.dtype)
+    worlds = torch.cat([parameters + displaced, parameters - displaced]).requires_grad_()
     (gradients,) = torch.autograd.grad(losses(worlds).sum(), worlds)
-    ahead, back = gradients.split(len(at))
-    found = ((ahead - back) / (2.0 * step)).numpy()
-    return 0.5 * (found + found.T)
+    forward, backward = gradients.split(len(parameters))
+    matrix = ((forward - backward) / (2.0 * step)).numpy()
+    return 0.5 * (matrix + matrix.T)

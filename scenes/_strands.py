@@ -1,4 +1,4 @@
-"""What scenes of hair share: strands of one kind, held by their first edge on roots that move rigidly; observed and checked."""
+"""Shared pieces of scenes of hair: strands of one kind, clamped at their first edge on rigidly moving roots."""
 
 import numpy as np
 
@@ -8,47 +8,48 @@ from ddg_warp.kernels.densities.quadratic import quadratic
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad
 HAIR = np.array([0.36, 0.21, 0.11])  # RGB
-PANELS = 3  # of the picture
+PANELS = 3  # panels of the picture
 GRAVITY = 9.81  # m/s^2
-HEAD = 0.97  # radius of the head that is drawn over that of the roots
+HEAD = 0.97  # radius of the drawn head over that of the roots
 
 
 def placed(motion: ddg.Motion, rest: np.ndarray, t: float) -> np.ndarray:
-    """Where a motion has points of the rest state (..., 3) at time t."""
+    """Return the positions of rest points (..., 3) under a motion at time t."""
     return (rest - motion.pivot) @ motion.rotation(motion.angle(t)).T + motion.pivot + np.asarray(motion.translation(t))
 
 
 def edge_lengths(points: np.ndarray) -> np.ndarray:
-    """Lengths (..., nodes - 1) of the edges between points (..., nodes, 3)."""
+    """Return lengths (..., nodes - 1) of the edges between points (..., nodes, 3)."""
     return np.linalg.norm(np.diff(points, axis=-2), axis=-1)
 
 
 def as_drawn(points: np.ndarray, **about) -> dict:
-    """Natural shapes and laws, as `add_rods` takes them, by which strands (count, nodes, 3) held by their first edge hang as drawn.
+    """Return natural shapes and laws for `add_rods` that make strands (count, nodes, 3), clamped at their first edge, hang as drawn.
 
     Args:
-        points: as drawn; about: section and material.
+        points: drawn equilibrium.
+        about: section and material.
     """
-    from ddg_warp.ask import sag_free  # brings SciPy, which scenes of hair do without
+    from ddg_warp.ask import sag_free  # imports SciPy, which scenes of hair do without
 
     scene = ddg.Scene()
     scene.clamp(scene.add_rods(points, **about), edges=[0])
-    found = sag_free.rest_strains(scene.build("cpu", "float64"))
-    *natural, stretch = (values.reshape(len(points), -1) for values in found.values())
+    strains = sag_free.rest_strains(scene.build("cpu", "float64"))
+    *natural, stretch = (values.reshape(len(points), -1) for values in strains.values())
     return {"natural": tuple(natural), "laws": {"rod_stretch": ddg.Law(quadratic, rest=stretch)}}
 
 
 def moments(points: np.ndarray, weight: float) -> np.ndarray:
-    """Moments (rods, nodes - 2) [N m] of what is beyond, about the inner nodes of rods (rods, nodes, 3) of a weight [N/m]."""
+    """Return moments (rods, nodes - 2) [N m] at inner nodes of rods (rods, nodes, 3) of the weight [N/m] beyond each."""
     half = 0.5 * weight * np.linalg.norm(np.diff(points, axis=1), axis=2)
     load = np.pad(half, ((0, 0), (1, 0))) + np.pad(half, ((0, 0), (0, 1)))
-    arms = points[:, None, :, :2] - points[:, 1:-1, None, :2]  # weights act along z: level arms alone count
+    arms = points[:, None, :, :2] - points[:, 1:-1, None, :2]  # weights act along z: only horizontal arms count
     beyond = np.arange(points.shape[1]) > np.arange(1, points.shape[1] - 1)[:, None]
     return np.linalg.norm((arms * (load[:, None] * beyond)[..., None]).sum(2), axis=2)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Stretch of edges, distance of the roots from where they belong [m], kinetic energy [J] and speed [m/s]."""
+    """Return stretch of edges, root position error [m], kinetic energy [J] and speed [m/s]."""
     batch, support = model.scene.batches[0], model.scene.supports[0]
     shape = (-1, *batch.points.shape)
     points, velocities = state.points().reshape(shape), state.velocities().reshape(shape)
@@ -66,12 +67,12 @@ def observe(model, state) -> dict[str, float]:
 
 
 def checks(result, stretch: float, source: str) -> list[ddg.Check]:
-    """Converged and finite everywhere, roots where their motion has them, lengths kept, no more energy than there can be.
+    """Check convergence, finite values, prescribed roots, lengths and a bound of the energy.
 
     Args:
         result: a run.
-        stretch: of an edge, the largest there can be.
-        source: where that comes from.
+        stretch: bound of the stretch of an edge.
+        source: source of that bound.
     """
     outcomes = result.statistics["outcomes"]
     failed = sum(number for name, number in outcomes.items() if not name.startswith("converged"))
@@ -94,43 +95,43 @@ def checks(result, stretch: float, source: str) -> list[ddg.Check]:
 
 
 def top_speed(result) -> float:
-    """What roots and gravity can give [m/s]: of a strand that rides along with the fastest and falls by its own length."""
+    """Return a bound of the speed [m/s]: of a strand that moves with the fastest root and falls by its length."""
     longest = edge_lengths(result.model.scene.batches[0].points).sum(axis=1).max()
     return float(np.sqrt(fastest_root(result) ** 2 + 2.0 * GRAVITY * longest))
 
 
 def stopped(result) -> float:
-    """Momentum of the longest strand at its top speed [N s]."""
+    """Return the momentum of the longest strand at top speed [N s]."""
     batch = result.model.scene.batches[0]
     return batch.section.mass_per_length * edge_lengths(batch.points).sum(axis=1).max() * top_speed(result)
 
 
 def fastest_root(result) -> float:
-    """Top speed [m/s] of any root up to the end of the run."""
+    """Return the top speed [m/s] of any root during the run."""
     batch, support = result.model.scene.batches[0], result.model.scene.supports[0]
     path = np.array([placed(support.motion, batch.points[:, 0], t) for t in result.times])
     return float(np.linalg.norm(np.diff(path, axis=0), axis=-1).max() / result.dt)
 
 
 def shown(frames) -> dict:
-    """A few of the frames (time -> points), from the first on."""
+    """Return a few frames (time -> points), the first included."""
     return {t: frames[t] for t in list(frames)[:: max(1, (len(frames) - 1) // (PANELS - 1))]}
 
 
 def ball(roots: np.ndarray) -> tuple[np.ndarray, float]:
-    """Center (3,) and radius [m] of the sphere that roots (count, 3) stand on, in least squares."""
+    """Return center (3,) and radius [m] of the least-squares sphere through roots (count, 3)."""
     # |x|^2 = 2 c . x + (r^2 - |c|^2)
-    found, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
-    return found[:3], float(np.sqrt(found[3] + found[:3] @ found[:3]))
+    fit, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
+    return fit[:3], float(np.sqrt(fit[3] + fit[:3] @ fit[:3]))
 
 
 def head(roots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) and triangles (t, 3) of the ball that roots (count, 3) stand on, a little below them."""
+    """Return points (n, 3) and triangles (t, 3) of a ball slightly below roots (count, 3)."""
     center, radius = ball(roots)
     points, triangles = meshes.sphere(4)
     return center + HEAD * radius * points, triangles
 
 
 def colors(count: int) -> np.ndarray:
-    """RGB (count, 3) of strands, which vary."""
+    """Return varied RGB colors (count, 3) of strands."""
     return np.random.default_rng(1).uniform(0.6, 1.3, (count, 1)) * HAIR

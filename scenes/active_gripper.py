@@ -1,9 +1,9 @@
-"""Five fingers wind about a post and hold it: the pull that it takes to draw it out is what friction says.
+"""Active gripper: five fingers coil around a post, and friction resists the pull that extracts it.
 
-The fingers are rods that stand around a post, straight and askew, clamped at a palm. Muscles give them natural curvature and twist,
-those of helices that are narrower than the post: so they wind about it, side by side, and press on it. Then the post is drawn away
-from the palm. Where it slides through the fingers, along itself, friction is mu times all that they press, and the palm feels as much.
-The pull makes the helices narrower, so that they press the harder. Each finger is the next one, turned by 72 degrees.
+The fingers are rods around a post, straight and inclined, clamped at a palm. Muscles give them the natural curvature and twist of
+helices narrower than the post, so that they coil around it side by side and press on it. Then the post moves away from the palm.
+While it slides axially through the fingers, friction is mu times the total normal force, and the palm carries the same force. The
+pull narrows the helices, so that they press harder. The fingers are rotated copies, 72 degrees apart.
 """
 
 import numpy as np
@@ -18,24 +18,24 @@ LENGTH = 0.2  # m, of a finger
 RADIUS = 2e-3  # m, of a finger
 RUBBER = ddg.Material(young=5e7, poisson=0.5, density=1100.0, viscosity=5e-3)
 POST = 0.01  # m, radius
-STANDS = POST + RADIUS + 1e-3  # m, from the axis of the post to the clamps
-RISE = 0.02  # m, of the helices in a radian about the post
-TIGHT = 0.8  # radius of the natural helices over the one that fingers have on the post
-RANGE = 2e-4  # m, of contact
-WINDS, PULLS, END = 1.0, 1.5, 2.5  # s: muscles are tense; the post starts to move; end
+STANDS = POST + RADIUS + 1e-3  # m, distance of the clamps from the axis of the post
+RISE = 0.02  # m, rise of the helices per radian around the post
+TIGHT = 0.8  # radius of the natural helices over that of fingers on the post
+RANGE = 2e-4  # m, activation distance
+WINDS, PULLS, END = 1.0, 1.5, 2.5  # s: end of muscle activation; start of the post's motion; end of the run
 SPEED = 0.02  # m/s, of the post
-VELOCITY = 1e-3  # m/s, of the friction law
+VELOCITY = 1e-3  # m/s, stick threshold of friction
 
 
 def build(n: int = 60, friction: float = 0.3, dt: float = 0.01, damping: float = 2.0, seed: int = -1) -> ddg.Scene:
-    """The fingers hang from the palm z = 0, the post is along z.
+    """Build the scene: fingers hang from the palm z = 0, the post is along z.
 
     Args:
         n: edges of a finger
-        friction: coefficient
+        friction: friction coefficient
         dt: time step [s]
-        damping: of masses [1/s]
-        seed: of a jitter of the nodes at first, half of the range of contact; none below 0
+        damping: mass-proportional damping [1/s]
+        seed: seed of the initial jitter of nodes, half of the activation distance; no jitter below 0
     """
     scene = ddg.Scene(
         analysis=ddg.Dynamics(dt=dt, duration=END),
@@ -62,7 +62,7 @@ def build(n: int = 60, friction: float = 0.3, dt: float = 0.01, damping: float =
 
 
 def standing(model, seed: int):
-    """The fingers as they stand, but for a jitter."""
+    """Return the initial state with jitter of the free nodes."""
     actuate(model, 0.0)
     points = model.state().points()
     free = np.arange(model.scene.batches[0].nodes) > 1
@@ -72,25 +72,27 @@ def standing(model, seed: int):
 
 
 def actuate(model, t: float) -> None:
-    """Give the fingers the natural curvature and twist of a time [s]; right where they have it."""
-    share = np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
+    """Set the natural curvature and twist of fingers at a time [s]."""
+    activation = np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
     radius = TIGHT * (POST + RADIUS)
     for name, whole in (("rest_1", radius), ("rest_3", -RISE)):
-        value = share * whole / (radius**2 + RISE**2)
+        value = activation * whole / (radius**2 + RISE**2)
         if np.any(model.parameters()[f"net/rod_bend_twist/{name}"] != value):
             model.set_parameter("rod_bend_twist", name, value)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Fewest turns of a finger about the post; what presses on it and what the palm feels of its pull [N]; how much fingers differ.
+    """Return the fewest turns of a finger, normal force on the post and pull on the palm [N], and the spread of finger forces.
 
-    The last is the difference between the finger that presses most and the one that presses least, over their mean.
+    The spread is the difference between the largest and the smallest normal force of a finger, over the mean.
     """
     points = state.points().reshape(FINGERS, -1, 3)
     turns = np.diff(np.unwrap(np.arctan2(points[..., 1], points[..., 0]), axis=1)[:, [0, -1]], axis=1) / (2.0 * np.pi)
-    found = model.contacts(state)
+    contacts = model.contacts(state)
     pressed = np.zeros(FINGERS + 1)
-    np.add.at(pressed, found.objects[:, 0], np.linalg.norm(found.force, axis=1) * (found.objects[:, 1] >= FINGERS))
+    np.add.at(
+        pressed, contacts.objects[:, 0], np.linalg.norm(contacts.force, axis=1) * (contacts.objects[:, 1] >= FINGERS)
+    )
     each = pressed[:FINGERS]
     palm = np.reshape(model.reactions(state)[0].force, (-1, 3))[:, 2].sum()
     return {
@@ -103,12 +105,12 @@ def observe(model, state) -> dict[str, float]:
 
 
 def weight(model) -> float:
-    """Of all fingers [N]."""
+    """Return the weight of all fingers [N]."""
     return float(FINGERS * LENGTH * model.scene.batches[0].section.mass_per_length * 9.81)
 
 
 def check(result) -> list[ddg.Check]:
-    """The fingers wind about the post, all alike, and it slides as soon as it is drawn by mu times what they press."""
+    """Check coiling and symmetry of the fingers, and a pull of mu times the normal force during sliding."""
     names = (
         "turns of fingers about the post",
         "pull over mu times what presses on the post",
@@ -133,14 +135,14 @@ def _checks(result, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The pull that the fingers hold, over edges and steps, against a finer one."""
+    """Study the final pull over edges and steps against a finer run."""
     return ddg.bench.Study(
         {"n": (30, 60), "dt": (0.02, 0.01)}, lambda result: result.series["pull"][-1], {"n": 120, "dt": 0.005}, unit="N"
     )
 
 
 def picture(result, frames) -> dict:
-    """Fingers and post at first, as they wind, and drawn at the end, all as thick as they are."""
+    """Draw fingers and post at the start, during coiling and at the end, with actual thickness."""
     pole, cells = meshes.cylinder(24, 1, POST, 1.2 * LENGTH)
     pole = pole - [0.0, 0.0, 1.1 * LENGTH]
     times = sorted(frames)

@@ -1,8 +1,8 @@
 """Axisymmetric dome: a shallow spherical cap under outer pressure snaps through, as a shell of revolution.
 
-The path passes a largest load, where the dome would jump, and a smallest one beyond. Under pressure the rim is clamped, and load
+The path passes a largest load, where the dome would jump, and then a smallest one. Under pressure the rim is clamped, and load
 parameter 1 is the buckling pressure of the whole sphere, 2 E h^2 / (R^2 sqrt(3 (1 - nu^2))). Under a force on the crown the rim may
-slide and turn, and load parameter 1 is 2 pi D / R. The limits then depend on lambda = (12 (1 - nu^2))^(1/4) a / sqrt(R h) alone
+slide and rotate, and load parameter 1 is 2 pi D / R. The limits then depend on lambda = (12 (1 - nu^2))^(1/4) a / sqrt(R h) alone
 (Budiansky 1959; Huang, J. Appl. Mech. 31, 1964), with a the radius of the rim.
 """
 
@@ -18,9 +18,11 @@ FORCE = np.pi * YOUNG * THICKNESS**3 / (6.0 * (1.0 - POISSON**2) * RADIUS)  # N
 UNIT = (RADIUS * THICKNESS) ** 0.5 / (12.0 * (1.0 - POISSON**2)) ** 0.25  # m; a / lambda
 SOURCE = "Marguerre and Reissner's equations by collocation (Budiansky 1959, Huang 1964)"
 
-# Load, lambda: largest and, beyond it, smallest load parameter t at nu = 0.3. With x = lambda r / a, b and f rotation and stress
-# function, x (x b')' - b = x f (b - x) - L and x (x f')' - f = x (x b - b^2 / 2), b = f = 0 at x = 0; under pressure L = 2 x^3 t,
-# b = x f' - nu f = 0 at lambda; under a force L = x t, x b' + nu b = f = 0 there.
+# (load, lambda) -> largest and subsequent smallest load parameter t at nu = 0.3. With x = lambda r / a and rotation b
+# and
+# stress function f: x (x b')' - b = x f (b - x) - L, x (x f')' - f = x (x b - b^2 / 2).
+# Boundary conditions are b = f = 0 at x = 0. Under pressure L = 2 x^3 t, b = x f' - nu f = 0 at lambda.
+# Under a force L = x t, x b' + nu b = f = 0 there.
 LIMITS = {
     ("pressure", 4): (0.5637254, 0.4244706),
     ("pressure", 5): (0.6159879, 0.2839929),
@@ -31,16 +33,16 @@ LIMITS = {
 
 
 def build(load: str = "pressure", shallowness: int = 5, n: int = 80) -> ddg.Scene:
-    """The dome, its crown at height R.
+    """Build the dome with the crown at height R.
 
     Args:
-        load: pressure, on a dome clamped at its rim, or force, on the crown of a dome whose rim may slide and turn
+        load: pressure, on a dome clamped at its rim, or force, on the crown of a dome whose rim may slide and rotate
         shallowness: lambda: 4, 5 or 6 under pressure, 5 or 6 under a force
         n: edges of the meridian
     """
     if (load, shallowness) not in LIMITS:
-        known = ", ".join(f"{name} {number}" for name, number in LIMITS)
-        raise ValueError(f"load = {load}, shallowness = {shallowness}; there are references for {known}")
+        cases = ", ".join(f"{name} {number}" for name, number in LIMITS)
+        raise ValueError(f"load = {load}, shallowness = {shallowness}; there are references for {cases}")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     angle = np.arcsin(shallowness * UNIT / RADIUS) * np.linspace(0.0, 1.0, n + 1)
     points = RADIUS * np.column_stack([np.sin(angle), np.cos(angle)])
@@ -58,7 +60,7 @@ def build(load: str = "pressure", shallowness: int = 5, n: int = 80) -> ddg.Scen
 
 
 def check(result) -> list[ddg.Check]:
-    """Both limit loads, to what edges of this length can resolve."""
+    """Check both limit loads within the discretisation error of the meridian."""
     dome = result.scene.axisymmetric_shells[0]
     limits = LIMITS[dome.name.rpartition(" ")[2], round(float(dome.points[-1, 0]) / UNIT)]
     tolerance = min(ddg.Check.COARSEST, 2e-3 * max(1.0, (80.0 / (len(dome.points) - 1)) ** 2))
@@ -71,5 +73,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The largest load over the edges of the meridian."""
+    """Study the largest load over the edges of the meridian."""
     return ddg.bench.Study({"n": (20, 40, 80, 160)}, "largest load")

@@ -1,10 +1,10 @@
 """45-degree bend: a force out of its plane bends and twists a curved cantilever.
 
 Bathe & Bolourchi (Int. J. Numer. Meth. Eng. 14, 1979). An eighth of a circle of radius 100 in, section 1 in x 1 in, E = 1e7 psi,
-nu = 0. Two torsion constants are in use for it: the polar moment of area, 1/6 in^4 (GJ = EI), and that of St. Venant, 0.1406 in^4;
-in the tip they differ by 0.3 in. The reference solves the Kirchhoff rod as a boundary value problem, by shooting and by
-collocation; the published numbers lie within the coarseness of their meshes around it (Simo & Vu-Quoc 1986: 8 elements). Inches and
-pounds are kept, so that the numbers can be compared.
+nu = 0. Two torsion constants are in use: the polar moment of area, 1/6 in^4 (GJ = EI), and that of St. Venant, 0.1406 in^4.
+The tips differ by 0.3 in. The reference solves the Kirchhoff rod as a boundary value problem, by shooting and by collocation.
+Published numbers scatter around it by the coarseness of their meshes (Simo & Vu-Quoc 1986: 8 elements). Inches and pounds are
+kept for comparison.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ import ddg_warp as ddg
 RADIUS = 100.0  # in
 EI = 1.0e7 / 12.0  # lbf in^2
 TORSION = {"polar": EI, "st_venant": 0.5e7 * 0.140577}  # GJ [lbf in^2]
-EA = {True: 1.0e7, False: 1.0e11}  # lbf; of an extensible rod, and so stiff that it counts as inextensible
+EA = {True: 1.0e7, False: 1.0e11}  # lbf; of an extensible rod, and of a nearly inextensible one
 LENGTH_UNIT = "in"
 SOURCE = "Kirchhoff rod as a boundary value problem, shooting against collocation to 1e-10"
 
@@ -38,7 +38,7 @@ TIP = {
 
 
 def build(load: float = 600.0, torsion: str = "polar", extensible: bool = False, n: int = 64) -> ddg.Scene:
-    """The bend in the plane of x and y, loaded along z.
+    """Build the bend in the plane of x and y, loaded along z.
 
     Args:
         load: force [lbf]; there are reference numbers for 300, 450 (inextensible) and 600
@@ -57,12 +57,12 @@ def build(load: float = 600.0, torsion: str = "polar", extensible: bool = False,
 
 
 def observe(model, state) -> dict[str, float]:
-    """Where the tip is [in]."""
+    """Return the tip position [in]."""
     return dict(zip(("tip_x", "tip_y", "tip_z"), state.points()[-1], strict=True))
 
 
 def check(result) -> list[ddg.Check]:
-    """The tip against the boundary value problem, for the loads for which it was solved."""
+    """Check the tip against the boundary value problem at loads with a reference."""
     scene = result.model.scene
     section = scene.batches[0].section
     torsion = next(name for name, GJ in TORSION.items() if section.GJ == GJ)
@@ -77,5 +77,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The tip over the edges of the rod."""
+    """Study the tip over the edges of the rod."""
     return ddg.bench.Study({"n": (16, 32, 64, 128)}, "tip y")

@@ -1,4 +1,4 @@
-"""Bend-twist: a naturally curved rod hangs in a plane until weight and curvature push it out.
+"""Bend-twist: a naturally curved rod hangs in a plane until weight and curvature buckle it out of plane.
 
 The top of an arc of natural curvature k0 is clamped with its tangent straight down; its weight per length w grows, G = w L^3 / B.
 The equilibrium in the plane of the arc loses its stability to bending out of the plane with twist (Miller et al., Phys. Rev. Lett.
@@ -11,12 +11,12 @@ import numpy as np
 import ddg_warp as ddg
 
 LENGTH = 1.0  # m
-B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2]; Poisson's ratio is 0.5
-EA = 1.0e7  # N; so stiff that the rod counts as inextensible
+B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2] at a Poisson's ratio of 0.5
+EA = 1.0e7  # N; nearly inextensible
 GRAVITY = 9.81  # m/s^2
 SOURCE = "second variation of the Kirchhoff rod, spectral against determinant to 1e-7"
 
-# k0 L -> G at which the planar equilibrium loses stability, regains it, and so on, as G grows from zero.
+# k0 L -> G at which the planar equilibrium loses stability, regains it, and so on, with growing G.
 FLIPS = {
     4.0: (),
     5.0: (),
@@ -29,7 +29,7 @@ FLIPS = {
 
 
 def build(curvature: float = 7.0, weight: float = 14.0, n: int = 100) -> ddg.Scene:
-    """The arc in the plane of x and z, under its weight.
+    """Build the arc in the plane of x and z, under its weight.
 
     Args:
         curvature: natural curvature over 1 / L; there are reference numbers for 4, 5, 5.5, 6, 7, 8 and 10
@@ -48,7 +48,7 @@ def build(curvature: float = 7.0, weight: float = 14.0, n: int = 100) -> ddg.Sce
 
 
 class PlanarBranch:
-    """Planar equilibria of one arc and their stability: symmetry keeps what starts in the plane there.
+    """Planar equilibria of one arc, and stability; symmetry keeps iterates in the plane.
 
     Attributes:
         unit: G at load parameter 1.
@@ -65,8 +65,8 @@ class PlanarBranch:
         self._known = {0.0: self.model.state()}
 
     def at(self, weight: float):
-        """Model and equilibrium at G = weight, followed from the nearest one known below."""
-        below = max(known for known in self._known if known <= weight)
+        """Return model and equilibrium at G = weight, followed from the nearest known one below."""
+        below = max(level for level in self._known if level <= weight)
         if below < weight:
             steps = max(1, int(np.ceil((weight - below) / (1.0 + 0.1 * below))))
             start = self._known[below]
@@ -74,20 +74,20 @@ class PlanarBranch:
         return self.model, self._known[weight]
 
     def lowest(self, weight: float) -> float:
-        """Lowest eigenvalue of the tangent at G = weight."""
+        """Return the lowest eigenvalue of the tangent at G = weight."""
         from ddg_warp.solve import stability
 
         return float(stability.spectrum(*self.at(weight), 1, "unit", self.tangent).eigenvalues[0])
 
     def flip(self, low: float, high: float) -> float:
-        """G between low and high at which the lowest eigenvalue vanishes."""
+        """Return the G between low and high of a zero lowest eigenvalue."""
         from ddg_warp.solve import stability
 
         return stability.critical(self.at, low, high)
 
 
 def check(result) -> list[ddg.Check]:
-    """Where the planar equilibrium gains or loses stability, for the curvatures for which it was computed."""
+    """Check the loads of lost and regained planar stability at curvatures with a reference."""
     first, second = np.diff(result.model.scene.batches[0].points[0], axis=0)[:2]
     n = result.model.curves.counts[0] - 1
     turn = np.arccos(first @ second / np.linalg.norm(first) ** 2)
@@ -106,5 +106,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The lowest critical weight over the nodes of the rod."""
+    """Study the lowest critical weight over the nodes of the rod."""
     return ddg.bench.Study({"n": (25, 50, 100, 200)}, "critical weight 1")

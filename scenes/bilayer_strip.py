@@ -1,13 +1,13 @@
-"""Bilayer: a strip of two bonded layers, one of which would be longer when free, curls.
+"""Bilayer: a strip of two bonded layers with different free lengths curls.
 
-Both layers grow by different amounts in all directions of the plane, so that a piece of the strip would like to be part of a sphere of
+The layers grow by different amounts in all directions of the plane, so that the stress-free shape is a piece of a sphere of
 curvature kappa (Timoshenko, J. Opt. Soc. Am. 11, 1925). A narrow strip bends along its length by kappa; a wide one cannot without
 stretching, and rolls up with (1 + nu) kappa. In between the curvature k minimises, per length and D W / 2,
 
     (1 - nu^2) (k - kappa)^2 + ((1 + nu) kappa - nu k)^2 (1 - phi) ,
-    phi = (cosh 2b - cos 2b) / (b (sinh 2b + sin 2b)) ,  b = (W / 2) (E h k^2 / 4 D)^(1/4) ,
+    phi = (cosh 2b - cos 2b) / (b (sinh 2b + sin 2b)) ,  b = (W / 2) (E h k^2 / 4 D)^(1/4) .
 
-as its cross-section bends like a beam on the elastic foundation of the strip's hoop stiffness (Ashwell, J. R. Aeronaut. Soc. 54,
+Its cross-section bends like a beam on the elastic foundation of the strip's hoop stiffness (Ashwell, J. R. Aeronaut. Soc. 54,
 1950).
 """
 
@@ -18,18 +18,18 @@ from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import bilayer_curvature, grown_metric, principal_form
 
 LENGTH = 1.0  # m
-THICKNESS = 0.004  # of both layers [m]
+THICKNESS = 0.004  # m, of both layers together
 YOUNG = 1.0e9  # Pa
 POISSON = 0.3
 SOURCE = "Timoshenko 1925 and Ashwell 1950"
 
 
 def build(mismatch: float = 4e-3, width: float = 0.1, cells: int = 8, mesh: str = "crossed") -> ddg.Scene:
-    """The strip along x, drawn as it would roll up if it were narrow, and let go.
+    """Build the strip along x, drawn with the curvature of a narrow strip, and released.
 
     Args:
-        mismatch: difference of the free strains of the two layers, which are alike otherwise
-        width: of the strip [m]
+        mismatch: difference of the free strains of two otherwise equal layers
+        width: width of the strip [m]
         cells: cells over the width, an even number; they are about square
         mesh: right, crossed, alternating, equilateral or jittered
     """
@@ -51,14 +51,14 @@ def build(mismatch: float = 4e-3, width: float = 0.1, cells: int = 8, mesh: str 
     strip = scene.add_shell(
         points, triangles, thickness=THICKNESS, material=ddg.Material(YOUNG, POISSON), rest=rest, name="strip"
     )
-    # Six components keep it from moving as a rigid body and strain nothing.
-    for place, held in (((0.0, 0.0), "xyz"), ((0.25 * LENGTH, 0.0), "yz"), ((0.0, 0.5 * width), "z")):
-        scene.hold(strip, [int(np.argmin(np.hypot(*(flat[:, :2] - place).T)))], held)
+    # Six fixed components suppress rigid-body modes without strain.
+    for place, components in (((0.0, 0.0), "xyz"), ((0.25 * LENGTH, 0.0), "yz"), ((0.0, 0.5 * width), "z")):
+        scene.hold(strip, [int(np.argmin(np.hypot(*(flat[:, :2] - place).T)))], components)
     return scene
 
 
 def exact(mismatch: float, width: float) -> float:
-    """Curvature along the strip [1/m]."""
+    """Return the curvature along the strip [1/m]."""
     from scipy.optimize import minimize_scalar
 
     kappa = bilayer_curvature(mismatch, 0.5 * THICKNESS, 0.5 * THICKNESS)
@@ -73,29 +73,29 @@ def exact(mismatch: float, width: float) -> float:
 
 
 def rest_curvature(model) -> float:
-    """kappa [1/m], from the forms of the strip at rest."""
+    """Return kappa [1/m] from the rest forms of the strip."""
     metric, second = model.scene.shells[0].rest
     return float(second[0, 0] / metric[0, 0])
 
 
 def curvature(model, state) -> float:
-    """Mean curvature [1/m] of the middle half along the strip: the turn of its cross-sections over the distance between them."""
+    """Return the mean curvature [1/m] of the middle half: rotation between cross-sections over their distance."""
     drawn, points, kappa = model.scene.shells[0].points, state.points(), rest_curvature(model)
     along = np.arctan2(kappa * drawn[:, 0], 1.0 - kappa * drawn[:, 2]) / kappa
     across = drawn[:, 1]
-    tangents, places = [], []
+    tangents, positions = [], []
     for side in (-0.25, 0.25):
         near = np.abs(along - side * LENGTH) < 0.05 * LENGTH
         near &= np.abs(across) < 0.25 * np.ptp(across) + 1e-9
         plane = np.column_stack([np.ones(near.sum()), along[near], across[near]])
         slope = np.linalg.lstsq(plane, points[near], rcond=None)[0][1]
         tangents.append(slope / np.linalg.norm(slope))
-        places.append(along[near].mean())
-    return float(np.arccos(np.clip(tangents[0] @ tangents[1], -1.0, 1.0)) / (places[1] - places[0]))
+        positions.append(along[near].mean())
+    return float(np.arccos(np.clip(tangents[0] @ tangents[1], -1.0, 1.0)) / (positions[1] - positions[0]))
 
 
 def check(result) -> list[ddg.Check]:
-    """Curvature against Ashwell's strip, to what its free ends and cells of this size allow."""
+    """Check the curvature against Ashwell's strip, within effects of free ends and cell size."""
     kappa, drawn = rest_curvature(result.model), result.model.scene.shells[0].points
     width = np.ptp(drawn[:, 1])
     cells = np.sqrt(0.5 * len(result.model.scene.shells[0].triangles) * width / LENGTH)
@@ -114,5 +114,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The curvature over meshes; the reference is that of a wide plate, which the narrow strip is not."""
+    """Study the curvature over meshes; the reference is a wide plate, unlike the narrow strip."""
     return ddg.bench.Study({"cells": (4, 8, 16), "mesh": ("right", "crossed")}, "curvature", series=("mesh",))

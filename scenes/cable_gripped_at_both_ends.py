@@ -1,10 +1,9 @@
-"""A cable gripped at both ends, as by two robots: brought together and turned, it throws loops; drawn apart, it comes back.
+"""Gripped cable: two grips approach and rotate, loops form, and the cable returns as they separate.
 
-Position and frame of both end nodes are prescribed; one end turns about the axis of the cable by several turns, counted, while both
-approach each other. A rod that does not pass through itself keeps its link (Calugareanu 1959, White 1969, Fuller 1971): the turns
-of one end against the other are twist and writhe together, however much of the former the loops take up. The motion is slow and
-damped, so that the way back ends in the equilibrium that the way out began in. The cable does not feel itself: wound up further, to
-five turns, its loops close and pass through themselves, which loses two turns for good.
+Position and frame of both end nodes are prescribed. One end rotates about the axis of the cable by several counted turns while the
+ends approach. A rod without self-crossing keeps its link (Calugareanu 1959, White 1969, Fuller 1971): relative end rotation equals
+twist plus writhe, however much of it the loops take up. The motion is slow and damped, so that it ends in the initial equilibrium.
+The cable has no self-contact: at five turns its loops close and pass through themselves, which loses two turns for good.
 """
 
 import numpy as np
@@ -13,9 +12,9 @@ import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
-FAR = 1.0e4  # m; where the cable, prolonged along its end tangents, is closed
-HANG = 1.0  # s; until then the ends stay, and the cable, released straight, comes to hang
-BACK = 7.0  # s; then the ends are where they were
+FAR = 1.0e4  # m; distance at which the cable, extended along its end tangents, is closed
+HANG = 1.0  # s; end of the initial rest, in which the straight cable comes to hang
+BACK = 7.0  # s; end of the motion, back at the initial ends
 LINK = "turns of the ends = twist + writhe (Calugareanu, White, Fuller)"
 MOTION = "prescribed motion"
 
@@ -26,13 +25,13 @@ def build(
     n: int = 80,
     stiffness: float = 0.05,
 ) -> ddg.Scene:
-    """The cable along x, under its weight.
+    """Build the cable along x, under its weight.
 
     Args:
-        turns: of the last end about x, at half the time
-        approach: of the ends over the length of the cable, at half the time
+        turns: turns of the last end about x, at half the time
+        approach: approach of the ends over the length of the cable, at half the time
         n: edges of the cable
-        stiffness: EI [N m^2]; a stranded cable, it resists twist by a quarter of that
+        stiffness: EI [N m^2]; GJ is a quarter of it, as of a stranded cable
     """
     scene = ddg.Scene(
         mass_damping=4.0,
@@ -54,19 +53,19 @@ def build(
         name="cable",
     )
 
-    def way(t: float) -> float:
-        """0 until HANG, up to 1 in the middle, 0 from BACK on; smooth between."""
+    def progress(t: float) -> float:
+        """Return the progress of the motion: 0 until HANG, 1 in the middle, 0 from BACK on, smoothly."""
         s = min(1.0, max(0.0, 2.0 * min(t - HANG, BACK - t) / (BACK - HANG)))
         return s * s * (3.0 - 2.0 * s)
 
     shift = 0.5 * approach * LENGTH
-    scene.clamp_end(cable, "first", motion=ddg.Motion(translation=lambda t: (shift * way(t), 0.0, 0.0)))
+    scene.clamp_end(cable, "first", motion=ddg.Motion(translation=lambda t: (shift * progress(t), 0.0, 0.0)))
     scene.clamp_end(
         cable,
         "last",
         motion=ddg.Motion(
-            translation=lambda t: (-shift * way(t), 0.0, 0.0),
-            angle=lambda t: 2.0 * np.pi * turns * way(t),
+            translation=lambda t: (-shift * progress(t), 0.0, 0.0),
+            angle=lambda t: 2.0 * np.pi * turns * progress(t),
             axis=(1.0, 0.0, 0.0),
         ),
     )
@@ -74,14 +73,14 @@ def build(
 
 
 def equilibrium(model):
-    """How the cable hangs before it is moved: statics loads it while motions go from 0 to 1 s, and until then they rest."""
+    """Return the hanging cable before the motion: statics loads from 0 to 1 s, while the ends are still."""
     from ddg_warp.solve.statics import solve
 
     return solve(model)
 
 
 def writhe(points: np.ndarray) -> float:
-    """Writhe of the cable (n, 3), prolonged along x and closed far away."""
+    """Return the writhe of the cable (n, 3), extended along x and closed far away."""
     from ddg_warp.ask.inquiry import writhe
 
     first, last = points[0], points[-1]
@@ -90,7 +89,7 @@ def writhe(points: np.ndarray) -> float:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Turns of the last end, twist and writhe, and the error of the end nodes [m]."""
+    """Return rotation of the last end in turns, twist and writhe, and the position error of end nodes [m]."""
     from ddg_warp.ask.inquiry import total_twist
 
     points = state.points().reshape(-1, 3)[: model.curves.counts[0]]
@@ -107,11 +106,11 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Ends where they belong, turns = twist + writhe at all times, no failed solve, and the way back."""
+    """Check end positions, turns = twist + writhe at all times, convergence, and the return to equilibrium."""
     series = {name: np.array(values) for name, values in result.series.items()}
     failed = sum(number for name, number in result.statistics["outcomes"].items() if not name.startswith("converged"))
     link = series["twist"] + series["writhe"] - series["turns"]
-    passes = np.round(0.5 * link)  # passing through itself changes the link of a curve by two
+    passes = np.round(0.5 * link)  # a self-crossing changes the link of a curve by two
     model = result.model
     last = "cable from where it was, at the end [m]"
 
@@ -129,7 +128,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The writhe of the cable over its nodes and steps, halfway through, against a finer cable in shorter steps."""
+    """Study the writhe halfway over nodes and steps against a finer cable in shorter steps."""
     return ddg.bench.Study(
         {"n": (20, 40, 80), "dt": (0.02, 0.01)},
         lambda result: result.series["writhe"][-1],

@@ -1,9 +1,9 @@
-"""A cable is laid down on a table in a sine by a moving grip, and lies as it was laid.
+"""Cable on a table: a moving grip lays a cable in a sine, and friction keeps it there.
 
-The grip holds one end. What hangs between it and the table is a catenary: under the horizontal pull w a, with the weight w a length,
-the length l reaches from where it touches down to the height sqrt(a^2 + l^2) - a, a asinh(l / a) ahead along the tangent of what lies.
-So the grip is led, as l runs out, by the path that the cable is to lie along. Friction holds what lies: w a times the curvature of the
-path is less than mu w. Bending rounds off the touchdown over (EI / w)^(1/3), which says how far the cable may be off its path.
+The grip prescribes one end. The hanging length is a catenary under the horizontal pull w a, with the weight w per length. A length l
+reaches from the touchdown point to the height sqrt(a^2 + l^2) - a, a asinh(l / a) ahead along the tangent of the laid cable. This
+prescribes the path of the grip as l decreases. Friction keeps the laid cable in place: w a times the curvature of the path is less
+than mu w. Bending rounds off the touchdown over (EI / w)^(1/3), the scale of the tolerated deviation from the path.
 """
 
 import numpy as np
@@ -18,12 +18,12 @@ RADIUS = 2e-3  # m
 EI, EA = 1.2e-6, 1e3  # N m^2, N
 MASS_PER_LENGTH = 0.019  # kg/m
 WEIGHT = 9.81 * MASS_PER_LENGTH  # N/m
-SLACK = 0.025  # m, a: the horizontal pull over the weight a length
-AMPLITUDE, WAVE = 0.025, 0.3  # m, of the sine
-LIES = 0.06  # m, that lie on the table at first, straight
-RANGE = 1e-4  # m, of contact
-VELOCITY = 1e-4  # m/s, of the friction law: what lies creeps by less
-REST = 2.0  # s, at the end, in which nothing moves
+SLACK = 0.025  # m, a: horizontal pull over weight per length
+AMPLITUDE, WAVE = 0.025, 0.3  # m, amplitude and wavelength of the sine
+LIES = 0.06  # m, initially laid straight length
+RANGE = 1e-4  # m, activation distance
+VELOCITY = 1e-4  # m/s, stick threshold of friction, and bound of the creep
+REST = 2.0  # s, of rest at the end
 SOFT = (EI / WEIGHT) ** (1.0 / 3.0)  # m
 
 
@@ -35,15 +35,15 @@ def build(
     damping: float = 2.0,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The cable over the table z = 0: a beginning that lies, a catenary, and the grip at its last node.
+    """Build the cable over the table z = 0: a laid beginning, a catenary, and the grip at its last node.
 
     Args:
         n: edges of the cable
-        friction: coefficient
-        speed: at which the cable is laid, in the mean [m/s]
+        friction: friction coefficient
+        speed: mean laying speed [m/s]
         dt: time step [s]
-        damping: of masses, by the air [1/s]
-        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+        damping: mass-proportional damping by the air [1/s]
+        seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     if not SLACK * AMPLITUDE * (2.0 * np.pi / WAVE) ** 2 < friction:
         raise ValueError(f"friction = {friction}; the pull of the grip would draw the cable off its path")
@@ -71,14 +71,14 @@ def build(
     return scene
 
 
-def lying(share: float) -> float:
-    """Length that is to lie on the table [m] after a share of the time in which the cable is laid."""
-    share = min(1.0, share)
-    return LIES + (LENGTH - LIES) * share**2 * (3.0 - 2.0 * share)
+def lying(fraction: float) -> float:
+    """Return the laid length [m] at a fraction of the laying time."""
+    fraction = min(1.0, fraction)
+    return LIES + (LENGTH - LIES) * fraction**2 * (3.0 - 2.0 * fraction)
 
 
 def path(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) [m] and tangents of the path at arc lengths s (n,) [m]: straight at first, then a sine."""
+    """Return points (n, 2) [m] and tangents of the path at arc lengths s (n,) [m]: straight at first, then a sine."""
     x = np.linspace(0.0, LENGTH, 4001)
     beyond = np.maximum(0.0, x - LIES)
     grows = np.clip(beyond / (0.5 * WAVE), 0.0, 1.0) ** 2 * (3.0 - 2.0 * np.clip(beyond / (0.5 * WAVE), 0.0, 1.0))
@@ -86,12 +86,12 @@ def path(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack([x, y], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     tangents = np.gradient(points, arc, axis=0)
-    at = [np.stack([np.interp(s, arc, values[:, k]) for k in range(2)], axis=1) for values in (points, tangents)]
-    return at[0], at[1] / np.linalg.norm(at[1], axis=1)[:, None]
+    samples = [np.stack([np.interp(s, arc, values[:, k]) for k in range(2)], axis=1) for values in (points, tangents)]
+    return samples[0], samples[1] / np.linalg.norm(samples[1], axis=1)[:, None]
 
 
 def hanging(s: np.ndarray, lies: float) -> np.ndarray:
-    """Points (n, 3) [m] at arc lengths s (n,) of a cable of which `lies` [m] lie along the path, and the rest hangs as a catenary."""
+    """Return points (n, 3) [m] at arc lengths s (n,): the first `lies` [m] follow the path, then a catenary hangs."""
     flat, _ = path(np.minimum(s, lies))
     (_,), (tangent,) = path(np.array([lies]))
     beyond = np.maximum(0.0, s - lies)
@@ -100,13 +100,13 @@ def hanging(s: np.ndarray, lies: float) -> np.ndarray:
 
 
 def off(points: np.ndarray) -> np.ndarray:
-    """How far points (n, 3) of a cable that lies are off the path, in its plane (n,) [m]."""
+    """Return distances (n,) of points (n, 3) of the laid cable from the path, in its plane [m]."""
     fine, _ = path(np.linspace(0.0, LENGTH, 2001))
     return np.linalg.norm(points[:, None, :2] - fine, axis=2).min(axis=1)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Pull of the grip, across and up [N], what the table carries [N], speed of the fastest node [m/s], and the smallest gap [m]."""
+    """Return forces of the grip, across and up, and of the table [N], largest speed [m/s], and smallest gap [m]."""
     grip, table = (np.reshape(reaction.force, (-1, 3))[0] for reaction in model.reactions(state))
     return {
         "across": float(np.hypot(grip[0], grip[1])),
@@ -118,7 +118,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """The catenary while the cable is laid; and once it lies its weight, its shape, and that it stays."""
+    """Check the catenary during laying, then weight, shape and rest of the laid cable."""
     names = (
         "pull of the grip across, over w a",
         "pull of the grip up, over the weight that hangs",
@@ -135,9 +135,9 @@ def _checks(result, duration, names) -> list[ddg.Check]:
     series, t = {name: np.array(values) for name, values in result.series.items()}, np.array(result.times)
     rest = np.ceil(REST / result.dt) * result.dt
     lies = np.array([lying(time / (duration - rest)) for time in t])
-    laying, late = (lies > 0.2 * LENGTH) & (lies < 0.75 * LENGTH), t > t[-1] - 0.5 * REST
+    laying, final = (lies > 0.2 * LENGTH) & (lies < 0.75 * LENGTH), t > t[-1] - 0.5 * REST
     up = series["up"][laying] / (WEIGHT * (LENGTH - lies[laying]))
-    carried = (series["up"] + series["carried"])[late].mean() / (WEIGHT * LENGTH)
+    carried = (series["up"] + series["carried"])[final].mean() / (WEIGHT * LENGTH)
     return [
         ddg.Check(names[0], series["across"][laying].mean() / (WEIGHT * SLACK), 1.0, 0.1, "catenary"),
         ddg.Check(names[1], up.mean(), 1.0, 0.05, "catenary"),
@@ -145,17 +145,17 @@ def _checks(result, duration, names) -> list[ddg.Check]:
         ddg.Check(
             names[3], off(result.state.points().reshape(-1, 3)).max(), 0.0, 0.25 * SOFT, "a quarter of (EI / w)^(1/3)"
         ),
-        ddg.Check(names[4], series["speed"][late].max(), 0.0, 0.1 * VELOCITY, "it lies as it was laid"),
+        ddg.Check(names[4], series["speed"][final].max(), 0.0, 0.1 * VELOCITY, "it lies as it was laid"),
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """How far the cable is off its path, over edges and steps."""
+    """Study the deviation of the cable from the path over edges and steps."""
     return ddg.bench.Study({"n": (80, 120, 160), "dt": (0.02, 0.01)}, "cable off its path", whole=True)
 
 
 def picture(result, frames) -> dict:
-    """The cable at a few times, as thick as it is where it lies at the end, on the table."""
+    """Draw the cable at a few times on the table, with actual thickness at the end."""
     last = max(frames)
     corners, cells = meshes.rectangle(1, 1)
     low, high = np.array([-0.02, -3.0 * AMPLITUDE]), np.array([LENGTH, 3.0 * AMPLITUDE])

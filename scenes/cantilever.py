@@ -1,6 +1,6 @@
 """Heavy elastica: a horizontal cantilever, released straight, swings under its own weight.
 
-A rod of length 1 m and radius 20 mm (E = 10 MPa, nu = 0.5, 1000 kg/m^3) is held at its first edge, and so soft that it
+A rod of length 1 m and radius 20 mm (E = 10 MPa, nu = 0.5, 1000 kg/m^3) is clamped at its first edge. It is so soft that it
 swings down past the vertical. Implicit Euler damps it: the published numbers hold for dt = 0.01 s only.
 """
 
@@ -21,7 +21,7 @@ TIP = {
 
 
 def build(n: int = 50) -> ddg.Scene:
-    """The cantilever along x.
+    """Build the cantilever along x.
 
     Args:
         n: nodes of the rod; there are published numbers for 50 and 100
@@ -40,13 +40,13 @@ def build(n: int = 50) -> ddg.Scene:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Where the tip is [m]; of the first world, if there are several."""
+    """Return the tip position [m] of the first world."""
     x, _, z = state.points().reshape(-1, 3)[model.curves.counts[0] - 1]
     return {"tip_x": x, "tip_z": z}
 
 
 def check(result) -> list[ddg.Check]:
-    """The tip where the published comparison has it, at those of its times that were run."""
+    """Check the tip against the published comparison at the times that were run."""
     reference = TIP.get(result.model.curves.counts[0], {}) if result.dt == DT else {}
     if not reference:
         return [ddg.Check.skip("tip [m]", f"there are published numbers for 50 and 100 nodes and dt = {DT} s")]
@@ -65,7 +65,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The tip at 0.5 s [m] over steps, nodes, schemes, precisions and tolerances, against a far finer rod and step."""
+    """Study the tip at 0.5 s [m] over steps, nodes, schemes, precisions and tolerances, against a far finer run."""
     return ddg.bench.Study(
         grid={
             "dt": (0.02, 0.01, 0.005, 0.0025, 0.00125),

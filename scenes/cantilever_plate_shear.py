@@ -1,7 +1,7 @@
-"""Cantilever plate: a force at its end bends a plate by nearly a right angle.
+"""Cantilever plate: an end force bends a plate by nearly a right angle.
 
-Case 3.1 of Sze, Liu and Lo (2004), a plate without Poisson's effect, which is an elastica: the exact tip is known
-(see the scene tip_load); their tables of Abaqus S4R differ from it by up to 0.1 %.
+Case 3.1 of Sze, Liu and Lo (2004), a plate without Poisson's effect, is an elastica with an exact tip (see the scene tip_load).
+The published tables of Abaqus S4R differ from it by up to 0.1 %.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ SOURCE = "elastica, elliptic integrals"
 
 
 def build(n: int = 32, pattern: str = "crossed", membrane: str = "curved", steps: int = 10) -> ddg.Scene:
-    """The plate along x, loaded upwards.
+    """Build the plate along x, loaded upwards.
 
     Args:
         n: cells along the plate; an eighth of it across
@@ -35,20 +35,20 @@ def build(n: int = 32, pattern: str = "crossed", membrane: str = "curved", steps
 
 
 def observe(model, state) -> dict[str, float]:
-    """Mean displacement of the loaded end inwards and along the force [m]."""
+    """Return the mean displacement of the loaded end inwards and along the force [m]."""
     tip = model.scene.shell_loads[0].vertices
     moved = (state.points() - model.scene.shells[0].points)[tip].mean(axis=0)
     return {"inwards": -moved[0], "along": moved[2]}
 
 
 def exact(load: float) -> tuple[float, float]:
-    """Displacement of the end inwards and along the force [m] at a fraction of the load."""
+    """Return the displacement of the end inwards and along the force [m] at a fraction of the load."""
     x, z, _ = tip_load.exact(load * FORCE * LENGTH**2 / (YOUNG * WIDTH * THICKNESS**3 / 12.0))
     return LENGTH * (1.0 - x), -LENGTH * z
 
 
 def check(result) -> list[ddg.Check]:
-    """Displacements at half and all of the load, to 0.3 % of the length at 32 cells."""
+    """Check displacements at half and full load, to 0.3 % of the length at 32 cells."""
     cells = len(np.unique(result.scene.shells[0].points[:, 0].round(9)))
     tolerance = LENGTH * min(ddg.Check.COARSEST, 0.003 * max(1.0, (64.0 / cells) ** 2))
     return [
@@ -61,7 +61,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The largest deflection over meshes and membranes."""
+    """Study the largest deflection over meshes and membranes."""
     return ddg.bench.Study(
         {"n": (8, 16, 32), "membrane": ("flat", "curved")}, "displacement inwards at 1 P", series=("membrane",)
     )

@@ -1,13 +1,13 @@
-"""A rod slides over a fixed drum: friction multiplies its tension (Euler and Eytelwein).
+"""Capstan: a rod slides over a fixed drum, and friction multiplies its tension (Euler and Eytelwein).
 
-A string that is wound about a drum by the angle phi and slides needs T2 = T1 exp(mu phi). Friction acts here on the middle line of a
-rod, between the closest points of rod and axis, so that it makes no couple and the exponent is mu, not the smaller one of friction at
-the surface. A rod with bending stiffness B bends beyond where it leaves the drum, of radius R to its middle line, by an angle t with
-sin(t/2) = sqrt(B / T) / 2R to the line of its pull T, and there the drum pushes with the single force T sin(t):
+A string wound about a drum by the angle phi slides at T2 = T1 exp(mu phi). Friction acts here on the centreline, between the
+closest points of rod and axis. It makes no couple, and the exponent is mu instead of the smaller one of surface friction. A rod with
+bending stiffness B leaves the drum, of radius R to its centreline, at an angle t to its line of pull T, with
+sin(t/2) = sqrt(B / T) / 2R, and the drum exerts a point force T sin(t) there:
 
     T2 (cos t2 - mu sin t2) = T1 (cos t1 + mu sin t1) exp(mu (phi - t1 - t2)) ,
 
-which is T1 exp(mu phi) up to t^2. One end is pulled by a dead force T1, the other drawn away at a constant speed.
+equal to T1 exp(mu phi) up to t^2. A dead force T1 pulls one end; the other moves away at a constant speed.
 """
 
 import numpy as np
@@ -18,17 +18,17 @@ from ddg_warp.scenes import _touching
 
 DRUM = 0.05  # m, radius
 RADIUS = 0.001  # m
-RANGE = 1e-4  # m, of contact
-AROUND = DRUM + RADIUS + 0.5 * RANGE  # m, about where the middle line runs
+RANGE = 1e-4  # m, activation distance
+AROUND = DRUM + RADIUS + 0.5 * RANGE  # m, radius of the wound centreline
 B = 1e-4  # N m^2
 STIFF = 4.0e4  # EA over T2
 MASS_PER_LENGTH = 1e-4  # kg/m
 TAIL = 1.0  # length of either end off the drum over AROUND
 SPREAD = 6.0  # radii between neighbouring turns
-STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
-SPEED = 2.5e-3 * AROUND  # m/s, at which the rod is drawn
-VELOCITY = 0.5 * SPEED  # m/s, of the friction law: what slides has all of the friction
-SETTLED = 0.5  # part of the run after which the tension is averaged
+STEP_TIME = 1.0  # s, long against all periods: motion is quasi-static
+SPEED = 2.5e-3 * AROUND  # m/s, of the drawn end
+VELOCITY = 0.5 * SPEED  # m/s, stick threshold, below the sliding speed so that friction is full
+SETTLED = 0.5  # fraction of the run after which the tension is averaged
 
 
 def build(
@@ -43,19 +43,19 @@ def build(
     lags: int = 1,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The rod about a drum along y, wound upwards over its top.
+    """Build the rod about a drum along y, wound upwards over its top.
 
     Args:
-        friction: coefficient
-        turns: by which the rod is wound about the drum
+        friction: friction coefficient
+        turns: turns of the rod about the drum
         n: edges in half a turn
-        tension: of the slack end, T1 R^2 / B
+        tension: tension of the slack end, T1 R^2 / B
         steps: time steps
-        stiffness: of contact [N/m]
-        range: of contact [m]
-        velocity: of the friction law, nu [m/s]; the rod is drawn at twice its default
-        lags: how often in a step friction takes the normal forces anew
-        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+        stiffness: contact stiffness [N/m]
+        range: activation distance of contact [m]
+        velocity: stick threshold nu of the friction law [m/s]; the default is half the drawing speed
+        lags: normal-force iterations a step
+        seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     if not 0.0 < turns <= 1.0:
         raise ValueError(f"turns = {turns}; the rod is wound by up to one turn")
@@ -81,9 +81,9 @@ def build(
 
 
 def wound(angle: float, edge: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) [m] of a helix about y with straight ends, and unit vectors (2, 3) along these, away from the drum.
+    """Return points (n, 3) [m] of a helix about y with straight ends, and outward unit vectors (2, 3) along the ends.
 
-    Edges of a length [m] touch the cylinder of a radius [m] in their middles.
+    Edges of length `edge` [m] are tangent at their middles to the cylinder of radius `radius` [m].
     """
     around = radius / np.cos(0.5 * edge / radius)
     rise = SPREAD * RADIUS / (2.0 * np.pi) * (angle > np.pi)  # up to half a turn it stays in a plane
@@ -99,13 +99,13 @@ def wound(angle: float, edge: float, radius: float) -> tuple[np.ndarray, np.ndar
 
 
 def bent(model, points: np.ndarray, seed: int):
-    """The rod where it is wound; its rest shape is straight."""
+    """Return the wound state of the rod; its rest shape is straight."""
     free = np.arange(len(points))[:, None] < len(points) - 1
     return model.state(points=points + 0.2 * model.scene.touching.range * free * _touching.jitter(points.shape, seed))
 
 
 def observe(model, state) -> dict[str, float]:
-    """Tension of the end that is drawn over that of the slack one, and the smallest gap [m]."""
+    """Return the tension of the drawn end over that of the slack end, and the smallest gap [m]."""
     slack = np.array(model.scene.loads[0].force)
     drawn = np.reshape(model.reactions(state)[0].force, (-1, 3))[0]
     return {
@@ -115,7 +115,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def expected(friction: float, angle: float, slack: float) -> float:
-    """T2 / T1 of a rod, wound by an angle [rad] between its pulls, T1 = slack [N]."""
+    """Return T2 / T1 of a rod wound by an angle [rad] between both pulls, with T1 = slack [N]."""
     from scipy.optimize import brentq
 
     def leaves(tension):
@@ -133,7 +133,7 @@ def expected(friction: float, angle: float, slack: float) -> float:
 
 
 def check(result) -> list[ddg.Check]:
-    """The ratio of tensions against that of a rod and that of a string."""
+    """Check the ratio of tensions against a rod and a string."""
     names = ("T2 / T1 of a rod", "T2 / T1 of a string")
     checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, names))
     return checks + _touching.kept_apart(result)
@@ -146,8 +146,8 @@ def _checks(result, names) -> list[ddg.Check]:
     steps = np.diff(scene.batches[0].points[0], axis=0)
     steps /= np.linalg.norm(steps, axis=1)[:, None]
     angle = np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1.0, 1.0)).sum()
-    late = np.array(result.times) > SETTLED * result.times[-1]
-    ratio = np.array(result.series["ratio"])[late].mean()
+    settled = np.array(result.times) > SETTLED * result.times[-1]
+    ratio = np.array(result.series["ratio"])[settled].mean()
     leaves = B / tension / AROUND**2  # t1^2
     return [
         ddg.Check(names[0], ratio, expected(mu, angle, tension), 0.02, "capstan with bending stiffness, exact", True),
@@ -156,7 +156,7 @@ def _checks(result, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The ratio of tensions over what contact, friction, steps and nodes are, one by one."""
+    """Study the ratio of tensions over parameters of contact, friction, steps and nodes, one by one."""
     grid = {"n": (15, 30, 60, 120), "dt": (4.0, 2.0, 1.0, 0.5)}
     grid |= {
         name: tuple(usual * s for s in (0.1, 0.3, 1.0, 3.0, 10.0))
@@ -167,5 +167,5 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The rod at first and at the end, on the drum."""
+    """Draw the rod on the drum at the start and the end."""
     return {"points_by_time": {t: frames[t] for t in (min(frames), max(frames))}}

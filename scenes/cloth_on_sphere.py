@@ -1,7 +1,7 @@
-"""A cloth falls on a ball and over its sides onto the floor, in folds that touch each other.
+"""Cloth on a ball: a cloth falls over a ball onto the floor, in folds with self-contact.
 
-The cloth, a square of rubber foil, is thin against what bends it: its weight folds it within (D / rho h g)^(1/3) = 3 cm. Implicit Euler
-only loses energy. Once it lies, ball and floor carry its weight.
+The cloth, a square of rubber foil, is thin: its weight folds it within (D / rho h g)^(1/3) = 3 cm. Implicit Euler only loses energy.
+At rest, ball and floor carry its weight.
 """
 
 import numpy as np
@@ -15,9 +15,11 @@ SIDE = 1.0  # m
 THICKNESS = 2e-3  # m
 MATERIAL = ddg.Material(young=3e5, poisson=0.3, density=500.0, viscosity=5e-3)
 RADIUS = 0.2  # m, of the ball
-RANGE = 2e-3  # m, of contact
-RESTS = 1.0  # s, by which the cloth lies, damped
-REFUSED = 20  # pairs: where a vertex slides around a fold, the straight line between both ends of its way cuts the fold
+RANGE = 2e-3  # m, activation distance
+RESTS = 1.0  # s, time at which the damped cloth is at rest
+REFUSED = (
+    20  # pairs: where a vertex slides around a fold, the straight line between both ends of its motion cuts the fold
+)
 
 
 def build(
@@ -29,16 +31,16 @@ def build(
     law: str = "barrier",
     seed: int = -1,
 ) -> ddg.Scene:
-    """The cloth a little above the ball.
+    """Build the cloth a little above the ball.
 
     Args:
-        cells: along a side of the cloth, of two triangles each
+        cells: cells along a side of the cloth, of two triangles each
         dt: time step [s]
-        duration: of the run [s]
-        friction: Coulomb's coefficient everywhere
-        damping: of masses, by the air [1/s]
+        duration: duration of the run [s]
+        friction: Coulomb friction coefficient everywhere
+        damping: mass-proportional damping by the air [1/s]
         law: barrier or penalty
-        seed: of a jitter of the vertices at first, a fifth of the range of contact; none below 0
+        seed: seed of the initial jitter of vertices, a fifth of the activation distance; no jitter below 0
     """
     points, triangles = meshes.rectangle(cells, cells, (SIDE, SIDE), "alternating")
     points = points - [0.5 * SIDE, 0.5 * SIDE, 0.0]
@@ -56,13 +58,13 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """See `_touching.observe`; and the lowest vertex and the largest speed."""
+    """Return `_touching.observe` with the lowest vertex and the largest speed."""
     speed = np.linalg.norm(state.velocities().reshape(-1, 3), axis=1).max()
     return _touching.observe(model, state) | {"lowest": state.points()[:, 2].min(), "speed": float(speed)}
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps; at rest ball and floor carry the weight; of that friction, which is not told, has a part."""
+    """Check that nothing interpenetrates, and that ball and floor carry the weight at rest, part of it by friction."""
     names = ("force of obstacles less inertia over weight",)
-    found = _touching.checks(result, REFUSED)
-    return found + once_reached(result, RESTS, names, lambda: [_touching.weight_check(result, 0.1)])
+    checks = _touching.checks(result, REFUSED)
+    return checks + once_reached(result, RESTS, names, lambda: [_touching.weight_check(result, 0.1)])

@@ -1,7 +1,7 @@
-"""A cylinder of cloth is twisted by both of its ends, 360 degrees a second each, until its folds lie on each other.
+"""Cloth twist: both ends of a cloth cylinder rotate by 360 degrees a second until folds are in contact.
 
-The ends are clamped and turn against each other; the cloth between them folds, and what folds touches itself. Nothing passes through
-anything, by either law. The couples at both ends balance but for the inertia of what lies between them.
+The clamped ends rotate in opposite directions; the cloth between folds into self-contact. Nothing interpenetrates, by either
+contact law. The couples at both ends balance except for the inertia of the cloth.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from ddg_warp.scenes import _touching
 RADIUS, LENGTH = 0.1, 0.3  # m
 THICKNESS = 1e-3  # m
 MATERIAL = ddg.Material(young=1e5, poisson=0.3, density=500.0, viscosity=1e-2)
-RANGE = 1e-3  # m, of contact
+RANGE = 1e-3  # m, activation distance
 RATE = 2.0 * np.pi  # rad/s, of each end
 
 
@@ -26,16 +26,16 @@ def build(
     law: str = "barrier",
     seed: int = -1,
 ) -> ddg.Scene:
-    """The cylinder about the axis z.
+    """Build the cylinder about the axis z.
 
     Args:
         around: cells around the cylinder
         along: cells along it
-        turns: of each end, at the end of the run
+        turns: turns of each end, at the end of the run
         dt: time step [s]
-        friction: Coulomb's coefficient
+        friction: Coulomb friction coefficient
         law: barrier or penalty
-        seed: of a jitter of the vertices at first, a fifth of the range of contact; none below 0
+        seed: seed of the initial jitter of vertices, a fifth of the activation distance; no jitter below 0
     """
     points, triangles = meshes.cylinder(around, along, RADIUS, LENGTH, "alternating")
     axis = int(np.argmin(np.abs(np.ptp(points, axis=0) - LENGTH)))
@@ -56,7 +56,7 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """Pairs in contact, the least distance from the axis over the radius, and the couples that turn both ends [N m]."""
+    """Return pairs in contact, least distance from the axis over the radius, and couples at both ends [N m]."""
     points = state.points()
     low, high = model.reactions(state, point=(0.0, 0.0, 0.0))
     return {
@@ -68,7 +68,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps; the cloth resists the twist at both ends alike."""
+    """Check that nothing interpenetrates, and that the couples of both ends balance."""
     couples = np.array([result.series["couple"], result.series["couple_low"]])[:, 1:]
     ratio = float(couples[0].sum() / -couples[1].sum())
     return [

@@ -1,7 +1,7 @@
-"""Two beams cross at right angles, and the clamps of the upper one are lowered onto the lower one.
+"""Crossed beams: the clamps of an upper beam are lowered onto a lower one at a right angle.
 
-Each is clamped at both ends, a spring of 192 EI / L^3 at its middle; two of them in series take half of the overlap delta each, and
-push each other with 96 EI delta / L^3. Steps of implicit Euler that are long against the beams' periods lead to the equilibrium.
+Each is clamped at both ends, a spring of 192 EI / L^3 at its middle. Two in series take half of the overlap delta each and exert
+96 EI delta / L^3 on each other. Implicit Euler steps that are long against the beams' periods lead to the equilibrium.
 """
 
 import numpy as np
@@ -12,20 +12,20 @@ from ddg_warp.scenes import _touching
 
 LENGTH = 1.0  # m
 RADIUS = 0.01  # m
-SPEED_UP = 8  # steps in which the clamps come down; as many follow for what still swings
-GAP = 0.02  # of the overlap, the range of contact
+SPEED_UP = 8  # steps of the lowering; as many follow for vibrations to decay
+GAP = 0.02  # activation distance over the overlap
 SOURCE = "two springs of 192 EI / L^3 in series"
 
 
 def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barrier", seed: int = -1) -> ddg.Scene:
-    """The beams along x and along y, a gap of twice the range apart.
+    """Build beams along x and y, a gap of twice the activation distance apart.
 
     Args:
         n: edges of each beam, an even number
-        overlap: how far the clamps go on from where the beams touch, over the length
+        overlap: displacement of the clamps beyond first contact, over the length
         dt: time step [s]
         law: "barrier" or "penalty"
-        seed: of a jitter of where the nodes are at first, a quarter of the range of contact; none below 0
+        seed: seed of the initial jitter of nodes, a quarter of the activation distance; no jitter below 0
     """
     if n < 4 or n % 2:
         raise ValueError(f"n = {n}; a beam has an even number of edges, 4 at least, and a node in the middle")
@@ -36,9 +36,9 @@ def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barri
         initial=lambda model: jittered(model, 0.25 * GAP * down, seed),
     )
     s = np.linspace(-0.5, 0.5, n + 1) * LENGTH
-    apart = 2.0 * RADIUS + 2.0 * GAP * down
+    height = 2.0 * RADIUS + 2.0 * GAP * down
     lower = np.stack([s, 0.0 * s, 0.0 * s], axis=1)
-    upper = np.stack([0.0 * s, s, 0.0 * s + apart], axis=1)
+    upper = np.stack([0.0 * s, s, 0.0 * s + height], axis=1)
     material = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
     whole = down + 2.0 * GAP * down
 
@@ -56,14 +56,14 @@ def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barri
 
 
 def jittered(model, size: float, seed: int):
-    """The beams at rest, inner nodes moved by up to a size [m]."""
+    """Return the beams at rest with inner nodes moved by up to `size` [m]."""
     points = np.concatenate([batch.points[0] for batch in model.scene.batches])
     inner = np.tile(np.pad(np.ones(len(points) // 2 - 2), 1), 2)[:, None]
     return model.state(points=points + size * inner * _touching.jitter(points.shape, seed))
 
 
 def observe(model, state) -> dict[str, float]:
-    """Heights of both middles [m], and the vertical force on the clamps of the lower beam [N]."""
+    """Return heights of both middles [m] and vertical forces on the clamps of both beams [N]."""
     points = state.points()
     middle = len(points) // 4
     reactions = model.reactions(state)
@@ -76,7 +76,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Force and deflections against those of springs, and action against reaction."""
+    """Check force and deflections against springs in series, and action against reaction."""
     batch = result.model.scene.batches[0]
     names = ("force L^3 / (EI delta)", "deflection of the lower beam over delta", "action and reaction")
     checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, batch, names))
@@ -98,11 +98,11 @@ def _checks(result, batch, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The force over the nodes of the beams."""
+    """Study the force over the nodes of the beams."""
     return ddg.bench.Study({"n": (10, 20, 40, 80)}, "force", whole=True)
 
 
 def picture(result, frames) -> dict:
-    """The beams as thick as they are, at the end."""
+    """Draw the beams at the end with actual thickness."""
     last = max(frames)
     return {"points_by_time": frames, "bodies": {last: _touching.tubes(result.model, frames[last])}}

@@ -11,16 +11,16 @@ import ddg_warp as ddg
 RADIUS = 100.0  # m
 ANGLE = 215.0  # degrees
 EI = 1.0e6  # N m^2
-EA = 1.0e9  # N; so stiff that the arch counts as inextensible
+EA = 1.0e9  # N; nearly inextensible
 LOAD = 1000.0  # N, at load parameter 1
 SOURCE = "inextensible elastica, collocation; 897 (DaDeppo & Schmidt 1975)"
 
-# First maximum of the load [N], and where the crown is then, down and aside [m].
+# First maximum of the load [N], with downward and sideways displacement of the crown [m].
 CRITICAL, DROP, SHIFT = 897.3089968, 113.7320631, 61.14146579
 
 
 def build(n: int = 240) -> ddg.Scene:
-    """The arch in the plane of x and z, its crown at (0, 0, R).
+    """Build the arch in the plane of x and z, its crown at (0, 0, R).
 
     Args:
         n: edges of the arch, an even number
@@ -40,7 +40,7 @@ def build(n: int = 240) -> ddg.Scene:
 
 
 def check(result) -> list[ddg.Check]:
-    """The limit load, and where the crown is there, to what edges of this length can resolve."""
+    """Check the limit load and the crown there, within the discretisation error."""
     limit = next(iter(result.path.limit_points), None)
     if limit is None:
         return [ddg.Check("critical load [N]", np.nan, CRITICAL, 0.0, SOURCE)]  # the path ended before it
@@ -53,5 +53,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The critical load over the edges of the arch."""
+    """Study the critical load over the edges of the arch."""
     return ddg.bench.Study({"n": (60, 120, 240, 480)}, "critical load")

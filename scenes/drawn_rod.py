@@ -1,16 +1,16 @@
-"""A soft rod on a rough floor is drawn by its end, and let back: friction decides by the way there.
+"""Drawn rod: a soft rod on a rough floor is drawn by its end and let back; friction depends on the load path.
 
-A rod with stretching stiffness EA lies along x with the weight w a length. Drawn by its last end it slides from there on, as far as
-friction needs to balance the pull F; tension falls by mu w along what slides, and the end goes by
+A rod with stretching stiffness EA lies along x with the weight w a length. Drawn by its last end, it slides over the length at which
+friction balances the pull F. Tension falls by mu w along the sliding length, and the end moves by
 
     u = F^2 / (2 EA mu w) .
 
-Let back, it slides the other way from its end on, where friction turns round: with u_0 and F_0 at the turn
+Let back, it slides in reverse from its end on, where friction changes sign: with u_0 and F_0 at the reversal
 
     u_0 - u = (F_0 - F)^2 / (4 EA mu w) ,
 
-so that the rod pushes back long before its end is where it was. Every state is an equilibrium, found from the one before; friction
-acts by its whole force, as everything that slides does so much faster than the friction law's speed.
+so that the rod pushes back long before its end has returned. Every state is an equilibrium, found from the one before. Friction is
+fully mobilised, as all sliding is much faster than the stick threshold.
 """
 
 import numpy as np
@@ -23,13 +23,13 @@ from ddg_warp.scenes import _touching
 LENGTH = 1.0  # m
 RADIUS = 0.01  # m
 WEIGHT = 2.0  # N/m
-FAR = 0.2  # m, by which the end is drawn
-SLIDES = 0.7  # part of the rod that slides then
-BACK = 0.6  # part of the way that the end is let back
-LAID, TURN = 0.1, 0.6  # load parameter at which the rod lies with its whole weight, and is let back
+FAR = 0.2  # m, largest displacement of the end
+SLIDES = 0.7  # fraction of the rod that then slides
+BACK = 0.6  # fraction of the displacement that is let back
+LAID, TURN = 0.1, 0.6  # load parameter at full weight, and at the reversal
 B = 1e-3  # N m^2
-RANGE = 1e-3  # m, of contact
-CLOSE = 0.5  # of the range, the gap at first
+RANGE = 1e-3  # m, activation distance
+CLOSE = 0.5  # initial gap over the activation distance
 SOURCE = "friction along what slides, exact"
 
 
@@ -41,15 +41,15 @@ def build(
     range: float = RANGE,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The rod along x, at half the range of contact above the floor z = 0.
+    """Build the rod along x, at half the activation distance above the floor z = 0.
 
     Args:
-        friction: coefficient, positive
+        friction: friction coefficient, positive
         n: edges of the rod
-        load_steps: equilibria, a multiple of 10; the rod is laid down in the first tenth, and let back after six
-        velocity: of the friction law, nu [m/s]; the load parameter counts as time
-        range: of contact [m]
-        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+        load_steps: equilibria, a multiple of 10; the weight is applied in the first tenth, and the rod is let back after six
+        velocity: stick threshold nu of the friction law [m/s]; the load parameter counts as time
+        range: activation distance of contact [m]
+        seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     if not friction > 0.0:
         raise ValueError(f"friction = {friction}; what slides without is not held by anything")
@@ -67,8 +67,8 @@ def build(
     section = ddg.Stiffness(EA=friction * WEIGHT * (SLIDES * LENGTH) ** 2 / (2.0 * FAR), EI1=B, GJ=B, radius=RADIUS)
     rod = scene.add_rod(points, section=section, name="rod")
     for k in np.arange(n + 1):
-        share = LENGTH / n * (0.5 if k in (0, n) else 1.0)
-        scene.add_force(rod, k, (0.0, 0.0, -WEIGHT * share), amplitude=lambda t: min(1.0, t / LAID))
+        length = LENGTH / n * (0.5 if k in (0, n) else 1.0)
+        scene.add_force(rod, k, (0.0, 0.0, -WEIGHT * length), amplitude=lambda t: min(1.0, t / LAID))
     scene.fix(rod, [-1], "xy", motion=ddg.Motion(translation=lambda t: (drawn(t), 0.0, 0.0)))
     scene.add_obstacle(ddg.Plane(), name="floor")
     scene.contact(range=range, friction=friction, velocity=velocity)
@@ -76,12 +76,12 @@ def build(
 
 
 def drawn(t: float) -> float:
-    """How far the end has been drawn at load parameter t [m]."""
+    """Return the prescribed displacement of the end [m] at load parameter t."""
     return FAR * np.interp(t, [LAID, TURN, 1.0], [0.0, 1.0, 1.0 - BACK])
 
 
 def expected(u: float, turned: bool) -> float:
-    """Force at the end over the weight that slides, mu w L, where it has been drawn by u [m], and after it turned at `FAR`."""
+    """Return the end force over mu w L at a displacement u [m], before or after the reversal at `FAR`."""
     EA = SLIDES**2 * LENGTH / (2.0 * FAR)  # over mu w L
     if not turned:
         return np.sqrt(2.0 * EA * u / LENGTH)
@@ -89,7 +89,7 @@ def expected(u: float, turned: bool) -> float:
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far the end was drawn, and the first end came [m]; force at the end over mu w L; the smallest gap [m]."""
+    """Return displacements of the last and first end [m], the end force over mu w L, and the smallest gap [m]."""
     moved = (state.points() - model.state().points())[:, 0]
     pull = np.reshape(model.reactions(state, factor=state.time)[0].force, (-1, 3))[0, 0]
     return {
@@ -101,7 +101,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """The force where the end turns, where it was let back, and on the way; and that the first end rests."""
+    """Check the force at the reversal, after it and along the path, and rest of the first end."""
     names = (
         "force over mu w L, drawn",
         "force over mu w L, let back",
@@ -127,7 +127,7 @@ def _checks(result, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The force where the end was let back over edges, equilibria on the way, the friction law's speed and the range, one by one."""
+    """Study the force after the reversal over edges, load steps, stick threshold and activation distance, one by one."""
     grid = {"n": (12, 25, 50, 100, 200), "load_steps": (10, 20, 40, 80), "velocity": (1e-6, 1e-5, 1e-4, 1e-3)}
     return ddg.bench.Study(
         grid | {"range": (2.5e-4, 5e-4, RANGE, 2e-3)}, "force over mu w L, let back", one_by_one=True
@@ -135,9 +135,9 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The rod at a few load parameters, side by side, and the floor."""
+    """Draw the rod at a few load parameters, side by side, and the floor."""
     corners, cells = meshes.rectangle(1, 1)
-    beside = {t: points + [0.0, -0.06 * i, 0.0] for i, (t, points) in enumerate(sorted(frames.items()))}
+    rows = {t: points + [0.0, -0.06 * i, 0.0] for i, (t, points) in enumerate(sorted(frames.items()))}
     wide = 0.06 * len(frames) + 0.06
     floor = np.column_stack([1.4 * corners[:, 0] - 0.1, 0.09 - wide * corners[:, 1], 0.0 * corners[:, 0]])
-    return {"points_by_time": beside, "bodies": {min(frames): (floor, cells)}}
+    return {"points_by_time": rows, "bodies": {min(frames): (floor, cells)}}

@@ -1,9 +1,9 @@
-"""Worms in a bundle wind about each other and tangle into a blob: nothing but each other acts on them.
+"""Entangled worms: active rods in a bundle coil around each other and tangle into a blob.
 
-They start as the wires of a rope, in layers that are wound by turns to the right and to the left. Muscles make their natural shapes
-helices that become narrower and steeper, so that they wind on and press inwards, and let waves of curvature of random phases run along
-them, by which they writhe; living worms tangle by helical waves as well (Patil et al., Science 380, 2023, 392). There is no gravity, no
-fluid and no wall: momentum stays zero, whatever muscles, contact, friction and inner damping do.
+They start as the wires of a rope, in layers of alternating hand. Muscles change their natural shapes to narrower and steeper helices,
+so that they coil further and press inwards, and drive waves of curvature of random phases along them. Living worms tangle by helical
+waves as well (Patil et al., Science 380, 2023, 392). There is no gravity, no fluid and no wall: momentum stays zero under muscles,
+contact, friction and internal damping.
 """
 
 import numpy as np
@@ -15,13 +15,13 @@ from ddg_warp.scenes import _layouts, _touching
 LENGTH = 0.15  # m
 RADIUS = 1.5e-3  # m
 FLESH = ddg.Material(young=5e5, density=1000.0, poisson=0.5, viscosity=0.02)
-RANGE = 3e-4  # m, of contact
+RANGE = 3e-4  # m, activation distance
 SPACING = 2.2 * RADIUS + 1.5 * RANGE  # m, between layers of the bundle
-LAY = 0.4  # slope of worms against its axis
-COIL, RISE = 5e-3, 4e-3  # m, radius of the natural helices in the end, and how far they rise in a radian
-WAVES, AMPLITUDE = 1.5, 0.2  # of their curvature along a worm, and how large over it
+LAY = 0.4  # slope of worms against the axis of the bundle
+COIL, RISE = 5e-3, 4e-3  # m, final radius of the natural helices, and rise per radian
+WAVES, AMPLITUDE = 1.5, 0.2  # number of curvature waves along a worm, and amplitude over the curvature
 PERIOD = 1.0  # s, of the waves
-WINDS = 1.0  # s, until when curvature and twist grow
+WINDS = 1.0  # s, duration of the growth of curvature and twist
 
 
 def build(
@@ -32,15 +32,15 @@ def build(
     duration: float = 1.5,
     seed: int = 1,
 ) -> ddg.Scene:
-    """The bundle along z.
+    """Build the bundle along z.
 
     Args:
-        count: worms, 7 or more
+        count: number of worms, 7 or more
         n: edges of each
-        friction: Coulomb's coefficient
+        friction: Coulomb friction coefficient
         dt: time step [s]
-        duration: of the run [s]
-        seed: of the phases
+        duration: duration of the run [s]
+        seed: seed of the phases
     """
     if count < 7:
         raise ValueError(f"count = {count}; there are 7 worms at least, one and six about it")
@@ -50,10 +50,13 @@ def build(
     slack = LAY / (1.0 + LAY**2) / np.maximum(radius, SPACING) * np.stack([LAY * hand**2, hand])
 
     def act(model, t: float) -> None:
-        share = np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
-        curvature, twist = ((1.0 - share) * slack + share * tight)[..., None]
+        activation = np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
+        curvature, twist = ((1.0 - activation) * slack + activation * tight)[..., None]
         wave = np.sin(2.0 * np.pi * (WAVES * np.arange(1, n) / n - t / PERIOD) + phases)
-        for name, values in (("rest_1", curvature * (1.0 + share * AMPLITUDE * wave)), ("rest_3", twist + 0.0 * wave)):
+        for name, values in (
+            ("rest_1", curvature * (1.0 + activation * AMPLITUDE * wave)),
+            ("rest_3", twist + 0.0 * wave),
+        ):
             model.set_parameter("rod_bend_twist", name, values.ravel())
 
     scene = ddg.Scene(
@@ -74,7 +77,7 @@ def build(
 
 
 def bundle(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of worms (count,) the angle about the axis [rad], the distance from it [m], and the hand: one, six about it, and so on."""
+    """Return angle about the axis [rad], distance from it [m], and hand of worms (count,): one, six around, and so on."""
     layers = int(np.ceil(np.sqrt(count / 3.0))) + 1
     sizes, left = [], count
     for layer in range(layers):
@@ -86,17 +89,17 @@ def bundle(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def observe(model, state) -> dict[str, float]:
-    """See `_touching.observe`; and what worms push each other by [N], their momentum [N s], radius of gyration [m], and how many blobs.
+    """Return `_touching.observe` with total contact force [N], momentum [N s], radius of gyration [m], and number of blobs.
 
-    What they push by is the sum of the sizes of the forces of all pairs; a blob is of worms that are linked by such that touch.
+    The total contact force is the sum of magnitudes over all pairs; a blob is a connected component of worms in contact.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    points, found, worms = state.points(), model.contacts(state), _touching.rods_of(model)
-    touching = coo_array((np.ones(len(found)), found.objects.T), shape=(worms, worms))
+    points, contacts, worms = state.points(), model.contacts(state), _touching.rods_of(model)
+    touching = coo_array((np.ones(len(contacts)), contacts.objects.T), shape=(worms, worms))
     return _touching.observe(model, state) | {
-        "pushed": float(np.linalg.norm(found.force, axis=1).sum()),
+        "pushed": float(np.linalg.norm(contacts.force, axis=1).sum()),
         "drift": float(np.linalg.norm(_touching.momentum(model, state))),
         "gyration": float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())),
         "blobs": float(connected_components(touching, directed=False)[0]),
@@ -104,7 +107,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps, momentum stays zero, and all worms are in one blob, in which more touch than do in a bundle."""
+    """Check that nothing interpenetrates, momentum stays zero, and all worms form one blob denser than a bundle."""
     names = (
         "pairs that touch in the closest bundle over those here",
         "radius of gyration over that of the bundle",
@@ -119,19 +122,19 @@ def check(result) -> list[ddg.Check]:
 
 
 def _checks(result, names) -> list[ddg.Check]:
-    worms, late = _touching.rods_of(result.model), slice(-max(1, len(result.times) // 10), None)
-    # of n equal disks in a plane, however they lie, this many pairs touch at most
+    worms, final = _touching.rods_of(result.model), slice(-max(1, len(result.times) // 10), None)
+    # largest number of contacts between n equal disks in a plane
     most = np.floor(3.0 * worms - np.sqrt(12.0 * worms - 3.0))
-    pairs, size = np.mean(result.series["touching_rods"][late]), result.series["gyration"]
+    pairs, size = np.mean(result.series["touching_rods"][final]), result.series["gyration"]
     return [
         ddg.Check(names[0], most / pairs, 0.0, 0.9, "Harborth 1974, of parallel cylinders"),
-        ddg.Check(names[1], np.mean(size[late]) / size[0], 0.0, 0.8, "they wind up"),
-        ddg.Check(names[2], max(result.series["blobs"][late]), 1.0, 0.0, "they hold each other"),
+        ddg.Check(names[1], np.mean(size[final]) / size[0], 0.0, 0.8, "they wind up"),
+        ddg.Check(names[2], max(result.series["blobs"][final]), 1.0, 0.0, "they hold each other"),
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The radius of gyration of a few worms while they wind up, over edges and steps."""
+    """Study the radius of gyration of a few coiling worms over edges and steps."""
     return ddg.bench.Study(
         {"n": (30, 60), "dt": (0.02, 0.01)},
         lambda result: result.series["gyration"][-1],
@@ -142,7 +145,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The bundle, and the blob, as thick as worms are."""
+    """Draw the bundle and the blob with actual thickness."""
     times = sorted(frames)
     times = times[0], times[len(times) // 3], times[-1]
     return {

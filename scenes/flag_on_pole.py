@@ -1,8 +1,8 @@
-"""A flag on a pole in a wind that veers and dies: the flag is blown about the pole, lies against it, and hangs in folds.
+"""Flag on a pole: a wind veers and dies; the flag moves around the pole, presses against it, and hangs in folds.
 
-The hoist of the flag is sewn to a rope, whose ends are held beside the pole. The wind is a dead force on the cloth, as large
-everywhere; it blows away from the pole first and turns half about it, so that cloth and rope are pressed against the pole. Once it is
-calm the flag falls, onto itself and the pole. At every time the pole and the ends of the rope carry weight and inertia.
+The hoist of the flag is sewn to a rope with fixed ends next to the pole. The wind is a uniform dead force on the cloth. It blows away
+from the pole first and rotates by half a turn, so that cloth and rope press against the pole. In calm air the flag falls onto itself
+and the pole. At every time the pole and the ends of the rope carry weight and inertia.
 """
 
 import numpy as np
@@ -16,9 +16,9 @@ WIDTH, HEIGHT = 0.6, 0.4  # m, of the flag
 THICKNESS = 2e-3  # m
 CLOTH = ddg.Material(young=3e5, poisson=0.3, density=300.0, viscosity=5e-3)
 POLE, ROPE = 0.02, 3e-3  # m, radii
-RANGE = 1.5e-3  # m, of contact
-APART = POLE + ROPE + 2.0 * RANGE  # m, from the middle of the pole to the rope
-STREAMS, VEERS, BLOWS, DIES = 0.4, 1.2, 2.2, 2.4  # s, until when the wind does
+RANGE = 1.5e-3  # m, activation distance
+APART = POLE + ROPE + 2.0 * RANGE  # m, from the axis of the pole to the rope
+STREAMS, VEERS, BLOWS, DIES = 0.4, 1.2, 2.2, 2.4  # s, ends of the phases of the wind
 
 
 def build(
@@ -30,16 +30,16 @@ def build(
     duration: float = 4.0,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The flag in the plane of x and z, the pole along z.
+    """Build the flag in the plane of x and z, the pole along z.
 
     Args:
-        cells: of the flag along its hoist, half as many more along its fly, of two triangles each
-        wind: its force over the weight of the flag
-        friction: Coulomb's coefficient everywhere
-        damping: of masses, by the air [1/s]
+        cells: cells of the flag along its hoist, half as many more along its fly, of two triangles each
+        wind: force of the wind over the weight of the flag
+        friction: Coulomb friction coefficient everywhere
+        damping: mass-proportional damping by the air [1/s]
         dt: time step [s]
-        duration: of the run [s]
-        seed: of a jitter of the cloth's vertices across it at first, a tenth of the range of contact; none below 0
+        duration: duration of the run [s]
+        seed: seed of the initial jitter across the cloth, a tenth of the activation distance; no jitter below 0
     """
     along = round(cells * WIDTH / HEIGHT)
     points, triangles = meshes.rectangle(along, cells, (WIDTH, HEIGHT), "alternating")
@@ -68,23 +68,23 @@ def build(
 
 
 def shares(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area that belongs to each vertex (n,) [m^2]."""
+    """Return the area of each vertex (n,) [m^2]."""
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3), len(points))
 
 
 def blowing(t: float) -> np.ndarray:
-    """Direction of the wind (2,), times how strong it is: along x at first, against it in the end."""
+    """Return the wind vector (2,), a direction times relative strength: along x at first, against it in the end."""
     angle = np.pi * np.clip((t - STREAMS) / (VEERS - STREAMS), 0.0, 1.0)
     return np.array([np.cos(angle), np.sin(angle)]) * np.clip((DIES - t) / (DIES - BLOWS), 0.0, 1.0)
 
 
 def observe(model, state) -> dict[str, float]:
-    """See `_touching.observe`, but what pole and rope carry together; direction of the flag from the pole [rad], pairs with itself."""
-    found, pairs = _touching.observe(model, state), model.contacts(state).objects
+    """Return `_touching.observe` with the force on pole and rope, direction of the flag [rad], and self-contact pairs."""
+    observed, pairs = _touching.observe(model, state), model.contacts(state).objects
     flag = state.points().reshape(-1, 3)[model.scene.batches[0].nodes :].mean(0)
-    return found | {
+    return observed | {
         "carried": float(sum(np.reshape(each.force, (-1, 3))[0, 2] for each in model.reactions(state))),
         "direction": float(np.arctan2(flag[1], flag[0])),
         "folds": float((pairs[:, 0] == pairs[:, 1]).sum()),
@@ -92,7 +92,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps; the flag goes with the wind about the pole, touches it, and itself; what holds it carries it."""
+    """Check that nothing interpenetrates; the flag follows the wind, is in contact with pole and itself, and is carried."""
     names = (
         "direction of the flag, blown against the pole [rad]",
         "flag touches pole and itself",
@@ -114,7 +114,7 @@ def _checks(result, names) -> list[ddg.Check]:
 
 
 def picture(result, frames) -> dict:
-    """The flag and its pole at first, blown against it, and at the end."""
+    """Draw flag and pole at the start, blown against the pole, and at the end."""
     pole = result.model.scene.obstacles[0].shape
     ring, cells = meshes.cylinder(24, 1, POLE, 2.0 * HEIGHT)
     ring = ring + pole.points[0]

@@ -1,11 +1,11 @@
-"""An elastic filament in a viscous fluid, driven up and down at its clamped base: waves that die out along it, and thrust.
+"""Flagellum: an elastic filament in a viscous fluid, driven at its clamped base, carries decaying waves and makes thrust.
 
 For small slopes the deflection y obeys zeta_n y_t = -EI y_xxxx (Machin, J. Exp. Biol. 35, 1958, 796; Wiggins and Goldstein, Phys. Rev.
 Lett. 80, 1998, 3879). Driven as y(0, t) = b sin(omega t) with y_x(0, t) = 0, and free at its end, it swings as
 
     y = Im(b Y(x) exp(i omega t)) ,  Y = sum of c_j exp(k_j x) ,  k_j^4 = -i (Sp / L)^4 ,  Sp = L (zeta_n omega / EI)^(1/4) ,
 
-with Y(0) = 1, Y'(0) = Y''(L) = Y'''(L) = 0. The mean axial force of the fluid is that of (zeta_n - zeta_t) y_t y_x, summed along it.
+with Y(0) = 1, Y'(0) = Y''(L) = Y'''(L) = 0. The mean axial force of the fluid is the integral of (zeta_n - zeta_t) y_t y_x.
 """
 
 import numpy as np
@@ -29,15 +29,15 @@ def build(
     amplitude: float = 0.02,
     scheme: str = "implicit_midpoint",
 ) -> ddg.Scene:
-    """The filament along x, without inertia, on its periodic motion.
+    """Build the filament along x, without inertia, in its periodic motion.
 
     Args:
         sp: sperm number
         n: edges of the filament
         steps: time steps in a period
-        periods: periods that the run lasts
-        amplitude: of the base, over the length
-        scheme: of time integration
+        periods: duration of the run in periods
+        amplitude: amplitude of the base, over the length
+        scheme: time integration scheme
     """
     analysis = ddg.Dynamics(dt=PERIOD / steps, duration=periods * PERIOD, scheme=scheme)
     scene = ddg.Scene(
@@ -53,12 +53,12 @@ def build(
 
 
 def resistance(sp: float) -> float:
-    """zeta_n [N s/m^2]."""
+    """Return zeta_n [N s/m^2]."""
     return sp**4 * EI / (OMEGA * LENGTH**4)
 
 
 def shape(sp: float, x: np.ndarray, order: int = 0) -> np.ndarray:
-    """Y (or its derivative of some order) at x [m], complex."""
+    """Return Y, or its derivative of some order, at x [m], complex."""
     k = sp / LENGTH * np.exp(-0.125j * np.pi) * np.array([1.0, 1.0j, -1.0, -1.0j])
     end = np.exp(k * LENGTH)
     c = np.linalg.solve(np.array([k**0, k, k**2 * end, k**3 * end]), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -66,7 +66,7 @@ def shape(sp: float, x: np.ndarray, order: int = 0) -> np.ndarray:
 
 
 def swinging(model, sp: float, amplitude: float):
-    """The state of the periodic motion at t = 0."""
+    """Return the state of the periodic motion at t = 0."""
     points = model.scene.batches[0].points[0].copy()
     velocities, y = np.zeros_like(points), amplitude * LENGTH * shape(sp, points[:, 0])
     points[:, 2], velocities[:, 2] = y.imag, (1j * OMEGA * y).imag
@@ -74,7 +74,7 @@ def swinging(model, sp: float, amplitude: float):
 
 
 def thrust(sp: float, amplitude: float) -> float:
-    """Mean force of the fluid along x [N]."""
+    """Return the mean force of the fluid along x [N]."""
     x = np.linspace(0.0, LENGTH, 2001)
     y, slope = (amplitude * LENGTH * shape(sp, x, order) for order in (0, 1))
     normal = resistance(sp)
@@ -82,33 +82,33 @@ def thrust(sp: float, amplitude: float) -> float:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Deflection of the tip [m], and force of the fluid along x [N]."""
+    """Return deflection of the tip [m] and force of the fluid along x [N]."""
     force = model.drag(state).force.reshape(-1, model.points_count, 3)[0]
     return {"tip": state.points().reshape(-1, 3)[-1, 2], "force": force[:, 0].sum()}
 
 
 def last_period(result) -> list[ddg.Check]:
-    """Amplitude and phase of the tip, and the mean force, of the last period."""
+    """Check amplitude and phase of the tip, and the mean force, of the last period."""
     sp = float(result.model.curves.names[0].split("=")[1])
     analysis, batch = result.scene.analysis, result.scene.batches[0]
     motion = result.scene.supports[0].motion
     amplitude = motion.translation(0.25 * PERIOD)[2] / LENGTH
     steps = round(PERIOD / analysis.dt)
     times, tip, force = (np.array(v[-steps:]) for v in (result.times, result.series["tip"], result.series["force"]))
-    found = 2j * np.mean(tip * np.exp(-1j * OMEGA * times)) / (amplitude * LENGTH)
+    tip_amplitude = 2j * np.mean(tip * np.exp(-1j * OMEGA * times)) / (amplitude * LENGTH)
     exact = complex(shape(sp, np.array(LENGTH)))
     order = 2 if analysis.scheme == "implicit_midpoint" else 1
     tolerance = 0.5 * (sp / batch.edges) ** 2 + 0.5 * (OMEGA * analysis.dt) ** order + 4.0 * amplitude**2
     return [
         ddg.Check(
             f"tip's amplitude over the base's, Sp = {sp:g}",
-            abs(found),
+            abs(tip_amplitude),
             abs(exact),
             tolerance,
             HYPERDIFFUSION,
             relative=True,
         ),
-        ddg.Check("tip's phase [rad]", np.angle(found), np.angle(exact), tolerance, HYPERDIFFUSION),
+        ddg.Check("tip's phase [rad]", np.angle(tip_amplitude), np.angle(exact), tolerance, HYPERDIFFUSION),
         ddg.Check(
             "mean thrust over its closed form",
             force.mean() / thrust(sp, amplitude),
@@ -120,13 +120,13 @@ def last_period(result) -> list[ddg.Check]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Amplitude, phase and thrust against linear hyperdiffusion, once a period is over."""
+    """Check amplitude, phase and thrust against linear hyperdiffusion, after a period."""
     names = ("tip's amplitude over the base's", "tip's phase [rad]", "mean thrust over its closed form")
     return once_reached(result, PERIOD, names, lambda: last_period(result))
 
 
 def benchmark() -> ddg.bench.Study:
-    """The tip over edges, steps and schemes."""
+    """Study the tip over edges, steps and schemes."""
     return ddg.bench.Study(
         {"n": (10, 20, 40, 80), "steps": (25, 50, 100), "scheme": ("implicit_euler", "implicit_midpoint")},
         "tip's amplitude",

@@ -1,10 +1,10 @@
-"""A flexible beam in free flight: pushed and turned at one end for five seconds, then left to itself.
+"""Flying beam: a flexible beam in free flight, forced and rotated at one end for five seconds, then unloaded.
 
 A test of conservation after Simo and Vu-Quoc (J. Appl. Mech. 53, 1986, 849 and 855): no support, no gravity, large rotations. By the
-impulse theorem the beam leaves with the momentum of the load, (20, 0) N s; the moment of the load, couple included, is its angular
-momentum; and from then on its energy stays. The implicit midpoint rule keeps both momenta to rounding, and the energy up to the
-square of the step. At steps of 0.02 s and more it is unstable here, and the integrator takes parts of a step to stay within its bound
-on the energy.
+impulse theorem the beam leaves with the momentum of the load, (20, 0) N s. The moment of the load, couple included, is its angular
+momentum, and from then on its energy is constant. The implicit midpoint rule keeps both momenta to rounding, and the energy up to the
+square of the step. At steps of 0.02 s and more it is unstable here, and the integrator takes substeps to stay within its bound on
+the energy.
 """
 
 import numpy as np
@@ -19,21 +19,21 @@ EA = 1.0e4  # N
 MASS_PER_LENGTH = 1.0  # kg/m
 PEAK = 8.0  # N
 UNLOADED = 5.0  # s
-ARM = 10.0  # m; the couple over the force
+ARM = 10.0  # m; couple over force
 IMPULSE = "impulse of the load"
 
 
 def force(t: float) -> float:
-    """Push along x [N]: a triangle from 0 to UNLOADED."""
+    """Return the force along x [N]: a triangle from 0 to UNLOADED."""
     return PEAK * max(0.0, 1.0 - abs(2.0 * t / UNLOADED - 1.0))
 
 
 def build(n: int = 40, scheme: str = "implicit_midpoint") -> ddg.Scene:
-    """The beam, inclined, at rest.
+    """Build the beam, inclined, at rest.
 
     Args:
         n: edges of the beam
-        scheme: of time integration
+        scheme: time integration scheme
     """
     scene = ddg.Scene(
         gravity=(0.0, 0.0, 0.0),
@@ -52,21 +52,21 @@ def build(n: int = 40, scheme: str = "implicit_midpoint") -> ddg.Scene:
 
 
 def masses(n: int) -> np.ndarray:
-    """Lumped masses of n + 1 nodes [kg]."""
+    """Return lumped masses of n + 1 nodes [kg]."""
     mass = np.full(n + 1, MASS_PER_LENGTH * LENGTH / n)
     mass[[0, -1]] *= 0.5
     return mass
 
 
 def observe(model, state) -> dict[str, float]:
-    """Momentum [N s], angular momentum about the y axis [N m s], height of the loaded end [m] and energy [J]."""
+    """Return momentum [N s], angular momentum about y [N m s], height of the loaded end [m] and energies [J]."""
     n = int(model.curves.counts[0]) - 1
     points, velocities = state.points().reshape(-1, n + 1, 3)[0], state.velocities().reshape(-1, n + 1, 3)[0]
     mass, cell = masses(n), LENGTH / n
     edges = np.diff(points[:, [0, 2]], axis=0)
     length = np.linalg.norm(edges, axis=1)
     first, second = edges[:-1], edges[1:]
-    # The rod's own curvature, 2 tan(turn / 2) over the cell, by the half-angle formula.
+    # Curvature measure of the rod, 2 tan(angle / 2) over the cell, by the half-angle formula.
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     curvature = 2.0 * cross / (length[:-1] * length[1:] + (first * second).sum(axis=1)) / cell
     momentum = mass @ velocities
@@ -81,20 +81,20 @@ def observe(model, state) -> dict[str, float]:
 
 
 def moment_of_load(times, end_z) -> float:
-    """Impulse of the moment about the y axis [N m s], by the midpoint rule over the recorded path of the loaded end."""
+    """Return the angular impulse about y [N m s] by the midpoint rule over the recorded path of the loaded end."""
     times, end_z = np.asarray(times), np.asarray(end_z)
     push = np.array([force(t) for t in 0.5 * (times[1:] + times[:-1])])
     return float((np.diff(times) * push * (ARM + 0.5 * (end_z[1:] + end_z[:-1]))).sum())
 
 
 def check(result) -> list[ddg.Check]:
-    """Momentum and angular momentum once unloaded, and the energy from then on."""
+    """Check momentum and angular momentum after the load, and the energy from then on."""
     names = ("momentum once unloaded [N s]", "angular momentum once unloaded [N m s]", "drift of the energy, unloaded")
     return once_reached(result, UNLOADED, names, lambda: unloaded(result))
 
 
 def unloaded(result) -> list[ddg.Check]:
-    """The checks of a run that got beyond the load."""
+    """Return the checks of a run beyond the load."""
     series = {name: np.array(values) for name, values in result.series.items()}
     begin = int(np.argmin(np.abs(np.array(result.times) - UNLOADED)))
     after = slice(begin, None)
@@ -116,7 +116,7 @@ def unloaded(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """Both ends of the beam after 3 s over edges and steps, by both schemes, against a finer beam in shorter steps."""
+    """Study both ends of the beam after 3 s over edges, steps and schemes, against a finer run."""
     return ddg.bench.Study(
         {"n": (10, 20, 40), "dt": (0.04, 0.02, 0.01), "scheme": ("implicit_euler", "implicit_midpoint")},
         lambda result: result.state.points()[[0, -1]],

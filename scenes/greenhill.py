@@ -1,8 +1,11 @@
 """Greenhill: a straight rod under tension is twisted until it buckles.
 
 Both ends are clamped, the last can slide under a dead tension T. With a moment M, its deflection u + i v follows
+
     B w'''' - i M w''' - T w'' = 0 ,  w ~ 1, s, exp(i a s), exp(i b s) ,  a, b = (M +- sqrt(M^2 - 4 B T)) / 2B ,
+
 and clamped ends give (Greenhill 1883; van der Heijden & Thompson, Nonlinear Dynamics 21, 2000), L = 1,
+
     (a cos(a/2) - 2 sin(a/2)) b sin(b/2) = (b cos(b/2) - 2 sin(b/2)) a sin(a/2) .
 """
 
@@ -12,17 +15,17 @@ import ddg_warp as ddg
 from ddg_warp.ask.buckled import buckled_points
 
 LENGTH = 1.0  # m
-B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2]; C only sets how far the end must turn
-EA = 1.0e9  # N; so stiff that the rod counts as inextensible
+B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2]; C only sets the end rotation
+EA = 1.0e9  # N; nearly inextensible
 SOURCE = "Greenhill 1883, determinant for clamped ends"
 
 
 def build(tension: float = 100.0, moment: float = 20.0, n: int = 200) -> ddg.Scene:
-    """The rod along x.
+    """Build the rod along x.
 
     Args:
         tension: dead load at the end over B / L^2; compression where negative
-        moment: moment at the end over B / L, reached by turning it
+        moment: moment at the end over B / L, reached by rotating it
         n: edges of the rod
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
@@ -37,7 +40,7 @@ def build(tension: float = 100.0, moment: float = 20.0, n: int = 200) -> ddg.Sce
 
 
 def exact(tension: float) -> float:
-    """Critical moment over B / L."""
+    """Return the critical moment over B / L."""
     from scipy.optimize import brentq
 
     tension = tension or 1e-9  # without tension b is zero and the equation is 0 = 0
@@ -46,7 +49,7 @@ def exact(tension: float) -> float:
         return x * np.cos(0.5 * x) - 2.0 * np.sin(0.5 * x), x * np.sin(0.5 * x)
 
     def balance(root):
-        """With the square root of the above as unknown; over its trivial zeros."""
+        """Return the characteristic equation in that square root, over its trivial zeros."""
         a, b = np.sqrt(root**2 + tension) + root, np.sqrt(root**2 + tension) - root
         (fa, ga), (fb, gb) = parts(a), parts(b)
         return (fa * gb - fb * ga) / (b * b * root)
@@ -58,7 +61,7 @@ def exact(tension: float) -> float:
 
 
 def critical_moment(tension: float, n: int, device: str = "cpu") -> float:
-    """Moment over B / L at which the lowest eigenvalue of the tangent vanishes, for a rod of n edges."""
+    """Return the moment over B / L of a zero lowest eigenvalue, for a rod of n edges."""
     from ddg_warp.solve import stability
     from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
@@ -66,8 +69,8 @@ def critical_moment(tension: float, n: int, device: str = "cpu") -> float:
     model = build(tension, unit, n).build(device, "float64")
     equilibrium = Equilibrium(model, StaticsOptions(mode="follow"))
 
-    # Edges that turn by M h / B against each other lower it by up to a third of the square of that. A narrow bracket holds one
-    # mode only.
+    # Relative edge rotations of M h / B lower it by up to a third of their square. A narrow bracket contains one mode
+    # only.
     low, high = 1.0 - 0.5 * (unit / n) ** 2, 1.0 + 0.1 * (unit / n) ** 2
     start = equilibrium.load(model.state(), 1, 0.0, low)
 
@@ -78,7 +81,7 @@ def critical_moment(tension: float, n: int, device: str = "cpu") -> float:
 
 
 def check(result) -> list[ddg.Check]:
-    """The critical moment against the determinant, to what edges of this length can resolve."""
+    """Check the critical moment against the determinant, within the discretisation error."""
     tension = result.model.scene.loads[0].force[0] * LENGTH**2 / B
     n = result.model.curves.counts[0] - 1
     reference = exact(tension)
@@ -96,11 +99,11 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The critical moment over the nodes of the shaft."""
+    """Study the critical moment over the nodes of the rod."""
     return ddg.bench.Study({"n": (50, 100, 200, 400)}, "critical moment")
 
 
 def picture(result, frames) -> dict:
-    """The mode in which the rod buckles, beside the straight rod."""
+    """Draw the buckling mode next to the straight rod."""
     shapes = {0.0: result.state.points(), 1.0: buckled_points(result.model, result.state, 0.1 * LENGTH)}
     return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}

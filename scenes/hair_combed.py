@@ -15,7 +15,7 @@ LENGTH = 0.12  # m
 RADIUS, TOOTH = 4e-4, 1e-3  # m, of strands and teeth
 SPACING = 2e-3  # m, of strands
 ABREAST = 3  # strands of a row between two teeth
-RANGE = 2e-4  # m, of contact
+RANGE = 2e-4  # m, activation distance
 APART = 2.0 * RADIUS + 1.5 * RANGE  # m, between strands at first
 CURL, TURNS = 3e-3, 3.0  # m, radius of the helices, and how many turns a strand has
 STRAIGHT = 0.02  # m, by the roots, where there are no curls yet
@@ -41,11 +41,11 @@ def build(
         gaps: between teeth, of 3 strands in each row
         rows: of strands, one behind the other
         n: edges of a strand
-        friction: Coulomb's coefficient between strands
+        friction: Coulomb friction coefficient between strands
         speed: of the comb [m/s]
-        damping: of masses, by the air [1/s]
+        damping: mass-proportional damping by the air [1/s]
         dt: time step [s]
-        seed: of the random phases of the curls
+        seed: seed of the random phases of the curls
     """
     duration = np.ceil((LENGTH + LEAVES - BEGINS) / speed / dt) * dt
     points = _layouts.pushed_apart(curled(gaps, rows, n, _layouts.random(seed)), APART, held=2)

@@ -36,7 +36,7 @@ def build(
         steps: time steps in a turn about the vertical
         turns: about the vertical that the run lasts
         young: Young's modulus, by which little the rod bends [Pa]
-        scheme: of time integration
+        scheme: time integration scheme
     """
     turn = 2.0 * np.pi / rate(spin)  # s
     scene = ddg.Scene(

@@ -44,7 +44,7 @@ def build(
         n: edges in a turn
         turns: of the helix, a whole number
         dt: time step [s]; it turns by one radian in a second
-        duration: of the run [s]
+        duration: duration of the run [s]
         stiffness: bending and twisting [N m^2]
     """
     if theory not in LAWS:

@@ -21,7 +21,7 @@ STITCH = 8e-3  # m, its width
 UNIT = STITCH / (2.0 * np.pi)  # m, u
 ROUND, HIGH, DEEP, APART = 1.5, 4.0, 1.0, 4.5  # a, h, d, and c between rows, by which middle lines are 1.5 u apart
 RADIUS = 8e-4  # m, of the yarn
-RANGE = 1.6e-4  # m, of contact
+RANGE = 1.6e-4  # m, activation distance
 YARN = ddg.Material(young=2e6, density=1000.0, poisson=0.5)
 LASTS = 1.0  # s
 
@@ -43,10 +43,10 @@ def build(
         columns: stitches of a row
         n: edges of a stitch
         stretch: of the patch in the end
-        friction: Coulomb's coefficient
-        damping: of masses [1/s]
+        friction: Coulomb friction coefficient
+        damping: mass-proportional damping [1/s]
         dt: time step [s]
-        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+        seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     if rows < 2 or columns < 2:
         raise ValueError(f"rows = {rows}, columns = {columns}; there are 2 or more of each")

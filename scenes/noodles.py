@@ -42,7 +42,7 @@ def build(
         dt: time step [s]
         duration: of the run [s]; the large case takes 4 s
         twist: whether strands have twist, of which straight round ones with free ends feel nothing
-        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+        seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     side = int(np.ceil(np.sqrt(count)))
     number = np.arange(count)

@@ -31,7 +31,7 @@ from ddg_warp.scenes import _knots, _touching
 RADIUS = 1e-3  # m
 B = 1e-4  # N m^2
 STIFF = 10.0  # EA h^2 / B
-RANGE = 0.4 * RADIUS  # m, of contact
+RANGE = 0.4 * RADIUS  # m, activation distance
 CLOSE = 1.15  # radii, half the distance of the strands at first
 LOOSE = 300.0  # R / h of one turn at first
 TAIL = 0.7  # length of either end beyond the loop over R at first
@@ -62,11 +62,11 @@ def build(
 
     Args:
         n: turns, 1 or 2
-        friction: coefficient; without any, nothing keeps the knot from sliding along the rod and off its end
+        friction: friction coefficient; without any, nothing keeps the knot from sliding along the rod and off its end
         tighter: by what R shrinks from 300 n^2 radii of the rod
         edge: length of an edge in the middle over n radii of the rod
         steps: time steps
-        seed: of a jitter of the nodes at first, a twentieth of the range of contact; none below 0
+        seed: seed of the initial jitter of nodes, a twentieth of the activation distance; no jitter below 0
     """
     if n not in SIGMA:
         raise ValueError(f"n = {n}; there are references for 1 and 2 turns")

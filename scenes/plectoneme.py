@@ -20,7 +20,7 @@ from ddg_warp.scenes import _touching
 RADIUS = 1e-3  # m
 B = 1e-4  # N m^2
 STIFF = 10.0  # EA h^2 / B
-RANGE = 0.4 * RADIUS  # m, of contact
+RANGE = 0.4 * RADIUS  # m, activation distance
 CLOSE = 1.15  # radii, half the distance of the strands at first
 BEND = 8.0 * RADIUS  # m, radius at which the ends turn into the strands at first
 WOUND = 1.5  # turns of the strands at first
@@ -47,7 +47,7 @@ def build(
         tail: length of the rod on either side over its radius, at first
         edge: length of an edge over the radius of the rod
         steps: time steps
-        seed: of a jitter of the nodes at first, a tenth of the range of contact; none below 0
+        seed: seed of the initial jitter of nodes, a tenth of the activation distance; no jitter below 0
     """
     if not 0.3 <= angle <= 0.5:
         raise ValueError(

@@ -18,7 +18,7 @@ RADIUS = 0.005  # m
 GRAVITY = 9.81  # m/s^2
 LANE = 0.1  # m, between rods
 LEAN = 0.05  # rad, by which the rod that lies down leans at first
-RANGE = 1e-4  # m, of contact
+RANGE = 1e-4  # m, activation distance
 SETTLED = 0.5  # part of the run after which what rests has come to rest
 STEEPNESS = 7.5  # of the logistic law
 NAMES = ("rests", "slides", "thrown")
@@ -43,16 +43,16 @@ def build(
     Args:
         n: edges of each rod
         angle: of the plane [degrees]
-        friction: coefficient of the rod that rests and of the one that is thrown
+        friction: friction coefficient of the rod that rests and of the one that is thrown
         slippery: coefficient of the one that slides
         speed: of the one that is thrown [m/s]
-        velocity: of the friction law, nu [m/s]
-        stiffness: of contact [N/m]
-        range: of contact [m]
-        lags: how often in a step friction takes the normal forces anew
+        velocity: stick threshold nu of the friction law [m/s]
+        stiffness: contact stiffness [N/m]
+        range: activation distance of contact [m]
+        lags: normal-force iterations a step
         dt: time step [s]
-        duration: of the run [s]
-        seed: of a jitter of where rods start; none below 0
+        duration: duration of the run [s]
+        seed: seed of the initial jitter of rods; no jitter below 0
     """
     down, normal, steep = slope(angle)
     if not slippery < steep < friction:

@@ -40,10 +40,10 @@ def build(
         count: rods
         width: of the box over the length of a rod; 0 takes 1.5, and more from 1,000 rods on, so that a pile is about a length high
         young: Young's modulus [Pa]
-        friction: Coulomb's coefficient between rods, and between rods and the floor; walls are smooth
+        friction: Coulomb friction coefficient between rods, and between rods and the floor; walls are smooth
         dt: time step [s]
-        duration: of the run [s]
-        seed: of the random numbers
+        duration: duration of the run [s]
+        seed: seed of the random numbers
     """
     width = LENGTH * (width or max(1.5, 1.5 * np.sqrt(count / 1000.0)))
     if width < LENGTH:

@@ -14,7 +14,7 @@ from ddg_warp.scenes import _touching, rod_on_floor
 LENGTH = 0.1  # m
 RADIUS = 0.005  # m
 GRAVITY = 9.81  # m/s^2
-RANGE = 1e-4  # m, of contact
+RANGE = 1e-4  # m, activation distance
 NAMES = ("rolls", "bowled", "slips")
 WAYS = [
     f"way of {what} that {does} [m]" for what in ("the rod", "the surface") for does in ("rolls", "is bowled", "slips")
@@ -41,16 +41,16 @@ def build(
     Args:
         n: edges of each rod
         angle: of the plane [degrees]
-        friction: coefficient of the rod that rolls and of the one that is bowled
+        friction: friction coefficient of the rod that rolls and of the one that is bowled
         slippery: coefficient of the one that slips
         speed: of the one that is bowled [m/s]
-        velocity: of the friction law, nu [m/s]
-        stiffness: of contact [N/m]
-        range: of contact [m]
-        lags: how often in a step friction takes the normal forces anew
+        velocity: stick threshold nu of the friction law [m/s]
+        stiffness: contact stiffness [N/m]
+        range: activation distance of contact [m]
+        lags: normal-force iterations a step
         dt: time step [s]
-        duration: of the run [s]
-        seed: of a jitter of where rods start; none below 0
+        duration: duration of the run [s]
+        seed: seed of the initial jitter of rods; no jitter below 0
     """
     down, normal, steep = rod_on_floor.slope(angle)
     if not 3.0 * slippery < steep < 3.0 * friction:

@@ -35,7 +35,7 @@ def build(
         radius: of the rod [m]
         duration: of the run [s]; rates of approach are 10 zeta / s
         dt: time step [s]
-        scheme: of time integration
+        scheme: time integration scheme
     """
     analysis = ddg.Dynamics(dt=dt, duration=duration, scheme=scheme)
     scene = ddg.Scene(gravity=(0.0, 0.0, -GRAVITY), analysis=analysis)

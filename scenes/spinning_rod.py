@@ -29,7 +29,7 @@ def build(
         n: edges of the rod
         steps: time steps in a turn
         turns: turns that the run lasts
-        scheme: of time integration
+        scheme: time integration scheme
     """
     if not 0.0 < k < np.pi:
         raise ValueError(f"k = {k}; it lies between 0 and pi, at which the rod would be stretched without bound")

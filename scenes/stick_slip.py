@@ -17,7 +17,7 @@ RADIUS = 0.002  # m
 B = 1.0  # N m^2
 STIFF = 1e5  # EA L^2 / B
 MASS_PER_LENGTH = 1e-3  # kg/m
-RANGE = 1e-4  # m, of contact
+RANGE = 1e-4  # m, activation distance
 CLOSE = 0.5  # of the range, the gap at first: the floor pushes from the start
 NUDGE = 0.1  # N, in the middle at first; tells the rod where to buckle
 NUDGED = 0.006  # way over L in which it fades
@@ -48,14 +48,14 @@ def build(
     """The rod along z, its tip at the range of contact above the floor z = 0.
 
     Args:
-        friction: coefficient; one of 0.05, 0.1, 0.2, 0.3 and 0.35
+        friction: friction coefficient; one of 0.05, 0.1, 0.2, 0.3 and 0.35
         n: edges of the rod, an even number
         steps: in which the clamp comes down
-        velocity: of the friction law, nu [m/s]; the clamp moves by about 1e-3 m/s
-        stiffness: of contact [N/m]
-        range: of contact [m]
-        lags: how often in a step friction takes the normal forces anew
-        seed: of a jitter of how strongly the rod is nudged aside; none below 0
+        velocity: stick threshold nu of the friction law [m/s]; the clamp moves by about 1e-3 m/s
+        stiffness: contact stiffness [N/m]
+        range: activation distance of contact [m]
+        lags: normal-force iterations a step
+        seed: seed of a jitter of the sideways nudge; no jitter below 0
     """
     if friction not in SLIP:
         raise ValueError(f"friction = {friction}; there are references for {', '.join(map(str, SLIP))}")

@@ -52,7 +52,7 @@ def build(
         sway: sideways amplitude of the head [m]
         contact: whether strands touch each other and the head
         sag_free: whether strands hang under their weight as they are drawn
-        seed: of a jitter of the shapes at rest, beyond what is held, a fifth of the range of contact; none below 0
+        seed: seed of a jitter of the free nodes of rest shapes, a fifth of the activation distance; no jitter below 0
     """
     points, radius = groom(path, count)
     thin = radius * min(1.0, np.sqrt(CROWD / count))

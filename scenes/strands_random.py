@@ -17,7 +17,7 @@ def build(count: int = 36, seed: int = 3) -> ddg.Scene:
 
     Args:
         count: rods
-        seed: of the random numbers
+        seed: seed of the random numbers
     """
     rods = [random_rod(np.random.default_rng([seed, i])) for i in range(count)]
     side = int(np.ceil(np.sqrt(count)))

@@ -18,7 +18,7 @@ from ddg_warp.scenes import _touching
 LENGTH = 0.3  # m
 RADIUS = 5e-3  # m
 LANE = 0.12  # m, between crawlers
-RANGE = 1e-4  # m, of contact
+RANGE = 1e-4  # m, activation distance
 PERIOD = 4.0  # s; inertia is some 1 % of friction
 WAVES = 1.5  # along a crawler
 CURVATURE = 15.0  # 1/m, amplitude
@@ -45,7 +45,7 @@ def build(
         forwards, backwards, across: coefficients of friction of the snake; the others have that across in all directions
         n: edges of each
         steps: time steps in a period
-        seed: of a jitter of where crawlers start; none below 0
+        seed: seed of the initial jitter of crawlers; no jitter below 0
     """
     scene = ddg.Scene(
         analysis=ddg.Dynamics(dt=PERIOD / steps, duration=PERIODS * PERIOD),

@@ -15,7 +15,7 @@ from ddg_warp.scenes import _touching
 
 CELL = 0.02  # m, between strands at first
 RADIUS = 1.5e-3  # m, of strands and rings
-RANGE = 3e-4  # m, of contact
+RANGE = 3e-4  # m, activation distance
 AMPLITUDE = RADIUS + 0.75 * RANGE  # m, a
 BARE = 0.5  # of a cell, which strands reach beyond the first and last ring
 THREAD = ddg.Material(young=2e6, density=1000.0, poisson=0.5)
@@ -43,10 +43,10 @@ def build(
         nodes: of a strand; the large case has 256, 0 takes 6 edges between rings
         around: nodes of a ring, the same number between any two strands; the large case has 444, 0 takes 6 between strands
         turns: of each end in a second, the run
-        friction: Coulomb's coefficient
-        damping: of masses [1/s]
+        friction: Coulomb friction coefficient
+        damping: mass-proportional damping [1/s]
         dt: time step [s]
-        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+        seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     nodes, around = nodes or 6 * rings + 1, around or 6 * strands
     if strands < 4 or strands % 2:
