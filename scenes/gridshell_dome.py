@@ -1,8 +1,8 @@
 """Gridshell dome: two families of steel rods cross, joined rigidly or hinged, and carry their weight and a load at the crown.
 
 The crossings lie on z = rise (1 - x^2) (1 - y^2) over a square plan, x and y in half spans; every rod is pinned at both ends.
-Reference: the reactions carry all loads, rods of twice as many segments sag alike, and the grillage of two crossing beams of length
-L under a force P at the crossing deflects by P L^3 / (96 EI), each beam carrying half (Timoshenko, Strength of Materials I).
+Reference: reactions carry all loads, and rods of twice as many segments sag alike. The grillage of two crossing beams of length L
+under a force P at the crossing deflects by P L^3 / (96 EI), each beam carrying half (Timoshenko, Strength of Materials I).
 """
 
 import numpy as np
@@ -17,13 +17,13 @@ GRAVITY = 9.81  # m/s^2
 
 
 def build(rods: int = 5, segments: int = 8, rise: float = 2.5, rigid: bool = True, load: float = 2000.0) -> ddg.Scene:
-    """The dome under its own weight and a load.
+    """Build the dome under self-weight and a crown load.
 
     Args:
         rods: rods in either direction, an odd number
         segments: edges between two crossings
         rise: height of the crown [m]
-        rigid: whether the rods turn together where they cross
+        rigid: whether joints are rigid
         load: force at the crown, downwards [N]
     """
     if rods % 2 == 0 or rods < 3 or segments < 1:
@@ -49,7 +49,7 @@ def build(rods: int = 5, segments: int = 8, rise: float = 2.5, rigid: bool = Tru
 
 
 def grillage(rigid: bool, edges: int = 16, force: float = 1.0) -> float:
-    """Deflection of two crossing beams under a force at the crossing, over P L^3 / (96 EI)."""
+    """Return the deflection of two crossing beams under a force at the crossing, over P L^3 / (96 EI)."""
     section = ddg.Stiffness(EA=1e9, EI1=1e3, GJ=1e3, mass_per_length=1.0)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     s = np.linspace(-0.5, 0.5, edges + 1)
@@ -65,24 +65,24 @@ def grillage(rigid: bool, edges: int = 16, force: float = 1.0) -> float:
 
 
 def sag(scene) -> float:
-    """How far the crown comes down [m]."""
+    """Return the sag of the crown [m]."""
     model = scene.build(device="cpu", precision="float64")
     return crown(model, model.state()) - crown(model, solve(model))
 
 
 def crown(model, state) -> float:
-    """Height of the crown [m]: the middle of the middle rib."""
+    """Return the height of the crown, the middle of the middle rib [m]."""
     ribs, nodes = len(model.curves.counts) // 2, int(model.curves.counts[0])
     return float(state.points()[ribs // 2 * nodes + nodes // 2, 2])
 
 
 def observe(model, state) -> dict[str, float]:
-    """Height of the crown [m]."""
+    """Return the height of the crown [m]."""
     return {"crown": crown(model, state)}
 
 
 def check(result) -> list[ddg.Check]:
-    """Reactions, refinement, the grillage, and the two kinds of joints against each other."""
+    """Check reactions, refinement, the grillage, and the two kinds of joints against each other."""
     model, state = result.model, result.state
     ribs, nodes = len(model.curves.counts) // 2, int(model.curves.counts[0])
     segments = (nodes - 1) // (ribs + 1)
@@ -90,14 +90,14 @@ def check(result) -> list[ddg.Check]:
     host, load = model.net.host, -model.scene.loads[0].force[2]
     outer = float(host.mass[: host.nodes, 2].sum()) * GRAVITY + load
     lift = sum(reaction.force[2] for reaction in model.reactions(state))
-    found = result.series["crown"][0] - result.series["crown"][-1]
+    drop = result.series["crown"][0] - result.series["crown"][-1]
     fine = sag(build(ribs, 2 * segments, rise, rigid, load))
-    other = sag(build(ribs, segments, rise, not rigid, load))
-    stiff, soft = (found, other) if rigid else (other, found)
+    opposite = sag(build(ribs, segments, rise, not rigid, load))
+    stiff, soft = (drop, opposite) if rigid else (opposite, drop)
     source = "rods of twice as many segments"
     return [
         ddg.Check("vertical reactions over the loads", lift / outer, 1.0, 1e-6, "balance of forces"),
-        ddg.Check("sag of the crown over that of a finer dome", found / fine, 1.0, 0.03, source),
+        ddg.Check("sag of the crown over that of a finer dome", drop / fine, 1.0, 0.03, source),
         ddg.Check("sag with rigid joints less than with hinged ones", float(stiff < soft), 1.0, 0.0, "stiffer joints"),
         ddg.Check("grillage with hinged joint, deflection 96 EI / P L^3", grillage(False), 1.0, 0.01, "beam theory"),
         ddg.Check("grillage with rigid joint, deflection 96 EI / P L^3", grillage(True), 1.0, 0.01, "beam theory"),
@@ -105,7 +105,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The sag of the crown over the segments of a rib between crossings, against four times as many as the defaults."""
+    """Study the sag of the crown over the segments of a rib between crossings, against four times as many as the defaults."""
     return ddg.bench.Study(
         {"segments": (2, 4, 8, 16), "rigid": (True, False)},
         lambda result: result.series["crown"][0] - result.series["crown"][-1],

@@ -1,9 +1,9 @@
-"""Hair as thin and as stiff as it is: curled strands on roots that are shaken, from 64 to 100,000.
+"""Hair: 64 to 100,000 curled strands of real thickness and stiffness on shaken roots.
 
-Each strand has the radius, stiffness and weight of a human hair, hangs from its root and is curled at rest: the radius of the curl
-grows from nothing at the root, and is whole from half the length on. Stretch resists 2e8 times as much as bending does, by EA L^2 / EI,
-and an edge swings along itself within 20 us, which no step resolves; bending alone is soft, and strands whip.
-They do not touch each other.
+Each strand has the radius, stiffness and weight of a human hair, hangs from its root and is curled at rest. The radius of the curl
+grows from nothing at the root, and is full from half the length on. Stretching is 2e8 times stiffer than bending, by EA L^2 / EI.
+An edge oscillates axially within 20 us, which no step resolves; bending alone is soft, and strands whip.
+There is no contact between strands.
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ from ddg_warp.scenes import _strands
 LENGTH = 0.3  # m, of a strand
 CURL = 0.01  # m, radius
 PITCH = 0.08  # m
-GROWN = 0.5  # part of the length over which the curl grows
+GROWN = 0.5  # fraction of the length over which the curl grows
 SPACING = 0.002  # m, between roots
 FREQUENCY = 2.0  # Hz
-SAMPLES = 4001  # of the curve along which nodes are placed
+SAMPLES = 4001  # samples of the curve on which nodes lie
 
 observe = _strands.observe
 
@@ -29,12 +29,12 @@ def build(
     step: float = 1.0 / 60.0,
     shake: float = 0.05,
 ) -> ddg.Scene:
-    """Strands on a square grid of roots, which move along x.
+    """Build strands on a square grid of roots, which move along x.
 
     Args:
-        strands: how many
-        nodes: of a strand
-        radius: of a strand [m]
+        strands: number of strands
+        nodes: nodes of a strand
+        radius: radius of a strand [m]
         step: time step [s]
         shake: amplitude of the roots [m]
     """
@@ -49,13 +49,13 @@ def build(
         natural="shape",
         name="hair",
     )
-    turn = 2.0 * np.pi * FREQUENCY
-    scene.clamp(hair, edges=[0], motion=ddg.Motion(translation=lambda t: (shake * np.sin(turn * t), 0.0, 0.0)))
+    rate = 2.0 * np.pi * FREQUENCY
+    scene.clamp(hair, edges=[0], motion=ddg.Motion(translation=lambda t: (shake * np.sin(rate * t), 0.0, 0.0)))
     return scene
 
 
 def curls(strands: int, nodes: int) -> np.ndarray:
-    """Points (strands, nodes, 3) [m], even in arc length; strands hang from z = 0, each turned by a golden angle from the last."""
+    """Return points (strands, nodes, 3) [m], even in arc length, of strands below z = 0, rotated by golden angles."""
     down = np.linspace(0.0, LENGTH, SAMPLES)
     curl = CURL * np.minimum(1.0, down / (GROWN * LENGTH)) * np.exp(2j * np.pi * down / PITCH)  # x + iy
     arc = np.append(0.0, np.cumsum(np.hypot(np.abs(np.diff(curl)), np.diff(down))))
@@ -68,10 +68,10 @@ def curls(strands: int, nodes: int) -> np.ndarray:
 
 
 def check(result) -> list[ddg.Check]:
-    """Converged and finite everywhere, roots where they are shaken to, no more stretch and energy than there can be.
+    """Check convergence, finite values, prescribed roots, and bounds of stretch and energy.
 
-    A strand pulls at its root by its weight, m g, by its inertia, m a where roots have the acceleration a, and by the bends that run
-    through it, no faster than its fastest node, by rho A v^2; loads that set in at once stretch by twice that over EA.
+    A strand pulls at its root by its weight m g and its inertia m a, with the root acceleration a. Travelling bends add rho A v^2
+    and are no faster than its fastest node. Suddenly applied loads stretch by twice that over EA.
     """
     batch, motion = result.model.scene.batches[0], result.model.scene.supports[0].motion
     length = _strands.edge_lengths(batch.points).sum(axis=1).max()
@@ -82,7 +82,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """All nodes of 32 strands at 0.5 s over steps and precisions, against short steps of the midpoint rule, off by 1e-5 m."""
+    """Study all nodes of 32 strands at 0.5 s over steps and precisions, against short midpoint steps, off by 1e-5 m."""
     return ddg.bench.Study(
         {
             "step": (1 / 30, 1 / 60, 1 / 120, 1 / 240, 1 / 480, 1 / 960),
@@ -97,6 +97,6 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """A few times side by side, in the colors of hair."""
+    """Draw a few times side by side, in the colors of hair."""
     colors = _strands.colors(len(result.model.scene.batches[0].points))
     return {"points_by_time": _strands.shown(frames), "colors": colors, "side_by_side": True}

@@ -1,9 +1,9 @@
-"""A comb is pulled down through curled hair, and every strand stays between its own teeth.
+"""Combed hair: a comb is pulled down through curled strands, each between the same two teeth throughout.
 
-Strands hang from held roots, as helices that widen with the distance from them. Teeth of the comb stand between groups of strands, by
-the roots, and move down and out of the hair. They are closer than the curls are wide, and draw these straight as they pass. Roots and
-comb together carry at every time the weight of the hair and its inertia, and the hair gains no more energy than the comb does work. The
-comb is smooth; strands rub on each other.
+Strands hang from fixed roots, as helices that widen with distance. Teeth of the comb start between groups of strands, near the
+roots, and move down and out of the hair. They are closer than the curls are wide and straighten these as they pass. Roots and comb
+together carry at every time the weight of the hair and its inertia. The hair gains no more energy than the work of the comb. The
+comb is smooth; there is friction between strands.
 """
 
 import numpy as np
@@ -16,12 +16,12 @@ RADIUS, TOOTH = 4e-4, 1e-3  # m, of strands and teeth
 SPACING = 2e-3  # m, of strands
 ABREAST = 3  # strands of a row between two teeth
 RANGE = 2e-4  # m, activation distance
-APART = 2.0 * RADIUS + 1.5 * RANGE  # m, between strands at first
-CURL, TURNS = 3e-3, 3.0  # m, radius of the helices, and how many turns a strand has
-STRAIGHT = 0.02  # m, by the roots, where there are no curls yet
-BEYOND = 0.012  # m, of teeth to both sides of the roots
-BEGINS = 8e-3  # m, of the comb below the roots
-LEAVES = 0.03  # m, of the comb below the ends of straight strands
+APART = 2.0 * RADIUS + 1.5 * RANGE  # m, initial distance of strands
+CURL, TURNS = 3e-3, 3.0  # m, radius of the helices, and number of turns of a strand
+STRAIGHT = 0.02  # m, straight length at the roots
+BEYOND = 0.012  # m, extent of teeth beyond the roots on both sides
+BEGINS = 8e-3  # m, initial distance of the comb below the roots
+LEAVES = 0.03  # m, final distance of the comb below the ends of straight strands
 HAIR = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
 
 
@@ -35,14 +35,14 @@ def build(
     dt: float = 1.0 / 300.0,
     seed: int = 1,
 ) -> ddg.Scene:
-    """The strands hang down along z from the plane z = 0, the teeth are along x.
+    """Build strands that hang along -z from the plane z = 0, with teeth along x.
 
     Args:
-        gaps: between teeth, of 3 strands in each row
-        rows: of strands, one behind the other
+        gaps: gaps between teeth, each with 3 strands in a row
+        rows: rows of strands
         n: edges of a strand
         friction: Coulomb friction coefficient between strands
-        speed: of the comb [m/s]
+        speed: speed of the comb [m/s]
         damping: mass-proportional damping by the air [1/s]
         dt: time step [s]
         seed: seed of the random phases of the curls
@@ -62,12 +62,12 @@ def build(
 
 
 def teeth(gaps: int) -> np.ndarray:
-    """Where teeth are along y (gaps + 1,) [m]; those between groups of strands are one more spacing wide."""
+    """Return positions of teeth along y (gaps + 1,) [m], which leave one extra spacing between groups of strands."""
     return SPACING * (ABREAST + 1) * np.arange(gaps + 1)
 
 
 def curled(gaps: int, rows: int, n: int, random) -> np.ndarray:
-    """Strands (rods, nodes, 3) [m]: one gap after the other, row by row; they may overlap."""
+    """Return strands (rods, nodes, 3) [m], gap by gap and row by row; they may overlap."""
     y = (teeth(gaps)[:-1, None] + SPACING * np.arange(1, ABREAST + 1)).ravel()
     roots = np.stack(np.meshgrid(y, SPACING * np.arange(rows), indexing="ij"), axis=-1).reshape(-1, 1, 2)[..., ::-1]
     s = np.linspace(0.0, LENGTH, n + 1)
@@ -78,9 +78,9 @@ def curled(gaps: int, rows: int, n: int, random) -> np.ndarray:
 
 
 def observe(model, state) -> dict[str, float]:
-    """See `_touching.observe`; force of the comb upwards [N], strands that are in a gap not their own, and the balance of forces [N].
+    """Return `_touching.observe` with the upward force of the comb [N], strands in a wrong gap, and forces on the hair [N].
 
-    The last is what roots and comb exert on the hair, with its weight, by components; its momentum [N s] follows.
+    Components of the force of roots and comb, weight included, and of the momentum [N s] are named `force_k` and `momentum_k`.
     """
     roots, *comb = (np.array(reaction.force) for reaction in model.reactions(state))
     forces = sum(comb) + roots + _touching.mass(model) * np.array(model.scene.gravity)
@@ -92,40 +92,40 @@ def observe(model, state) -> dict[str, float]:
 
 
 def comb_at(model, t: float) -> float:
-    """Height of the comb at a time [m]."""
+    """Return the height of the comb at a time [m]."""
     return float(model.scene.obstacles[0].motion.shift(t)[0, 2]) - BEGINS
 
 
 def astray(model, state) -> int:
-    """How often strands cross the height of the comb in another gap than that of their roots."""
+    """Return the number of strand crossings of the comb's height in a gap other than at the root."""
     points, gaps = state.points().reshape(_touching.rods_of(model), -1, 3), len(model.scene.obstacles) - 1
     above = points[..., 2] - comb_at(model, state.time)
     rod, edge = np.nonzero(above[:, :-1] * above[:, 1:] <= 0.0)
-    share = above[rod, edge] / (above[rod, edge] - above[rod, edge + 1])
-    y = (1.0 - share) * points[rod, edge, 1] + share * points[rod, edge + 1, 1]
+    weight = above[rod, edge] / (above[rod, edge] - above[rod, edge + 1])
+    y = (1.0 - weight) * points[rod, edge, 1] + weight * points[rod, edge + 1, 1]
     return int((np.searchsorted(teeth(gaps), y) - 1 != rod // (len(points) // gaps)).sum())
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps, forces and momentum balance, the comb's work covers the energy, and no strand leaves its gap."""
+    """Check that nothing interpenetrates, momentum balances, comb work covers the energy, and no strand leaves its gap."""
     model, times = result.model, np.array(result.times)
     series = {name: np.array(values) for name, values in result.series.items()}
     force, momentum = (np.stack([series[f"{name}_{k}"] for k in range(3)], axis=1) for name in ("force", "momentum"))
     inertia = np.diff(momentum, axis=0) / np.diff(times)[:, None] + model.scene.mass_damping * momentum[1:]
     off = np.linalg.norm(force[1:] - inertia, axis=1) / _touching.weight(model)
-    # a step that is taken in parts ends with the force of the last
+    # a step of several substeps ends with the force of the last one
     whole = np.sort(off)[: max(1, len(off) - result.statistics["retries"])]
-    way = np.diff([comb_at(model, t) for t in times])
+    displacement = np.diff([comb_at(model, t) for t in times])
     return [
         *_touching.checks(result),
         ddg.Check("forces less inertia over the weight", whole.max(), 0.0, 1e-5, "Newton"),
-        _touching.energy_check(result, np.append(0.0, np.cumsum(series["comb"][1:] * way)), 2e-3),
+        _touching.energy_check(result, np.append(0.0, np.cumsum(series["comb"][1:] * displacement)), 2e-3),
         ddg.Check("strands in another gap than their roots", series["astray"].max(), 0.0, 0.0, "teeth part the hair"),
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """Work of the comb over edges and steps."""
+    """Study the work of the comb over edges and steps."""
     return ddg.bench.Study(
         {"n": (20, 40), "dt": (1 / 150, 1 / 300)},
         lambda result: np.mean(result.series["comb"]),
@@ -136,7 +136,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The hair and the comb before, halfway, and at the end."""
+    """Draw hair and comb before, halfway, and at the end."""
     times = sorted(frames)
     times = times[0], times[len(times) // 2], times[-1]
     return {

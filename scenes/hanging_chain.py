@@ -1,8 +1,8 @@
-"""A hanging chain without any stiffness to bending swings in shapes of Bessel's function.
+"""Hanging chain: without bending stiffness, it swings in mode shapes of Bessel's function.
 
-Daniel Bernoulli (1733): a chain of length L that hangs from its top has the frequencies omega = j sqrt(g / L) / 2, with j the zeros
-of J0, and the shapes J0(j sqrt(s / L)), s from the free end. Tension alone, which falls to nothing at that end, brings it back. The
-tangent at the hanging equilibrium gives all frequencies; a run with the implicit midpoint rule follows one of them.
+Daniel Bernoulli (1733): a hanging chain of length L has the frequencies omega = j sqrt(g / L) / 2 and the shapes J0(j sqrt(s / L)).
+Here j are the zeros of J0 and s is the arc length from the free end. Tension alone, which falls to zero at that end, restores it.
+The tangent at the hanging equilibrium gives all frequencies; a run with the implicit midpoint rule follows one of them.
 """
 
 import numpy as np
@@ -20,13 +20,13 @@ SOURCE = "half the zeros of J0 (Bernoulli 1733)"
 
 
 def build(n: int = 50, mode: int = 1, steps: int = 60, periods: float = 1.0, amplitude: float = 1e-3) -> ddg.Scene:
-    """The chain along z, displaced along x by one of its modes.
+    """Build the hanging chain along z, displaced along x by one of its modes.
 
     Args:
-        n: edges of the chain
-        mode: which mode, from 1
+        n: edges of the hanging chain
+        mode: number of the mode, from 1
         steps: time steps in a period
-        periods: periods that the run lasts
+        periods: duration of the run in periods
         amplitude: deflection of the free end over the length
     """
     if not 1 <= mode <= len(FREQUENCIES):
@@ -50,7 +50,7 @@ def build(n: int = 50, mode: int = 1, steps: int = 60, periods: float = 1.0, amp
 
 
 def hanging(model):
-    """The equilibrium. The search begins stretched, since an unstretched chain offers no resistance sideways."""
+    """Return the equilibrium, from a stretched initial guess, as unstretched edges have no lateral stiffness."""
     from ddg_warp.solve.statics import solve
 
     points = model.scene.batches[0].points[0].copy()
@@ -59,16 +59,16 @@ def hanging(model):
 
 
 def modes(model, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest frequencies omega sqrt(L / g) about the equilibrium, and sideways shapes (modes, nodes), 1 at the free end."""
+    """Return lowest frequencies omega sqrt(L / g) about the equilibrium, and lateral shapes (modes, nodes), 1 at the free end."""
     from ddg_warp.solve.stability import spectrum
 
-    found = spectrum(model, hanging(model), count)
-    shapes = found.modes.reshape(-1, 2, count)[:, 0]
-    return found.frequencies * np.sqrt(LENGTH / GRAVITY), (shapes / shapes[-1]).T
+    eigen = spectrum(model, hanging(model), count)
+    shapes = eigen.modes.reshape(-1, 2, count)[:, 0]
+    return eigen.frequencies * np.sqrt(LENGTH / GRAVITY), (shapes / shapes[-1]).T
 
 
 def swinging(model, mode: int, amplitude: float):
-    """The equilibrium, displaced by a mode: edges are turned, not stretched, since so stiff a chain would jump at that."""
+    """Return the equilibrium displaced by a mode through edge rotations, as stretch would make so stiff edges jump."""
     from ddg_warp.solve.tangent import Tangent
 
     state, tangent = hanging(model), Tangent(model)
@@ -81,12 +81,12 @@ def swinging(model, mode: int, amplitude: float):
 
 
 def observe(model, state) -> dict[str, float]:
-    """Deflection of the free end [m]."""
+    """Return the deflection of the free end [m]."""
     return {"tip_x": state.points().reshape(-1, 3)[model.curves.counts[0] - 1, 0]}
 
 
 def check(result) -> list[ddg.Check]:
-    """Frequencies from eigenvalues, and that of the run."""
+    """Check frequencies of eigenvalues, and of the run."""
     edges = int(result.model.curves.counts[0]) - 1
     measured, _ = modes(result.model)
     space = (50.0 / edges) ** 2
@@ -106,11 +106,11 @@ def check(result) -> list[ddg.Check]:
 
 
 def in_time(result, measured: np.ndarray, names) -> list[ddg.Check]:
-    """Frequency and damping of the run against the mode of the nearest of the measured frequencies."""
+    """Check frequency and damping of the run against the eigenmode of nearest frequency."""
     factor, phase = step_factor(result.series["tip_x"])
     frequency = (
         2.0 * np.tan(0.5 * phase) / result.dt * np.sqrt(LENGTH / GRAVITY)
-    )  # of which the midpoint rule makes that phase
+    )  # inverse of the phase of a midpoint step
     nearest = measured[np.abs(measured - frequency).argmin()]
     return [
         ddg.Check(names[0], frequency / nearest, 1.0, 1e-4, "eigenvalue"),
@@ -119,5 +119,5 @@ def in_time(result, measured: np.ndarray, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The third frequency over the nodes of the chain."""
+    """Study the third frequency over the nodes of the hanging chain."""
     return ddg.bench.Study({"n": (13, 25, 50, 100)}, "frequency 3", whole=True)

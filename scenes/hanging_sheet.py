@@ -1,7 +1,7 @@
-"""Hanging sheet: a square of rubber, held at two corners, let go flat and damped until it hangs; from 16 to 1024 cells a side.
+"""Hanging sheet: a square of rubber, fixed at two corners, falls from flat and hangs; from 16 to 1024 cells a side.
 
-A sheet this thin carries its weight by tension, from the two corners, in folds. Implicit Euler only loses energy; at rest the corners
-carry half the weight each, and the lowest vertex hangs where that of a finer mesh does.
+A sheet this thin carries its weight by tension from the two corners, in folds. Implicit Euler only loses energy. At rest the
+corners carry half the weight each, and the lowest vertex agrees with a finer mesh.
 """
 
 import numpy as np
@@ -17,13 +17,13 @@ MATERIAL = ddg.Material(young=1.0e6, poisson=0.3, density=1000.0, viscosity=0.02
 GRAVITY = 9.81  # m/s^2
 BALANCE = "balance of forces at rest"
 LOWEST = -1.0214
-HANGS = 3.0  # s; it has come to rest by then
+HANGS = 3.0  # s, time at which the sheet is at rest
 
 
 def build(
     cells: int = 16, duration: float = 3.0, dt: float = 1.0 / 60.0, damping: float = 4.0, bending: str = "midedge_dof"
 ) -> ddg.Scene:
-    """A square sheet, held at two neighbouring corners.
+    """Build a square sheet, fixed at two neighbouring corners.
 
     Args:
         cells: cells along a side, two triangles each
@@ -43,20 +43,20 @@ def build(
 
 
 def held(points: np.ndarray) -> list[int]:
-    """The two corners with the smallest x."""
+    """Return the two corners with the smallest x."""
     left = np.flatnonzero(points[:, 0] == points[:, 0].min())
     return [int(left[np.argmin(points[left, 1])]), int(left[np.argmax(points[left, 1])])]
 
 
 def observe(model, state) -> dict[str, float]:
-    """Height of the lowest vertex [m], total energy and its kinetic part [J]."""
-    parts = energies(model, state)
+    """Return the height of the lowest vertex [m], and total and kinetic energy [J]."""
+    contributions = energies(model, state)
     lowest = float(state.points().reshape(-1, 3)[:, 2].min())
-    return {"lowest": lowest, "energy": sum(parts.values()), "kinetic": parts["kinetic"]}
+    return {"lowest": lowest, "energy": sum(contributions.values()), "kinetic": contributions["kinetic"]}
 
 
 def check(result) -> list[ddg.Check]:
-    """Energy that only falls, and, once it hangs, the balance of forces and the place of the lowest vertex."""
+    """Check that energy only falls, and at rest the balance of forces and the height of the lowest vertex."""
     energy = np.array(result.series["energy"])
     gain = max(0.0, float(np.diff(energy).max())) / (energy[0] - energy[-1])
     energies = ddg.Check("largest gain of energy in a step over the whole drop", gain, 0.0, 1e-9, "implicit Euler")
@@ -69,7 +69,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def hanging(result, names) -> list[ddg.Check]:
-    """The checks of a sheet that has come to rest."""
+    """Return the checks of a sheet at rest."""
     model, state = result.model, result.state
     weight = MATERIAL.density * THICKNESS * SIDE**2 * GRAVITY
     first, second = (reaction.force[2] for reaction in model.reactions(state))
@@ -82,9 +82,9 @@ def hanging(result, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """Free corners and the middle between them after 0.2 s, against the same sheet at a finer mesh and a shorter step.
+    """Study free corners and the middle of the free side after 0.2 s, against the same sheet at a finer mesh and a shorter step.
 
-    Implicit Euler is of first order in the step, the midpoint rule of second; mesh and tolerance are lines of their own.
+    Implicit Euler is of first order in the step, the midpoint rule of second; mesh and tolerance are separate lines.
     """
     return ddg.bench.Study(
         grid={
@@ -102,7 +102,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def _marks(model) -> list[int]:
-    """Vertices at the two free corners and in the middle between them."""
+    """Return vertices at the two free corners and in the middle of the free side."""
     rest = model.state().points()
     right = np.flatnonzero(rest[:, 0] == rest[:, 0].max())
     across = rest[right, 1]

@@ -1,12 +1,11 @@
-"""A heavy top: a spinning rod that one end holds up stays level and goes round, by the gyroscopic couple of its spin.
+"""Heavy top: a spinning rod, supported at one end, stays level and precesses by its gyroscopic couple.
 
-A top of mass m whose centre is at l from its pivot, with the spin momentum I3 w along its level axis, goes round the vertical without
-nutation at
+A top of mass m with its centre at l from the pivot and spin momentum I3 w along its level axis precesses without nutation at
 
     W = m g l / (I3 w) ,
 
-exactly, as a level axis has no part of W along itself. The rod starts with that; without the couple it would fall by g t^2 / 2 at once.
-Lumped masses have their own m l. Energy and the vertical angular momentum are constants.
+exactly, as W has no component along a level axis. The rod starts in this motion; without the couple it would fall by g t^2 / 2 at
+once. Lumped masses have the same m l. Energy and the vertical angular momentum are constants.
 """
 
 import numpy as np
@@ -28,20 +27,20 @@ def build(
     young: float = 1e10,
     scheme: str = "implicit_midpoint",
 ) -> ddg.Scene:
-    """The top along x, its pivot at the origin.
+    """Build the top along x, its pivot at the origin.
 
     Args:
-        spin: of the rod about its axis, w [rad/s]
+        spin: spin of the rod about its axis, w [rad/s]
         n: edges of the rod
-        steps: time steps in a turn about the vertical
-        turns: about the vertical that the run lasts
-        young: Young's modulus, by which little the rod bends [Pa]
+        steps: time steps in a period of precession
+        turns: duration of the run in periods of precession
+        young: Young's modulus, large for small bending [Pa]
         scheme: time integration scheme
     """
-    turn = 2.0 * np.pi / rate(spin)  # s
+    period = 2.0 * np.pi / rate(spin)  # s
     scene = ddg.Scene(
         gravity=(0.0, 0.0, -GRAVITY),
-        analysis=ddg.Dynamics(dt=turn / steps, duration=round(turns * steps) * turn / steps, scheme=scheme),
+        analysis=ddg.Dynamics(dt=period / steps, duration=round(turns * steps) * period / steps, scheme=scheme),
         initial=lambda model: going_round(model, spin),
     )
     points = np.linspace((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), n + 1)
@@ -52,25 +51,25 @@ def build(
 
 
 def rate(spin: float) -> float:
-    """W [rad/s]; m l = rho A L^2 / 2 of lumped masses as of the rod itself, I3 = rho A L r^2 / 2."""
+    """Return W [rad/s], with m l = rho A L^2 / 2, also of lumped masses, and I3 = rho A L r^2 / 2."""
     return GRAVITY * LENGTH / (RADIUS**2 * spin)
 
 
 def going_round(model, spin: float):
-    """The level top with its steady motion."""
+    """Return the level top in steady precession."""
     points = model.scene.batches[0].points[0]
     velocities = np.cross((0.0, 0.0, rate(spin)), points)
     return model.state(velocities=velocities, spins=np.full(len(points) - 1, spin))
 
 
 def observe(model, state) -> dict[str, float]:
-    """Angle that the axis has gone round, up to half a turn either way [rad], and height of the end [m]."""
+    """Return the precession angle, between -pi and pi [rad], and the height of the end [m]."""
     end = state.points().reshape(-1, model.points_count, 3)[0, -1]
     return {"angle": float(np.arctan2(end[1], end[0])), "height": float(end[2])}
 
 
 def check(result) -> list[ddg.Check]:
-    """Rate of going round, and how level the axis stays."""
+    """Check the precession rate and the level of the axis."""
     spin = float(result.model.scene.initial(result.model).groups[0].omega.numpy().max())
     angle = np.unwrap(result.series["angle"])
     times = np.array(result.times)
@@ -85,7 +84,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The rate over steps and schemes."""
+    """Study the rate over steps and schemes."""
     return ddg.bench.Study(
         {"steps": (100, 200, 400, 800), "scheme": ("implicit_euler", "implicit_midpoint")},
         "rate of going round [rad/s]",

@@ -1,8 +1,8 @@
-"""A stiff helix that a motor turns about its axis in a viscous fluid: thrust, torque, and how fast it swims.
+"""Helical flagellum: a motor rotates a stiff helix in a viscous fluid; thrust, torque and swimming speed.
 
-By resistive force theory a right-handed helix of radius R, pitch p and contour length S, tangent at the angle theta to the axis,
-tan(theta) = 2 pi R / p, that moves at U along its axis and turns at W about it feels the force -(A U + B W) and the torque
--(B U + D W) with, for whole turns,
+A right-handed helix of radius R, pitch p and contour length S has the angle theta between tangent and axis, tan(theta) = 2 pi R /
+p. Moving at U along its axis and rotating at W about it, it feels the force -(A U + B W) and the torque -(B U + D W). By resistive
+force theory, for whole turns,
 
     A = S (zeta_t cos^2 + zeta_n sin^2) ,  B = -(zeta_n - zeta_t) sin cos R S ,
     D = R^2 S (zeta_t sin^2 + zeta_n cos^2) + zeta_r cos^2 S
@@ -36,16 +36,16 @@ def build(
     duration: float = 2.0,
     stiffness: float = 1e5,
 ) -> ddg.Scene:
-    """The helix about z, without inertia, turned at its first end.
+    """Build the helix about z, without inertia, rotated at its first end.
 
     Args:
         theory: gray_hancock or lighthill
-        swims: whether it is free to move along z, instead of held
+        swims: whether the helix is free to move along z
         n: edges in a turn
-        turns: of the helix, a whole number
-        dt: time step [s]; it turns by one radian in a second
+        turns: turns of the helix, a whole number
+        dt: time step [s]; the rate is one radian a second
         duration: duration of the run [s]
-        stiffness: bending and twisting [N m^2]
+        stiffness: bending and twisting stiffness [N m^2]
     """
     if theory not in LAWS:
         raise ValueError(f"theory {theory!r}: take one of {', '.join(LAWS)}")
@@ -62,7 +62,7 @@ def build(
 
 
 def turning(model):
-    """The state at rest, turning at once as a rigid body."""
+    """Return the rest shape in rigid rotation."""
     points = model.scene.batches[0].points[0]
     edges = np.diff(points, axis=0)
     axis = np.array([0.0, 0.0, RATE])
@@ -70,7 +70,7 @@ def turning(model):
 
 
 def grand_resistance(theory: str, turns: float) -> tuple[float, float, float]:
-    """A [N s/m], B [N s] and D [N m s]."""
+    """Return A [N s/m], B [N s] and D [N m s]."""
     length = turns * PITCH / np.cos(THETA)
     rows = LAWS[theory].coefficients("", np.array(THICKNESS), np.array(length))
     along, across, about = (float(value) for value in rows[:3])
@@ -83,7 +83,7 @@ def grand_resistance(theory: str, turns: float) -> tuple[float, float, float]:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Force [N] and torque [N m] of the fluid along the axis, and speed along it [m/s]."""
+    """Return force [N] and torque [N m] of the fluid along the axis, and speed along it [m/s]."""
     points, drag = state.points().reshape(-1, model.points_count, 3)[0], model.drag(state)
     force, moment = drag.force.reshape(-1, *points.shape)[0], drag.moment.reshape(-1, len(points) - 1)[0]
     tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1, keepdims=True)
@@ -96,28 +96,28 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Thrust and torque of a helix that is held, speed and torque of one that swims."""
+    """Check thrust and torque of a fixed helix, or speed and torque of a swimming one."""
     theory, how = result.model.curves.names[0].split(", ")
     points = result.scene.batches[0].points[0]
     edges = 2.0 * np.pi / (np.unwrap(np.arctan2(points[:, 1], points[:, 0]))[1])
     A, B, D = grand_resistance(theory, (len(points) - 1) / edges)
     U = -B / A * RATE if how == "swims" else 0.0
-    bent = 60.0 / result.scene.batches[0].section.EI1  # how far the helix is from being rigid
+    bent = 60.0 / result.scene.batches[0].section.EI1  # departure of the helix from a rigid body
     tolerance = 8.0 / edges**2 + 0.5 * (RATE * result.dt) ** 2 + bent
-    found = {name: values[-1] for name, values in result.series.items()}
-    checks = {"torque [N m]": (found["torque"], -(B * U + D * RATE))}
+    final = {name: values[-1] for name, values in result.series.items()}
+    checks = {"torque [N m]": (final["torque"], -(B * U + D * RATE))}
     if how == "swims":
-        checks["speed [m/s]"] = (found["speed"], U)
+        checks["speed [m/s]"] = (final["speed"], U)
     else:
-        checks["thrust [N]"] = (found["force"], -B * RATE)
+        checks["thrust [N]"] = (final["force"], -B * RATE)
     return once_reached(
         result,
-        3.0 * result.dt,  # velocities are means over steps: they start at the second
+        3.0 * result.dt,  # velocities are means over steps, from the second on
         tuple(checks),
         lambda: [ddg.Check(name, *pair, tolerance, SOURCE, relative=True) for name, pair in checks.items()],
     )
 
 
 def benchmark() -> ddg.bench.Study:
-    """The torque over edges and steps."""
+    """Study the torque over edges and steps."""
     return ddg.bench.Study({"n": (10, 20, 40, 80), "dt": (0.04, 0.02, 0.01)}, "torque", series=("dt",))

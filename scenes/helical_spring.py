@@ -1,9 +1,11 @@
-"""Helical spring: a spring of wire held far from its natural height.
+"""Helical spring: a spring of wire stretched far from its natural height.
 
-A helix whose ends carry a force and a moment along its axis stays a helix (Kirchhoff; Love, Mathematical Theory of Elasticity, 1927,
-art. 271): with curvature k and twist t, natural ones k0 and t0, and w^2 = k^2 + t^2,
+A helix whose ends carry a force and a moment along its axis stays a helix (Kirchhoff; Love, Mathematical Theory of Elasticity,
+1927, art. 271). With curvature k and twist t, natural ones k0 and t0, and w^2 = k^2 + t^2,
+
     F = (C (t - t0) - B t (k - k0) / k) w ,  moment about the axis = (B (k - k0) k + C (t - t0) t) / w .
-The first and last edge are held on the exact helix, as arms to its axis would hold them; what holds them is measured.
+
+The first and last edge are fixed on the exact helix, as rigid arms from its axis would do; the wrench on the last is measured.
 """
 
 import numpy as np
@@ -11,8 +13,8 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import polyline
 
-B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2]; Poisson's ratio is 0.5
-EA = 1.0e5  # N; so stiff that the wire counts as inextensible: EA L^2 / B = 4e8
+B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2] at a Poisson's ratio of 0.5
+EA = 1.0e5  # N; nearly inextensible: EA L^2 / B = 4e8
 RADIUS = 1.0  # m
 PITCH = np.radians(10.0)
 TURNS = 10.0
@@ -22,13 +24,13 @@ SOURCE = "uniform helix (Love 1927)"
 
 
 def build(stretch: float = 2.0, turns: float = TURNS, n: int = 400, curvature: str = "tangent") -> ddg.Scene:
-    """The spring along z.
+    """Build the spring along z.
 
     Args:
         stretch: height over height at rest
         turns: turns of the wire; 10 at rest
         n: edges of the wire
-        curvature: by what it is measured, tangent or angle
+        curvature: curvature measure, tangent or angle
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
     points, normals = wire(stretch, turns, n)
@@ -45,16 +47,16 @@ def build(stretch: float = 2.0, turns: float = TURNS, n: int = 400, curvature: s
 
 
 def helix(stretch: float, turns: float) -> tuple[float, float]:
-    """Radius [m] and pitch angle [rad] of the wire at a height and number of turns."""
+    """Return radius [m] and pitch angle [rad] of the wire at a height and number of turns."""
     pitch = np.arcsin(stretch * HEIGHT / WIRE)
     return WIRE * np.cos(pitch) / (2.0 * np.pi * turns), pitch
 
 
 def wire(stretch: float, turns: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (n + 1, 3) [m] on a helix with edges as long as at rest, and its normals on the edges (n, 3)."""
+    """Return nodes (n + 1, 3) [m] on a helix with edges as long as at rest, and normals on the edges (n, 3)."""
     angle = np.linspace(0.0, 2.0 * np.pi * turns, n + 1)
     rise = np.linspace(0.0, stretch * HEIGHT, n + 1)
-    square = (2.0 * RADIUS * np.sin(np.pi * TURNS / n)) ** 2 + (HEIGHT / n) ** 2  # of an edge
+    square = (2.0 * RADIUS * np.sin(np.pi * TURNS / n)) ** 2 + (HEIGHT / n) ** 2  # of an edge length
     radius = np.sqrt(square - (stretch * HEIGHT / n) ** 2) / (2.0 * np.sin(np.pi * turns / n))
     middle = 0.5 * (angle[1:] + angle[:-1])
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), rise], axis=1)
@@ -62,7 +64,7 @@ def wire(stretch: float, turns: float, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def natural(n: int, by_angle: bool = False) -> tuple[float, float, float]:
-    """Curvatures and twist of the nodes and edges of the helix at rest [1/m]: there the discrete spring is free of stress."""
+    """Return curvatures and twist of the discrete rest helix [1/m], the stress-free state."""
     points, normals = wire(1.0, TURNS, n)
     edges = polyline.edge_vectors(points[None, :3], False)
     tangents, length = polyline.unit(edges), np.linalg.norm(edges[0, 0])
@@ -72,12 +74,12 @@ def natural(n: int, by_angle: bool = False) -> tuple[float, float, float]:
 
 
 def strains(radius: float, pitch: float) -> tuple[float, float]:
-    """Curvature and torsion of a helix [1/m]."""
+    """Return curvature and torsion of a helix [1/m]."""
     return np.cos(pitch) ** 2 / radius, np.sin(pitch) * np.cos(pitch) / radius
 
 
 def exact(stretch: float, turns: float) -> tuple[float, float]:
-    """Force [N] and moment [N m] along the axis."""
+    """Return force [N] and moment [N m] along the axis."""
     k, t = strains(*helix(stretch, turns))
     k0, t0 = strains(RADIUS, PITCH)
     w = np.hypot(k, t)
@@ -85,18 +87,18 @@ def exact(stretch: float, turns: float) -> tuple[float, float]:
 
 
 def measure(model, state) -> tuple[float, float]:
-    """Force [N] and moment [N m] along the axis, from what holds the two nodes and the angle of the last edge."""
+    """Return force [N] and moment [N m] along the axis, from reactions on the last two nodes and the last twist angle."""
     from ddg_warp.solve.tangent import Tangent
 
     points = state.points()[-2:]
-    held = Tangent(model).gradient(state).reshape(-1, 4)[-2:]
+    reactions = Tangent(model).gradient(state).reshape(-1, 4)[-2:]
     tangent = points[1] - points[0]
-    moment = np.cross(points, held[:, :3]).sum(axis=0) + held[0, 3] * tangent / np.linalg.norm(tangent)
-    return held[:, 2].sum(), moment[2]
+    moment = np.cross(points, reactions[:, :3]).sum(axis=0) + reactions[0, 3] * tangent / np.linalg.norm(tangent)
+    return reactions[:, 2].sum(), moment[2]
 
 
 def check(result) -> list[ddg.Check]:
-    """Force and moment against the exact helix, to what edges of this length can resolve."""
+    """Check force and moment against the exact helix, within the discretisation error."""
     first, last = result.state.points()[[0, -1]]
     added = np.arctan2(last[1], last[0]) / (2.0 * np.pi)
     stretch, turns = (last[2] - first[2]) / HEIGHT, TURNS + added
@@ -112,5 +114,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The axial force over the nodes of ten turns."""
+    """Study the axial force over the nodes of ten turns."""
     return ddg.bench.Study({"n": (100, 200, 400, 800)}, "axial force")

@@ -1,7 +1,7 @@
 """Hinged roof: a shallow cylindrical roof is pressed at its crown and snaps through.
 
-Case 3.8 of Sze, Liu and Lo (2004), thickness 12.7 or 6.35. The crown is lowered and the force that it takes observed, so that the
-first limit load is passed. Limit loads agree with a Ritz solution by Kirchhoff and Love's theory to 0.2 %.
+Case 3.8 of Sze, Liu and Lo (2004), thickness 12.7 or 6.35. The crown is lowered under displacement control, which passes the first
+limit load. Limit loads agree with a Ritz solution by Kirchhoff and Love's theory to 0.2 %.
 """
 
 import numpy as np
@@ -24,11 +24,11 @@ def build(
     membrane: str = "curved",
     steps: int = 32,
 ) -> ddg.Scene:
-    """A quarter of the roof; its axis is z, its crown at y = 0 faces +x.
+    """Build a quarter of the roof; its axis is z, its crown at y = 0 faces +x.
 
     Args:
         thickness: 12.7 or 6.35 [mm]
-        drop: how far the crown is lowered [mm]
+        drop: displacement of the crown [mm]
         n: cells around half and along half of the roof
         pattern: how cells become triangles: right, alternating, crossed or jittered
         membrane: flat or curved, see Scene.add_shell
@@ -47,7 +47,7 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far the crown is lowered [mm] and the force on the whole roof that holds it there [N]."""
+    """Return the drop of the crown [mm] and the reaction there for the whole roof [N]."""
     from ddg_warp.solve.tangent import Tangent
 
     crown = model.net.host.shells[0].nodes[0]
@@ -56,7 +56,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def limit(series) -> tuple[float, float]:
-    """First limit load [N] and the drop there [mm], by a quartic around the first maximum; NaN without one."""
+    """Return the first limit load [N] and the drop there [mm] by a quartic around the first maximum, or NaN without one."""
     drop, force = np.array(series["drop"]), np.array(series["force"])
     peaks = np.flatnonzero((force[1:-1] >= force[:-2]) & (force[1:-1] > force[2:])) + 1
     if not peaks.size:
@@ -64,12 +64,12 @@ def limit(series) -> tuple[float, float]:
     near = slice(max(0, peaks[0] - 2), peaks[0] + 3)
     curve = np.polynomial.Polynomial.fit(drop[near], force[near], min(4, len(drop[near]) - 1))
     roots = curve.deriv().roots()
-    place = roots[np.argmin(np.abs(roots - drop[peaks[0]]))].real
-    return float(curve(place)), float(place)
+    position = roots[np.argmin(np.abs(roots - drop[peaks[0]]))].real
+    return float(curve(position)), float(position)
 
 
 def check(result) -> list[ddg.Check]:
-    """First limit load against the table, to 1.5 % at 12 cells."""
+    """Check the first limit load against the table, to 1.5 % at 12 cells."""
     thickness = float(result.scene.shells[0].thickness)
     if thickness not in LIMIT:
         return [
@@ -79,5 +79,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The limit load over meshes and membranes; the published one is of a finite mesh, too."""
+    """Study the limit load over meshes and membranes; the published one is of a finite mesh, too."""
     return ddg.bench.Study({"n": (4, 8, 12), "membrane": ("flat", "curved")}, "limit load", series=("membrane",))

@@ -1,13 +1,14 @@
-"""Inverse design: rods that take the shape they were drawn in under their own weight, by gradients of equilibria.
+"""Inverse design: natural shapes of rods that sag under their weight into the drawn shape, by gradients of equilibria.
 
-Curled strands that hang, and a shelf, a rod held level by one end, are drawn as they are to be in equilibrium. With the drawn shape as
-their natural one they sag. `learn`, which `build` calls, moves the natural curvatures and twists of all vertices down the gradient of
-what is off in the equilibrium, until strands hang and the shelf lies as drawn; the scene is built with these, released without weight,
-and loaded by it. What is off is measured by second differences of positions, which are sensitive to the curvature of their own
-vertex, so that the search is well conditioned; root and tip weigh alike. Reference: moments about the vertices of a rod held at
-one end follow from statics alone, so that K (k - k0) of the drawn shape is known; along the shelf k0 = w (L - s)^2 / 2 EI.
-The natural shape is not unique, as a round section may turn about its line; moments are. Lengths are not learned: strands stay longer
-than drawn by their stretch, w L^2 / 2 EA.
+Curled hanging strands and a shelf, a rod clamped level at one end, are drawn in their desired equilibrium. With the drawn shape as
+natural shape they sag. `learn`, called by `build`, fits natural curvatures and twists of all vertices by the gradient of the error
+in equilibrium. The scene is built with the result, released without weight, and loaded by it. The error is measured by second
+differences of positions, each sensitive to the curvature of its own vertex. The search is then well conditioned, and root and tip
+weigh alike.
+
+Reference: moments about the vertices of a cantilever follow from statics alone, so that K (k - k0) of the drawn shape is known.
+Along the shelf k0 = w (L - s)^2 / 2 EI. The natural shape is not unique, as a round section may rotate about its tangent; moments
+are. Lengths are not fitted: strands remain longer than drawn by their stretch, w L^2 / 2 EA.
 """
 
 from functools import cache
@@ -17,7 +18,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.scenes import _learn, _strands
 
-LENGTH = 0.3  # m, of a strand from root to tip, and of the shelf along itself
+LENGTH = 0.3  # m, of a strand from root to tip, and of the shelf
 CURL = 0.015  # m, radius at the tip
 PITCH = 0.1  # m
 SPACING = 0.05  # m, between roots
@@ -29,11 +30,11 @@ STATICS = "statics of the drawn shape"
 
 
 def build(strands: int = 8, nodes: int = 32) -> ddg.Scene:
-    """Strands and shelf with the natural shape that was learned for them; building takes as long as learning it.
+    """Build strands and shelf with the fitted natural shape; building includes the fit.
 
     Args:
-        strands: how many
-        nodes: of each rod
+        strands: number of strands
+        nodes: nodes of each rod
     """
     if strands < 1 or nodes < 8:
         raise ValueError(f"strands = {strands}, nodes = {nodes}: take 1 strand and 8 nodes at least")
@@ -42,27 +43,27 @@ def build(strands: int = 8, nodes: int = 32) -> ddg.Scene:
 
 
 def rods(strands: int, nodes: int, natural: np.ndarray | None = None) -> ddg.Scene:
-    """The rods as drawn, held by their first edges.
+    """Return a scene of the drawn rods, clamped by their first edges.
 
     Args:
-        strands, nodes: as of `build`.
-        natural: natural curvatures and twist (3, strands + 1, nodes - 2) [1/m]; by default those of the drawn shape.
+        strands, nodes: see `build`.
+        natural: natural curvatures and twist (3, strands + 1, nodes - 2) [1/m]; by default of the drawn shape.
     """
     scene, drawn = ddg.Scene(gravity=(0.0, 0.0, -GRAVITY), analysis=ddg.Statics(load_steps=4)), shapes(strands, nodes)
     for points, rows, radius, name in (
         (drawn[:-1], slice(0, strands), RADIUS, "strands"),
         (drawn[-1:], slice(strands, None), SHELF, "shelf"),
     ):
-        own = "shape" if natural is None else tuple(natural[:, rows])
+        shape = "shape" if natural is None else tuple(natural[:, rows])
         added = scene.add_rods(
-            points, section=ddg.Circle(radius), material=MATERIAL, natural=own, curvature="angle", name=name
+            points, section=ddg.Circle(radius), material=MATERIAL, natural=shape, curvature="angle", name=name
         )
         scene.clamp(added, edges=[0])
     return scene
 
 
 def shapes(strands: int, nodes: int) -> np.ndarray:
-    """Drawn points (strands + 1, nodes, 3) [m]: curls that grow along strands, each turned a bit further, and the shelf along x."""
+    """Return drawn points (strands + 1, nodes, 3) [m]: growing curls of strands with shifted phases, and the shelf along x."""
     down = np.linspace(0.0, LENGTH, nodes)
     number = np.arange(strands)[:, None]
     curl = CURL * down / LENGTH * np.exp(2j * np.pi * (down / PITCH + number / strands))
@@ -73,7 +74,7 @@ def shapes(strands: int, nodes: int) -> np.ndarray:
 
 @cache
 def learn(strands: int, nodes: int) -> np.ndarray:
-    """Natural curvatures and twist (3, strands + 1, nodes - 2) [1/m] with which the rods are in equilibrium as drawn."""
+    """Fit natural curvatures and twist (3, strands + 1, nodes - 2) [1/m] to the drawn equilibrium."""
     import torch
 
     from ddg_warp.torch import Simulator
@@ -87,18 +88,18 @@ def learn(strands: int, nodes: int) -> np.ndarray:
         off = simulator.equilibrium(parameters).positions.reshape(drawn.shape) - drawn
         return ((off.diff(dim=1).diff(dim=1) * nodes**2 / LENGTH) ** 2).mean()
 
-    found, _ = _learn.minimise(loss, torch.zeros_like(first), iterations=100, tolerance=1e-10)
-    return (first + found / LENGTH).reshape(3, strands + 1, nodes - 2).numpy()
+    fitted, _ = _learn.minimise(loss, torch.zeros_like(first), iterations=100, tolerance=1e-10)
+    return (first + fitted / LENGTH).reshape(3, strands + 1, nodes - 2).numpy()
 
 
 def size(result) -> tuple[int, int]:
-    """Strands and nodes of a run."""
+    """Return numbers of strands and nodes of a run."""
     strands, shelf = result.model.scene.batches
     return len(strands.points), shelf.points.shape[1]
 
 
 def check(result) -> list[ddg.Check]:
-    """Everything where it was drawn, but for its stretch; the natural shape against statics."""
+    """Check positions against the drawing, except for stretch, and the natural shape against statics."""
     from ddg_warp.ask import inquiry
 
     strands, nodes = size(result)
@@ -109,8 +110,8 @@ def check(result) -> list[ddg.Check]:
     arc = np.linalg.norm(np.diff(drawn, axis=1), axis=2).sum(1).max()
 
     stresses = inquiry.stresses(result.model, result.state)["rod_bend_twist"]
-    found = np.stack([np.linalg.norm(own, axis=-1) for own in stresses[:strands]])
-    known = _strands.moments(drawn[:-1], weights[0])
+    moments = np.stack([np.linalg.norm(stress, axis=-1) for stress in stresses[:strands]])
+    expected = _strands.moments(drawn[:-1], weights[0])
 
     along = LENGTH * np.arange(1, nodes - 1) / (nodes - 1)
     shelf = weights[1] * (LENGTH - along) ** 2 / (2.0 * sections[1].EI1)
@@ -130,7 +131,7 @@ def check(result) -> list[ddg.Check]:
         ),
         ddg.Check(
             "moments off statics, largest over the largest moment",
-            np.abs(found - known).max() / known.max(),
+            np.abs(moments - expected).max() / expected.max(),
             0.0,
             tolerance,
             STATICS,
@@ -139,7 +140,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def picture(result, frames) -> dict:
-    """How rods hang whose natural shape is that drawn, the learned natural shape, and how rods hang that have it."""
+    """Draw the sag of the drawn natural shape, the fitted natural shape without weight, and with it."""
     from ddg_warp.solve.statics import solve
 
     strands, nodes = size(result)
@@ -158,5 +159,5 @@ def picture(result, frames) -> dict:
 
 
 def benchmark() -> ddg.bench.Study:
-    """Moments against statics over the nodes of the rods."""
+    """Study moments against statics over the nodes of the rods."""
     return ddg.bench.Study({"nodes": (12, 16, 24, 32)}, "moments off", fixed={"strands": 2})

@@ -1,14 +1,15 @@
-"""A knitted patch is pulled: its loops slide through each other until they lock, so that it stiffens, and it becomes narrow.
+"""Knit patch: loops of a pulled knit slide through each other until they lock, so that it stiffens and narrows.
 
-Plain knitting (stockinette) of one yarn, by the curve of Crane, A simple parametric model of plain-knit yarns, 2023: of a row along x
+Plain knitting (stockinette) of one yarn, by the curve of Crane, A simple parametric model of plain-knit yarns, 2023: of a row along
+x
 
     x = (t + a sin 2t) u ,  z = h u cos t ,  y = -d u cos 2t ,
 
-2 pi u wide a stitch, with rows c u above each other, so that the feet of each row pass through the heads of the row below. Rows run to
-and fro. The shape of the loops is that of the yarn at rest, as of yarn that is steamed after it is knitted; otherwise the patch would
-curl up by itself. One grip holds the feet of the first row, the other the heads of the last, and both let them slide sideways. At first
-loops bend where they touch; in the end their legs are straight and the yarn is stretched, which takes much more (Kaldor, James and
-Marschner, ACM Transactions on Graphics 27, 2008, 65, show as much of their knits).
+2 pi u wide a stitch, with rows c u above each other, so that the feet of each row pass through the heads of the row below. Rows run
+to and fro. The drawn loops are the rest shape of the yarn, as after steaming; otherwise the patch would curl up by itself. One grip
+prescribes the feet of the first row, the other the heads of the last, and both let them slide sideways. At first loops bend at
+contacts. In the end their legs are straight and the yarn is stretched, which takes much more force, as in Kaldor, James and
+Marschner, ACM Transactions on Graphics 27, 2008, 65.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ from ddg_warp.scenes import _touching
 
 STITCH = 8e-3  # m, its width
 UNIT = STITCH / (2.0 * np.pi)  # m, u
-ROUND, HIGH, DEEP, APART = 1.5, 4.0, 1.0, 4.5  # a, h, d, and c between rows, by which middle lines are 1.5 u apart
+ROUND, HIGH, DEEP, APART = 1.5, 4.0, 1.0, 4.5  # a, h, d, and c between rows, for which centrelines are 1.5 u apart
 RADIUS = 8e-4  # m, of the yarn
 RANGE = 1.6e-4  # m, activation distance
 YARN = ddg.Material(young=2e6, density=1000.0, poisson=0.5)
@@ -36,13 +37,13 @@ def build(
     dt: float = 0.01,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The patch in the plane y = 0.
+    """Build the patch in the plane y = 0.
 
     Args:
-        rows: of stitches
+        rows: rows of stitches
         columns: stitches of a row
         n: edges of a stitch
-        stretch: of the patch in the end
+        stretch: final stretch of the patch
         friction: Coulomb friction coefficient
         damping: mass-proportional damping [1/s]
         dt: time step [s]
@@ -68,7 +69,7 @@ def build(
 
 
 def knitted(rows: int, columns: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of the yarn (nodes, 3) [m], and its nodes at the heads of the last row and the feet of the first.
+    """Return points of the yarn (nodes, 3) [m], and its nodes at the heads of the last row and the feet of the first.
 
     Half circles join the last foot of a row with the first of the next; the last row ends with half a loop more, by its head.
     """
@@ -79,13 +80,13 @@ def knitted(rows: int, columns: int, n: int) -> tuple[np.ndarray, np.ndarray, np
     turn = 0.5 * APART * np.stack([np.sin(angle), 0.0 * angle, 1.0 - np.cos(angle)], axis=1) + [end, -DEEP, -HIGH]
     row = np.concatenate([loops[:-half], turn])
     every = [row] * (rows - 1) + [loops]
-    points = [part * [(-1.0) ** k, 1.0, 1.0] + [0.0, 0.0, APART * k] for k, part in enumerate(every)]
+    points = [loop * [(-1.0) ** k, 1.0, 1.0] + [0.0, 0.0, APART * k] for k, loop in enumerate(every)]
     feet = n * np.arange(columns + 1)
     return UNIT * np.concatenate(points), (rows - 1) * len(row) + half + feet, feet
 
 
 def observe(model, state) -> dict[str, float]:
-    """See `_touching.observe`; pulls of both grips along z [N], and width of the patch over that at first.
+    """Return `_touching.observe` with pulls of both grips along z [N], and width of the patch over the initial one.
 
     The width is the standard deviation of x of all nodes.
     """
@@ -98,23 +99,23 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps, the grips' work covers the energy, their pulls balance, and the patch stiffens and narrows."""
+    """Check that nothing interpenetrates, grip work covers the energy, pulls balance, and the patch stiffens and narrows."""
     names = ("pull at half of the way over half of that at the end", "contraction over stretch")
     model, series = result.model, {name: np.array(values) for name, values in result.series.items()}
-    way = np.array([model.scene.supports[1].motion.shift(t)[0, 2] for t in result.times])
-    work = np.append(0.0, np.cumsum((series["high"] - series["low"])[1:] * np.diff(way)))
-    late = np.array(result.times) > 0.1 * LASTS  # a jitter has died away
-    balance = np.abs(series["high"] + series["low"])[late].max() / series["high"][late].max()
+    displacement = np.array([model.scene.supports[1].motion.shift(t)[0, 2] for t in result.times])
+    work = np.append(0.0, np.cumsum((series["high"] - series["low"])[1:] * np.diff(displacement)))
+    settled = np.array(result.times) > 0.1 * LASTS  # without the transient of the jitter
+    balance = np.abs(series["high"] + series["low"])[settled].max() / series["high"][settled].max()
     return [
         *_touching.checks(result),
         _touching.energy_check(result, work),
         ddg.Check("pulls of both grips, their sum over the largest", balance, 0.0, 0.01, "balance of forces"),
-        *once_reached(result, LASTS, names, lambda: _checks(series, 2.0 * way[-1] / height(model), names)),
+        *once_reached(result, LASTS, names, lambda: _checks(series, 2.0 * displacement[-1] / height(model), names)),
     ]
 
 
 def height(model) -> float:
-    """From the feet of the first row to the heads of the last, at first [m]."""
+    """Return the initial distance from the feet of the first row to the heads of the last [m]."""
     return float(np.ptp(model.scene.batches[0].points[0, :, 2]))
 
 
@@ -127,7 +128,7 @@ def _checks(series, stretch: float, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The pull over edges of a stitch and steps."""
+    """Study the pull over edges of a stitch and steps."""
     return ddg.bench.Study(
         {"n": (16, 24, 32, 48), "dt": (0.02, 0.01)},
         lambda result: result.series["high"][-1],
@@ -138,7 +139,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The patch as it is knitted, and pulled, as thick as its yarn is."""
+    """Draw the patch before and after pulling, with actual thickness."""
     times = min(frames), max(frames)
     return {
         "points_by_time": {t: frames[t] for t in times},

@@ -1,8 +1,8 @@
-"""Leaf: a strip whose edge has grown ripples.
+"""Leaf: a strip with a grown edge ripples.
 
-The strip is held along its root and has grown along it by growth (y / W)^2 at the distance y from there. Flat, it would be compressed;
-it buckles and follows the metric that it has grown instead, the better the thinner it is (Sharon, Roman, Marder, Shin, Swinney, Nature
-419, 2002; Efrati, Sharon, Kupferman, J. Mech. Phys. Solids 57, 2009): what is left of the energy is bending.
+The strip is clamped along its root and has grown along it by growth (y / W)^2 at the distance y. Flat, it would be compressed. It
+buckles and approaches its grown metric, the better the thinner it is (Sharon, Roman, Marder, Shin, Swinney, Nature
+419, 2002; Efrati, Sharon, Kupferman, J. Mech. Phys. Solids 57, 2009): the remaining energy is bending.
 """
 
 import numpy as np
@@ -18,16 +18,16 @@ SOURCE = "energy and length of the grown metric"
 
 
 def build(growth: float = 0.2, thickness: float = 0.005, waves: int = 4, cells: int = 40) -> ddg.Scene:
-    """The strip in the plane of x and y, drawn with ripples whose lengths are those grown, and let go; its ends are symmetry planes.
+    """Build the strip in the plane of x and y with ripples of the grown length, released between symmetry planes.
 
     Args:
         growth: strain of the free edge
-        thickness: of the strip [m]
-        waves: half waves that it is drawn with; it may leave them for others
+        thickness: thickness of the strip [m]
+        waves: half waves of the initial ripples; it may change their number
         cells: cells along the strip
     """
     flat, triangles = mesh(cells)
-    # The clamp holds the normals of the drawn triangles: those of the first row are flat.
+    # The clamp fixes the normals of the drawn triangles; the first row is flat.
     first = np.min(flat[flat[:, 1] > 1e-9, 1])
     lift = np.clip((flat[:, 1] - first) / (WIDTH - first), 0.0, None) ** 2
     points = flat.copy()
@@ -48,39 +48,39 @@ def build(growth: float = 0.2, thickness: float = 0.005, waves: int = 4, cells: 
 
 
 def mesh(cells: int) -> meshes.Mesh:
-    """Points and triangles of the flat strip."""
+    """Return points and triangles of the flat strip."""
     return meshes.rectangle(cells, max(2, round(cells * WIDTH / LENGTH)), (LENGTH, WIDTH), "alternating")
 
 
 def grown(growth: float, cells: int) -> np.ndarray:
-    """Metric at rest (T, 3) [m^2]."""
+    """Return the rest metric (T, 3) [m^2]."""
     flat, triangles = mesh(cells)
     return grown_metric(flat, triangles, 1.0 + growth * (flat[triangles].mean(1)[:, 1] / WIDTH) ** 2, 1.0)
 
 
 def edge(state) -> np.ndarray:
-    """Points of the free edge, in order (., 3) [m]."""
+    """Return points of the free edge, in order (., 3) [m]."""
     drawn = state.model.scene.shells[0].points
     return state.points()[drawn[:, 1] > WIDTH - 1e-9]
 
 
 def strains(state) -> tuple[float, float]:
-    """How much longer the free edge is than at the start, over its length then: as it is, and at rest."""
+    """Return the strain of the free edge against the initial length: actual, and in the rest metric."""
     shell = state.model.net.host.shells[0]
     sides = np.flatnonzero((shell.surface.points[shell.surface.edges, 1] > WIDTH - 1e-9).all(1))
-    at, corner = np.nonzero(np.isin(shell.surface.triangle_edges, sides))
-    rest = np.sqrt(shell.plate.lengths_squared[at, corner]).sum()
+    triangle, corner = np.nonzero(np.isin(shell.surface.triangle_edges, sides))
+    rest = np.sqrt(shell.plate.lengths_squared[triangle, corner]).sum()
     length = np.linalg.norm(np.diff(edge(state), axis=0), axis=1).sum()
     return float(length / LENGTH - 1.0), float(rest / LENGTH - 1.0)
 
 
 def flat_state(model):
-    """The state in which the strip has not left its plane."""
+    """Return the flat state of the strip."""
     return model.state(points=model.scene.shells[0].points * [1.0, 1.0, 0.0])
 
 
 def check(result) -> list[ddg.Check]:
-    """Energy below a tenth of the flat state's; the free edge as long as it has grown, to a tenth."""
+    """Check energy below a tenth of the flat state, and the strain of the free edge to a tenth."""
     model = result.model
     energies = [sum(model.energies(state).values()) for state in (result.state, flat_state(model))]
     strain, rest = strains(result.state)
@@ -91,5 +91,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The strain of the free edge over meshes; it is that of a thinner leaf in the limit."""
+    """Study the strain of the free edge over meshes; its limit is a thinner leaf."""
     return ddg.bench.Study({"cells": (10, 20, 40)}, "strain of the free edge")

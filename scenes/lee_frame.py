@@ -1,6 +1,6 @@
 """Lee frame: a column and a beam, joined rigidly and hinged at their far ends, snap through under a force on the beam.
 
-Load and displacement of the loaded point both turn back on the way (Lee, Manuel and Rossow, J. Eng. Mech. Div. ASCE 94, 1968).
+Load and displacement of the loaded point both reverse along the path (Lee, Manuel and Rossow, J. Eng. Mech. Div. ASCE 94, 1968).
 Reference: inextensible elastica by collocation, checked by shooting; with the stretch and shear of the original section the limit
 loads are 0.1 to 0.3 % lower.
 """
@@ -11,16 +11,16 @@ import ddg_warp as ddg
 
 LEG = 120.0  # cm
 EI = 1440.0  # t cm^2
-EA = 4.32e6  # t; a thousand times that of the section, so that the frame counts as inextensible
+EA = 4.32e6  # t; a thousand times that of the section, nearly inextensible
 LENGTH_UNIT = "cm"
 SOURCE = "inextensible elastica, collocation"
 
-# Load [t] at its stationary values, and how far the loaded point is then down and to the right [cm].
+# Stationary load [t], with downward and rightward displacement of the loaded point [cm].
 LIMITS = ((1.855874654, 48.73945421, 26.88685253), (-0.9421287454, 58.20048419, 90.21191386))
 
 
 def build(n: int = 60, stretch: float = EA) -> ddg.Scene:
-    """The frame in the plane of x and z: the column along z, the beam along x.
+    """Build the frame in the plane of x and z: the column along z, the beam along x.
 
     Args:
         n: edges of each of the two, a multiple of five
@@ -47,17 +47,17 @@ def build(n: int = 60, stretch: float = EA) -> ddg.Scene:
 
 
 def check(result) -> list[ddg.Check]:
-    """Both limit points, to what edges of this length can resolve."""
+    """Check both limit points within the discretisation error."""
     tolerance = min(ddg.Check.COARSEST, 5e-3 * max(1.0, (60.0 / (result.model.curves.counts[0] - 1)) ** 2))
     checks = []
-    met = [(point.load, point.values["v"], point.values["u"]) for point in result.path.limit_points]
-    met += [(np.nan,) * 3] * 2  # a limit that was not met fails
-    for name, values, reference in zip(("first", "second"), met, LIMITS, strict=False):
-        for what, measured, exact in zip(("load [t]", "v [cm]", "u [cm]"), values, reference, strict=True):
-            checks.append(ddg.Check(f"{name} limit, {what}", measured, exact, tolerance, SOURCE, relative=True))
+    limits = [(point.load, point.values["v"], point.values["u"]) for point in result.path.limit_points]
+    limits += [(np.nan,) * 3] * 2  # a limit that was not met fails
+    for name, values, reference in zip(("first", "second"), limits, LIMITS, strict=False):
+        for quantity, measured, exact in zip(("load [t]", "v [cm]", "u [cm]"), values, reference, strict=True):
+            checks.append(ddg.Check(f"{name} limit, {quantity}", measured, exact, tolerance, SOURCE, relative=True))
     return checks
 
 
 def benchmark() -> ddg.bench.Study:
-    """The first limit load over the edges of each leg."""
+    """Study the first limit load over the edges of each leg."""
     return ddg.bench.Study({"n": (20, 40, 60, 120)}, "first limit, load")

@@ -1,8 +1,9 @@
-"""Localised helix: a rod wound up by 27 turns buckles into a helix in its middle when its ends approach.
+"""Localised helix: a rod twisted by 27 turns buckles into a helix in its middle as its ends approach.
 
-The test of Bergou et al. (Discrete Elastic Rods, ACM Trans. Graph. 27, 2008): clamped ends, 27 turns, shortening 0.3. In the infinite
-rod (Coyne, IEEE J. Oceanic Eng. 15, 1990; van der Heijden & Thompson, Nonlinear Dynamics 21, 2000) the angle phi between tangent and
-axis, at most p, follows
+The test of Bergou et al. (Discrete Elastic Rods, ACM Trans. Graph. 27, 2008): clamped ends, 27 turns, shortening 0.3. In the
+infinite rod (Coyne, IEEE J. Oceanic Eng. 15, 1990; van der Heijden & Thompson, Nonlinear Dynamics 21, 2000) the angle phi between
+tangent and axis, at most p, follows
+
     (cos phi - cos p) / (1 - cos p) = tanh^2(s / s*) ,  s* = (2B / M) cot(p / 2) ,  T = M^2 / (2B (1 + cos p)) ,
     shortening D = (4B / M) sin p ,  end rotation R = M L / C + 2 p .
 """
@@ -13,17 +14,17 @@ import ddg_warp as ddg
 
 LENGTH = 9.29  # m
 B, C = 1.345, 0.789  # bending and twisting stiffness [N m^2]
-TAUT = 80.0  # N, pull at the start: above M^2 / 4B, so that the wound rod is straight
-NUDGE = 0.1  # N, in the middle; tells the rod where to buckle
+TAUT = 80.0  # N, initial tension above M^2 / 4B, at which the twisted rod is straight
+NUDGE = 0.1  # N, in the middle; localises the buckle
 SOURCE = "localised helix of the infinite rod (Coyne 1990)"
 
 
 def build(turns: float = 27.0, shortening: float = 0.3, axial: float = 1.0e6, n: int = 400) -> ddg.Scene:
-    """The rod along x, wound up and pulled taut; then its ends are let together.
+    """Build the rod along x, twisted under tension, with ends that then approach.
 
     Args:
         turns: turns of twist between the ends
-        shortening: approach of the ends [m], beyond what the tension stretches the rod
+        shortening: approach of the ends [m], beyond the stretch by tension
         axial: EA L^2 / B; the reference is inextensible
         n: edges of the rod, an even number
     """
@@ -35,8 +36,9 @@ def build(turns: float = 27.0, shortening: float = 0.3, axial: float = 1.0e6, n:
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=max(30, steps)))
     points = np.zeros((n + 1, 3))
     points[:, 0] = np.linspace(0.0, LENGTH, n + 1)
-    # An isotropic rod does not tell turns of its end from a natural twist the other way. With the latter, material frames do not
-    # turn from edge to edge; turned by 27 / 200 of a revolution they would cost a sixth of the bending stiffness.
+    # End rotation of an isotropic rod is equivalent to natural twist of opposite sign. With the latter, material frames
+    # do not rotate from edge to edge; rotations of 27 / 200 of a revolution would cost a sixth of the bending
+    # stiffness.
     rod = scene.add_rod(
         points,
         section=ddg.Stiffness(EA=EA, EI1=B, GJ=C, radius=0.03),
@@ -51,7 +53,7 @@ def build(turns: float = 27.0, shortening: float = 0.3, axial: float = 1.0e6, n:
 
 
 def exact(turns: float, shortening: float) -> tuple[float, float, float, float]:
-    """Largest angle p [rad], s* [m], moment [N m] and tension [N] on the branch that starts from the straight rod."""
+    """Return largest angle p [rad], s* [m], moment [N m] and tension [N] on the branch from the straight rod."""
     from scipy.optimize import brentq
 
     def moment(angle):
@@ -63,7 +65,7 @@ def exact(turns: float, shortening: float) -> tuple[float, float, float, float]:
 
 
 def envelope(state) -> tuple[np.ndarray, np.ndarray]:
-    """Middle s of every edge from the middle of the rod [m], and the angle phi of the edge to the axis [rad]."""
+    """Return the position s of edge midpoints from the middle [m], and their angle phi to the axis [rad]."""
     edges = np.diff(state.points(), axis=0)
     lengths = np.linalg.norm(edges, axis=1)
     s = (np.arange(len(edges)) + 0.5) * (LENGTH / len(edges)) - 0.5 * LENGTH
@@ -71,7 +73,7 @@ def envelope(state) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(model, state) -> tuple[float, float, float, float]:
-    """What `exact` gives: p and s* by least squares over all edges, moment and tension from what holds the last end."""
+    """Return the values of `exact`: p and s* by least squares over all edges, moment and tension from end reactions."""
     from scipy.optimize import curve_fit
 
     from ddg_warp.solve.tangent import Tangent
@@ -83,16 +85,16 @@ def measure(model, state) -> tuple[float, float, float, float]:
 
     (p, width, _), _ = curve_fit(cosine, s, np.cos(phi), (phi.max(), 0.05 * LENGTH, s[np.argmax(phi)]))
     tangent = Tangent(model)
-    held, place = (
+    reactions, positions = (
         tangent.gradient(state).reshape(-1, 4)[-2:],
         tangent.dofs(state).reshape(-1, 4)[-2:, :3],
     )  # end and ghost
-    moment = np.cross(place, held[:, :3]).sum(axis=0)[0] + held[0, 3]
-    return p, width, moment, held[:, 0].sum()
+    moment = np.cross(positions, reactions[:, :3]).sum(axis=0)[0] + reactions[0, 3]
+    return p, width, moment, reactions[:, 0].sum()
 
 
 def check(result) -> list[ddg.Check]:
-    """Envelope, moment and tension against the infinite rod."""
+    """Check envelope, moment and tension against the infinite rod."""
     scene = result.model.scene
     turns = -scene.batches[0].natural[2] * LENGTH / (2.0 * np.pi)
     points = result.state.points()
@@ -105,5 +107,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The moment over the nodes; the reference is that of an infinite rod."""
+    """Study the moment over the nodes; the reference is an infinite rod."""
     return ddg.bench.Study({"n": (200, 400, 800)}, "moment")

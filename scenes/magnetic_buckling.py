@@ -1,9 +1,12 @@
-"""Magnetic buckling: a hard-magnetic column, magnetised along its axis, in a field that points back along it.
+"""Magnetic buckling: a hard-magnetic column, magnetised along its axis, in an opposite field.
 
-The field's couple M A B sin(th) on the column is that of a dead force M A B at its free end on Euler's: clamped and free it buckles at
+The field's couple M A B sin(th) is that of a dead force M A B at the free end of Euler's column. Clamped and free it buckles at
+
     M A B L^2 / EI = (pi / 2)^2
-and then follows the elastica. With the angle of the tip th1 and k = sin(th1 / 2) (Love, Mathematical Theory of Elasticity, 1927, art.
+
+and then follows the elastica. With the tip angle th1 and k = sin(th1 / 2) (Love, Mathematical Theory of Elasticity, 1927, art.
 263),
+
     M A B L^2 / EI = K(k)^2 ,  deflection of the tip = 2 L k / K(k) ,  its height = L (2 E(k) / K(k) - 1) .
 """
 
@@ -13,7 +16,7 @@ import ddg_warp as ddg
 
 LENGTH = 1.0  # m
 EI = 1.0  # N m^2
-EA = 1.0e7  # N; so stiff that the column counts as inextensible
+EA = 1.0e7  # N; nearly inextensible
 AREA = 1.0e-4  # m^2
 MAGNETISATION = 1.0e5  # A/m
 CRITICAL = 0.25 * np.pi**2
@@ -22,10 +25,10 @@ BENT = "elastica, elliptic integrals"
 
 
 def build(over: float = 1.8, n: int = 50) -> ddg.Scene:
-    """The column along z.
+    """Build the column along z.
 
     Args:
-        over: field over that at which the column buckles
+        over: field over the critical field
         n: edges of the column
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2, analysis=ddg.Statics(load_steps=10))
@@ -38,7 +41,7 @@ def build(over: float = 1.8, n: int = 50) -> ddg.Scene:
 
 
 def exact(over: float) -> tuple[float, float]:
-    """Deflection and height of the tip [m] in a field beyond the critical one."""
+    """Return deflection and height of the tip [m] in a field beyond the critical one."""
     from scipy.optimize import brentq
     from scipy.special import ellipe, ellipk
 
@@ -48,17 +51,17 @@ def exact(over: float) -> tuple[float, float]:
 
 
 def critical_field(n: int, device: str = "cpu") -> float:
-    """M A B L^2 / EI at which the lowest eigenvalue of the tangent vanishes, for a column of n edges."""
+    """Return M A B L^2 / EI of a zero lowest eigenvalue, for a column of n edges."""
     model = build(1.0, n).build(device, "float64")
 
-    def straight(at):
-        return model, ddg.statics.solve(model, end=at, mode="follow")
+    def straight(load_factor):
+        return model, ddg.statics.solve(model, end=load_factor, mode="follow")
 
     return CRITICAL * ddg.stability.critical(straight, 0.9, 1.1)
 
 
 def check(result) -> list[ddg.Check]:
-    """The critical field, and the tip of the buckled column."""
+    """Check the critical field and the tip of the buckled column."""
     n = len(result.state.points()) - 1
     over = -result.scene.applied_field.value[2] * MAGNETISATION * AREA * LENGTH**2 / (EI * CRITICAL)
     tolerance = min(ddg.Check.COARSEST, 1.0 / n**2)
@@ -67,7 +70,8 @@ def check(result) -> list[ddg.Check]:
     if over > 1.0:
         x, _, z = result.state.points()[-1]
         deflection, height = exact(over)
-        # the deflection grows like the root of what is beyond the critical field, of which the mesh errs by its square
+        # the deflection grows like the root of the supercritical field, and the critical field has an error of order
+        # h^2
         near = min(ddg.Check.COARSEST, 3.0 / (n**2 * (over - 1.0)))
         checks.append(ddg.Check("deflection of the tip [m]", abs(x), deflection, near, BENT, relative=True))
         checks.append(ddg.Check("height of the tip [m]", z, height, near, BENT))
@@ -75,5 +79,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The critical field over the edges of the column."""
+    """Study the critical field over the edges of the column."""
     return ddg.bench.Study({"n": (20, 40, 80, 160)}, "critical field")

@@ -1,11 +1,13 @@
-"""Magnetic cantilever: a hard-magnetic beam, magnetised along its axis, turns into a field at any angle to it.
+"""Magnetic cantilever: a hard-magnetic beam, magnetised along its axis, bends into a field at any angle.
 
-A beam along x with magnetisation M along its tangent t = (cos th, sin th) in a uniform field B (cos a, sin a) has the energy
-int EI th'^2 / 2 - M A B cos(th - a) ds, so that with G = M A B L^2 / EI, the magnetic load over bending,
+A beam along x has the magnetisation M along its tangent (cos th, sin th). In a uniform field B (cos a, sin a) it has the energy
+int EI th'^2 / 2 - M A B cos(th - a) ds. With G = M A B L^2 / EI, the magnetic load over bending,
+
     th'' = G sin(th - a) / L^2 ,  th(0) = 0 ,  th'(L) = 0
+
 (Zhao, Kim, Cabrera, Ferracin, Nguyen and Dunn, J. Mech. Phys. Solids 124, 2019, 244; Wang, Kim, Guo and Zhao, J. Mech. Phys. Solids
-142, 2020, 104045). Across, a = 90 degrees, it is the elastica with a dead force G EI / L^2 at its tip. The tip of a beam that bends
-little turns by tan(a) (1 - 1 / cosh(sqrt(G cos a))), which is G / 2 across.
+142, 2020, 104045). Across, a = 90 degrees, it is the elastica with a dead force G EI / L^2 at its tip. For small bending the tip
+rotates by tan(a) (1 - 1 / cosh(sqrt(G cos a))), which is G / 2 across.
 """
 
 import numpy as np
@@ -14,18 +16,18 @@ import ddg_warp as ddg
 
 LENGTH = 1.0  # m
 EI = 1.0  # N m^2
-EA = 1.0e7  # N; so stiff that the beam counts as inextensible
+EA = 1.0e7  # N; nearly inextensible
 AREA = 1.0e-4  # m^2
 MAGNETISATION = 1.0e5  # A/m
 SOURCE = "EI th'' = M A B sin(th - a) as a boundary value problem"
 
 
 def build(load: float = 5.0, angle: float = 90.0, n: int = 50) -> ddg.Scene:
-    """The beam along x, in a field in the plane of x and z.
+    """Build the beam along x, in a field in the plane of x and z.
 
     Args:
         load: M A B L^2 / EI, the magnetic load over bending
-        angle: of the field from the axis of the beam [degrees], between -170 and 170
+        angle: angle of the field from the axis of the beam [degrees], between -170 and 170
         n: edges of the beam
     """
     if not abs(angle) <= 170.0:
@@ -43,7 +45,7 @@ def build(load: float = 5.0, angle: float = 90.0, n: int = 50) -> ddg.Scene:
 
 
 def exact(load: float, angle: float) -> tuple[float, float, float]:
-    """Angle [rad] and place (x, z) [m] of the tip, in a field at `angle` [rad] from the axis."""
+    """Return angle [rad] and position (x, z) [m] of the tip, in a field at `angle` [rad] from the axis."""
     from scipy.integrate import solve_bvp
 
     s = np.linspace(0.0, 1.0, 401)
@@ -56,26 +58,26 @@ def exact(load: float, angle: float) -> tuple[float, float, float]:
         def ends(first, last):
             return np.array([first[0], last[1], first[2], first[3]])
 
-        found = solve_bvp(rates, ends, s, y, tol=1e-9, max_nodes=20_000)
-        s, y = found.x, found.y
+        solution = solve_bvp(rates, ends, s, y, tol=1e-9, max_nodes=20_000)
+        s, y = solution.x, solution.y
     return y[0, -1], LENGTH * y[2, -1], LENGTH * y[3, -1]
 
 
 def linear(load: float, angle: float) -> float:
-    """Angle of the tip of a beam that bends little [rad]: th'' = G (th cos a - sin a)."""
+    """Return the tip angle [rad] for small bending: th'' = G (th cos a - sin a)."""
     root = np.sqrt(complex(load * np.cos(angle)))
     return float(np.tan(angle) * (1.0 - 1.0 / np.cosh(root)).real) if abs(root) > 1e-6 else 0.5 * load * np.sin(angle)
 
 
 def tip(state) -> tuple[float, float, float]:
-    """Angle [rad] and place (x, z) [m] of the tip; the last edge's middle is half an edge before it, where th' is zero."""
+    """Return angle [rad] and position (x, z) [m] of the tip; th' is zero in the half edge between midpoint and tip."""
     points = state.points()
     edge = points[-1] - points[-2]
     return float(np.arctan2(edge[2], edge[0])), points[-1, 0], points[-1, 2]
 
 
 def check(result) -> list[ddg.Check]:
-    """Angle and place of the tip against the boundary value problem, and of a hundredth of the field against the linear beam."""
+    """Check the tip against the boundary value problem, and at a hundredth of the field against the linear beam."""
     field = result.scene.applied_field.value
     load = np.linalg.norm(field) * MAGNETISATION * AREA * LENGTH**2 / EI
     angle = float(np.arctan2(field[2], field[0]))
@@ -99,5 +101,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The tip over the edges of the beam."""
+    """Study the tip over the edges of the beam."""
     return ddg.bench.Study({"n": (20, 40, 80, 160)}, "tip x")

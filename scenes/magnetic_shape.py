@@ -1,11 +1,11 @@
-"""Magnetic shape: a magnetic rod is brought from pose to pose, and to rest in each, by a field over time that is learned.
+"""Magnetic shape: an optimised field over time moves a magnetic rod to rest in a sequence of poses.
 
-A slender rod of silicone full of magnetised particles stands out from a wall, magnetised along itself. Poses are its equilibria in
-fields of three directions. A field that goes from one of these to the next carries the rod there, but it arrives with speed and
-swings on. The field at knots in time, linear between them, is learned: gradients of what is off when a pose is due, positions and
-velocities alike, go back through all steps to the field of every step (`controls={"field": ...}`). The scene is built with that field
-as a function of time, for a rod of more edges and in shorter steps than it was learned with. Source of the model: Zhao et al., J. Mech.
-Phys. Solids 124, 2019, 244; of control by shapes at rest alone: Lum et al., PNAS 113, 2016, E6007.
+A slender cantilever of silicone with magnetised particles is magnetised axially. Poses are its equilibria in fields of three
+directions. A field that moves linearly between these carries the rod there, but it arrives with speed and overshoots. The field at
+knots in time, linear between them, is optimised. Gradients of position and velocity errors at the due times go back through all
+steps to the field of every step (`controls={"field": ...}`). The scene is built with that field as a function of time, for a rod of
+more edges and in shorter steps. Source of the model: Zhao et al., J. Mech. Phys. Solids 124, 2019, 244; of control by equilibrium
+shapes alone: Lum et al., PNAS 113, 2016, E6007.
 """
 
 from functools import cache
@@ -23,17 +23,17 @@ MAGNETISATION = 1.0e5  # A/m
 POSES = np.array([[0.0, 0.0, 3.0], [-2.0, 3.0, 1.0], [1.0, -2.0, -3.0]])  # fields of the poses: M A B L^2 / EI
 APART = 0.5  # s, between poses
 KNOT = 0.05  # s, between values of the field
-EDGES, STEP = 16, 0.0125  # of the learner's rod, and its steps [s]
-TIME = 0.06  # s, by which velocities are compared with distances: a first period over 2 pi
+EDGES, STEP = 16, 0.0125  # edges and time step [s] of the optimised rod
+TIME = 0.06  # s, weight of velocities against distances: a first period over 2 pi
 ITERATIONS = 16
-BETTER = 20.0  # times closer than by going straight from field to field
-CLOSE = 5e-3  # of the length, from poses
+BETTER = 20.0  # required ratio of errors of the linear and the optimised field
+CLOSE = 5e-3  # tolerated error of a pose over the length
 END = APART * len(POSES)
 SOURCE = "equilibrium in the field of the pose"
 
 
 def build(n: int = 32) -> ddg.Scene:
-    """The rod in the field that was learned; building takes as long as learning it.
+    """Build the rod in the optimised field; building includes the optimisation.
 
     Args:
         n: edges, an even number
@@ -45,33 +45,33 @@ def build(n: int = 32) -> ddg.Scene:
 
 
 def over_time(values: np.ndarray):
-    """The field as a function of time, from its values at knots (knots, 3)."""
+    """Return the field as a function of time, from values at knots (knots, 3)."""
     times = KNOT * np.arange(len(values))
-    return lambda t: tuple(np.interp(t, times, own) for own in values.T)
+    return lambda t: tuple(np.interp(t, times, component) for component in values.T)
 
 
 def rod(n: int, field=(0.0, 0.0, 0.0), analysis=None) -> ddg.Scene:
-    """The rod of n edges along x in a field."""
+    """Return a scene of the rod of n edges along x in a field."""
     analysis = analysis or ddg.Dynamics(dt=0.5 * STEP, duration=END, scheme="implicit_midpoint")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=analysis)
     points = np.linspace((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), n + 1)
-    own = scene.add_rod(
+    index = scene.add_rod(
         points, section=ddg.Circle(RADIUS), material=MATERIAL, twist=False, natural="straight", name="rod"
     )
-    scene.clamp_end(own)
-    scene.magnetize(own, MAGNETISATION)
+    scene.clamp_end(index)
+    scene.magnetize(index, MAGNETISATION)
     scene.magnetic_field(field)
     return scene
 
 
 def unit() -> float:
-    """Field [T] of M A B L^2 / EI = 1."""
+    """Return the field [T] of M A B L^2 / EI = 1."""
     return ddg.Circle(RADIUS).stiffness(MATERIAL).EI1 / (MAGNETISATION * np.pi * RADIUS**2 * LENGTH**2)
 
 
 @cache
 def poses(n: int) -> np.ndarray:
-    """Nodes of a rod of n edges in every pose (poses, n + 1, 3) [m]."""
+    """Return nodes of a rod of n edges in every pose (poses, n + 1, 3) [m]."""
     fields = unit() * POSES
     scenes = (rod(n, tuple(field), ddg.Statics(load_steps=4)) for field in fields)
     return np.array([ddg.statics.solve(scene.build("cpu", "float64"), load_steps=4).points() for scene in scenes])
@@ -80,8 +80,9 @@ def poses(n: int) -> np.ndarray:
 @cache
 @_learn.one_thread()
 def learn() -> dict:
-    """The "field" at knots (knots, 3) [T] and that of the "guess", straight from pose to pose; how far the rod is from its poses when
-    they are due, "off", after every evaluation, the guess's first: root mean square of distances and of speeds x `TIME` [m].
+    """Optimise the "field" at knots (knots, 3) [T] from a "guess" that is linear between poses.
+
+    "off" is the root mean square of distances and of speeds x `TIME` at the due times [m], of every evaluation from the guess on.
     """
     import torch
 
@@ -90,50 +91,50 @@ def learn() -> dict:
     simulator = Simulator(rod(EDGES).build("cpu", "float64"), STEP, scheme="implicit_midpoint")
     wanted, steps = torch.tensor(poses(EDGES)), round(APART / STEP)
     times, knots = STEP * (np.arange(steps * len(POSES)) + 0.5), round(END / KNOT) + 1
-    shares = torch.tensor(np.maximum(0.0, 1.0 - np.abs(times[:, None] / KNOT - np.arange(knots))))
+    weights = torch.tensor(np.maximum(0.0, 1.0 - np.abs(times[:, None] / KNOT - np.arange(knots))))
     due = np.linspace(0.0, END, len(POSES) + 1)
-    guess = np.stack([np.interp(KNOT * np.arange(knots), due, [0.0, *own]) for own in POSES.T], axis=1)
+    guess = np.stack([np.interp(KNOT * np.arange(knots), due, [0.0, *component]) for component in POSES.T], axis=1)
 
     def loss(values):
-        fields = unit() * (shares @ values)
+        fields = unit() * (weights @ values)
         states = simulator.rollout(
             simulator.initial_state(), None, lambda k: {"field": fields[k]}, steps=len(times), save=steps
         )
-        apart = torch.stack([state.positions[0] for state in states]) - wanted
+        distances = torch.stack([state.positions[0] for state in states]) - wanted
         speeds = TIME * torch.stack([state.velocities[0] for state in states])
-        return ((torch.cat([apart, speeds]) / LENGTH) ** 2).sum(2).mean()
+        return ((torch.cat([distances, speeds]) / LENGTH) ** 2).sum(2).mean()
 
-    found, losses = _learn.minimise(loss, torch.tensor(guess), ITERATIONS, tolerance=1e-12)
-    return {"field": unit() * found.numpy(), "guess": unit() * guess, "off": LENGTH * np.sqrt(losses)}
+    optimised, losses = _learn.minimise(loss, torch.tensor(guess), ITERATIONS, tolerance=1e-12)
+    return {"field": unit() * optimised.numpy(), "guess": unit() * guess, "off": LENGTH * np.sqrt(losses)}
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far nodes are from every pose, and how fast they are x `TIME`, root mean square [m]; height of the tip [m]."""
+    """Return distances from every pose and speed x `TIME`, root mean squares [m], and height of the tip [m]."""
     points = state.points()
-    apart = ((points - poses(len(points) - 1)) ** 2).sum(2).mean(1) ** 0.5
+    distances = ((points - poses(len(points) - 1)) ** 2).sum(2).mean(1) ** 0.5
     speed = TIME * np.sqrt((state.velocities() ** 2).sum(1).mean())
-    found = {f"from pose {number + 1}": float(own) for number, own in enumerate(apart)}
-    return found | {"speed": float(speed), "tip": float(points[-1, 2])}
+    observed = {f"from pose {number + 1}": float(distance) for number, distance in enumerate(distances)}
+    return observed | {"speed": float(speed), "tip": float(points[-1, 2])}
 
 
 def arrived(times, observed) -> tuple[np.ndarray, np.ndarray]:
-    """How far a run was from each pose when it was due, and how fast it was x `TIME` (poses,) [m]."""
+    """Return the distance from each pose when due, and speed x `TIME` (poses,) [m]."""
     due = [int(np.argmin(np.abs(np.array(times) - APART * (k + 1)))) for k in range(len(POSES))]
-    apart = [observed[f"from pose {k + 1}"][at] for k, at in enumerate(due)]
-    return np.array(apart), np.array([observed["speed"][at] for at in due])
+    distances = [observed[f"from pose {k + 1}"][step] for k, step in enumerate(due)]
+    return np.array(distances), np.array([observed["speed"][step] for step in due])
 
 
 @cache
 def straight(n: int) -> tuple[np.ndarray, dict]:
-    """Times, and what is observed of a rod of n edges whose field goes straight from pose to pose."""
+    """Return times and observed values of a rod of n edges in the linear field."""
     from ddg_warp.run.simulate import simulate
 
-    found = simulate(rod(n, over_time(learn()["guess"])), device="cpu", observe=observe, progress=False)
-    return np.array(found.times), {name: np.array(values) for name, values in found.series.items()}
+    run = simulate(rod(n, over_time(learn()["guess"])), device="cpu", observe=observe, progress=False)
+    return np.array(run.times), {name: np.array(values) for name, values in run.series.items()}
 
 
 def check(result) -> list[ddg.Check]:
-    """Poses are met when they are due, at rest, and far better than by going straight from field to field."""
+    """Check that poses are reached on time, at rest, and far better than by the linear field."""
     result.learned = learn()
     names = [
         "furthest from a pose that is due [m]",
@@ -141,35 +142,35 @@ def check(result) -> list[ddg.Check]:
         "the same over going straight",
     ]
 
-    def met() -> list[ddg.Check]:
-        apart, speed = arrived(result.times, result.series)
+    def reached() -> list[ddg.Check]:
+        distances, speed = arrived(result.times, result.series)
         before = arrived(*straight(len(result.state.points()) - 1))
         return [
-            ddg.Check(names[0], apart.max(), 0.0, CLOSE * LENGTH, SOURCE),
+            ddg.Check(names[0], distances.max(), 0.0, CLOSE * LENGTH, SOURCE),
             ddg.Check(names[1], speed.max(), 0.0, CLOSE * LENGTH, "at rest"),
-            ddg.Check(names[2], np.hypot(apart, speed).max() / np.hypot(*before).max(), 0.0, 1.0 / BETTER, SOURCE),
+            ddg.Check(names[2], np.hypot(distances, speed).max() / np.hypot(*before).max(), 0.0, 1.0 / BETTER, SOURCE),
         ]
 
-    return once_reached(result, END, names, met)
+    return once_reached(result, END, names, reached)
 
 
 def picture(result, frames) -> dict:
-    """The rod at first and when its poses are due, which balls stand for."""
+    """Draw the rod at the start and at the due times, with poses as balls."""
     from ddg_warp.run.simulate import simulate
 
     n = len(result.state.points()) - 1
     ball, triangles = meshes.sphere(2)
     balls = poses(n)[:, 2 :: max(1, n // 8)].reshape(-1, 1, 3) + RADIUS * ball
-    own = (triangles[None] + len(ball) * np.arange(len(balls))[:, None, None]).reshape(-1, 3)
+    cells = (triangles[None] + len(ball) * np.arange(len(balls))[:, None, None]).reshape(-1, 3)
     shapes = {0.0: result.model.state().points()}
     for due in APART * (1.0 + np.arange(len(POSES))):
         scene = rod(n, over_time(learn()["field"]), ddg.Dynamics(0.5 * STEP, due, "implicit_midpoint"))
         shapes[due] = simulate(scene, device="cpu", progress=False).state.points()
-    return {"points_by_time": shapes, "bodies": {0.0: (balls.reshape(-1, 3), own)}, "field": None}
+    return {"points_by_time": shapes, "bodies": {0.0: (balls.reshape(-1, 3), cells)}, "field": None}
 
 
 def plot(result) -> dict:
-    """Height of the tip over time, by the field that was learned and by going straight from field to field, and in the poses."""
+    """Plot the height of the tip over time in the optimised and the linear field, and in the poses."""
     n = len(result.state.points()) - 1
     before, series = straight(n)
     due = APART * (1.0 + np.arange(len(POSES)))
@@ -186,5 +187,5 @@ def plot(result) -> dict:
 
 
 def benchmark() -> ddg.bench.Study:
-    """Distance from the poses of rods of more edges than it was learned with, in the same steps."""
+    """Study the distance from the poses over the edges, in the steps of the optimisation."""
     return ddg.bench.Study({"n": (10, 20, 40)}, "furthest from a pose")

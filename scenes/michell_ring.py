@@ -1,8 +1,7 @@
-"""Michell ring: a ring with twist in it leaves its plane.
+"""Michell ring: a twisted ring buckles out of its plane.
 
-A straight rod is bent to a circle and closed with a total twist Tw. The circle is stable up to Tw = 2 pi sqrt(3) B / C, whatever its
-radius (Michell 1889; Zajac, J. Appl. Mech. 29, 1962). Here the frames are closed without a jump and the twist is one that the rod
-would have when free.
+A straight rod is bent to a circle and closed with a total twist Tw. The circle is stable up to Tw = 2 pi sqrt(3) B / C, whatever
+its radius (Michell 1889; Zajac, J. Appl. Mech. 29, 1962). Here the frames are closed without a jump and the twist is a natural one.
 """
 
 import numpy as np
@@ -12,12 +11,12 @@ from ddg_warp.ask.buckled import buckled_points
 
 RADIUS = 1.0  # m
 B = 1.0  # bending stiffness [N m^2]
-EA = 1.0e7  # N; so stiff that the ring counts as inextensible
+EA = 1.0e7  # N; nearly inextensible
 SOURCE = "2 pi sqrt(3) B / C (Michell 1889, Zajac 1962)"
 
 
 def build(twist: float = 0.95, ratio: float = 1.0, n: int = 200) -> ddg.Scene:
-    """The ring in the plane of x and y.
+    """Build the ring in the plane of x and y.
 
     Args:
         twist: total twist over the critical one
@@ -37,7 +36,7 @@ def build(twist: float = 0.95, ratio: float = 1.0, n: int = 200) -> ddg.Scene:
         natural=(0.0, 0.0, -twist * exact(ratio) / length),
         name="ring",
     )
-    # Six components keep it from moving as a rigid body, and an angle its frames from turning along: none of them strains it.
+    # Six fixed components suppress rigid-body modes, and a fixed twist angle the uniform spin, without strain.
     scene.fix(ring, [0])
     scene.fix(ring, [n // 4], "yz")
     scene.fix(ring, [n // 2], "z")
@@ -46,12 +45,12 @@ def build(twist: float = 0.95, ratio: float = 1.0, n: int = 200) -> ddg.Scene:
 
 
 def exact(ratio: float) -> float:
-    """Critical twist [rad] for a ratio C / B."""
+    """Return the critical twist [rad] for a ratio C / B."""
     return 2.0 * np.pi * np.sqrt(3.0) / ratio
 
 
 def critical_twist(ratio: float, n: int, device: str = "cpu") -> float:
-    """Total twist [rad] at which the lowest eigenvalue of the tangent vanishes, for a ring of n edges."""
+    """Return the total twist [rad] of a zero lowest eigenvalue, for a ring of n edges."""
     from ddg_warp.solve import stability, statics
 
     def twisted(fraction):
@@ -62,7 +61,7 @@ def critical_twist(ratio: float, n: int, device: str = "cpu") -> float:
 
 
 def check(result) -> list[ddg.Check]:
-    """The critical twist against the closed form, to what edges of this length can resolve."""
+    """Check the critical twist against the closed form, within the discretisation error."""
     section = result.model.scene.batches[0].section
     n = result.model.curves.counts[0]
     ratio = section.GJ / section.EI1
@@ -75,11 +74,11 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The critical twist over the nodes of the ring."""
+    """Study the critical twist over the nodes of the ring."""
     return ddg.bench.Study({"n": (52, 100, 200)}, "critical twist")
 
 
 def picture(result, frames) -> dict:
-    """The mode in which the ring leaves its plane, beside the ring."""
+    """Draw the out-of-plane buckling mode next to the ring."""
     shapes = {0.0: result.state.points(), 1.0: buckled_points(result.model, result.state, 0.3 * RADIUS)}
     return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}

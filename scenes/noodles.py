@@ -1,6 +1,6 @@
-"""Noodles are poured into a bowl: 9 strands of 97 nodes, or 121 of 961 with 4.8 m each.
+"""Noodles: strands are poured into a bowl, 9 of 97 nodes, or 121 of 961 with 4.8 m each.
 
-They hang above the bowl, straight and side by side, and fall into it end first. Their weight bends them over (EI / w)^(1/3) = 6 cm,
+They hang above the bowl, straight and side by side, and fall into it end first. Weight bends them over (EI / w)^(1/3) = 6 cm,
 so that they coil and lie down in loops on each other. The bowl is a mesh, half of a sphere.
 """
 
@@ -13,15 +13,15 @@ from ddg_warp.scenes import _touching
 EDGE = 5e-3  # m
 SPACING = 0.05  # m, between strands
 RADIUS = 3e-3  # m
-GAP = 3e-3  # m, below which surfaces push each other
+GAP = 3e-3  # m, activation distance
 CLEAR = 0.02  # m, between the bowl and the lowest ends
 BENDING, STRETCHING, MASS = 2.44e-3, 1e4, 1.0  # N m^2, N, kg/m
 FRICTION = 0.05
-CONTACT = 3e3  # N/m: strands that fall end first press on what they land on with a hundred times their weight
-RTOL = 3e-2  # of a rod's weight, to which forces balance: nodes are off by a fiftieth of what half the step changes
-SLIP = 1e-2  # m/s, from which on friction is all there
+CONTACT = 3e3  # N/m: strands that fall end first press with a hundred times their weight
+RTOL = 3e-2  # relative to the weight of a rod: position errors are a fiftieth of the change by half the step
+SLIP = 1e-2  # m/s, stick threshold of friction
 WALL = 1e-3  # m, half the thickness of the bowl
-CELLS = 0.06  # m, about the sides of the bowl's triangles
+CELLS = 0.06  # m, approximate side of the bowl's triangles
 
 
 def build(
@@ -33,15 +33,15 @@ def build(
     twist: bool = True,
     seed: int = -1,
 ) -> ddg.Scene:
-    """Strands on a square grid above the bowl.
+    """Build strands on a square grid above the bowl.
 
     Args:
-        count: strands
-        nodes: of a strand, 5 mm apart
-        bowl: its radius [m]; the large case has 1.1
+        count: number of strands
+        nodes: nodes of a strand, 5 mm apart
+        bowl: radius of the bowl [m]; the large case has 1.1
         dt: time step [s]
-        duration: of the run [s]; the large case takes 4 s
-        twist: whether strands have twist, of which straight round ones with free ends feel nothing
+        duration: duration of the run [s]; the large case takes 4 s
+        twist: whether strands have twist, which does not act on straight round ones with free ends
         seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     side = int(np.ceil(np.sqrt(count)))
@@ -56,7 +56,7 @@ def build(
     points = np.empty((count, nodes, 3))
     points[..., :2] = across[:, None]
     points[..., 2] = above[:, None] + EDGE * np.arange(nodes)
-    # no strand is as straight as a line: each is off by a part of its radius, in a direction of its own
+    # each strand is bowed by a fraction of its radius, in its own direction
     bow = 0.2 * RADIUS * np.sin(np.linspace(0.0, 3.0 * np.pi, nodes))
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number
     points[..., :2] += bow[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
@@ -86,18 +86,18 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """As of all scenes of contact, and how far nodes are from the middle of the bowl [m]."""
-    found = _touching.observe(model, state)
-    return {**found, "farthest": float(np.linalg.norm(below(state.points()), axis=1).max(initial=0.0))}
+    """Return `_touching.observe` with the largest distance of nodes from the centre of the bowl [m]."""
+    observed = _touching.observe(model, state)
+    return {**observed, "farthest": float(np.linalg.norm(below(state.points()), axis=1).max(initial=0.0))}
 
 
 def below(points: np.ndarray) -> np.ndarray:
-    """Those of points (n, 3) that are below the rim."""
+    """Return the points (n, 3) below the rim."""
     return points[points[:, 2] < 0.0]
 
 
 def check(result) -> list[ddg.Check]:
-    """No crossing and no overlap, all inside of the bowl, energy; and the bowl carries the weight, but for what friction does."""
+    """Check no crossing, no overlap, all nodes inside the bowl, energy, and the weight on the bowl except for friction."""
     bowl = float(np.abs(result.model.scene.obstacles[0].shape.points[:, 2]).max())
     inside = max(result.series["farthest"]) / (bowl - RADIUS)
     return [
@@ -109,7 +109,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """How deep the strands' centre is at 0.3 s, over steps."""
+    """Study the height of the strands' centre at 0.3 s over steps."""
     return ddg.bench.Study(
         {"dt": (1 / 60, 1 / 120, 1 / 240)},
         lambda result: result.state.points()[:, 2].mean(),
@@ -120,9 +120,9 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """Before, while they are poured, and at the end, in the bowl."""
+    """Draw the strands before, during and after pouring, in the bowl."""
     shape = result.model.scene.obstacles[0].shape
-    back = shape.points[shape.cells].mean(axis=1)[:, 1] > 0.0  # the half that hides nothing
+    back = shape.points[shape.cells].mean(axis=1)[:, 1] > 0.0  # the half that occludes nothing
     times = list(frames)
     times = times[0], times[len(times) // 2], times[-1]
     return {

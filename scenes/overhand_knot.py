@@ -1,25 +1,25 @@
-"""An overhand knot of n turns in a long rod is drawn tight: n = 1 is the trefoil, n = 2 the double overhand knot.
+"""Overhand knot: a knot of n turns in a long rod is drawn tight; n = 1 is the trefoil, n = 2 the double overhand knot.
 
 A loose knot is a loop of radius R and a braid, where the two strands wind about each other by some 2 n + 1 half turns. Drawn by a
 traction F, a rod of radius h and bending stiffness B needs, by matched expansions in epsilon = sqrt(h / R),
 
     F h^2 / B = epsilon^4 / 2 + c epsilon^5 + mu P h^2 / B ,    P h^2 / B = sigma epsilon^3 + O(epsilon^4) :
 
-half of the loop's curvature squared, what the braid changes of the energy, and friction of the normal force P in the braid (Audoly,
-Clauvelin and Neukirch, Elastic knots, PRL 99, 164301, 2007; sigma = 0.492 of the trefoil). In the braid half the distance of the
-strands is h v(s / sqrt(h R)), a curve about the unit disc that makes the integral of |v''|^2 / 2 least, with curvatures of opposite
-sign and size 1/2 beyond: sigma is the total force of the disc on it and c comes of its energy (by finite
-differences, `tests/accuracy/test_braid.py`). Another turn adds 2 pi / 12^(3/4) to sigma, nearly, as the braid becomes a helix.
+half of the loop's squared curvature, the energy of the braid, and friction of the normal force P in the braid. Source: Audoly,
+Clauvelin and Neukirch, Elastic knots, PRL 99, 164301, 2007; sigma = 0.492 of the trefoil. In the braid half the distance of the
+strands is h v(s / sqrt(h R)). This curve around the unit disc minimises the integral of |v''|^2 / 2, with curvatures of opposite
+sign and size 1/2 beyond. Here sigma is the total force of the disc on it, and c follows from its energy (by finite
+differences, `tests/accuracy/test_braid.py`). Another turn adds nearly 2 pi / 12^(3/4) to sigma, as the braid becomes a helix.
 
-Long braids have a law of their own (Jawed, Dieleman, Audoly and Reis, PRL 115, 118302, 2015; `_knots`). It is of many turns: in a
-loose knot its sigma is n times 2 pi / 12^(3/4), that of the braid computed here n - 0.495 and n - 0.494 times, as the ends of the
-braid take half a turn from the helix. The law is therefore given n - 1/2 turns. It leaves out that friction's traction bends the
-tails, which shortens the braid: of two turns it makes the normal force a tenth more with mu = 0.02 and half more with 0.3. Where
-this is a small part of friction, what traction is above the elastic part is compared with the law; everywhere, all of the
-traction with a braid between tails that bend.
+Long braids have another law (Jawed, Dieleman, Audoly and Reis, PRL 115, 118302, 2015; `_knots`), for many turns. In a loose knot
+its sigma is n times 2 pi / 12^(3/4). The braid computed here has n - 0.495 and n - 0.494 times that, as the ends of the braid take
+half a turn from the helix. The law is therefore evaluated at n - 1/2 turns. It leaves out that friction's traction bends the tails,
+which shortens the braid: at two turns the normal force grows by a tenth with mu = 0.02 and by half with 0.3. Where this effect is
+small, traction above the elastic one is compared with the law. In all cases, total traction is compared with a braid between
+bending tails.
 
-R is the rod's length less the distance of its ends over 2 pi, h half of the distance at which strands touch. Edges grow along the rod,
-so that nodes of one strand pass those of the other at different times: by equal ones they would lock.
+R is the rod's length minus the distance of its ends over 2 pi, h half of the distance of strands in contact. Edges grow along the
+rod, so that nodes of one strand pass the other's at different times; equal edges would lock.
 """
 
 import numpy as np
@@ -32,16 +32,16 @@ RADIUS = 1e-3  # m
 B = 1e-4  # N m^2
 STIFF = 10.0  # EA h^2 / B
 RANGE = 0.4 * RADIUS  # m, activation distance
-CLOSE = 1.15  # radii, half the distance of the strands at first
-LOOSE = 300.0  # R / h of one turn at first
-TAIL = 0.7  # length of either end beyond the loop over R at first
-GROWS = 0.3  # edges grow by as much either way from the middle of the rod
-STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
-INERTIA = 1e-3  # of what moves, over the traction
-SATURATED = 0.2  # velocity of the friction law over the slowest with which the strands slide
-SETTLED = 0.1  # part of the run after which it is compared
+CLOSE = 1.15  # radii, initial half distance of the strands
+LOOSE = 300.0  # initial R / h of one turn
+TAIL = 0.7  # initial length of either end beyond the loop, over R
+GROWS = 0.3  # relative growth of edges either way from the middle of the rod
+STEP_TIME = 1.0  # s, long against all periods: motion is quasi-static
+INERTIA = 1e-3  # inertial force over the traction
+SATURATED = 0.2  # stick threshold over the slowest sliding speed of strands
+SETTLED = 0.1  # fraction of the run after which results are compared
 LATE = 0.5  # the same for long braids
-UNBENT = 0.05  # of friction, that tails which bend may change where Jawed's law is compared
+UNBENT = 0.05  # largest effect of bending tails on friction for the comparison with Jawed's law
 SIGMA = {1: 0.492, 2: 1.468}  # P h^2 / (B epsilon^3)
 BRAID = {1: 0.472, 2: 1.402}  # c
 SOURCE = "Audoly, Clauvelin and Neukirch, 2007"
@@ -58,12 +58,12 @@ NAMES = (
 def build(
     n: int = 1, friction: float = 0.1, tighter: float = 4.0, edge: float = 2.0, steps: int = 150, seed: int = -1
 ) -> ddg.Scene:
-    """The knot, its ends along x and its loop in the plane of x and y.
+    """Build the knot, its ends along x and its loop in the plane of x and y.
 
     Args:
         n: turns, 1 or 2
-        friction: friction coefficient; without any, nothing keeps the knot from sliding along the rod and off its end
-        tighter: by what R shrinks from 300 n^2 radii of the rod
+        friction: friction coefficient; without friction the knot slides off the end of the rod
+        tighter: ratio by which R shrinks from 300 n^2 radii of the rod
         edge: length of an edge in the middle over n radii of the rod
         steps: time steps
         seed: seed of the initial jitter of nodes, a twentieth of the activation distance; no jitter below 0
@@ -97,33 +97,34 @@ def build(
 
     scene.fix(rod, [0], motion=ddg.Motion(translation=lambda t: (-drawn(t), 0.0, 0.0)))
     scene.fix(rod, [-1], motion=ddg.Motion(translation=lambda t: (drawn(t), 0.0, 0.0)))
-    # what touches pushes with some B h n / R^2 an edge, and is to keep the strands about half of the range apart
+    # contacts carry some B h n / R^2 an edge at a gap of about half the activation distance
     stiffness = 3.0 * B * n / R**2 / RADIUS
     scene.contact(range=RANGE, stiffness=stiffness, friction=friction, velocity=SATURATED * speed / tighter)
     return scene
 
 
 def tied(n: int, R: float, edge: float) -> np.ndarray:
-    """Points (m, 3) [m] of a loose knot: two straight ends, a circle of radius R [m], and strands that wind about each other where
-    these touch. Edges have a length [m] in the middle of the rod.
+    """Return points (m, 3) [m] of a loose knot with edges of a length [m] in the middle of the rod.
+
+    It consists of two straight ends, a circle of radius R [m], and strands that wind about each other where these meet.
     """
     around, reach = 0.6 * R, (3.8 + 5.86 * (n - 1)) * np.sqrt(RADIUS * R)
     x = np.linspace(-around, around, 8001)
     height = R - np.sqrt(R**2 - x**2)
-    share = np.clip(0.5 * (x / min(reach, 0.9 * around) + 1.0), 0.0, 1.0)
-    angle = (2 * n + 1) * np.pi * share**2 * (3.0 - 2.0 * share)
-    apart = np.hypot(height, 2.0 * CLOSE * RADIUS * (1.0 - (x / around) ** 2) ** 2)
-    half = 0.5 * apart[:, None] * np.stack([0.0 * x, np.cos(angle), np.sin(angle)], axis=1)
+    fraction = np.clip(0.5 * (x / min(reach, 0.9 * around) + 1.0), 0.0, 1.0)
+    angle = (2 * n + 1) * np.pi * fraction**2 * (3.0 - 2.0 * fraction)
+    distance = np.hypot(height, 2.0 * CLOSE * RADIUS * (1.0 - (x / around) ** 2) ** 2)
+    half = 0.5 * distance[:, None] * np.stack([0.0 * x, np.cos(angle), np.sin(angle)], axis=1)
     middle = np.stack([x, 0.5 * height, 0.0 * x], axis=1)
-    turn = np.linspace(np.arcsin(0.6), 2.0 * np.pi - np.arcsin(0.6), 8001)[1:-1]
-    loop = R * np.stack([np.sin(turn), 1.0 - np.cos(turn), 0.0 * turn], axis=1)
+    arc = np.linspace(np.arcsin(0.6), 2.0 * np.pi - np.arcsin(0.6), 8001)[1:-1]
+    loop = R * np.stack([np.sin(arc), 1.0 - np.cos(arc), 0.0 * arc], axis=1)
     end = np.zeros((2001, 3))
     end[:, 0] = np.linspace(-TAIL * R, 0.0, 2001) - around
     curve = np.concatenate([end[:-1], middle - half, loop, middle + half, -end[-2::-1]])
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
     k = np.linspace(0.0, 1.0, int(np.ceil(along[-1] / edge)) + 1)
-    place = (k - GROWS * k * (1.0 - k)) * along[-1]
-    return np.stack([np.interp(place, along, component) for component in curve.T], axis=1)
+    position = (k - GROWS * k * (1.0 - k)) * along[-1]
+    return np.stack([np.interp(position, along, component) for component in curve.T], axis=1)
 
 
 def _inner(points: np.ndarray) -> np.ndarray:
@@ -131,22 +132,22 @@ def _inner(points: np.ndarray) -> np.ndarray:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Traction F [N], normal force P in the braid [N], R [m], half of the distance of strands that touch, and the smallest gap [m]."""
-    points, found = state.points().reshape(-1, 3), model.contacts(state)
+    """Return traction F [N], normal force P in the braid [N], R [m], half distance of strands in contact, and smallest gap [m]."""
+    points, contacts = state.points().reshape(-1, 3), model.contacts(state)
     first, last = (np.reshape(reaction.force, (-1, 3))[0] for reaction in model.reactions(state))
-    push = np.linalg.norm(found.force, axis=1)
+    forces = np.linalg.norm(contacts.force, axis=1)
     slack = np.linalg.norm(np.diff(points, axis=0), axis=1).sum() - np.linalg.norm(points[-1] - points[0])
     return {
         "traction": 0.5 * (last[0] - first[0]),
-        "normal": push.sum(),
+        "normal": forces.sum(),
         "radius": slack / (2.0 * np.pi),
-        "half": RADIUS + 0.5 * float((push * found.gap).sum() / max(push.sum(), 1e-300)),
+        "half": RADIUS + 0.5 * float((forces * contacts.gap).sum() / max(forces.sum(), 1e-300)),
         "gap": _touching.smallest_gap(model, state),
     }
 
 
 def check(result) -> list[ddg.Check]:
-    """Traction against that of the loose knot, normal force against its limit, and both laws of long braids."""
+    """Check traction against the loose knot, normal force against its limit, and both laws of long braids."""
     checks = once_reached(result, result.model.scene.analysis.duration, NAMES, lambda: _checks(result))
     return checks + _touching.kept_apart(result)
 
@@ -157,31 +158,31 @@ def _checks(result) -> list[ddg.Check]:
     n = round(float(np.sqrt(R[0] / RADIUS / LOOSE)))
     epsilon, traction, normal = np.sqrt(h / R), traction * h**2 / B, normal * h**2 / B
     elastic = 0.5 * epsilon**4 + BRAID[n] * epsilon**5
-    settled, late = times > SETTLED * times[-1], times > LATE * times[-1]
+    settled, second_half = times > SETTLED * times[-1], times > LATE * times[-1]
     loose = (traction / (elastic + friction * normal))[settled].mean()
     limit = np.polyfit(epsilon[settled], (normal / epsilon**3)[settled], 1)[1]
 
-    turns, slack = n - 0.5, 2.0 * np.pi * (R / h)[late]
+    turns, slack = n - 0.5, 2.0 * np.pi * (R / h)[second_half]
     law = np.array([_knots.jawed(turns, each, friction) for each in slack])
     drawn, pressed = np.array([_knots.drawn(turns, each, friction) for each in slack]).T
-    ratio, bent = ((traction - elastic)[late] / law).mean(), (friction * pressed / law).mean()
+    ratio, bent = ((traction - elastic)[second_half] / law).mean(), (friction * pressed / law).mean()
     return [
         ddg.Check(NAMES[0], loose, 1.0, 0.1, SOURCE, True),
         ddg.Check(NAMES[1], limit, SIGMA[n], 0.1, SOURCE, True),
         ddg.Check(NAMES[2], ratio, 1.0, 0.1, LONG, True)
         if abs(bent - 1.0) < UNBENT
         else ddg.Check.skip(NAMES[2], f"{ratio:.3f}, of which tails that bend explain {bent:.3f}"),
-        ddg.Check(NAMES[3], (traction[late] / drawn).mean(), 1.0, 0.1, BENT, True),
+        ddg.Check(NAMES[3], (traction[second_half] / drawn).mean(), 1.0, 0.1, BENT, True),
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The normal force in the braid over the length of edges."""
+    """Study the normal force in the braid over the length of edges."""
     return ddg.bench.Study({"edge": (8.0, 4.0, 2.0)}, "P h^2 / (B epsilon^3)", whole=True)
 
 
 def picture(result, frames) -> dict:
-    """The second half of the run, without the ends of the rod."""
+    """Draw the second half of the run, without the ends of the rod."""
     shown = {t: points.copy() for t, points in frames.items() if t >= 0.5 * max(frames)}
     reach = 0.9 * np.ptp(shown[min(shown)][:, 1])
     for points in shown.values():

@@ -1,11 +1,11 @@
-"""Parachute: a canopy under pressure, its lines and a payload, falling at a steady speed.
+"""Parachute: a canopy under pressure, its lines and a payload descend at a steady speed.
 
-The pressure follows the canopy; drag of everything else is proportional to mass, so that all accelerations die out. Then, with M the
-whole mass, m that of the payload, v the speed of descent and alpha the damping,
+The pressure follows the canopy; drag of everything else is proportional to mass, so that all accelerations decay. Then, with M the
+total mass, m the payload, v the speed of descent and alpha the damping,
 
     M (g - alpha v) = p A ,        sum over lines of tension times cosine = m (g - alpha v) ,
 
-A the canopy's area seen from above.
+with A the canopy's area seen from above.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ CLOTH = ddg.Material(young=2.0e6, poisson=0.3, density=400.0, viscosity=0.02)
 GRAVITY = 9.81  # m/s^2
 DAMPING = 2.0  # 1/s
 STEADY = "steady descent"
-SETTLED = 4.0  # s; it sinks steadily from then on
+SETTLED = 4.0  # s; time of steady descent
 
 
 def build(
@@ -32,13 +32,13 @@ def build(
     duration: float = 4.0,
     dt: float = 0.02,
 ) -> ddg.Scene:
-    """A shallow canopy with lines from its rim to a payload, let go with slack-free lines.
+    """Build a shallow canopy with straight lines from the rim to a payload, released from rest.
 
     Args:
         rings: rings of the canopy's mesh, six times as many vertices around the rim
-        lines: lines, a divisor of the vertices around the rim
+        lines: number of lines, a divisor of the vertices around the rim
         payload: mass of the payload [kg]
-        pressure: on the canopy [Pa]
+        pressure: pressure on the canopy [Pa]
         duration: end of the run [s]
         dt: time step [s]
     """
@@ -67,7 +67,7 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """Speed of descent of payload and canopy [m/s], and the canopy's area seen from above [m^2]."""
+    """Return speed of descent of payload and canopy [m/s], and the canopy's area seen from above [m^2]."""
     velocity, points = (np.reshape(v, (-1, 3)) for v in (state.velocities(), state.points()))
     rods = int(model.curves.counts.sum())
     corners = points[model.surfaces.triangles]
@@ -80,7 +80,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Steady descent: canopy and lines carry what they must."""
+    """Check lift and line tensions in steady descent."""
     names = (
         "speed of the canopy over that of the payload",
         "lift over M (g - alpha v)",
@@ -90,7 +90,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def descent(result, names) -> list[ddg.Check]:
-    """The checks of a canopy that has settled."""
+    """Return the checks of a steady canopy."""
     model, state = result.model, result.state
     host, last = model.net.host, {name: values[-1] for name, values in result.series.items()}
     total = float(host.mass[: host.nodes, 2].sum())
@@ -98,8 +98,8 @@ def descent(result, names) -> list[ddg.Check]:
     effective = GRAVITY - DAMPING * last["payload"]
     lift = model.scene.pressures[0].pressure[0] * last["area"]
     tension = model.stresses(state)["rod_stretch"]
-    points, at, pull = state.points().reshape(-1, 3), np.cumsum(model.curves.counts), 0.0
-    for end, values in zip(at, tension, strict=True):
+    points, ends, pull = state.points().reshape(-1, 3), np.cumsum(model.curves.counts), 0.0
+    for end, values in zip(ends, tension, strict=True):
         edge = points[end - 2] - points[end - 1]
         pull += float(values[-1, 0] * edge[2] / np.linalg.norm(edge))
     return [
@@ -110,12 +110,12 @@ def descent(result, names) -> list[ddg.Check]:
 
 
 def _last_edges(model) -> list[float]:
-    """Rest lengths of the edges at the payload [m]."""
+    """Return rest lengths of the edges at the payload [m]."""
     return [float(np.linalg.norm(batch.points[0, -1] - batch.points[0, -2])) for batch in model.scene.batches]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The speed of payload and canopy at 2 s over steps, rings and tolerances, against a finer canopy in shorter steps."""
+    """Study the speed of payload and canopy at 2 s over steps, rings and tolerances, against a finer run."""
     return ddg.bench.Study(
         {"dt": (0.04, 0.02, 0.01), "rings": (3, 6), "rtol": (1e-4, 1e-8)},
         lambda result: [result.series[name][-1] for name in ("payload", "canopy")],

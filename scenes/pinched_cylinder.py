@@ -1,7 +1,7 @@
 """Pinched cylinder: two forces crush a thin cylinder between rigid diaphragms.
 
-Case 3.6 of Sze, Liu and Lo (2004). At small loads the wall dips by 164.24 P / (E h) (Lindberg, Olson and Cowper 1969), in a dimple a
-tenth of the radius wide, for which the mesh is graded; at larger loads it snaps from fold to fold.
+Case 3.6 of Sze, Liu and Lo (2004). At small loads the wall dips by 164.24 P / (E h) (Lindberg, Olson and Cowper 1969). The dimple
+is a tenth of the radius wide, and the mesh is graded for it; at larger loads it snaps from fold to fold.
 """
 
 import numpy as np
@@ -24,12 +24,12 @@ def build(
     membrane: str = "flat",
     steps: int = 40,
 ) -> ddg.Scene:
-    """An eighth of the cylinder about z, pressed along x.
+    """Build an eighth of the cylinder about z, pressed along x.
 
     Args:
         n: cells around a quarter and along half of the cylinder
         load: fraction of the load
-        grading: how much wider than the mean the cells would be without it, under the force; 1 for an even mesh
+        grading: ratio of even to graded cell width under the force; 1 for an even mesh
         pattern: how cells become triangles: right, alternating, crossed or jittered
         membrane: flat or curved, see Scene.add_shell; here, where a dimple bends the wall, flat ones are twice as exact
         steps: load steps
@@ -45,12 +45,12 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """Displacement under the force, inwards [m]."""
+    """Return the inward displacement under the force [m]."""
     return {"inwards": -_sze.displacement(model, state, 0, 0)}
 
 
 def compliance(model) -> float:
-    """w E h / P of the cylinder at rest, from the tangent there."""
+    """Return w E h / P of the cylinder at rest, from the tangent there."""
     from ddg_warp.solve.direct import Factorisation
     from ddg_warp.solve.tangent import Tangent
 
@@ -62,13 +62,13 @@ def compliance(model) -> float:
 
 
 def check(result) -> list[ddg.Check]:
-    """Compliance at rest, to 4 % at 12 cells: the error of a point force falls with the size of the cells under it."""
+    """Check the compliance at rest, to 4 % at 12 cells: a point force has an error of the size of its cells."""
     name = "w E h / P at rest"
     return [ddg.Check(name, compliance(result.model), LINEAR, 0.04, SOURCE, relative=True)]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The compliance under a small force over meshes and membranes."""
+    """Study the compliance under a small force over meshes and membranes."""
     return ddg.bench.Study(
         {"n": (6, 12, 24), "membrane": ("flat", "curved")},
         "w E h / P at rest",

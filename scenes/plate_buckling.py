@@ -1,9 +1,9 @@
-"""Square plate: the load in its plane at which it buckles, compressed along one or two axes or sheared.
+"""Plate buckling: in-plane critical load of a square plate, compressed along one or two axes or sheared.
 
 Kirchhoff's plate under a uniform stress, N = k pi^2 D / b^2. Supported edges: k = 4 and 2 under uniaxial and biaxial compression
-(Bryan 1891); shear, and all with clamped edges, by a Legendre-Ritz method (classical values 9.34, 10.07 and 14.71). The plate is
-loaded on its edges by dead forces; the critical factor is that for which K(0) + factor (K(load) - K(0)), with the exact tangents K
-of the free and the loaded plate, is singular.
+(Bryan 1891); shear, and all with clamped edges, by a Legendre-Ritz method (classical values 9.34, 10.07 and 14.71). Dead edge
+forces load the plate. The critical factor makes K(0) + factor (K(load) - K(0)) singular, with the exact tangents K of the free and
+the loaded plate.
 """
 
 import numpy as np
@@ -38,10 +38,10 @@ def build(
     mesh: str = "crossed",
     bending: str = "midedge_dof",
 ) -> ddg.Scene:
-    """The plate in the plane of x and y under a tenth of its critical load; edges may move in this plane.
+    """Build the plate in the plane of x and y at a tenth of the critical load, with edges free in this plane.
 
     Args:
-        edges: supported (free to turn) or clamped
+        edges: supported (free to rotate) or clamped
         load: uniaxial, biaxial (supported edges only) or shear
         cells: cells a side
         mesh: crossed, alternating, right, equilateral or jittered
@@ -66,26 +66,26 @@ def build(
     scene.hold(plate, corners[:1], "xy")
     scene.hold(plate, corners[1:], "y")
     n11, n12, n22 = LOADED * FACTORS[edges, load] * np.pi**2 * STIFFNESS / SIDE**2 * np.array(STRESSES[load])
-    for axis, at, force in (
+    for axis, coordinate, force in (
         (0, 0.0, (-n11, -n12)),
         (0, SIDE, (n11, n12)),
         (1, 0.0, (-n12, -n22)),
         (1, SIDE, (n12, n22)),
     ):
-        path = np.flatnonzero(np.abs(points[:, axis] - at) < 1e-9 * SIDE)
+        path = np.flatnonzero(np.abs(points[:, axis] - coordinate) < 1e-9 * SIDE)
         scene.add_edge_force(plate, path[np.argsort(points[path, 1 - axis])], (*force, 0.0))
     return scene
 
 
 def critical_load(model, state) -> float:
-    """Critical load over the exact one, from the tangents of the free plate and of the loaded one."""
+    """Return the critical load over the exact one, from the tangents of the free and the loaded plate."""
     from ddg_warp.solve import stability
 
     return LOADED * stability.buckling(model, model.state(), state)[0]
 
 
 def check(result) -> list[ddg.Check]:
-    """The critical load against the closed form, to what cells of this size resolve (second order)."""
+    """Check the critical load against the closed form, within the second-order discretisation error."""
     cells = np.sqrt(0.25 * len(result.model.scene.shells[0].triangles))  # of four triangles
     measured = critical_load(result.model, result.state)
     return [
@@ -96,7 +96,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The critical load over meshes and bending models."""
+    """Study the critical load over meshes and bending models."""
     return ddg.bench.Study(
         {"cells": (6, 12, 24, 48), "bending": ("midedge_dof", "midedge_boundary", "hinge")},
         "critical load",
@@ -105,7 +105,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The mode in which the plate buckles, as shape and color."""
+    """Draw the buckling mode of the plate, as shape and color."""
     flat = result.state.points()
     size = 0.15 * np.ptp(flat[:, 1])
     shown = buckled_points(result.model, result.state, size)

@@ -14,7 +14,7 @@ SIDE = 1.0  # m
 THICKNESS = 0.01  # m
 POISSON = 0.3
 STIFFNESS = 1.0  # D [N m]
-DEFLECTION = 1e-3 * THICKNESS  # of the centre [m], so small that the membrane takes no part
+DEFLECTION = 1e-3 * THICKNESS  # of the centre [m], small enough to leave the membrane unstressed
 SOURCE = "Kirchhoff plate, Legendre-Ritz; Timoshenko and Woinowsky-Krieger 1959"
 COEFFICIENTS = {
     ("supported", "pressure"): 0.004062352661,
@@ -27,10 +27,10 @@ COEFFICIENTS = {
 def build(
     edges: str = "clamped", load: str = "pressure", cells: int = 32, mesh: str = "crossed", bending: str = "midedge_dof"
 ) -> ddg.Scene:
-    """The plate in the plane of x and y, loaded along -z.
+    """Build the plate in the plane of x and y, loaded along -z.
 
     Args:
-        edges: supported (free to turn) or clamped
+        edges: supported (free to rotate) or clamped
         load: pressure on all of it, or force at its centre
         cells: cells a side, an even number
         mesh: crossed, alternating, right, equilateral or jittered
@@ -64,25 +64,25 @@ def build(
 
 
 def plate_mesh(mesh: str, cells: int) -> meshes.Mesh:
-    """Points and triangles of the square."""
+    """Return points and triangles of the square."""
     if mesh == "jittered":
         return meshes.jittered_rectangle(cells, cells, (SIDE, SIDE), jitter=0.25)
     return meshes.rectangle(cells, cells, (SIDE, SIDE), mesh)
 
 
 def centre(points: np.ndarray) -> int:
-    """The vertex nearest to the centre."""
+    """Return the vertex nearest to the centre."""
     return int(np.argmin(np.linalg.norm(points[:, :2] - 0.5 * SIDE, axis=1)))
 
 
 def deflection(state) -> float:
-    """Deflection of the centre over the closed form."""
+    """Return the deflection of the centre over the closed form."""
     points = state.points()
     return -points[centre(points), 2] / DEFLECTION
 
 
 def check(result) -> list[ddg.Check]:
-    """The deflection against the closed form, to what cells of this size resolve: second order, the force up to a logarithm."""
+    """Check the deflection against the closed form, of second order, for the force up to a logarithm."""
     scene = result.model.scene
     cells = np.sqrt(0.25 * len(scene.shells[0].triangles))  # of four triangles
     tolerance = min(ddg.Check.COARSEST, (25.0 if scene.shell_loads else 12.0) / cells**2)
@@ -90,7 +90,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The deflection over meshes and bending models."""
+    """Study the deflection over meshes and bending models."""
     return ddg.bench.Study(
         {"cells": (8, 16, 32, 64), "bending": ("midedge_dof", "midedge_boundary", "hinge")},
         "deflection",
@@ -99,7 +99,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The deflection, drawn larger by as much as it takes to be seen, and as color."""
+    """Draw the magnified deflection, and as color."""
     points = result.state.points()
     deflection = points[:, 2]
     shown = points * [1.0, 1.0, 0.15 * SIDE / np.abs(deflection).max()]

@@ -1,14 +1,14 @@
-"""A long rod under tension is twisted until it winds about itself: a plectoneme, two strands on one helix, with a loop at its end.
+"""Plectoneme: a long twisted rod under tension coils into two strands on one helix with an end loop.
 
-Of a plectoneme of the radius r, at which the strands touch, and the angle a between them and its axis the energy is stationary,
+Strands of a plectoneme of the contact radius r have the angle a to its axis. The energy is stationary at
 
     M r / B = 2 sin^3(a) cos(a) / cos(2 a) ,    T r^2 / B = sin^4(a) (1 / 2 + 1 / cos(2 a)) ,
 
-with B the bending stiffness, T the tension and M the torque: while it grows, both are constant (Clauvelin, Audoly and Neukirch,
-Mechanical response of plectonemic DNA: an analytical solution, Macromolecules 41, 4479, 2008). The twisting stiffness says how much
-of the turns goes there, and no more. Here the tension is a dead force, the ends are hinges, and one of them is turned. A
-straight rod bears more than twice that torque before it buckles; so it is drawn with a loop of one turn and a half, which tension and
-twist close.
+with B the bending stiffness, T the tension and M the torque. During growth both are constant (Clauvelin, Audoly and Neukirch,
+Mechanical response of plectonemic DNA: an analytical solution, Macromolecules 41, 4479, 2008). The twisting stiffness only
+determines how much of the end rotation becomes twist. Here the tension is a dead force, the ends are hinges, and one of them
+rotates. A straight rod bears more than twice that torque before it buckles. The rod is therefore drawn with a loop of one turn and
+a half, which tension and twist close.
 """
 
 import numpy as np
@@ -21,30 +21,28 @@ RADIUS = 1e-3  # m
 B = 1e-4  # N m^2
 STIFF = 10.0  # EA h^2 / B
 RANGE = 0.4 * RADIUS  # m, activation distance
-CLOSE = 1.15  # radii, half the distance of the strands at first
-BEND = 8.0 * RADIUS  # m, radius at which the ends turn into the strands at first
-WOUND = 1.5  # turns of the strands at first
-LOOP = (6.0 * RADIUS, 14.0 * RADIUS)  # m, about half of the width and the height of the loop at first
-LOOPED = 0.4  # rad, the angle at which it has that size
-STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
-MASS_PER_LENGTH = (
-    1000.0  # kg/m; in steps so long inertia is some thousandths of the tension, yet slows what is drawn too freely
-)
-TWISTED = 1.1  # torque at first over that of the plectoneme
-FINE = 0.16  # times the radius and the curvature of strands sin^2(a) / r, the longest edges that find all to 5 %
-SETTLED = 0.6  # part of the run after which tension, torque and angle are compared
+CLOSE = 1.15  # radii, initial half distance of the strands
+BEND = 8.0 * RADIUS  # m, initial radius of the bends between ends and strands
+WOUND = 1.5  # initial turns of the strands
+LOOP = (6.0 * RADIUS, 14.0 * RADIUS)  # m, approximate initial half width and height of the loop
+LOOPED = 0.4  # rad, the angle at which the loop has that size
+STEP_TIME = 1.0  # s, long against all periods: motion is quasi-static
+MASS_PER_LENGTH = 1000.0  # kg/m; inertia is some thousandths of the tension, yet slows free motion
+TWISTED = 1.1  # initial torque over that of the plectoneme
+FINE = 0.16  # longest edge over the radius, times sin^2(a), for errors of 5 %
+SETTLED = 0.6  # fraction of the run after which results are compared
 SOURCE = "Clauvelin, Audoly and Neukirch, 2008"
 
 
 def build(
     angle: float = 0.4, turns: float = 7.0, tail: float = 70.0, edge: float = 1.0, steps: int = 200, seed: int = -1
 ) -> ddg.Scene:
-    """The rod along x, with a loop in it along y.
+    """Build the rod along x, with a loop along y.
 
     Args:
-        angle: between strands and axis for which the tension is meant [rad]
-        turns: of the end
-        tail: length of the rod on either side over its radius, at first
+        angle: angle between strands and axis that sets the tension [rad]
+        turns: turns of the end
+        tail: initial length of the rod on either side over its radius
         edge: length of an edge over the radius of the rod
         steps: time steps
         seed: seed of the initial jitter of nodes, a tenth of the activation distance; no jitter below 0
@@ -90,39 +88,42 @@ def build(
 
 
 def law(angle: float) -> tuple[float, float]:
-    """M r / B and T r^2 / B of strands at an angle [rad] to the axis."""
+    """Return M r / B and T r^2 / B of strands at an angle [rad] to the axis."""
     s, c, both = np.sin(angle), np.cos(angle), np.cos(2.0 * angle)
     return 2.0 * s**3 * c / both, s**4 * (0.5 + 1.0 / both)
 
 
 def looped(angle: float, tail: float, edge: float) -> np.ndarray:
-    """Points (n, 3) [m] of two ends of a length [m] along x, which turn into strands about y with a loop; edges of a length [m]."""
+    """Return points (n, 3) [m] of two ends along x that bend into strands about y with a loop, from edges of a length [m]."""
     r = CLOSE * RADIUS
     high = 2.0 * np.pi * WOUND * r / np.tan(angle)
     u = np.linspace(0.0, 1.0, 4001)
-    turn, end = 0.5 * np.pi * u, np.linspace(tail, 0.0, 4001)
+    quarter, end = 0.5 * np.pi * u, np.linspace(tail, 0.0, 4001)
     # distance from y, angle about it, and height, from the end to the top of the loop
-    distance = [r + BEND + end, r + BEND * (1.0 - np.sin(turn)), r + 0.0 * u]
-    # a weaker tension holds a larger loop, as sqrt(B / T)
+    distance = [r + BEND + end, r + BEND * (1.0 - np.sin(quarter)), r + 0.0 * u]
+    # a weaker tension keeps a larger loop, as sqrt(B / T)
     wide, tall = np.array(LOOP) * np.sqrt(law(LOOPED)[1] / law(angle)[1])
-    distance.append(np.cos(turn) * (r + wide * np.sin(turn) ** 2))
+    distance.append(np.cos(quarter) * (r + wide * np.sin(quarter) ** 2))
     about = [0.0 * u, 0.0 * u, np.pi * 2.0 * WOUND * u, 2.0 * np.pi * WOUND + 0.0 * u]
-    height = [0.0 * u, BEND * (1.0 - np.cos(turn)), BEND + high * u, BEND + high + tall * np.sin(turn)]
-    d, a, y = (np.concatenate([part[:-1] for part in parts]) for parts in (distance, about, height))
+    height = [0.0 * u, BEND * (1.0 - np.cos(quarter)), BEND + high * u, BEND + high + tall * np.sin(quarter)]
+    d, a, y = (np.concatenate([piece[:-1] for piece in pieces]) for pieces in (distance, about, height))
     one = np.stack([-d * np.cos(a), y, d * np.sin(a)], axis=1)
     curve = np.concatenate([one, (one * [-1.0, 1.0, -1.0])[::-1]])
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
-    place = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / edge)) + 1)
-    return np.stack([np.interp(place, along, component) for component in curve.T], axis=1)
+    position = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / edge)) + 1)
+    return np.stack([np.interp(position, along, component) for component in curve.T], axis=1)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Torque [N m], tension [N], half of the distance of strands that touch [m], and the smallest gap [m]; of the middle of what
-    touches the angle [rad] between strands and axis and the mean distance [m] from it, both 0 before, and its length [m]."""
-    points, found = state.points().reshape(-1, 3), model.contacts(state)
-    push = np.linalg.norm(found.force, axis=1)
+    """Return torque [N m], tension [N], half distance of strands in contact [m], and the smallest gap [m].
+
+    The middle of the contact region adds the angle [rad] between strands and axis, the mean distance [m] from it (both 0 without
+    contact), and the length [m] of that region.
+    """
+    points, contacts = state.points().reshape(-1, 3), model.contacts(state)
+    forces = np.linalg.norm(contacts.force, axis=1)
     reactions = model.reactions(state)
-    inner, axis = wound(points, found.point)
+    inner, axis = wound(points, contacts.point)
     angle = radius = 0.0
     if len(inner) > 8:
         tangents = np.diff(points, axis=0)
@@ -133,16 +134,16 @@ def observe(model, state) -> dict[str, float]:
     return {
         "torque": abs(np.reshape(reactions[2].moment, (-1, 3))[0, 0]),
         "tension": abs(np.reshape(reactions[0].force, (-1, 3))[0, 0]),
-        "half": RADIUS + 0.5 * float((push * found.gap).sum() / max(push.sum(), 1e-300)),
+        "half": RADIUS + 0.5 * float((forces * contacts.gap).sum() / max(forces.sum(), 1e-300)),
         "gap": _touching.smallest_gap(model, state),
         "angle": angle,
         "radius": radius,
-        "length": float(np.ptp(found.point @ axis)) if len(found.point) else 0.0,
+        "length": float(np.ptp(contacts.point @ axis)) if len(contacts.point) else 0.0,
     }
 
 
 def wound(points: np.ndarray, touching: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of the middle half of what touches at points (n, 3) [m], and the direction (3,) of its axis."""
+    """Return nodes of the middle half of the contact region of points (n, 3) [m], and the direction (3,) of the axis."""
     if len(touching) < 4:
         return np.zeros(0, int), np.array([0.0, 1.0, 0.0])
     middle = touching.mean(axis=0)
@@ -153,7 +154,7 @@ def wound(points: np.ndarray, touching: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def check(result) -> list[ddg.Check]:
-    """Torque, tension, angle and radius of the plectoneme while it grows."""
+    """Check torque, tension, angle and radius of the growing plectoneme."""
     names = (
         "torque M r / B by the tension",
         "tension T r^2 / B by the angle",
@@ -167,8 +168,8 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, names) -> list[ddg.Check]:
     from scipy.optimize import brentq
 
-    late = np.array(result.times) > SETTLED * result.times[-1]
-    values = {name: np.array(series)[late].mean() for name, series in result.series.items()}
+    settled = np.array(result.times) > SETTLED * result.times[-1]
+    values = {name: np.array(series)[settled].mean() for name, series in result.series.items()}
     r, tension = values["half"], values["tension"]
     pull = tension * r**2 / B
     angle = brentq(lambda a: law(a)[1] - pull, 1e-3, 0.75)
@@ -181,12 +182,12 @@ def _checks(result, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The torque over the length of edges."""
+    """Study the torque over the length of edges."""
     return ddg.bench.Study({"edge": (2.0, 1.4, 1.0, 0.7)}, "torque", whole=True)
 
 
 def picture(result, frames) -> dict:
-    """The rod at the end, without most of its ends."""
+    """Draw the rod at the end, with most of the ends cut off."""
     last = max(frames)
     points = frames[last].copy()
     top = points[points[:, 1].argmax(), 0]

@@ -1,7 +1,8 @@
 """Post-buckling: a hinged rod compressed far beyond its Euler load.
 
-A rod that is straight when free is bent into an arc of a circle, hinged at its ends, and let go. The elastica by elliptic integrals
+A naturally straight rod starts as a circular arc, hinged at its ends. The elastica by elliptic integrals
 (Love, Mathematical Theory of Elasticity, 1927, art. 263): with the angle a of the ends and k = sin(a / 2),
+
     shortening = 2 L (1 - E(k) / K(k)) ,  P = 4 K(k)^2 EI / L^2 ,  amplitude = L k / K(k) .
 """
 
@@ -15,7 +16,7 @@ SOURCE = "elastica, elliptic integrals"
 
 
 def build(shortening: float = 0.3, axial: float = 1.0e8, n: int = 100) -> ddg.Scene:
-    """The rod along x, buckled towards z.
+    """Build the rod along x, buckled towards z.
 
     Args:
         shortening: approach of the ends over the length of the rod
@@ -32,7 +33,7 @@ def build(shortening: float = 0.3, axial: float = 1.0e8, n: int = 100) -> ddg.Sc
 
 
 def arc(shortening: float, n: int) -> np.ndarray:
-    """Nodes (n + 1, 3) [m] on a circle, LENGTH / n apart, the last at (1 - shortening) LENGTH from the first along x."""
+    """Return nodes (n + 1, 3) [m] on a circle, LENGTH / n apart, with a chord of (1 - shortening) LENGTH along x."""
     from scipy.optimize import brentq
 
     def chord(angle):
@@ -47,7 +48,7 @@ def arc(shortening: float, n: int) -> np.ndarray:
 
 
 def exact(shortening: float) -> tuple[float, float, float]:
-    """Axial load [N], amplitude in the middle [m] and angle of the ends [rad]."""
+    """Return axial load [N], amplitude in the middle [m] and angle of the ends [rad]."""
     from scipy.optimize import brentq
     from scipy.special import ellipe, ellipk
 
@@ -57,17 +58,17 @@ def exact(shortening: float) -> tuple[float, float, float]:
 
 
 def measure(model, state) -> tuple[float, float, float]:
-    """Axial load [N], amplitude in the middle [m] and angle of the first edge [rad]."""
+    """Return axial load [N], amplitude in the middle [m] and angle of the first edge [rad]."""
     from ddg_warp.solve.tangent import Tangent
 
     points = state.points()
     edge = points[1] - points[0]
-    load = Tangent(model).gradient(state)[0]  # first dof: x of the first node, held
+    load = Tangent(model).gradient(state)[0]  # first dof: x of the first node, fixed
     return load, points[len(points) // 2, 2], np.arctan2(edge[2], edge[0])
 
 
 def check(result) -> list[ddg.Check]:
-    """Reaction, amplitude and angle against elliptic integrals."""
+    """Check reaction, amplitude and angle against elliptic integrals."""
     points = result.state.points()
     shortening = 1.0 - (points[-1, 0] - points[0, 0]) / LENGTH
     tolerance = min(ddg.Check.COARSEST, 1e-3 * max(1.0, (100.0 / (len(points) - 1)) ** 2))
@@ -77,5 +78,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The axial load over the edges of the column."""
+    """Study the axial load over the edges of the column."""
     return ddg.bench.Study({"n": (26, 50, 100, 200)}, "axial load")

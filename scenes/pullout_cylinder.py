@@ -1,4 +1,4 @@
-"""Pullout of a cylinder: two forces pull an open cylinder apart until it carries them as a membrane.
+"""Pullout of a cylinder: two forces pull an open cylinder apart until membrane stress carries the load.
 
 Case 3.5 of Sze, Liu and Lo (2004): bending first, then, past half of the load, a jump of stiffness as the wall straightens.
 """
@@ -14,7 +14,7 @@ TABLE = {0.1: (1.707,), 0.25: (2.18,), 0.4: (2.376,), 0.75: (2.692,), 1.0: (2.76
 
 
 def build(n: int = 16, pattern: str = "crossed", membrane: str = "curved", steps: int = 20) -> ddg.Scene:
-    """An eighth of the cylinder about z, pulled along x.
+    """Build an eighth of the cylinder about z, pulled along x.
 
     Args:
         n: cells around a quarter and along half of the cylinder
@@ -31,17 +31,17 @@ def build(n: int = 16, pattern: str = "crossed", membrane: str = "curved", steps
 
 
 def observe(model, state) -> dict[str, float]:
-    """Radial displacement under the force [m]."""
+    """Return the radial displacement under the force [m]."""
     return {"radial": _sze.displacement(model, state, 0, 0)}
 
 
 def check(result) -> list[ddg.Check]:
-    """Displacement under the force against the table, to 1 % at 16 cells."""
+    """Check the displacement under the force against the table, to 1 % at 16 cells."""
     return _sze.table_checks(result, TABLE, {"radial": "radial displacement [m]"}, 0.01)
 
 
 def benchmark() -> ddg.bench.Study:
-    """The largest displacement over meshes and membranes."""
+    """Study the largest displacement over meshes and membranes."""
     return ddg.bench.Study(
         {"n": (8, 16), "membrane": ("flat", "curved")}, "radial displacement [m] at 1 P", series=("membrane",)
     )

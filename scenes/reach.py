@@ -1,11 +1,11 @@
-"""Reaching: the ends of a hanging cable are moved so that it takes a goal shape, by gradients through its motion.
+"""Reaching: motion of both ends shapes a hanging cable, by gradients through its dynamics.
 
-Two grips hold the ends of a cable, as two robots would, and bring it within one second from a straight line to where it comes to hang.
-Seven points between are to be where a demonstration had them, whose grips are not told. Where the grips end, a translation and a
-rotation vector each, is learned: `build` calls `learn`, which rolls a coarse cable out in long steps and goes back through all of
-them to these twelve numbers, every coordinate of the goal in a world of its own, for the Jacobian of Levenberg's method. What is built
-is a finer cable in shorter steps, moved as was learned. The demonstration has other edges again, steps by the midpoint rule, and turns
-its grips about the cable, too, which hardly shows in the shape: translations are found again, rotations need not be.
+Two grips at the ends of a cable, as of two robots, move it within one second from a straight line to a hanging shape. Seven points
+between shall end where a demonstration had them, of which the grip motion is unknown. The final grip poses, a translation and a
+rotation vector each, are fitted. `build` calls `learn`, which rolls out a coarse cable in long steps. Gradients with respect to
+these twelve numbers go through all steps, with one world a goal coordinate, for the Jacobian of Levenberg's method. The scene is a
+finer cable in shorter steps with the fitted motion. The demonstration has other edges again and steps by the midpoint rule. It also
+rotates its grips about the cable, which hardly affects the shape: translations are identified, rotations need not be.
 """
 
 from functools import cache
@@ -19,20 +19,20 @@ from ddg_warp.scenes import _learn
 
 LENGTH = 1.0  # m
 WEIGHT = 0.4  # N, of the cable
-STIFFNESS = 0.01  # N m^2, EI; a quarter of that against twist
+STIFFNESS = 0.01  # N m^2, EI; GJ is a quarter of it
 SHOWN = np.array(
     [[0.1, 0.06, 0.0, 0.3, 0.4, 0.7], [-0.15, -0.06, 0.08, 0.6, -0.3, 0.5]]
 )  # m, rad; poses of the demonstration
-MOVED = 1.0  # s; then the grips stand
+MOVED = 1.0  # s; end of the grip motion
 END = 2.0  # s
-EDGES, DT = 16, 0.02  # of the learner's cable, and of its steps [s]
+EDGES, DT = 16, 0.02  # edges and time step [s] of the fitted cable
 CLOSE = 2e-3  # m, from the goal
-BALL = 0.014  # m, radius of the goals drawn
-GOALS = 8  # parts of the cable between points that have a goal
+BALL = 0.014  # m, radius of the drawn goals
+GOALS = 8  # pieces of the cable between goal points
 
 
 def build(n: int = 32, step: float = 0.01) -> ddg.Scene:
-    """The cable, moved as was learned; building takes as long as learning it.
+    """Build the cable with the fitted motion; building includes the fit.
 
     Args:
         n: edges, a multiple of 8
@@ -45,7 +45,7 @@ def build(n: int = 32, step: float = 0.01) -> ddg.Scene:
 
 
 def cable(n: int, motions, analysis: ddg.Dynamics) -> ddg.Scene:
-    """The cable along x, its ends held by these motions."""
+    """Return a scene of the cable along x with prescribed motions of the ends."""
     scene = ddg.Scene(mass_damping=4.0, analysis=analysis)
     points = np.zeros((n + 1, 3))
     points[:, 0] = np.linspace(0.0, LENGTH, n + 1)
@@ -65,18 +65,18 @@ def cable(n: int, motions, analysis: ddg.Dynamics) -> ddg.Scene:
 
 
 def way(t: float) -> float:
-    """Part of the way of the grips at time t [s]: from 0 to 1, at rest at both ends."""
+    """Return the progress of the grips at time t [s], from 0 to 1 with zero rates at both ends."""
     s = min(1.0, t / MOVED)
     return s * s * (3.0 - 2.0 * s)
 
 
 def pivots() -> list[tuple]:
-    """What the grips turn about [m]: the ends of the cable."""
+    """Return the pivots of the grips [m], the ends of the cable."""
     return [(0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0)]
 
 
 def moved(n: int, poses: np.ndarray, dt: float, scheme: str) -> ddg.Scene:
-    """The cable of n edges whose grips end in these poses (2, 6) [m, rad], in steps of dt [s]."""
+    """Return a scene of the cable of n edges with final grip poses (2, 6) [m, rad] and steps of dt [s]."""
     motions = [
         ddg.Motion(
             translation=lambda t, pose=pose: tuple(way(t) * pose[:3]),
@@ -90,14 +90,14 @@ def moved(n: int, poses: np.ndarray, dt: float, scheme: str) -> ddg.Scene:
 
 
 def tracked(points):
-    """The points (..., 7, 3) of a cable (..., nodes, 3) that have goals, at eighths of its length."""
-    apart = (points.shape[-2] - 1) // GOALS
-    return points[..., apart:-1:apart, :]
+    """Return the goal points (..., 7, 3) of a cable (..., nodes, 3), at eighths of its length."""
+    stride = (points.shape[-2] - 1) // GOALS
+    return points[..., stride:-1:stride, :]
 
 
 @cache
 def goals() -> np.ndarray:
-    """Where they are to be (7, 3) [m]: where a demonstration ends, by a finer cable and the midpoint rule."""
+    """Return goals (7, 3) [m], the end of a demonstration by a finer cable and the midpoint rule."""
     from ddg_warp.run.simulate import simulate
 
     result = simulate(moved(48, SHOWN, 0.01, "implicit_midpoint"), device="cpu", precision="float64", progress=False)
@@ -106,7 +106,7 @@ def goals() -> np.ndarray:
 
 @cache
 def learn() -> tuple[np.ndarray, list[float]]:
-    """Poses of both grips at the end (2, 6) [m, rad], and how far points are from their goals after every step of the search [m]."""
+    """Fit final poses of both grips (2, 6) [m, rad]; return also the error of goal points after every step [m]."""
     import torch
 
     from ddg_warp.torch import Simulator
@@ -116,7 +116,7 @@ def learn() -> tuple[np.ndarray, list[float]]:
     steps, wanted = round(END / DT), torch.tensor(goals())
 
     def residuals(poses):
-        """What every world is off (worlds, 21) [m] with its poses (worlds, 12)."""
+        """Return errors (worlds, 21) [m] for poses (worlds, 12)."""
         *_, state = simulator.rollout(
             simulator.initial_state(len(poses)),
             controls=lambda number: {"poses": way((number + 1) * DT) * poses.reshape(-1, 2, 6)},
@@ -125,18 +125,18 @@ def learn() -> tuple[np.ndarray, list[float]]:
         )
         return (tracked(state.positions) - wanted).flatten(1)
 
-    found, _, passed = _learn.least_squares(residuals, np.zeros(12), iterations=20, tolerance=1e-2)
-    return found.reshape(2, 6), [float(np.sqrt((off**2).sum() / len(wanted))) for off in passed]
+    fitted, _, history = _learn.least_squares(residuals, np.zeros(12), iterations=20, tolerance=1e-2)
+    return fitted.reshape(2, 6), [float(np.sqrt((off**2).sum() / len(wanted))) for off in history]
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far points are from their goals, root mean square [m]."""
+    """Return the root mean square error of goal points [m]."""
     off = tracked(state.points().reshape(-1, 3)[: int(model.curves.counts[0])]) - goals()
     return {"off": float(np.sqrt((off**2).sum(1).mean()))}
 
 
 def check(result) -> list[ddg.Check]:
-    """The goal shape is reached, by the translations of the demonstration."""
+    """Check the goal shape, and translations against the demonstration."""
     poses, result.learned = learn()
     shift = np.abs(poses[:, :3] - SHOWN[:, :3]).max()
     name = "point furthest from its goal [m]"
@@ -152,16 +152,16 @@ def check(result) -> list[ddg.Check]:
 
 
 def picture(result, frames) -> dict:
-    """The cable at a few times, with its goals as balls."""
+    """Draw the cable at a few times, with goals as balls."""
     ball, triangles = meshes.sphere(2)
     wanted = goals()
     balls = (wanted[:, None] + BALL * ball).reshape(-1, 3)
-    own = (triangles[None] + len(ball) * np.arange(len(wanted))[:, None, None]).reshape(-1, 3)
-    return {"points_by_time": frames, "bodies": {max(frames): (balls, own)}}
+    cells = (triangles[None] + len(ball) * np.arange(len(wanted))[:, None, None]).reshape(-1, 3)
+    return {"points_by_time": frames, "bodies": {max(frames): (balls, cells)}}
 
 
 def plot(result) -> dict:
-    """How far points are from their goals after every step of the search."""
+    """Plot the error of goal points after every step of the search."""
     off = 1e3 * np.array(result.learned)
     line = ("of a coarse cable, root mean square", np.arange(len(off)), off, "o-")
     return {
@@ -174,7 +174,7 @@ def plot(result) -> dict:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The cable's end shape over its edges and steps, for what was learned."""
+    """Study the end shape of the fitted motion over edges and steps."""
     return ddg.bench.Study(
         {"n": (8, 16, 32), "dt": (0.04, 0.02, 0.01)},
         lambda result: tracked(result.state.points()),

@@ -1,11 +1,11 @@
-"""Residual network: forces that a simulator lacks are learned from recordings, through its steps.
+"""Residual network: a network learns forces that a simulator lacks from recordings, through its steps.
 
-The run is the recording: twelve thin rods, held at one end, fall and swing in a fluid whose drag is five times larger across them than
-along them. Four markers on each are seen every 20 ms, each coordinate with noise. The learner knows no fluid: rods of a third
-of the edges, stepped by implicit Euler instead of the midpoint rule in steps four times as long. A network of one hidden layer, the
-same at every node, adds forces per length along and across the rod by how fast it moves that way, so that what is learned turns with
-the rod. It is trained on the beginning of six motions, end to end through all steps (Um et al., Solver-in-the-loop, NeurIPS 2020), and
-tried on the six others, for longer. What it learns is drag, less what implicit Euler damps on its own.
+The run is the recording: twelve thin rods, clamped at one end, fall and swing in a fluid with five times more drag across than
+along them. Four markers on each are recorded every 20 ms, each coordinate with noise. The trained simulator has no fluid: rods of a
+third of the edges, stepped by implicit Euler instead of the midpoint rule in steps four times as long. A network of one hidden
+layer, the same at every node, adds forces per length along and across the rod as functions of these speeds. It therefore rotates
+with the rod. It is trained on the beginning of six motions, end to end through all steps (Um et al., Solver-in-the-loop, NeurIPS
+2020), and validated on the six others, for longer. It learns drag minus the numerical damping of implicit Euler.
 """
 
 import numpy as np
@@ -17,24 +17,24 @@ from ddg_warp.scenes import _learn
 LENGTH = 0.4  # m
 SECTION = ddg.Stiffness(EA=200.0, EI1=1.5e-3, GJ=1e-3, mass_per_length=0.02, rotary_inertia=1e-6, radius=0.004)
 TANGENTIAL, NORMAL = 0.05, 0.25  # N s/m^2, drag of the fluid
-RODS, TAUGHT = 12, 6  # recorded, and those of them that are learned from
+RODS, TAUGHT = 12, 6  # recorded rods, and number of training rods
 APART = 0.5  # m
 MARKERS = 4  # at a quarter, half, three quarters and the whole of the length
 SEEN = 0.02  # s, between frames of the camera
 NOISE = 1e-3  # m, standard deviation of a coordinate
-DURATION, LEARNED = 0.8, 0.5  # s, recorded, and learned from
-EDGES, DT = 12, 0.01  # of the learner's rods, and of its steps [s]
-ROUNDS, RATE = 60, 2e-2  # of the search, and of Adam at most
-SCALE = 0.1  # N s/m^2, of what the network gives
-BETTER = 5.0  # how much smaller the error becomes, at least
+DURATION, LEARNED = 0.8, 0.5  # s, of the recording, and of its training window
+EDGES, DT = 12, 0.01  # edges and time step [s] of the trained simulator
+ROUNDS, RATE = 60, 2e-2  # rounds of the search, and largest learning rate of Adam
+SCALE = 0.1  # N s/m^2, of the output of the network
+BETTER = 5.0  # least ratio of errors without and with the network
 
 
 def build(n: int = 36, step: float = 0.0025) -> ddg.Scene:
-    """The rods that are recorded.
+    """Build the recorded rods.
 
     Args:
         n: edges of a rod, a multiple of the markers
-        step: time step [s], which goes a whole number of times into 20 ms
+        step: time step [s], an integer fraction of 20 ms
     """
     if n < 2 * MARKERS or n % MARKERS or abs(SEEN / step - round(SEEN / step)) > 1e-6:
         raise ValueError(f"n = {n}, step = {step}: take a multiple of {MARKERS} edges and a part of {SEEN} s")
@@ -44,7 +44,7 @@ def build(n: int = 36, step: float = 0.0025) -> ddg.Scene:
 
 
 def rods(n: int, chosen, analysis: ddg.Dynamics) -> ddg.Scene:
-    """Some of the rods, of n edges, each straight and at rest in a direction of its own, in vacuum."""
+    """Return a scene of chosen rods of n edges, each straight and still in its own direction, in vacuum."""
     directions = np.random.default_rng(0).normal(size=(RODS, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     scene = ddg.Scene(analysis=analysis)
@@ -56,32 +56,34 @@ def rods(n: int, chosen, analysis: ddg.Dynamics) -> ddg.Scene:
 
 
 def markers(points):
-    """Markers (..., 4, 3) of rods (..., nodes, 3)."""
-    apart = (points.shape[-2] - 1) // MARKERS
-    return points[..., apart::apart, :]
+    """Return markers (..., 4, 3) of rods (..., nodes, 3)."""
+    stride = (points.shape[-2] - 1) // MARKERS
+    return points[..., stride::stride, :]
 
 
 def observe(model, state) -> dict[str, float]:
-    """Coordinates of the markers [m], without noise."""
-    places = markers(state.points().reshape(RODS, -1, 3)).reshape(-1, 3)
+    """Return coordinates of the markers [m], without noise."""
+    positions = markers(state.points().reshape(RODS, -1, 3)).reshape(-1, 3)
     return {
-        f"{axis}{k // MARKERS}_{k % MARKERS}": float(p[i]) for k, p in enumerate(places) for i, axis in enumerate("xyz")
+        f"{axis}{k // MARKERS}_{k % MARKERS}": float(p[i])
+        for k, p in enumerate(positions)
+        for i, axis in enumerate("xyz")
     }
 
 
 def recording(result) -> np.ndarray:
-    """What the camera saw (frames, rods, 4, 3) [m], from 20 ms on, with noise."""
+    """Return recorded markers (frames, rods, 4, 3) [m], from 20 ms on, with noise."""
     every, names = (
         round(SEEN / result.dt),
         [f"{axis}{rod}_{k}" for rod in range(RODS) for k in range(MARKERS) for axis in "xyz"],
     )
     exact = np.stack([result.series[name] for name in names], axis=1)
-    seen = exact[every::every].reshape(-1, RODS, MARKERS, 3)
-    return seen + np.random.default_rng(1).normal(scale=NOISE, size=seen.shape)
+    frames = exact[every::every].reshape(-1, RODS, MARKERS, 3)
+    return frames + np.random.default_rng(1).normal(scale=NOISE, size=frames.shape)
 
 
 def network():
-    """Speeds along and across a rod to what holds it back that way, over SCALE; at first nothing does."""
+    """Return a network from speeds along and across a rod to drag coefficients over SCALE, initially zero."""
     import torch
 
     with torch.random.fork_rng(devices=[]):
@@ -93,7 +95,7 @@ def network():
 
 
 def forces(correction, state):
-    """Forces on nodes (1, rods nodes, 3) [N], by their velocities along and across."""
+    """Return forces on nodes (1, rods nodes, 3) [N] as functions of velocities along and across."""
     import torch
 
     points, velocities = (values.reshape(-1, EDGES + 1, 3) for values in (state.positions, state.velocities))
@@ -108,24 +110,23 @@ def forces(correction, state):
 
 
 def motion(simulator, frames: int, correction=None):
-    """Markers (frames, rods, 4, 3) as the learner's rods move, corrected or not."""
+    """Return markers (frames, rods, 4, 3) of the simulated rods, with or without correction."""
     import torch
 
-    state, seen = simulator.initial_state(), []
+    state, positions = simulator.initial_state(), []
     for number in range(1, frames * round(SEEN / DT) + 1):
         state = simulator.step(state, controls=correction and {"forces": forces(correction, state)})
         if number % round(SEEN / DT) == 0:
-            seen.append(markers(state.positions.reshape(-1, EDGES + 1, 3)))
-    return torch.stack(seen)
+            positions.append(markers(state.positions.reshape(-1, EDGES + 1, 3)))
+    return torch.stack(positions)
 
 
 @_learn.one_thread()
-def learn(seen: np.ndarray) -> dict:
-    """The network, from a recording (frames, rods, 4, 3) [m].
+def learn(recorded: np.ndarray) -> dict:
+    """Train the network on a recording (frames, rods, 4, 3) [m].
 
     Returns:
-        "losses" of the search; the markers of rods that it has not learned from, "recorded", "uncorrected" and "corrected"
-        (frames, 6, 4, 3) [m].
+        "losses" of the search, and validation markers, "recorded", "uncorrected" and "corrected" (frames, 6, 4, 3) [m].
     """
     import torch
 
@@ -133,13 +134,13 @@ def learn(seen: np.ndarray) -> dict:
 
     groups = (range(TAUGHT), range(TAUGHT, RODS))
     analysis = ddg.Dynamics(dt=DT, duration=DURATION)
-    taught, others = (Simulator(rods(EDGES, own, analysis).build("cpu", "float64"), DT) for own in groups)
+    training, validation = (Simulator(rods(EDGES, item, analysis).build("cpu", "float64"), DT) for item in groups)
     correction, losses = network(), []
-    frames, target = round(LEARNED / SEEN), torch.tensor(seen)
+    frames, target = round(LEARNED / SEEN), torch.tensor(recorded)
     search = torch.optim.Adam(correction.parameters(), lr=RATE)
     rates = torch.optim.lr_scheduler.OneCycleLR(search, RATE, total_steps=ROUNDS, pct_start=0.2)
     for _ in range(ROUNDS):
-        loss = ((motion(taught, frames, correction) - target[:frames, :TAUGHT]) ** 2).sum(3).mean() / NOISE**2
+        loss = ((motion(training, frames, correction) - target[:frames, :TAUGHT]) ** 2).sum(3).mean() / NOISE**2
         search.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(correction.parameters(), 1e4, error_if_nonfinite=True)
@@ -147,33 +148,32 @@ def learn(seen: np.ndarray) -> dict:
         rates.step()
         losses.append(loss.item())
     with torch.no_grad():
-        uncorrected, corrected = (motion(others, len(seen), own).numpy() for own in (None, correction))
-    return {"losses": losses, "recorded": seen[:, TAUGHT:], "uncorrected": uncorrected, "corrected": corrected}
+        uncorrected, corrected = (motion(validation, len(recorded), item).numpy() for item in (None, correction))
+    return {"losses": losses, "recorded": recorded[:, TAUGHT:], "uncorrected": uncorrected, "corrected": corrected}
 
 
 def check(result) -> list[ddg.Check]:
-    """Of motions that it has not seen the corrected simulator makes a part of the error."""
+    """Check the error of the corrected simulator on validation motions."""
     name = "error of other motions over that uncorrected"
 
     def make() -> list[ddg.Check]:
-        found = result.learned = learn(recording(result))
+        fit = result.learned = learn(recording(result))
         off = {
-            kind: np.sqrt(((found[kind] - found["recorded"]) ** 2).sum(3).mean())
-            for kind in ("uncorrected", "corrected")
+            kind: np.sqrt(((fit[kind] - fit["recorded"]) ** 2).sum(3).mean()) for kind in ("uncorrected", "corrected")
         }
-        told = f"{1e3 * off['corrected']:.1f} instead of {1e3 * off['uncorrected']:.0f} mm, root mean square"
-        return [ddg.Check(name, off["corrected"] / off["uncorrected"], 0.0, 1.0 / BETTER, told)]
+        note = f"{1e3 * off['corrected']:.1f} instead of {1e3 * off['uncorrected']:.0f} mm, root mean square"
+        return [ddg.Check(name, off["corrected"] / off["uncorrected"], 0.0, 1.0 / BETTER, note)]
 
     return _learn.skipped([name]) or once_reached(result, DURATION, [name], make)
 
 
 def plot(result) -> dict:
-    """Height of the free end of some rods that were not learned from."""
-    found, lines = result.learned, []
-    times = SEEN * (1.0 + np.arange(len(found["recorded"])))
+    """Plot the height of the free end of some validation rods."""
+    fit, lines = result.learned, []
+    times = SEEN * (1.0 + np.arange(len(fit["recorded"])))
     kinds = (("recorded", "recorded", "o"), ("without a network", "uncorrected", "--"), ("with it", "corrected", "-"))
     for rod in range(3):
-        lines += [(label, times, 1e3 * found[name][:, rod, -1, 2], style) for label, name, style in kinds]
+        lines += [(label, times, 1e3 * fit[name][:, rod, -1, 2], style) for label, name, style in kinds]
     return {
         "lines": lines,
         "x": f"time [s]; it has learned from {LEARNED:g} s of other rods",
@@ -183,7 +183,7 @@ def plot(result) -> dict:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The free end of a recorded rod over its edges and steps."""
+    """Study the free end of a recorded rod over edges and steps."""
     return ddg.bench.Study(
         {"n": (12, 24, 36), "dt": (0.01, 0.005, 0.0025)},
         lambda result: result.state.points()[-1],

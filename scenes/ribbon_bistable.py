@@ -1,11 +1,12 @@
-"""Bistable ribbon: an arch whose clamped ends are moved against each other sideways leans over to one side or the other.
+"""Bistable ribbon: lateral displacement of the clamped ends makes a symmetric arch lean to one side.
 
-A strip is bent to an arch by clamps brought together by a quarter of its length; then they are moved apart across the strip, the first
-by -y / 2, the last by y / 2. The arch goes on looking the same from both of its ends up to a pitchfork at some y, from which on it
-leans towards either: Yu and Hanna, Extreme Mech. Lett. 34 (2020), "Bifurcations of buckled, clamped anisotropic rods and thin bands
-under lateral end translations"; Huang, Wang, Li and Jawed, J. Mech. Phys. Solids 145 (2020), from narrow to wide bands. Kirchhoff's rod
-of the same section does so at nearly the same y however wide it is, 6 % late at the largest width here; a strip of plate the sooner
-the wider it is, and so does a ribbon, 2 to 3 % late. Of plates, not of ribbons, clamps also hinder the warping near the ends.
+Clamps that approach by a quarter of its length bend a strip to an arch. Then they move apart across the strip, the first by -y / 2,
+the last by y / 2. The arch keeps its symmetry under exchange of its ends up to a pitchfork at some y, and leans towards either side
+from there on: Yu and Hanna, Extreme Mech. Lett. 34 (2020), "Bifurcations of buckled, clamped anisotropic rods and thin bands under
+lateral end translations"; Huang, Wang, Li and Jawed, J. Mech. Phys. Solids 145 (2020), from narrow to wide bands.
+
+Kirchhoff's rod of the same section does so at nearly the same y for all widths, 6 % late at the largest width here. A wider plate
+strip does so sooner, and so does a ribbon, 2 to 3 % late. In plates, unlike ribbons, clamps also hinder the warping near the ends.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import grown_metric
 
 LENGTH = 1.0  # m
-APPROACH = 0.25  # of the clamps over the length
+APPROACH = 0.25  # approach of the clamps over the length
 THICKNESS = 5.0e-4  # m
 YOUNG = 1.0e9  # Pa
 POISSON = 0.3
@@ -27,10 +28,10 @@ PLATE = {0.01: 0.2441, 0.02: 0.2350, 0.03: 0.2311}
 
 
 def build(width: float = 0.03, law: str = "audoly_neukirch", lateral: float = 0.3, n: int = 80) -> ddg.Scene:
-    """The strip along x as an arch in the plane of x and z, its ends moved along y.
+    """Build the strip along x as an arch in the plane of x and z, its ends moved along y.
 
     Args:
-        width: of the strip [m]; there are reference numbers for 0.01, 0.02 and 0.03
+        width: width of the strip [m]; there are reference numbers for 0.01, 0.02 and 0.03
         law: audoly_neukirch, sano_wada, sadowsky, or kirchhoff: a rod with the strip's section
         lateral: displacement of one end against the other [m]
         n: edges of the strip
@@ -53,12 +54,12 @@ def build(width: float = 0.03, law: str = "audoly_neukirch", lateral: float = 0.
 
 
 def plate(width: float, cells: int, lateral: float = 0.3) -> ddg.Scene:
-    """The same strip as a plate, of square cells, `cells` of them over the width."""
+    """Return a scene of the strip as a plate, with `cells` square cells over the width."""
     along = 2 * max(1, round(0.5 * cells * LENGTH / width))
     flat, triangles = meshes.rectangle(along, cells, (LENGTH, width), "crossed")
-    curve, place = arch(4000), 4000.0 * flat[:, 0] / LENGTH
-    x, z = (np.interp(place, np.arange(4001), curve[:, axis]) for axis in (0, 2))
-    # The clamp holds the normals of the drawn triangles: those of the first and last cell are flat.
+    curve, position = arch(4000), 4000.0 * flat[:, 0] / LENGTH
+    x, z = (np.interp(position, np.arange(4001), curve[:, axis]) for axis in (0, 2))
+    # The clamp fixes the normals of the drawn triangles; the first and last cell are flat.
     inside = np.minimum(flat[:, 0], LENGTH - flat[:, 0]) > 1.01 * LENGTH / along
     points = np.stack([x, flat[:, 1] - 0.5 * width, np.where(inside, z, 0.0)], axis=1)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=4))
@@ -78,7 +79,7 @@ def _motions(lateral: float) -> list[ddg.Motion]:
 
 
 def arch(n: int) -> np.ndarray:
-    """Points (n + 1, 3) [m] of an arch with edges of equal length, level at both ends, which are as far apart as the clamps."""
+    """Return points (n + 1, 3) [m] of an arch with equal edges, horizontal at both ends, with the distance of the clamps."""
     from scipy.optimize import brentq
 
     wave = np.sin(2.0 * np.pi * (np.arange(n) + 0.5) / n)
@@ -89,12 +90,12 @@ def arch(n: int) -> np.ndarray:
 
 
 def pitchfork(model, lateral: float = 0.3, step: float = 0.02) -> float:
-    """Lateral displacement [m] at which the arch that looks the same from both ends loses its stability.
+    """Return the critical lateral displacement [m] of the symmetric arch.
 
     Args:
-        model: of a strip whose ends are moved by `lateral` [m] at load parameter 1.
-        lateral: that.
-        step: displacement [m] between equilibria on the way.
+        model: model of a strip with the end displacement `lateral` [m] at load parameter 1.
+        lateral: that displacement [m].
+        step: displacement [m] between equilibria of the path.
     """
     from ddg_warp.solve import stability
     from ddg_warp.solve.statics import Equilibrium, StaticsOptions
@@ -104,22 +105,22 @@ def pitchfork(model, lateral: float = 0.3, step: float = 0.02) -> float:
     first = 1e-3 * step
     states = {first: Equilibrium(model, StaticsOptions()).load(model.state(), 1, 0.0, first / lateral)}
 
-    def at(y: float):
-        below = max(known for known in states if known <= y)
+    def equilibrium(y: float):
+        below = max(level for level in states if level <= y)
         if below < y:
             states[y] = follow.load(states[below], 1, below / lateral, y / lateral)
         return model, states[y]
 
     y = first
-    while stability.spectrum(*at(y), 1, "unit", tangent).eigenvalues[0] > 0.0:
+    while stability.spectrum(*equilibrium(y), 1, "unit", tangent).eigenvalues[0] > 0.0:
         y += step
         if y > LENGTH:
             return np.nan
-    return stability.critical(at, y - step, y, tolerance=1e-3)
+    return stability.critical(equilibrium, y - step, y, tolerance=1e-3)
 
 
 def check(result) -> list[ddg.Check]:
-    """The pitchfork against the plate's, to what clamps that do not warp make of strips this narrow."""
+    """Check the pitchfork against the plate, within the effect of hindered warping at this width."""
     batch, points = result.model.scene.batches[0], result.state.points()
     width = float(np.round(np.sqrt(12.0 * batch.section.EI1 / batch.section.EA), 6))
     name = "lateral displacement at the pitchfork [m]"
@@ -133,5 +134,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The pitchfork over the nodes of the strip."""
+    """Study the pitchfork over the nodes of the strip."""
     return ddg.bench.Study({"n": (20, 40, 80, 160)}, "lateral displacement")

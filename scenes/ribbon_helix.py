@@ -1,10 +1,10 @@
-"""Ribbon helix: a straight strip wound on a cylinder, which bends like its plane does.
+"""Ribbon helix: a straight strip wound on a cylinder, which bends as a developable surface.
 
-A strip of paper wound at the angle a to the hoops of a cylinder of radius R has the curvature k = cos^2 a / R and the twist
-t = sin a cos a / R. It is a piece of a plane rolled up with the curvature 1 / R, whatever the angle: 2 E / D W L = 1 / R^2, which is
-Sadowsky's energy (k^2 + t^2)^2 / k^2 (Sadowsky 1930). A rod of the same section takes bending and twist one by one and has but 0.58
-of it at 45 degrees and nu = 0.3. The ends are held as on the cylinder; the helix between them is an equilibrium of every law, as its
-strains are uniform and what holds a helix is a force and a moment along its axis.
+A strip of paper is wound at the angle a to the hoops of a cylinder of radius R. Its curvature is k = cos^2 a / R and its twist t =
+sin a cos a / R. It is a piece of a plane rolled up with the curvature 1 / R at any angle: 2 E / D W L = 1 / R^2. This is Sadowsky's
+energy (k^2 + t^2)^2 / k^2 (Sadowsky 1930). A rod of the same section has separate bending and twist energies and only 0.58 of it at
+45 degrees and nu = 0.3. The ends are fixed as on the cylinder. The helix between them is an equilibrium of every law, as its
+strains are uniform and a force and a moment along its axis hold it.
 """
 
 import numpy as np
@@ -21,12 +21,12 @@ LAWS = ("sadowsky", "audoly_neukirch", "sano_wada", "kirchhoff")
 
 
 def build(angle: float = 45.0, law: str = "sadowsky", width: float = 0.1, n: int = 100) -> ddg.Scene:
-    """The strip around z, drawn on the cylinder and let go between its ends.
+    """Build the strip around z, drawn on the cylinder and free between its ends.
 
     Args:
-        angle: of the strip to the hoops [degrees]
+        angle: angle of the strip to the hoops [degrees]
         law: sadowsky, audoly_neukirch, sano_wada, or kirchhoff: a rod with the strip's section
-        width: of the strip [m]
+        width: width of the strip [m]
         n: edges of the strip
     """
     if law not in LAWS:
@@ -49,25 +49,25 @@ def build(angle: float = 45.0, law: str = "sadowsky", width: float = 0.1, n: int
 
 
 def on_cylinder(along: np.ndarray, a: float) -> np.ndarray:
-    """Points (., 3) [m] of the center line at arc lengths (.,) on the cylinder, at the angle a to its hoops."""
-    turn = along * np.cos(a) / RADIUS
-    return np.stack([RADIUS * np.cos(turn), RADIUS * np.sin(turn), along * np.sin(a)], axis=1)
+    """Return points (., 3) [m] of the centreline at arc lengths (.,) on the cylinder, at the angle a to its hoops."""
+    angle = along * np.cos(a) / RADIUS
+    return np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), along * np.sin(a)], axis=1)
 
 
 def across(along: np.ndarray, a: float) -> np.ndarray:
-    """Directions (., 3) across the strip, in the cylinder."""
-    turn = along * np.cos(a) / RADIUS
-    return np.stack([np.sin(a) * np.sin(turn), -np.sin(a) * np.cos(turn), np.full_like(turn, np.cos(a))], axis=1)
+    """Return directions (., 3) across the strip, tangent to the cylinder."""
+    angle = along * np.cos(a) / RADIUS
+    return np.stack([np.sin(a) * np.sin(angle), -np.sin(a) * np.cos(angle), np.full_like(angle, np.cos(a))], axis=1)
 
 
 def strains(angle: float) -> tuple[float, float]:
-    """Curvature and twist [1/m] at an angle [degrees]."""
+    """Return curvature and twist [1/m] at an angle [degrees]."""
     a = np.radians(angle)
     return np.cos(a) ** 2 / RADIUS, np.sin(a) * np.cos(a) / RADIUS
 
 
 def exact(angle: float, law: str, width: float) -> float:
-    """2 E R^2 / D W L of uniform strains: a rod's and, but for a rod, what keeps the section from bending alone."""
+    """Return 2 E R^2 / D W L of uniform strains: the rod's energy plus the constraint of the section by a law."""
     k, t = strains(angle)
     rod = (1.0 - POISSON**2) * k**2 + 2.0 * (1.0 - POISSON) * t**2
     x = (3.0 * (1.0 - POISSON**2)) ** 0.25 * width * np.sqrt(k / THICKNESS)
@@ -84,7 +84,7 @@ def exact(angle: float, law: str, width: float) -> float:
 
 
 def normalised_energy(model, state) -> float:
-    """2 E R^2 / D W L, of the length that the bending energy of the clamped strip covers: all but half of its end edges."""
+    """Return 2 E R^2 / D W L of the length with bending energy, without half of both end edges."""
     points = model.scene.batches[0].points[0]
     length = np.linalg.norm(np.diff(points, axis=0), axis=1)
     covered = length.sum() - 0.5 * (length[0] + length[-1])
@@ -93,7 +93,7 @@ def normalised_energy(model, state) -> float:
 
 
 def check(result) -> list[ddg.Check]:
-    """Energy against that of the helix, and how far the strip has left the cylinder."""
+    """Check the energy against the helix, and the distance of the strip from the cylinder."""
     scene, points = result.model.scene, result.state.points()
     batch = scene.batches[0]
     law = batch.laws["rod_bend_twist"].density.name if batch.laws else "kirchhoff"
@@ -117,5 +117,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The energy over the nodes of the strip."""
+    """Study the energy over the nodes of the strip."""
     return ddg.bench.Study({"n": (25, 50, 100, 200)}, "2 E R^2")

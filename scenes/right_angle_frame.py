@@ -1,4 +1,4 @@
-"""Right-angle frame: a thin angle, clamped at one foot and loaded at the other in its plane, buckles out of it.
+"""Right-angle frame: a thin angle, clamped at one foot and loaded at the other in its plane, buckles laterally.
 
 Two strips meet rigidly at a right angle; a force along the clamped leg acts at the free end of the other one. Bending of one leg is
 twist of the other. (Argyris et al., Comput. Methods Appl. Mech. Eng. 20, 1979; Simo and Vu-Quoc, ibid. 58, 1986.) Reference:
@@ -20,7 +20,7 @@ CRITICAL = {1: 1.086757492, -1: -0.6802353021}
 
 
 def build(n: int = 20, sense: int = 1, in_plane: float = 1.0) -> ddg.Scene:
-    """The frame in the plane of x and z: one leg along x from the clamp, the other down along z.
+    """Build the frame in the plane of x and z: one leg along x from the clamp, the other down along z.
 
     Args:
         n: edges of each leg
@@ -49,19 +49,19 @@ def build(n: int = 20, sense: int = 1, in_plane: float = 1.0) -> ddg.Scene:
 
 
 def check(result) -> list[ddg.Check]:
-    """The load at which the path in the plane branches."""
+    """Check the load of the bifurcation of the planar path."""
     (force,) = (load.force[0] for load in result.scene.loads)
     loads = [*(point.load for point in result.path.bifurcations), np.nan]  # a path without a branch fails
     return [ddg.Check("lateral buckling load [N]", force * loads[0], CRITICAL[int(force)], 1e-2, SOURCE, relative=True)]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The buckling load over the edges of each leg."""
+    """Study the buckling load over the edges of each leg."""
     return ddg.bench.Study({"n": (5, 10, 20, 40)}, "lateral buckling load")
 
 
 def picture(result, frames) -> dict:
-    """The mode of the branch, out of the plane, beside the frame at the same load."""
+    """Draw the lateral mode of the bifurcation next to the frame at the same load."""
     if not result.path.bifurcations:
         return {}
     branch = result.path.bifurcations[0].state

@@ -1,9 +1,9 @@
-"""Three rods on an inclined plane: one lies down and rests, one slides down, one is thrown downhill and stops.
+"""Rods on a slope: Coulomb friction holds one rod, lets one slide, and stops one thrown downhill.
 
-Coulomb's law: at the angle a a rod rests where tan(a) < mu. Else it slides with the acceleration g (sin a - mu cos a); thrown at the
-speed v it stops after v^2 / (2 g (mu cos a - sin a)). Friction that is regularised lets what rests creep: the logistic law carries
-tan(a) / mu of mu N at the speed nu atanh(tan(a) / mu) / 7.5, and no faster, however long it rests. Friction acts here on the middle
-line of a rod, which slides and never rolls; see `rolling_rods`.
+By Coulomb's law a rod sticks at the angle a where tan(a) < mu. Else it slides with the acceleration g (sin a - mu cos a). Thrown at
+the speed v it stops after v^2 / (2 g (mu cos a - sin a)). Regularised friction creeps: the logistic law carries tan(a) / mu of mu N
+at the constant speed nu atanh(tan(a) / mu) / 7.5. Friction acts here on the centreline of a rod, which slides and never rolls; see
+`rolling_rods`.
 """
 
 import numpy as np
@@ -17,9 +17,9 @@ LENGTH = 0.3  # m
 RADIUS = 0.005  # m
 GRAVITY = 9.81  # m/s^2
 LANE = 0.1  # m, between rods
-LEAN = 0.05  # rad, by which the rod that lies down leans at first
+LEAN = 0.05  # rad, initial inclination of the sticking rod to the plane
 RANGE = 1e-4  # m, activation distance
-SETTLED = 0.5  # part of the run after which what rests has come to rest
+SETTLED = 0.5  # fraction of the run after which the sticking rod is at rest
 STEEPNESS = 7.5  # of the logistic law
 NAMES = ("rests", "slides", "thrown")
 
@@ -38,14 +38,14 @@ def build(
     duration: float = 1.2,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The rods side by side, along the slope, which falls towards x.
+    """Build the rods side by side, along a slope that falls towards x.
 
     Args:
         n: edges of each rod
-        angle: of the plane [degrees]
-        friction: friction coefficient of the rod that rests and of the one that is thrown
-        slippery: coefficient of the one that slides
-        speed: of the one that is thrown [m/s]
+        angle: angle of the plane [degrees]
+        friction: friction coefficient of the sticking and the thrown rod
+        slippery: friction coefficient of the sliding rod
+        speed: initial speed of the thrown rod [m/s]
         velocity: stick threshold nu of the friction law [m/s]
         stiffness: contact stiffness [N/m]
         range: activation distance of contact [m]
@@ -81,7 +81,7 @@ def build(
 
 
 def slope(angle: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Directions down a slope that falls towards x, and out of it, and the tangent of its angle [degrees]."""
+    """Return the downhill direction of a slope that falls towards x, its normal, and the tangent of its angle [degrees]."""
     a = np.radians(angle)
     if not 0.0 < a < 0.5 * np.pi:
         raise ValueError(f"angle = {angle}; a slope is between 0 and 90 degrees")
@@ -89,7 +89,7 @@ def slope(angle: float) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def thrown(model, velocity: np.ndarray, name: str = "thrown"):
-    """The rods at rest but for the one that is thrown."""
+    """Return the rest state with a velocity of the rod `name`."""
     batches = model.scene.batches
     velocities = np.zeros((len(batches), len(batches[0].points[0]), 3))
     velocities[[batch.name for batch in batches].index(name)] = velocity
@@ -97,7 +97,7 @@ def thrown(model, velocity: np.ndarray, name: str = "thrown"):
 
 
 def ways(model, state) -> dict[str, float]:
-    """How far down the slope each rod is [m], by name."""
+    """Return the downhill displacement of each rod [m], by name."""
     batches, normal = model.scene.batches, np.array(model.scene.obstacles[0].shape.normal)
     start = np.array([batch.points[0].mean(0) for batch in batches])
     middles = state.points().reshape(-1, len(batches), *batches[0].points.shape[1:])[0].mean(1)
@@ -106,7 +106,7 @@ def ways(model, state) -> dict[str, float]:
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far down the slope each rod is [m], the smallest gap [m], and what the plane carries over the weight that lies on it."""
+    """Return downhill displacements of rods [m], the smallest gap [m], and the plane's force over the normal weight."""
     normal = np.array(model.scene.obstacles[0].shape.normal)
     weight = sum(batch.section.mass_per_length for batch in model.scene.batches) * LENGTH * GRAVITY * normal[2]
     carried = np.reshape(model.reactions(state)[-1].force, (-1, 3))[0] @ normal
@@ -114,7 +114,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Weight carried, creep of what rests, way of what slides and of what stops."""
+    """Check the carried weight, creep of the sticking rod, and displacements of the sliding and the stopping rod."""
     names = (
         "plane carries, over the weight across it",
         "creep of the rod that rests [m/s]",
@@ -138,21 +138,21 @@ def _checks(result, scene, names) -> list[ddg.Check]:
     slow = law.velocity * np.arctanh(tangent / law.friction) / STEEPNESS
     pull = GRAVITY * cosine * (tangent - slippery)
     brake = GRAVITY * cosine * (law.friction - tangent)
-    # implicit Euler advances by the speed at the end of each step; what was thrown creeps once it has stopped
+    # implicit Euler advances by the speed at the end of each step; the thrown rod creeps after it has stopped
     slid = 0.5 * pull * t[-1] * (t[-1] + result.dt)
     stopped = 0.5 * speed * (speed / brake - result.dt) + slow * (t[-1] - speed / brake)
-    # friction comes late by a step where its normal force is taken once
-    late = min(ddg.Check.COARSEST, 0.01 * max(1.0, result.dt / 1e-3)) if law.lags == 1 else 1e-3
+    # friction lags by a step with one normal-force iteration
+    tolerance = min(ddg.Check.COARSEST, 0.01 * max(1.0, result.dt / 1e-3)) if law.lags == 1 else 1e-3
     return [
         ddg.Check(names[0], series["carried"][settled].mean(), 1.0, 1e-3, "balance of forces"),
         ddg.Check(names[1], creep, slow, 0.01, "nu atanh(tan(a) / mu) / 7.5", True),
-        ddg.Check(names[2], series["slides"][-1], slid, late, "g (sin a - mu cos a) t^2 / 2", True),
-        ddg.Check(names[3], series["thrown"][-1], stopped, late, "v^2 / (2 g (mu cos a - sin a))", True),
+        ddg.Check(names[2], series["slides"][-1], slid, tolerance, "g (sin a - mu cos a) t^2 / 2", True),
+        ddg.Check(names[3], series["thrown"][-1], stopped, tolerance, "v^2 / (2 g (mu cos a - sin a))", True),
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The way of the rod that was thrown over what contact, friction, steps and nodes are, one by one."""
+    """Study the displacement of the thrown rod over parameters of contact, friction, steps and nodes, one by one."""
     grid = {"n": (5, 10, 20, 40), "dt": (4e-3, 2e-3, 1e-3, 5e-4), "velocity": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)}
     grid |= {"stiffness": (2e3, 6e3, 2e4, 6e4, 2e5), "range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4)}
     grid |= {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8), "lags": (1, 2, 3)}
@@ -160,7 +160,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The rods as thick as they are on the plane, at the end."""
+    """Draw the rods on the plane at the end with actual thickness."""
     scene, last = result.model.scene, max(frames)
     plane = scene.obstacles[0].shape
     points = frames[last]

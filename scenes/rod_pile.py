@@ -1,10 +1,10 @@
-"""Rods are dropped into a box and come to rest on each other: 30, or 10,000 of 50 nodes each.
+"""Rod pile: 30 rods, or 10,000 of 50 nodes each, fall into a box and come to rest on each other.
 
-They start in all directions, apart from each other, and fall. Straight stiff rods in all directions pack to the density phi at which
-phi L / D = 5.4 +- 0.2 (Philipse, Langmuir 12, 1996: his experiments and his random contact equation, by which phi L / D is half of
-the contacts a rod), whatever their length L over the diameter D is, where that is more than about 15. These here bend under
-what lies on them, lie down where they land, and feel smooth walls one and a half lengths apart, so that they pack closer; a pile
-that is lower than half a length is no packing in this sense, and is not compared.
+They start in random directions without overlap, and fall. Long stiff rods with random directions pack to the density phi at which
+phi L / D = 5.4 +- 0.2, for ratios of length L to diameter D above about 15 (Philipse, Langmuir 12, 1996). By the random contact
+equation phi L / D is half of the contacts a rod. Here rods bend under load, align with the floor, and are in contact with smooth
+walls one and a half lengths apart, so that they pack closer. A pile lower than half a length is no packing in this sense, and is
+not compared.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ from ddg_warp.scenes import _layouts, _touching
 
 LENGTH = 0.1  # m
 RADIUS = 1e-3  # m; L / D = 50
-START = 1.0  # phi L / D before the fall: a rod that is placed at random meets 2 others
+START = 1.0  # initial phi L / D: a rod placed at random meets 2 others
 NODES = 50
 RANDOM_CONTACT = 5.4  # phi L / D of long rods
-SOFT = 2e-6  # m, stiffness of contact over Young's modulus
-REFUSED = 50  # pairs: iterates may slip around the end of a rod to its other side; the straight way, which cuts it, is not taken
-RTOL = 3e-2  # of a rod's weight, to which forces balance: nodes are off by a fiftieth of what half the step changes
-SLIP = 5e-3  # m/s, from which on friction is all there
-DENSEST = np.pi / np.sqrt(12.0)  # cylinders side by side in a hexagonal lattice
+SOFT = 2e-6  # m, contact stiffness over Young's modulus
+REFUSED = 50  # pairs: iterates may slip around the end of a rod, where the straight motion cuts it
+RTOL = 3e-2  # relative to the weight of a rod: position errors are a fiftieth of the change by half the step
+SLIP = 5e-3  # m/s, stick threshold of friction
+DENSEST = np.pi / np.sqrt(12.0)  # parallel cylinders in a hexagonal lattice
 PHILIPSE = "Philipse 1996, of stiff rods in all directions"
 
 
@@ -34,11 +34,11 @@ def build(
     duration: float = 0.5,
     seed: int = 1,
 ) -> ddg.Scene:
-    """Rods above the floor of a square box.
+    """Build rods above the floor of a square box.
 
     Args:
-        count: rods
-        width: of the box over the length of a rod; 0 takes 1.5, and more from 1,000 rods on, so that a pile is about a length high
+        count: number of rods
+        width: width of the box over the length of a rod; 0 takes 1.5, more from 1,000 rods on, for a pile about a length high
         young: Young's modulus [Pa]
         friction: Coulomb friction coefficient between rods, and between rods and the floor; walls are smooth
         dt: time step [s]
@@ -61,7 +61,7 @@ def build(
         material=ddg.Material(young=young, density=1000.0, poisson=0.5, viscosity=2e-3),
         name="rods",
     )
-    # as fast as they fall, stiffer contact and friction take twice the iterations
+    # Measured: stiffer contact and friction, for this speed of fall, take twice the iterations.
     scene.contact(stiffness=SOFT * young, **_touching.rubbing(friction, velocity=SLIP))
     scene.add_obstacle(ddg.Plane(), name="floor")
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
@@ -72,25 +72,27 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """As of all scenes of contact; height of the pile, twice that of its centre [m], and phi L / D."""
-    found = _touching.observe(model, state)
+    """Return `_touching.observe` with height of the pile, twice that of its centre [m], phi L / D, and contacts a rod."""
+    observed = _touching.observe(model, state)
     points, walls = state.points(), np.array([each.shape.points[0] for each in model.scene.obstacles[1:]])
     height = 2.0 * float(points[:, 2].mean())
-    share = _touching.rods_of(model) * np.pi * RADIUS**2 * LENGTH / (np.ptp(walls[:, 0]) * np.ptp(walls[:, 1]) * height)
-    contacts = 2.0 * found["touching_rods"] / _touching.rods_of(model)
-    return {**found, "height": height, "packing": share * LENGTH / (2.0 * RADIUS), "contacts_per_rod": contacts}
+    fraction = (
+        _touching.rods_of(model) * np.pi * RADIUS**2 * LENGTH / (np.ptp(walls[:, 0]) * np.ptp(walls[:, 1]) * height)
+    )
+    contacts = 2.0 * observed["touching_rods"] / _touching.rods_of(model)
+    return {**observed, "height": height, "packing": fraction * LENGTH / (2.0 * RADIUS), "contacts_per_rod": contacts}
 
 
 def check(result) -> list[ddg.Check]:
-    """No crossing and no overlap, impulses, energy; rods inside of their box; and the packing of a pile that is high enough."""
+    """Check no crossing, no overlap, impulses, energy, the box, and the packing of a sufficiently high pile."""
     series = {name: values[-1] for name, values in result.series.items()}
-    share = series["packing"] * 2.0 * RADIUS / LENGTH
+    fraction = series["packing"] * 2.0 * RADIUS / LENGTH
     checks = [
         *_touching.checks(result, REFUSED),
         _touching.weight_check(result, 1e-3),
         _touching.energy_check(result),
         ddg.Check("rods outside of the box [m]", outside(result), 0.0, 0.0, "floor and walls"),
-        ddg.Check("packing fraction over that of cylinders side by side", share / DENSEST, 0.0, 1.0, "Thue 1910"),
+        ddg.Check("packing fraction over that of cylinders side by side", fraction / DENSEST, 0.0, 1.0, "Thue 1910"),
     ]
     resting = series["kinetic"] < 1e-3 * max(result.series["kinetic"])
     if resting and series["height"] > 0.5 * LENGTH:
@@ -99,14 +101,14 @@ def check(result) -> list[ddg.Check]:
 
 
 def outside(result) -> float:
-    """How far surfaces of rods reach out of the box [m], 0 where they do not."""
+    """Return how far surfaces of rods protrude from the box [m], 0 if none does."""
     points, planes = result.state.points(), [each.shape for each in result.model.scene.obstacles]
     depth = [np.min((points - plane.point) @ np.array(plane.normal, float)) - RADIUS for plane in planes]
     return max(0.0, -float(min(depth)))
 
 
 def benchmark() -> ddg.bench.Study:
-    """Height of the pile's centre over steps and seconds of the clock."""
+    """Study the height of the pile's centre over steps and run time."""
     return ddg.bench.Study(
         {"dt": (1 / 120, 1 / 240, 1 / 480)},
         lambda result: result.series["height"][-1],
@@ -117,7 +119,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """Before the fall, during it, and the pile, each rod in a color of its own."""
+    """Draw the rods before the fall, during it, and in the pile, one color a rod."""
     times = list(frames)
     return {
         "points_by_time": {t: frames[t] for t in (times[0], times[len(times) // 3], times[-1])},

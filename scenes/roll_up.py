@@ -1,7 +1,7 @@
 """Roll-up: a couple at the end of a cantilever rolls it into a circle.
 
-Its curvature is M / EI everywhere, and no force acts along it: the shape is an arc of any number of turns (Euler 1744). A couple on a
-rod of nodes and edges is a pair of forces that turns with the last edge; here it is an energy, since all stays in a plane.
+Its curvature is M / EI everywhere, and no force acts along it: the shape is an arc of any number of turns (Euler 1744). A couple on
+nodes and edges is a pair of forces that rotates with the last edge. Here it is an energy, since the motion is planar.
 """
 
 import numpy as np
@@ -10,12 +10,12 @@ import ddg_warp as ddg
 
 LENGTH = 1.0  # m
 EI = 1.0  # N m^2
-EA = 1.0e6  # N; no force stretches the rod, so its value is of no importance
+EA = 1.0e6  # N; no force stretches the rod, so that its value has no effect
 SOURCE = "circle of curvature M / EI (Euler 1744)"
 
 
 def build(turns: float = 1.0, n: int = 200) -> ddg.Scene:
-    """The cantilever along x, rolled towards z.
+    """Build the cantilever along x, rolled towards z.
 
     Args:
         turns: turns of the end
@@ -31,27 +31,27 @@ def build(turns: float = 1.0, n: int = 200) -> ddg.Scene:
 
 
 def exact(turns: float) -> tuple[float, float]:
-    """The tip (x, z) [m]."""
+    """Return the tip (x, z) [m]."""
     curvature = 2.0 * np.pi * turns / LENGTH
     return np.sin(curvature * LENGTH) / curvature, (1.0 - np.cos(curvature * LENGTH)) / curvature
 
 
 def curvature(state) -> np.ndarray:
-    """Turn between edges over their length, at the nodes inside (n - 1,) [1/m]."""
+    """Return rotations between edges over the edge length at inner nodes (n - 1,) [1/m]."""
     edges = np.diff(state.points()[:, [0, 2]], axis=0)
     first, second = edges[:-1], edges[1:]
-    turn = np.arctan2(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0], np.sum(first * second, axis=1))
-    return turn * (len(edges) / LENGTH)
+    rotation = np.arctan2(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0], np.sum(first * second, axis=1))
+    return rotation * (len(edges) / LENGTH)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Where the tip is [m]."""
+    """Return the tip position [m]."""
     x, _, z = state.points()[-1]
     return {"tip_x": x, "tip_z": z}
 
 
 def check(result) -> list[ddg.Check]:
-    """The tip, the curvature and the length against the circle; errors of space are of second order."""
+    """Check tip, curvature and length against the circle, with errors of second order in the edges."""
     points = result.state.points()
     turns = -result.model.scene.loads[0].couple[1] * LENGTH / (2.0 * np.pi * EI)
     angle = 2.0 * np.pi * turns / (len(points) - 1)  # between neighbouring edges
@@ -69,5 +69,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The tip over the edges of the rod."""
+    """Study the tip over the edges of the rod."""
     return ddg.bench.Study({"n": (25, 50, 100, 200)}, "tip x", scale=1.0)

@@ -1,8 +1,8 @@
-"""Three rods lie across a slope: one rolls down it, one is bowled and comes to roll, one finds it too slippery.
+"""Rolling rods: of three rods across a slope one rolls, one is bowled and comes to roll, and one slips.
 
-Friction acts on the surface of a rod and turns it about its axis. A cylinder, I = m r^2 / 2, rolls with 2/3 g sin a, whatever the
-friction mu, as long as tan(a) <= 3 mu. Where it slides with the speed v it gains g (sin a - mu cos a), and its surface, r omega,
-2 mu g cos a: so one that is bowled with v0 comes to roll after v0 / (g (3 mu cos a - sin a)), and where tan(a) > 3 mu none ever does.
+Surface friction rotates a rod about its axis. A cylinder, I = m r^2 / 2, rolls with 2/3 g sin a at any friction mu with tan(a) <= 3
+mu. Sliding with the speed v, its acceleration is g (sin a - mu cos a), and that of its surface, r omega, 2 mu g cos a. A rod bowled
+with v0 comes to roll after v0 / (g (3 mu cos a - sin a)); where tan(a) > 3 mu none ever does.
 """
 
 import numpy as np
@@ -36,14 +36,14 @@ def build(
     duration: float = 0.5,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The rods side by side, across the slope, which falls towards x.
+    """Build the rods side by side, across a slope that falls towards x.
 
     Args:
         n: edges of each rod
-        angle: of the plane [degrees]
-        friction: friction coefficient of the rod that rolls and of the one that is bowled
-        slippery: coefficient of the one that slips
-        speed: of the one that is bowled [m/s]
+        angle: angle of the plane [degrees]
+        friction: friction coefficient of the rolling and the bowled rod
+        slippery: friction coefficient of the slipping rod
+        speed: initial speed of the bowled rod [m/s]
         velocity: stick threshold nu of the friction law [m/s]
         stiffness: contact stiffness [N/m]
         range: activation distance of contact [m]
@@ -79,25 +79,25 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far down the slope each rod is [m], how far its surface has turned [m], and the smallest gap [m]."""
+    """Return downhill displacements of rods and surface rotations of rods [m], and the smallest gap [m]."""
     edges = len(model.scene.batches[0].points[0]) - 1
-    turned = (state.angles() - model.state().angles()).reshape(-1, len(NAMES), edges)[0].mean(1)
-    found = rod_on_floor.ways(model, state)
-    found |= {f"{name}, turned": RADIUS * value for name, value in zip(NAMES, turned, strict=True)}
-    return found | {"gap": _touching.smallest_gap(model, state)}
+    rotations = (state.angles() - model.state().angles()).reshape(-1, len(NAMES), edges)[0].mean(1)
+    observed = rod_on_floor.ways(model, state)
+    observed |= {f"{name}, turned": RADIUS * value for name, value in zip(NAMES, rotations, strict=True)}
+    return observed | {"gap": _touching.smallest_gap(model, state)}
 
 
 def expected(angle: float, friction: float, speed: float, t: float) -> tuple[float, float]:
-    """Way down a slope [rad], and that of the surface about the axis [m], at the time t of a cylinder with a speed at first."""
+    """Return displacement down a slope [rad], and of the surface about the axis [m], at time t from an initial speed."""
     pull, brake = GRAVITY * np.sin(angle), GRAVITY * friction * np.cos(angle)
     slides = min(t, speed / (3.0 * brake - pull)) if 3.0 * brake > pull else t
-    rolls, then = t - slides, 2.0 * brake * slides
-    rolled = then * rolls + pull / 3.0 * rolls**2
+    rolls, surface_speed = t - slides, 2.0 * brake * slides
+    rolled = surface_speed * rolls + pull / 3.0 * rolls**2
     return (speed + 0.5 * (pull - brake) * slides) * slides + rolled, brake * slides**2 + rolled
 
 
 def check(result) -> list[ddg.Check]:
-    """Ways of the rods, and of their surfaces about their axes."""
+    """Check displacements of rods, and of surfaces about the axes."""
     scene = result.model.scene
     checks = once_reached(result, scene.analysis.duration, WAYS, lambda: _checks(result, scene))
     return checks + _touching.kept_apart(result)
@@ -106,21 +106,21 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, scene) -> list[ddg.Check]:
     normal, mu = np.array(scene.obstacles[0].shape.normal), scene.touching.friction
     speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
-    given = {"rolls": (mu, 0.0), "bowled": (mu, speed), "slips": (scene.betweens[0].friction, 0.0)}
-    found = [expected(np.arctan2(normal[0], normal[2]), *given[name], result.times[-1]) for name in NAMES]
+    inputs = {"rolls": (mu, 0.0), "bowled": (mu, speed), "slips": (scene.betweens[0].friction, 0.0)}
+    exact = [expected(np.arctan2(normal[0], normal[2]), *inputs[name], result.times[-1]) for name in NAMES]
     law = "m x'' = m g sin a - f, I omega' = f r, f = mu N while it slides"
     last = {name: values[-1] for name, values in result.series.items()}
     close = 0.01 * max(1.0, result.dt / 1e-3)
     keys = [*NAMES, *(f"{name}, turned" for name in NAMES)]
-    ways = [way for way, _ in found] + [turned for _, turned in found]
+    displacements = [displacement for displacement, _ in exact] + [rotation for _, rotation in exact]
     return [
-        ddg.Check(name, last[key], way, min(ddg.Check.COARSEST, close), law, True)
-        for name, key, way in zip(WAYS, keys, ways, strict=True)
+        ddg.Check(name, last[key], displacement, min(ddg.Check.COARSEST, close), law, True)
+        for name, key, displacement in zip(WAYS, keys, displacements, strict=True)
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The way of the rod that was bowled over what contact, friction, steps and nodes are, one by one."""
+    """Study the displacement of the bowled rod over parameters of contact, friction, steps and nodes, one by one."""
     grid = {"n": (5, 10, 20), "dt": (4e-3, 2e-3, 1e-3, 5e-4), "velocity": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)}
     grid |= {"stiffness": (2e3, 2e4, 2e5), "range": (2.5e-5, RANGE, 4e-4), "lags": (1, 2, 3)}
     return ddg.bench.Study(grid, WAYS[1], one_by_one=True)

@@ -1,11 +1,12 @@
-"""Sag-free hair: 512 curled strands of a groom that hang under their weight as they were drawn.
+"""Sag-free hair: rest shapes with which 512 curled strands of a groom hang under their weight as drawn.
 
-With the drawn shape as their natural one, as in `strands`, they sag. Here each has the rest stretches, natural curvatures and twists
-with which the drawn shape is its equilibrium (`ddg_warp.ask.sag_free`); the scene begins without weight, where they stand out from the
-head, and loads them by it. Strands that are too soft are unstable in their shape, as they are naturally bent far from it, and turn
-over: here the first of them at 1.3e8 Pa, half of them at 1e8 Pa, the last at 8e7 Pa, so that at the 4e7 Pa of `strands` none stays as
-drawn. `check` says how many do. Reference: moments about the nodes follow from the weight of what is beyond; which strands are
-unstable, from second derivatives of the energy.
+With the drawn shape as natural shape, as in `strands`, they sag. Here each strand has the rest stretches, natural curvatures and
+twists that put the drawn shape in equilibrium (`ddg_warp.ask.sag_free`). The run starts without weight, where strands stand out
+from the head, and applies it. Strands that are too soft are unstable in the drawn shape, far from their natural one, and flip over.
+
+Measured: the first strand is unstable at 1.3e8 Pa, half of them at 1e8 Pa, the last at 8e7 Pa. At the 4e7 Pa of `strands` none
+stays as drawn. `check` counts stable strands. Reference: moments about the nodes follow from the weight beyond each; second
+derivatives of the energy give the unstable strands.
 """
 
 from functools import cache
@@ -17,8 +18,8 @@ from ddg_warp.ask import sag_free
 from ddg_warp.scenes import _learn, _strands
 from ddg_warp.scenes.strands import GROOM, groom
 
-GRADED = 16  # strands of which gradients are taken
-LEFT = 1e-6  # m, from where it was drawn, beyond which a strand has left
+GRADED = 16  # number of strands with gradient checks
+LEFT = 1e-6  # m, distance from the drawing beyond which a strand counts as flipped
 MOMENTS = (
     "weight of what is beyond; by the slope of 2 tan(phi / 2) off by sin(phi / 2)^2, phi the largest turn between edges"
 )
@@ -26,11 +27,11 @@ SLOPE = "slope of the distance by rest strains, over that of hair that sags"
 
 
 def build(path: str = str(GROOM), count: int = 512, young: float = 1.5e8) -> ddg.Scene:
-    """The groom with rest shapes for its weight.
+    """Build the groom with sag-free rest shapes.
 
     Args:
         path: USD file with curves of equal vertex counts
-        count: strands; fewer are picked evenly, more are copies that stand between them
+        count: number of strands, an even selection, or with copies between them
         young: Young's modulus [Pa]
     """
     points, radius = groom(path, count)
@@ -39,69 +40,69 @@ def build(path: str = str(GROOM), count: int = 512, young: float = 1.5e8) -> ddg
 
 
 def kind(radius: float, young: float) -> dict:
-    """Section and material of strands."""
+    """Return section and material of strands."""
     material = ddg.Material(young=young, poisson=0.4, density=1300.0)
     return {"section": ddg.Circle(radius), "material": material}
 
 
 def strands(points: np.ndarray, **about) -> ddg.Scene:
-    """Strands (count, nodes, 3) held by their first edge; by default their drawn shape is their natural one."""
+    """Return a scene of strands (count, nodes, 3) clamped at their first edge, with the drawn shape as default natural one."""
     scene = ddg.Scene(analysis=ddg.Statics(load_steps=4))
     scene.clamp(scene.add_rods(points, **about, name="strands"), edges=[0])
     return scene
 
 
 def young(batch) -> float:
-    """Young's modulus [Pa] of the strands of a batch."""
+    """Return Young's modulus [Pa] of the strands of a batch."""
     return float(batch.section.EA / (np.pi * batch.section.radius**2))
 
 
 @cache
 def sagged(model) -> np.ndarray:
-    """Where strands hang (nodes, 3) whose natural shape is the drawn one."""
+    """Return hanging strands (nodes, 3) with the drawn shape as natural one."""
     (batch,) = model.scene.batches
     scene = strands(batch.points, **kind(float(batch.section.radius), young(batch)))
     return ddg.statics.solve(scene.build("cpu", "float64"), load_steps=4).points()
 
 
 def distances(points: np.ndarray, batch) -> np.ndarray:
-    """Of each strand the largest distance of a node from where it is drawn [m]."""
+    """Return the largest distance of a node from the drawn position for each strand [m]."""
     return np.linalg.norm(points.reshape(batch.points.shape) - batch.points, axis=2).max(1)
 
 
 def check(result) -> list[ddg.Check]:
-    """Stable strands hang as drawn, unstable ones have left; moments against statics; gradients find nothing to improve."""
+    """Check stable strands against the drawing, counts of unstable ones, moments against statics, and a zero gradient."""
     from ddg_warp.ask import inquiry
 
     (batch,) = result.model.scene.batches
     least = young(batch) * sag_free.least_stiffness(result.model, result.model.state())[0]
     unstable, off = least >= young(batch), distances(result.state.points(), batch)
-    told = f"second derivatives; strands are unstable below {least.min():.3g} to {least.max():.3g} Pa, each its own"
+    note = f"second derivatives; strands are unstable below {least.min():.3g} to {least.max():.3g} Pa, each its own"
     checks = [
-        ddg.Check("strands that are unstable as drawn", unstable.sum(), 0.0, 0.0, told),
+        ddg.Check("strands that are unstable as drawn", unstable.sum(), 0.0, 0.0, note),
         ddg.Check("strands that have left", (off > LEFT).sum(), unstable.sum(), 0.0, "those that are unstable"),
     ]
     if unstable.all():
         return checks
     before = distances(sagged(result.model), batch)
-    told = f"drawn; with that as natural shape {100.0 * before.mean():.3g} cm on average, {100.0 * before.max():.3g} at most"
+    note = f"drawn; with that as natural shape {100.0 * before.mean():.3g} cm on average, {100.0 * before.max():.3g} at most"
     stresses = inquiry.stresses(result.model, result.state)["rod_bend_twist"]
-    found = np.stack([np.linalg.norm(own, axis=-1) for own in stresses])[~unstable]
-    known = _strands.moments(batch.points, _strands.GRAVITY * batch.section.mass_per_length)[~unstable]
-    away = np.abs(found - known).max() / known.max()
+    moments = np.stack([np.linalg.norm(stress, axis=-1) for stress in stresses])[~unstable]
+    exact = _strands.moments(batch.points, _strands.GRAVITY * batch.section.mass_per_length)[~unstable]
+    away = np.abs(moments - exact).max() / exact.max()
     edges = np.diff(batch.points, axis=1)
     edges /= np.linalg.norm(edges, axis=2, keepdims=True)
     turned = 0.5 * (1.0 - (edges[:, 1:] * edges[:, :-1]).sum(2).min())  # sin(phi / 2)^2
     return [
         *checks,
-        ddg.Check("stable strands from where they are drawn [m]", off[~unstable].max(), 0.0, 1e-9, told),
+        ddg.Check("stable strands from where they are drawn [m]", off[~unstable].max(), 0.0, 1e-9, note),
         ddg.Check("moments off statics, over the largest", away, 0.0, turned, MOMENTS),
         *(_learn.skipped([SLOPE]) or [ddg.Check(SLOPE, slope(result, ~unstable), 0.0, 1e-6, "a minimum has none")]),
     ]
 
 
 def slope(result, chosen: np.ndarray) -> float:
-    """Largest derivative by rest strains of the mean square distance from the drawn shape of some strands, over that where they sag."""
+    """Return the largest gradient by rest strains of the mean square distance of strands, over that of sagging ones."""
     import torch
 
     from ddg_warp.torch import Simulator
@@ -111,17 +112,17 @@ def slope(result, chosen: np.ndarray) -> float:
     about = kind(float(batch.section.radius), young(batch))
     model = strands(batch.points[rows], **about).build("cpu", "float64")
     simulator, points, sizes = Simulator(model, dt=0.01), torch.tensor(model.state().points()), []
-    for load in (0.0, 1.0):  # rest strains for no weight are those drawn
+    for load in (0.0, 1.0):  # rest strains without weight are the drawn shape
         strains = sag_free.rest_strains(model, load=load)
         parameters = {name: torch.tensor(values, requires_grad=True) for name, values in strains.items()}
         off = simulator.equilibrium(parameters, load_steps=4).positions[0] - points
         slopes = torch.autograd.grad((off**2).sum(1).mean(), parameters.values())
-        sizes.append(max(float(own.abs().max()) for own in slopes))
+        sizes.append(max(float(gradient.abs().max()) for gradient in slopes))
     return sizes[1] / sizes[0]
 
 
 def picture(result, frames) -> dict:
-    """How strands hang whose natural shape is that drawn, those of the groom without weight, and with it: as drawn."""
+    """Draw strands with the drawn natural shape, rest shapes without weight, and with it."""
     (batch,) = result.model.scene.batches
     free = ddg.statics.solve(result.model, end=0.0)
     head = _strands.head(batch.points[:, 0])
@@ -135,5 +136,5 @@ def picture(result, frames) -> dict:
 
 
 def benchmark() -> ddg.bench.Study:
-    """Moments against statics over the strands."""
+    """Study moments against statics over the number of strands."""
     return ddg.bench.Study({"count": (8, 32, 128)}, "moments off")

@@ -1,10 +1,10 @@
-"""A straight rod that sinks inclined through a viscous fluid: it drifts sideways, and does not turn.
+"""Sedimenting rod: a straight rod sinks inclined through a viscous fluid, drifts sideways, and does not rotate.
 
 With the tilt phi against the vertical, weight w and mass m per length, resistive force theory gives velocities along and across
 
     v_t = w cos(phi) / zeta_t (1 - exp(-zeta_t t / m)) ,  v_n = w sin(phi) / zeta_n (1 - exp(-zeta_n t / m)) ,
 
-and in the end the drift tan(delta) = (zeta_n - zeta_t) sin(phi) cos(phi) / (zeta_t sin(phi)^2 + zeta_n cos(phi)^2).
+and the final drift tan(delta) = (zeta_n - zeta_t) sin(phi) cos(phi) / (zeta_t sin(phi)^2 + zeta_n cos(phi)^2).
 """
 
 import numpy as np
@@ -27,13 +27,13 @@ def build(
     dt: float = 0.01,
     scheme: str = "implicit_midpoint",
 ) -> ddg.Scene:
-    """The rod in the plane of x and z.
+    """Build the rod in the plane of x and z.
 
     Args:
-        tilt: against the vertical [degrees]
+        tilt: angle against the vertical [degrees]
         n: edges of the rod
-        radius: of the rod [m]
-        duration: of the run [s]; rates of approach are 10 zeta / s
+        radius: radius of the rod [m]
+        duration: duration of the run [s]; rates of approach are 10 zeta / s
         dt: time step [s]
         scheme: time integration scheme
     """
@@ -49,39 +49,39 @@ def build(
 
 
 def direction(tilt: float) -> np.ndarray:
-    """Tangent (3,) of the rod, upwards."""
+    """Return the upward tangent (3,) of the rod."""
     return np.array([np.sin(np.radians(tilt)), 0.0, np.cos(np.radians(tilt))])
 
 
 def observe(model, state) -> dict[str, float]:
-    """Speed of sinking and of drifting [m/s], the mean over the nodes; power that the fluid takes [W]."""
+    """Return mean speeds of sinking and drifting over nodes [m/s], and power dissipated by the fluid [W]."""
     x, _, z = state.velocities().reshape(-1, 3).mean(0)
     return {"sinking": -z, "drifting": -x, "power": -float(np.mean(model.drag(state).power))}
 
 
 def check(result) -> list[ddg.Check]:
-    """Velocities at the end against the closed form, drift and power against those of steady sinking."""
+    """Check final velocities against the closed form, drift and power against steady sinking."""
     batch, time, dt = result.scene.batches[0], float(result.times[-1]), result.dt
     tangent = batch.points[0, -1] / np.linalg.norm(batch.points[0, -1])
     coefficients = LAW.coefficients("", np.array(batch.section.radius), np.array(LENGTH))
     along, across = (float(zeta) for zeta in coefficients[:2])
     rates = np.array([along, across]) * GRAVITY / WEIGHT
-    share = 1.0 - np.exp(-rates * time)
+    progress = 1.0 - np.exp(-rates * time)
     sine, cosine = tangent[0], tangent[2]
     final = WEIGHT * np.array([cosine / along, sine / across])
-    v_t, v_n = final * share
+    v_t, v_n = final * progress
     order = 2 if result.scene.analysis.scheme == "implicit_midpoint" else 1
     tolerance = 1e-6 + float(np.max(time * rates * (rates * dt) ** order * np.exp(-rates * time)))
     sinking, drifting = result.series["sinking"][-1], result.series["drifting"][-1]
-    found = (sinking * cosine + drifting * sine, sinking * sine - drifting * cosine)
+    measured = (sinking * cosine + drifting * sine, sinking * sine - drifting * cosine)
     checks = [
-        ddg.Check("velocity along the rod [m/s]", found[0], v_t, tolerance, SOURCE, relative=True),
-        ddg.Check("velocity across the rod [m/s]", found[1], v_n, tolerance, SOURCE, relative=True),
+        ddg.Check("velocity along the rod [m/s]", measured[0], v_t, tolerance, SOURCE, relative=True),
+        ddg.Check("velocity across the rod [m/s]", measured[1], v_n, tolerance, SOURCE, relative=True),
     ]
     names = ("drift [degrees]", "power of the drag [W]")
     drift = np.degrees(np.arctan2((across - along) * sine * cosine, along * sine**2 + across * cosine**2))
     power = WEIGHT * LENGTH * (final[0] * cosine + final[1] * sine)
-    found = (np.degrees(np.arctan2(drifting, sinking)), result.series["power"][-1])
+    measured = (np.degrees(np.arctan2(drifting, sinking)), result.series["power"][-1])
     steady = 7.0 / rates.min()  # s
     return checks + once_reached(
         result,
@@ -89,6 +89,6 @@ def check(result) -> list[ddg.Check]:
         names,
         lambda: [
             ddg.Check(name, value, exact, 4.0 * np.exp(-steady * rates.min()), SOURCE, relative=True)
-            for name, value, exact in zip(names, found, (drift, power), strict=True)
+            for name, value, exact in zip(names, measured, (drift, power), strict=True)
         ],
     )

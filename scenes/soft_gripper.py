@@ -1,11 +1,11 @@
-"""Soft gripper: fingers that close around a ball, by natural curvatures that are learned from gradients of equilibria.
+"""Soft gripper: fingers close around a ball by natural curvatures that are fitted through equilibria.
 
-Three fingers of silicone hang from a palm around a ball. Actuators along each of them set its natural curvature inwards, linear between
-six knots. The values there are learned: the lower half of a finger is to lie on the ball, its axis half a thickness off the surface,
-in equilibrium with its weight, by curvatures that change little from knot to knot. `build` calls `learn`, which moves the six numbers
-by Levenberg's method, every number that is to vanish in a world of its own. Built are fingers of more edges with these natural
-curvatures, loaded by their weight. Nothing touches anything here: a finger takes the shape of the ball, it does not press on it.
-Reference: the axis of a finger on the ball is an arc of radius R + r; its free tip, without moment, has that as its natural curvature.
+Three fingers of silicone hang from a palm around a ball. Actuators along each of them set its natural curvature inwards, linear
+between six knots. The values at knots are fitted with small changes between knots. In equilibrium under its weight, the lower half
+of a finger shall lie on the ball, its axis half a thickness off the surface. `build` calls `learn`, which uses Levenberg's method
+with one world a residual. The scene has fingers of more edges with these natural curvatures, loaded by their weight. There is no
+contact here: a finger takes the shape of the ball without pressing on it. Reference: the axis of a finger on the ball is an arc of
+radius R + r. Its free tip, without moment, has that as its natural curvature.
 """
 
 from functools import cache
@@ -21,21 +21,21 @@ LENGTH = 0.13  # m, of a finger
 RADIUS = 0.006  # m, of a finger
 SILICONE = ddg.Material(young=1.0e6, poisson=0.5, density=1100.0)
 BALL, CENTRE = 0.04, np.array([0.0, 0.0, -0.06])  # m
-PALM = BALL + RADIUS  # radius of the circle on which fingers stand [m]: from there they go straight down to the ball
+PALM = BALL + RADIUS  # m, radius of the circle of clamps, from which fingers go straight down to the ball
 KNOTS = 6
-GRASP = 0.4  # of the finger; from there on it is to lie on the ball
-EDGES = 40  # of the learner's finger
+GRASP = 0.4  # fraction of the finger from which on it shall lie on the ball
+EDGES = 40  # edges of the fitted finger
 CLOSE = 1e-3  # m, of a gap
-TAME = 5e-5  # m, weight of a step of curvature of 1 / R beside gaps
+TAME = 5e-5  # m, weight of a curvature change of 1 / R against gaps
 NAME = "rod_bend_twist.rest_1"
 
 
 def build(n: int = 60, fingers: int = 3) -> ddg.Scene:
-    """The gripper with the natural curvatures that were learned; building takes as long as learning them.
+    """Build the gripper with the fitted natural curvatures; building includes the fit.
 
     Args:
         n: edges of a finger, at least 12
-        fingers: how many
+        fingers: number of fingers
     """
     if n < 2 * KNOTS or fingers < 1:
         raise ValueError(f"n = {n}, fingers = {fingers}: take {2 * KNOTS} edges and one finger at least")
@@ -44,13 +44,13 @@ def build(n: int = 60, fingers: int = 3) -> ddg.Scene:
 
 
 def gripper(n: int, fingers: int, curvatures: np.ndarray) -> ddg.Scene:
-    """Fingers of n edges that are drawn straight, with natural curvatures (6,) [1/m] towards the axis of the gripper."""
+    """Return a scene of straight fingers of n edges with natural curvatures (6,) [1/m] towards the axis of the gripper."""
     angle = 2.0 * np.pi * np.arange(fingers) / fingers
     out = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     points = PALM * out[:, None] - np.linspace(0.0, LENGTH, n + 1)[:, None] * [0.0, 0.0, 1.0]
     scene = ddg.Scene(analysis=ddg.Statics(load_steps=10))
     natural = (shares(n) @ curvatures)[1:]
-    own = scene.add_rods(
+    index = scene.add_rods(
         points,
         section=ddg.Circle(RADIUS),
         material=SILICONE,
@@ -59,19 +59,21 @@ def gripper(n: int, fingers: int, curvatures: np.ndarray) -> ddg.Scene:
         curvature="angle",
         name="fingers",
     )
-    scene.clamp_end(own)
+    scene.clamp_end(index)
     return scene
 
 
 def shares(n: int) -> np.ndarray:
-    """What knots have of the natural curvature of a finger of n edges (n, knots), linear in between: at its vertices, before which
-    comes its clamped end, that has what the first vertex has."""
-    place = np.maximum(1, np.arange(n)) / n * (KNOTS - 1)
-    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(KNOTS)))
+    """Return weights (n, knots) of linear interpolation from knots to the vertices of a finger of n edges.
+
+    The row of the clamped end comes first and equals that of the first vertex.
+    """
+    position = np.maximum(1, np.arange(n)) / n * (KNOTS - 1)
+    return np.maximum(0.0, 1.0 - np.abs(position[:, None] - np.arange(KNOTS)))
 
 
 def gaps(points):
-    """How far nodes (..., nodes, 3) are off the axis of a finger that lies on the ball, outwards [m], as arrays or tensors."""
+    """Return outward distances of nodes (..., nodes, 3) from the axis of a finger on the ball [m], as arrays or tensors."""
     x, y, z = (points[..., k] - CENTRE[k] for k in range(3))
     return (x**2 + y**2 + z**2) ** 0.5 - BALL - RADIUS
 
@@ -79,7 +81,7 @@ def gaps(points):
 @cache
 @_learn.one_thread()
 def learn() -> tuple[np.ndarray, list[float]]:
-    """Natural curvatures (6,) [1/m], and the gaps of a coarse finger after every step of the search, root mean square [m]."""
+    """Fit natural curvatures (6,) [1/m]; return also the RMS gap of a coarse finger after every step of the search [m]."""
     import torch
 
     from ddg_warp.torch import Simulator
@@ -88,16 +90,16 @@ def learn() -> tuple[np.ndarray, list[float]]:
     weights, grasp, scale = torch.tensor(shares(EDGES)), round(GRASP * EDGES), 1.0 / BALL
 
     def residuals(factors):
-        """Gaps of every world [m] and steps of its curvatures from knot to knot (worlds, 26), of curvatures (worlds, 6) times R."""
+        """Return gaps [m] and weighted curvature changes (worlds, 26) for curvatures (worlds, 6) times R."""
         state = simulator.equilibrium({NAME: scale * factors @ weights.T}, batch=len(factors), load_steps=10)
         return torch.cat([gaps(state.positions)[:, grasp:], TAME * factors.diff(dim=1)], 1)
 
-    found, _, passed = _learn.least_squares(residuals, np.zeros(KNOTS), iterations=30, tolerance=1e-3)
-    return scale * found, [float(np.sqrt((off[: 1 - KNOTS] ** 2).mean())) for off in passed]
+    fitted, _, history = _learn.least_squares(residuals, np.zeros(KNOTS), iterations=30, tolerance=1e-3)
+    return scale * fitted, [float(np.sqrt((off[: 1 - KNOTS] ** 2).mean())) for off in history]
 
 
 def check(result) -> list[ddg.Check]:
-    """No gap along the grasp, no finger in the ball, and the natural curvature of a tip without moment."""
+    """Check gaps along the grasp, penetration of the ball, and the natural curvature of the moment-free tip."""
     curvatures, result.learned = learn()
     names = ["gap along the grasp, largest [m]", "finger in the ball, deepest [m]"]
 
@@ -117,7 +119,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def picture(result, frames) -> dict:
-    """Fingers at rest as drawn and as they close, beside the ball."""
+    """Draw initial and closed fingers, next to the ball."""
     ball, triangles = meshes.sphere(4)
     last = max(frames)
     shown = {min(frames): frames[min(frames)], last: frames[last]}
@@ -130,7 +132,7 @@ def picture(result, frames) -> dict:
 
 
 def plot(result) -> dict:
-    """Gaps of the grasp after every step of the search."""
+    """Plot gaps of the grasp after every step of the search."""
     off = 1e3 * np.array(result.learned)
     line = ("of a coarse finger, root mean square", np.arange(len(off)), off, "o-")
     return {
@@ -143,7 +145,7 @@ def plot(result) -> dict:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The grasp over the edges of fingers, for what was learned."""
+    """Study the grasp with fitted curvatures over the edges of fingers."""
     return ddg.bench.Study(
         {"n": (20, 30, 60)}, lambda result: result.state.points()[-1], {"n": 120}, unit="m", fixed={"fingers": 1}
     )

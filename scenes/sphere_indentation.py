@@ -1,8 +1,8 @@
-"""Sphere under a point force: the stiffness of a thin spherical shell pushed in at its pole.
+"""Sphere indentation: a point force at the pole of a thin spherical shell, and its stiffness.
 
 Membrane and bending balance over a length sqrt(R h), and k = 4 E h^2 / (R sqrt(3 (1 - nu^2))) for a small force on a shallow shell
-(Reissner, J. Math. Phys. 25, 1946). A cap that reaches ten of these lengths from the pole stands for the sphere; its mesh gets finer
-towards the pole, where the moments grow like a logarithm.
+(Reissner, J. Math. Phys. 25, 1946). A cap that reaches ten of these lengths from the pole stands for the sphere. Its mesh is
+refined towards the pole, where the moments grow like a logarithm.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ SOURCE = "Reissner 1946"
 
 
 def build(slenderness: float = 1000.0, rings: int = 32, grading: float = 2.0) -> ddg.Scene:
-    """The cap about the z axis, clamped at its rim, pushed along -z at the pole by a thousandth of its thickness.
+    """Build the cap about the z axis, clamped at its rim, with the pole loaded to move by a thousandth of the thickness along -z.
 
     Args:
         slenderness: radius over thickness, 100 at least
@@ -37,7 +37,7 @@ def build(slenderness: float = 1000.0, rings: int = 32, grading: float = 2.0) ->
 
 
 def cap(rings: int, angle: float, grading: float) -> meshes.Mesh:
-    """Points and triangles of a cap whose rings crowd towards the pole."""
+    """Return points and triangles of a cap with rings refined towards the pole."""
     points, triangles = meshes.spherical_cap(rings, RADIUS, angle)
     polar = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
     around = np.arctan2(points[:, 1], points[:, 0])
@@ -48,23 +48,23 @@ def cap(rings: int, angle: float, grading: float) -> meshes.Mesh:
 
 
 def exact(thickness: float) -> float:
-    """Stiffness [N/m]."""
+    """Return the stiffness [N/m]."""
     return 4.0 * YOUNG * thickness**2 / (RADIUS * np.sqrt(3.0 * (1.0 - POISSON**2)))
 
 
 def stiffness(model, state) -> float:
-    """Force over displacement of the pole, over the closed form."""
+    """Return force over displacement of the pole, over the closed form."""
     scene = model.scene
     force = -scene.shell_loads[0].force[0, 2]
     return force / (RADIUS - state.points()[0, 2]) / exact(float(scene.shells[0].thickness))
 
 
 def check(result) -> list[ddg.Check]:
-    """The stiffness against Reissner's."""
+    """Check the stiffness against Reissner's."""
     measured = stiffness(result.model, result.state)
     return [ddg.Check("stiffness over exact", measured, 1.0, 0.03, SOURCE, relative=True)]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The stiffness over the rings of triangles."""
+    """Study the stiffness over the rings of triangles."""
     return ddg.bench.Study({"rings": (16, 32, 64)}, "stiffness")

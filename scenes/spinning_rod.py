@@ -1,11 +1,11 @@
-"""A straight elastic rod spinning about its centre: it stretches until tension balances the centrifugal force.
+"""Spinning rod: a straight elastic rod stretches until tension balances the centrifugal force.
 
 With W the rate and k = W L sqrt(rho A / EA) the exact relative equilibrium is, X from -L/2 to L/2,
 
     r(X) = sin(k X / L) L / (k cos(k / 2)) ,   length / L = tan(k / 2) / (k / 2) .
 
-It solves EA r'' + rho A W^2 r = 0 with r' = 1 at the ends. The rod starts in it; the implicit midpoint rule then has to keep its
-length, and both momenta to rounding, which implicit Euler would damp.
+It solves EA r'' + rho A W^2 r = 0 with r' = 1 at the ends. The rod starts in it. The implicit midpoint rule then keeps its length,
+and both momenta to rounding, which implicit Euler would damp.
 """
 
 import numpy as np
@@ -22,21 +22,21 @@ SYMMETRY = "symmetry of the energy"
 def build(
     k: float = 0.5, n: int = 50, steps: int = 200, turns: float = 2.0, scheme: str = "implicit_midpoint"
 ) -> ddg.Scene:
-    """The rod, turning in the plane of x and y.
+    """Build the rod, rotating in the plane of x and y.
 
     Args:
         k: rate, W L sqrt(rho A / EA)
         n: edges of the rod
-        steps: time steps in a turn
-        turns: turns that the run lasts
+        steps: time steps in a revolution
+        turns: duration of the run in revolutions
         scheme: time integration scheme
     """
     if not 0.0 < k < np.pi:
         raise ValueError(f"k = {k}; it lies between 0 and pi, at which the rod would be stretched without bound")
-    turn = 2.0 * np.pi / rate(k)  # s
+    period = 2.0 * np.pi / rate(k)  # s
     scene = ddg.Scene(
         gravity=(0.0, 0.0, 0.0),
-        analysis=ddg.Dynamics(dt=turn / steps, duration=round(turns * steps) * turn / steps, scheme=scheme),
+        analysis=ddg.Dynamics(dt=period / steps, duration=round(turns * steps) * period / steps, scheme=scheme),
         initial=lambda model: spinning(model, k),
     )
     points = np.zeros((n + 1, 3))
@@ -47,12 +47,12 @@ def build(
 
 
 def rate(k: float) -> float:
-    """W [rad/s]."""
+    """Return W [rad/s]."""
     return k / LENGTH * np.sqrt(EA / MASS_PER_LENGTH)
 
 
 def spinning(model, k: float):
-    """The exact relative equilibrium."""
+    """Return the exact relative equilibrium."""
     rest = model.scene.batches[0].points[0]
     points, velocities = np.zeros_like(rest), np.zeros_like(rest)
     points[:, 0] = np.sin(k * rest[:, 0] / LENGTH) * LENGTH / (k * np.cos(0.5 * k))
@@ -61,7 +61,7 @@ def spinning(model, k: float):
 
 
 def observe(model, state) -> dict[str, float]:
-    """Length over that at rest, linear [N s] and angular momentum [N m s], and kinetic plus stretching energy [J]."""
+    """Return length over rest length, linear [N s] and angular momentum [N m s], and kinetic plus stretching energy [J]."""
     rest = model.scene.batches[0].points[0]
     cell = LENGTH / (len(rest) - 1)
     mass = np.full(len(rest), MASS_PER_LENGTH * cell)
@@ -79,13 +79,14 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Length against the exact one, momenta and energy against their first values."""
+    """Check the length against the exact one, momenta and energy against initial values."""
     series = {name: np.array(values) for name, values in result.series.items()}
     k = float(result.model.curves.names[0].split("=")[1])
     edges = result.model.curves.counts[0] - 1
     angle = rate(k) * result.dt
     exact = np.tan(0.5 * k) / (0.5 * k)
-    # Second order in the edges, and in the step: the middle of a chord is nearer to the axis than the arc, by angle^2 / 8.
+    # Second order in the edges, and in the step: the middle of a chord is nearer to the axis than the arc, by angle^2 /
+    # 8.
     tolerance = 0.1 * (k**2 / edges) ** 2 + 0.2 * angle**2 + 1e-9
     rounding = 1e-9 if result.model.precision == "float64" else 1e-5
     momentum, energy = series["angular_momentum"], series["energy"]
@@ -100,7 +101,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The mean length over steps and schemes."""
+    """Study the mean length over steps and schemes."""
     return ddg.bench.Study(
         {"steps": (50, 100, 200, 400), "scheme": ("implicit_euler", "implicit_midpoint")},
         "length over that at rest",

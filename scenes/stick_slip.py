@@ -1,8 +1,8 @@
-"""A rod that hangs from a clamp is pushed onto a rough floor: it buckles, its tip sticks, and then slips.
+"""Stick-slip: a rod pressed onto a rough floor buckles; its tip sticks, and then slips.
 
-The tip of a rod of length L just touches the floor, and the clamp comes down by delta. While the tip sticks, the rod is an elastica
-that is clamped at its top and hinged at its tip: it pushes with the normal force P and with the horizontal force H, and H / P grows
-with delta from 0. Where it reaches mu the tip slips. Regularised friction lets what sticks creep, by less than its speed nu.
+The tip of a rod of length L is in contact with the floor, and the clamp comes down by delta. While the tip sticks, the rod is an
+elastica, clamped at its top and hinged at its tip. It exerts the normal force P and the horizontal force H, and H / P grows with
+delta from 0. The tip slips at H / P = mu. Regularised sticking friction creeps at less than its threshold nu.
 """
 
 import numpy as np
@@ -18,11 +18,11 @@ B = 1.0  # N m^2
 STIFF = 1e5  # EA L^2 / B
 MASS_PER_LENGTH = 1e-3  # kg/m
 RANGE = 1e-4  # m, activation distance
-CLOSE = 0.5  # of the range, the gap at first: the floor pushes from the start
-NUDGE = 0.1  # N, in the middle at first; tells the rod where to buckle
-NUDGED = 0.006  # way over L in which it fades
-BEYOND = 1.1  # times the delta of the slip, to which the clamp comes down
-STEP_TIME = 1.0  # s, long against the periods of the rod: the march is one of equilibria
+CLOSE = 0.5  # initial gap over the activation distance, so that the floor acts from the start
+NUDGE = 0.1  # N, in the middle at first; sets the direction of buckling
+NUDGED = 0.006  # displacement over L in which the nudge fades
+BEYOND = 1.1  # final displacement of the clamp over the delta of the slip
+STEP_TIME = 1.0  # s, long against the periods of the rod: motion is quasi-static
 SLIP = {0.05: (0.01238049378, 20.28494139), 0.1: (0.04687417821, 20.54906118), 0.2: (0.1548673548, 21.38052121)}
 SLIP |= {0.3: (0.2715634261, 22.23208412), 0.35: (0.3239935114, 22.56281079)}  # mu: delta / L, P L^2 / B
 STICKS = {
@@ -45,12 +45,12 @@ def build(
     lags: int = 2,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The rod along z, its tip at the range of contact above the floor z = 0.
+    """Build the rod along z, its tip half the activation distance above the floor z = 0.
 
     Args:
         friction: friction coefficient; one of 0.05, 0.1, 0.2, 0.3 and 0.35
         n: edges of the rod, an even number
-        steps: in which the clamp comes down
+        steps: time steps of the clamp motion
         velocity: stick threshold nu of the friction law [m/s]; the clamp moves by about 1e-3 m/s
         stiffness: contact stiffness [N/m]
         range: activation distance of contact [m]
@@ -69,9 +69,9 @@ def build(
         EA=STIFF * B / LENGTH**2, EI1=B, GJ=B, mass_per_length=MASS_PER_LENGTH, rotary_inertia=1e-9, radius=RADIUS
     )
     rod = scene.add_rod(points, section=section, name="rod")
-    way = BEYOND * SLIP[friction][0] * LENGTH
-    scene.clamp_end(rod, "first", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -way * t / duration)))
-    fades = min(1.0, NUDGED * LENGTH / way) * duration
+    displacement = BEYOND * SLIP[friction][0] * LENGTH
+    scene.clamp_end(rod, "first", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -displacement * t / duration)))
+    fades = min(1.0, NUDGED * LENGTH / displacement) * duration
     nudge = NUDGE * (1.0 + 0.5 * float(_touching.jitter((), seed)))
     scene.add_force(rod, n // 2, (nudge, 0.0, 0.0), amplitude=lambda t: max(0.0, 1.0 - t / fades))
     scene.add_obstacle(ddg.Plane(), name="floor")
@@ -80,7 +80,7 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """How far the clamp has come towards the tip over L, both forces of the floor L^2 / B, and the tip's place and speed over L."""
+    """Return delta over L, both forces of the floor L^2 / B, and position and speed of the tip over L."""
     count = model.scene.batches[0].points.shape[1]
     points, velocities = state.points().reshape(-1, 3), state.velocities().reshape(-1, 3)
     force = model.reactions(state)[0].force.reshape(-1, 3)[0] * LENGTH**2 / B
@@ -94,7 +94,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Where the tip slips, the forces there and before, and how far it creeps until then."""
+    """Check delta of the slip, forces there and before, and creep until then."""
     mu, law = result.model.scene.touching.friction, result.model.scene.touching
     series = {name: np.array(values) for name, values in result.series.items()}
     slips = np.flatnonzero(series["tip_speed"] * LENGTH > law.velocity)
@@ -116,16 +116,18 @@ def _checks(result, series, slips, reference, names) -> list[ddg.Check]:
     first = slips[0] if len(slips) else -1
     mu, law = result.model.scene.touching.friction, result.model.scene.touching
     ratio = series["tangential"] / np.maximum(series["normal"], 1e-12)
-    back = max(first - 1, 0)
-    # within the step before the first that slips the tangential force reaches its bound
-    share = np.clip((mu - ratio[back]) / max(ratio[back] - ratio[back - 1], 1e-12), 0.0, 1.0)
-    # before, as after the slip the forces are others
-    delta, force = (v[back] + share * (v[back] - v[back - 1]) for v in (series["delta"], series["normal"]))
-    crept = abs(series["tip"][back] - series["tip"][1])
+    previous = max(first - 1, 0)
+    # the tangential force reaches its bound within the step before the first slipping one
+    fraction = np.clip((mu - ratio[previous]) / max(ratio[previous] - ratio[previous - 1], 1e-12), 0.0, 1.0)
+    # extrapolated from before the slip, which changes the forces
+    delta, force = (
+        v[previous] + fraction * (v[previous] - v[previous - 1]) for v in (series["delta"], series["normal"])
+    )
+    crept = abs(series["tip"][previous] - series["tip"][1])
     return [
         ddg.Check(names[0], delta, where, 0.02, SOURCE, True),
         ddg.Check(names[1], force, normal, 0.01, SOURCE, True),
-        ddg.Check(names[2], crept, 0.0, law.velocity * result.times[back] / LENGTH, "nu times the time"),
+        ddg.Check(names[2], crept, 0.0, law.velocity * result.times[previous] / LENGTH, "nu times the time"),
         *(
             # H / P grows as the root of delta at first
             ddg.Check(name, np.sqrt(np.interp(d, series["delta"], ratio**2)), exact, 0.02, SOURCE, True)
@@ -135,7 +137,7 @@ def _checks(result, series, slips, reference, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The delta of the slip over what contact, friction, steps and nodes are, one by one."""
+    """Study the delta of the slip over parameters of contact, friction, steps and nodes, one by one."""
     grid = {"n": (10, 20, 40, 80), "dt": (3.0, 1.5, 1.0, 0.5), "velocity": (1e-7, 1e-6, 1e-5, 1e-4)}
     grid |= {"stiffness": (5e3, 1.5e4, 5e4, 1.5e5, 5e5), "range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4)}
     return ddg.bench.Study(
@@ -144,7 +146,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The rod at a few times, and the floor."""
+    """Draw the rod at a few times, and the floor."""
     corners, cells = meshes.rectangle(1, 1)
     floor = np.column_stack([0.6 * corners[:, 0] - 0.15, 0.3 * corners[:, 1] - 0.15, 0.0 * corners[:, 0]])
     return {"points_by_time": frames, "bodies": {min(frames): (floor, cells)}}

@@ -1,7 +1,7 @@
-"""Rods of many kinds in one scene: lengths, node counts, sections and materials at random; each moves as it would alone.
+"""Random rods: many lengths, node counts, sections and materials in one scene; each rod moves as if alone.
 
-Rods that share a scene are sorted, padded and advanced together. None of that may be felt: a rod that does not touch others has the
-same motion whether it is simulated with them or without. Helices of random size, clamped at one end, fall and swing.
+Rods that share a scene are sorted, padded and advanced together. None of that may have an effect: without contact a rod has the
+same motion in the scene and alone. Helices of random size, clamped at one end, fall and swing.
 """
 
 import numpy as np
@@ -13,10 +13,10 @@ SOURCE = "the same rods, each simulated alone"
 
 
 def build(count: int = 36, seed: int = 3) -> ddg.Scene:
-    """Rods on a square grid.
+    """Build rods on a square grid.
 
     Args:
-        count: rods
+        count: number of rods
         seed: seed of the random numbers
     """
     rods = [random_rod(np.random.default_rng([seed, i])) for i in range(count)]
@@ -27,7 +27,7 @@ def build(count: int = 36, seed: int = 3) -> ddg.Scene:
 
 
 def scene_of(rods: list[dict], analysis: ddg.Dynamics) -> ddg.Scene:
-    """A scene with these rods, each held by its first edge."""
+    """Return a scene of rods, each clamped by its first edge."""
     scene = ddg.Scene(analysis=analysis, mass_damping=0.2)
     for options in rods:
         scene.clamp(scene.add_rod(**options), edges=[0])
@@ -35,11 +35,14 @@ def scene_of(rods: list[dict], analysis: ddg.Dynamics) -> ddg.Scene:
 
 
 def random_rod(rng: np.random.Generator) -> dict:
-    """Arguments of `add_rod` for a random helix that leaves the origin upwards or sideways."""
+    """Return arguments of `add_rod` for a random helix that leaves the origin upwards or sideways."""
     nodes = int(rng.integers(8, 65))
     length = rng.uniform(0.1, 0.6)  # m
     s = np.linspace(0.0, length, nodes)[:, None]
-    turns, winding = rng.uniform(0.2, 2.0), rng.uniform(0.2, 0.8)  # of the helix; share of the length that winds
+    turns, winding = (
+        rng.uniform(0.2, 2.0),
+        rng.uniform(0.2, 0.8),
+    )  # number of turns of the helix; fraction of the length along the circumference
     phase = 2.0 * np.pi * turns * s / length
     across, along = winding * length / (2.0 * np.pi * turns), np.sqrt(1.0 - winding**2)
     shape = np.hstack([across * np.cos(phase), across * np.sin(phase), along * s])
@@ -51,7 +54,7 @@ def random_rod(rng: np.random.Generator) -> dict:
         "ellipse": ddg.Ellipse(size, rng.uniform(0.4, 0.9) * size),
         "rectangle": ddg.Rectangle(2.0 * size, rng.uniform(0.3, 1.0) * size),
     }[kind]
-    # Young's modulus from the length over which the weight bends the rod, (EI / w)^(1/3), so that the nodes resolve it.
+    # Young's modulus from the length (EI / w)^(1/3) over which the weight bends the rod, so that the nodes resolve it.
     density, poisson = rng.uniform(500.0, 2000.0), rng.uniform(0.2, 0.5)
     unit = section.stiffness(ddg.Material(1.0, poisson, density))
     bending = rng.uniform(0.2, 0.8) * length
@@ -61,13 +64,13 @@ def random_rod(rng: np.random.Generator) -> dict:
 
 
 def alone(scene: ddg.Scene, rod: int) -> ddg.Scene:
-    """A scene with one rod of `scene`, which is one batch there."""
+    """Return a scene with one rod of `scene`, one of its batches."""
     batch = scene.batches[rod]
     return scene_of([{"points": batch.points[0], "section": batch.section, "name": batch.name}], scene.analysis)
 
 
 def check(result) -> list[ddg.Check]:
-    """A few rods, short and long, of every section, against the same rods alone; and no solve that failed."""
+    """Check a few rods, short and long, of every section, against the same rods alone, and convergence."""
     from ddg_warp.run.simulate import simulate
 
     model, scene = result.model, result.scene
@@ -96,7 +99,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """All nodes at 0.5 s over steps, schemes and tolerances, against shorter steps of the midpoint rule."""
+    """Study all nodes at 0.5 s over steps, schemes and tolerances, against shorter midpoint steps."""
     return ddg.bench.Study(
         {
             "dt": (0.02, 0.01, 0.005, 0.0025),

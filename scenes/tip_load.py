@@ -1,7 +1,8 @@
-"""Tip load: a dead force across the end of a cantilever bends it far.
+"""Tip load: large bending of a cantilever by a transverse dead force at its tip.
 
 The elastica by elliptic integrals (Frisch-Fay, Flexible Bars, 1962; Mattiasson, Int. J. Numer. Meth. Eng. 17, 1981): with the angle
 a of the tip, p^2 = (1 + sin a) / 2 and sin(phi) = 1 / (p sqrt 2),
+
     sqrt(P L^2 / EI) = K(p) - F(phi, p) ,  x^2 = 2 EI sin(a) / P ,  z = -L + 2 sqrt(EI / P) (E(p) - E(phi, p)) .
 """
 
@@ -11,12 +12,12 @@ import ddg_warp as ddg
 
 LENGTH = 1.0  # m
 EI = 1.0  # N m^2
-EA = 1.0e8  # N; so stiff that the rod counts as inextensible
+EA = 1.0e8  # N; nearly inextensible
 SOURCE = "elastica, elliptic integrals"
 
 
 def build(load: float = 10.0, n: int = 100) -> ddg.Scene:
-    """The cantilever along x, loaded downwards.
+    """Build the cantilever along x, loaded downwards.
 
     Args:
         load: force over EI / L^2
@@ -32,7 +33,7 @@ def build(load: float = 10.0, n: int = 100) -> ddg.Scene:
 
 
 def exact(load: float) -> tuple[float, float, float]:
-    """The tip (x, z) [m] and its angle below the horizontal [rad], for a force over EI / L^2."""
+    """Return the tip (x, z) [m] and its angle below the horizontal [rad], for a force over EI / L^2."""
     from scipy.optimize import brentq
     from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
@@ -51,19 +52,19 @@ def exact(load: float) -> tuple[float, float, float]:
 
 
 def tip(state) -> tuple[float, float, float]:
-    """The tip (x, z) [m] and the angle of the last edge below the horizontal [rad]."""
+    """Return the tip (x, z) [m] and the angle of the last edge below the horizontal [rad]."""
     points = state.points()
     edge = points[-1] - points[-2]
     return points[-1, 0], points[-1, 2], np.arctan2(-edge[2], edge[0])
 
 
 def observe(model, state) -> dict[str, float]:
-    """Where the tip is [m] and points [rad]."""
+    """Return position [m] and angle [rad] of the tip."""
     return dict(zip(("tip_x", "tip_z", "tip_angle"), tip(state), strict=True))
 
 
 def check(result) -> list[ddg.Check]:
-    """The tip against elliptic integrals."""
+    """Check the tip against elliptic integrals."""
     load = -result.model.scene.loads[0].force[2] * LENGTH**2 / EI
     tolerance = min(ddg.Check.COARSEST, 1e-4 * max(1.0, (100.0 / (result.model.curves.counts[0] - 1)) ** 2))
     values = zip(("tip x [m]", "tip z [m]", "tip angle [rad]"), tip(result.state), exact(load), strict=True)
@@ -71,5 +72,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The tip over the edges of the rod."""
+    """Study the tip over the edges of the rod."""
     return ddg.bench.Study({"n": (25, 50, 100, 200)}, "tip x", scale=1.0)

@@ -1,12 +1,13 @@
-"""Three crawlers on the ground: rods whose natural curvature changes as waves, of which two travel from head to tail.
+"""Crawlers: rods with waves of natural curvature on the ground, of which two travel from head to tail.
 
-Muscles make the natural curvature kappa(s, t) of a rod that is stiff against what friction bends it by; gravity keeps it down. Where
-friction is less along the rod than across, as that of a snake on cloth is (mu = 0.11 forwards, 0.14 backwards, 0.20 across; Hu, Nirody,
-Scott and Shelley, PNAS 106, 2009, 10081), a travelling wave pushes it forwards. Without inertia forces and moments of friction of the
-known shape balance at every time, by which three velocities of the rod follow (Hu and Shelley, in: Natural Locomotion in Fluids and on
-Surfaces, 2012); they are those by which friction takes least power. The reference is that balance, of a fine curve, for the law of
-friction that the scene has. Coulomb's friction is no drag: with one coefficient for all directions a travelling wave still drifts, a
-quarter as far and the other way, along with the wave. A standing wave that is its own mirror image gets nowhere.
+Muscles set the natural curvature kappa(s, t) of a rod that is stiff against bending by friction; gravity keeps it down. With less
+friction along the rod than across, as of a snake on cloth (mu = 0.11 forwards, 0.14 backwards, 0.20 across; Hu, Nirody,
+Scott and Shelley, PNAS 106, 2009, 10081), a travelling wave moves it forwards. Without inertia, friction forces and moments of the
+known shape balance at every time. This gives the three velocities of the rod of least frictional power (Hu and Shelley, in: Natural
+Locomotion in Fluids and on Surfaces, 2012). The reference is that balance, of a fine curve, with the friction law of the scene.
+
+Coulomb friction is no drag: with one coefficient for all directions a travelling wave still drifts, a quarter as far and in
+reverse, along with the wave. A standing wave that is its own mirror image does not travel.
 """
 
 import numpy as np
@@ -22,9 +23,9 @@ RANGE = 1e-4  # m, activation distance
 PERIOD = 4.0  # s; inertia is some 1 % of friction
 WAVES = 1.5  # along a crawler
 CURVATURE = 15.0  # 1/m, amplitude
-RISES = 0.5  # periods in which the waves grow
+RISES = 0.5  # periods of the growth of waves
 PERIODS = 2
-VELOCITY = 1e-3  # m/s, of the friction law
+VELOCITY = 1e-3  # m/s, stick threshold of friction
 STEEPNESS = 7.5  # of the logistic law
 SNAKE, EVEN, STANDING = NAMES = ("snake", "even", "standing")
 MATERIAL = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
@@ -39,10 +40,10 @@ def build(
     steps: int = 150,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The crawlers side by side along x, straight at first, their heads at the last node.
+    """Build the crawlers side by side along x, straight at first, their heads at the last node.
 
     Args:
-        forwards, backwards, across: coefficients of friction of the snake; the others have that across in all directions
+        forwards, backwards, across: friction coefficients of the snake; others have `across` in all directions
         n: edges of each
         steps: time steps in a period
         seed: seed of the initial jitter of crawlers; no jitter below 0
@@ -66,36 +67,36 @@ def build(
 
 
 def curvature(name: str, s: np.ndarray, t: float) -> np.ndarray:
-    """Natural curvature of a crawler at arc lengths s [m] from its tail, to its left [1/m]."""
+    """Return the natural curvature of a crawler at arc lengths s [m] from the tail, to the left [1/m]."""
     rise = np.sin(0.5 * np.pi * min(1.0, t / (RISES * PERIOD))) ** 2
-    place, phase = 2.0 * np.pi * WAVES * (s / LENGTH - 0.5), 2.0 * np.pi * t / PERIOD
+    position, phase = 2.0 * np.pi * WAVES * (s / LENGTH - 0.5), 2.0 * np.pi * t / PERIOD
     if name == STANDING:
-        return CURVATURE * rise * np.cos(place) * np.sin(phase)
-    return CURVATURE * rise * np.sin(place + phase)
+        return CURVATURE * rise * np.cos(position) * np.sin(phase)
+    return CURVATURE * rise * np.sin(position + phase)
 
 
 def actuate(model, t: float) -> None:
-    """Give all crawlers the natural curvatures of a time [s]."""
+    """Set the natural curvatures of all crawlers at a time [s]."""
     s = LENGTH * np.arange(1, model.scene.batches[0].edges) / model.scene.batches[0].edges
     values = np.concatenate([curvature(name, s, t) for name in NAMES])
     model.set_parameter("rod_bend_twist", "rest_1", values)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Where the middle of each crawler is along x [m], the smallest gap [m], and what the ground carries over their weight."""
+    """Return the x position of each crawler's middle [m], the smallest gap [m], and ground force over weight."""
     middles = state.points().reshape(-1, len(NAMES), model.scene.batches[0].nodes, 3)[0, ..., 0]
     weight = sum(batch.section.mass_per_length for batch in model.scene.batches) * LENGTH * 9.81
     carried = np.reshape(model.reactions(state)[-1].force, (-1, 3))[0, 2]
-    places = {name: float(0.5 * (x[1:] + x[:-1]).mean()) for name, x in zip(NAMES, middles, strict=True)}
-    return places | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
+    positions = {name: float(0.5 * (x[1:] + x[:-1]).mean()) for name, x in zip(NAMES, middles, strict=True)}
+    return positions | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
 
 
 def advance(name: str, coefficients, segments: int = 120, steps: int = 200) -> float:
-    """How far a crawler gets along x in the last period [m], by the balance of friction.
+    """Return the displacement of a crawler along x in the last period [m], by the balance of friction.
 
     Args:
-        name: of the crawler
-        coefficients: of friction forwards, backwards and across
+        name: name of the crawler
+        coefficients: friction coefficients forwards, backwards and across
         segments, steps: of the curve, and in a period
 
     Raises:
@@ -110,15 +111,15 @@ def advance(name: str, coefficients, segments: int = 120, steps: int = 200) -> f
     least = min(coefficients)
 
     def shape(t):
-        """Points from the middle of mass, and tangents, in a frame that goes with the first edge; complex."""
+        """Return points from the centre of mass, and tangents, in the frame of the first edge; complex."""
         edges = np.exp(1j * np.concatenate([[0.0], np.cumsum(curvature(name, s, t) * ds)]))
         points = np.concatenate([[0.0], np.cumsum(edges * ds)])
         tangents = np.concatenate([edges[:1], edges[1:] + edges[:-1], edges[-1:]])
         return points - (weight * points).sum() / weight.sum(), tangents / np.abs(tangents)
 
-    def balance(rates, points, tangents, own):
-        """Force and moment of friction, by the velocity of the middle and the spin of the frame."""
-        speed = (own + rates[0] + 1j * rates[1] + 1j * rates[2] * points / LENGTH) * tangents.conj()
+    def balance(rates, points, tangents, deformation):
+        """Return force and moment of friction for the velocity of the centre and the spin of the frame."""
+        speed = (deformation + rates[0] + 1j * rates[1] + 1j * rates[2] * points / LENGTH) * tangents.conj()
         along = np.where(speed.real > 0.0, coefficients[0], coefficients[1])
         slip = along * speed.real / least + 1j * coefficients[2] * speed.imag / least
         size = np.maximum(np.abs(slip), 1e-300)
@@ -126,23 +127,23 @@ def advance(name: str, coefficients, segments: int = 120, steps: int = 200) -> f
         force = pull * (along * slip.real + 1j * coefficients[2] * slip.imag) * tangents
         return [force.real.sum(), force.imag.sum(), (points.conj() * force).imag.sum() / LENGTH]
 
-    heading, place, rates, places = 0.0, 0.0, np.zeros(3), [0.0]
+    heading, position, rates, path = 0.0, 0.0, np.zeros(3), [0.0]
     for k in range(PERIODS * steps):
         t = (k + 0.5) * dt
         points, tangents = shape(t)
-        own = (shape(t + 0.5 * dt)[0] - shape(t - 0.5 * dt)[0]) / dt
-        found = root(balance, rates, args=(points, tangents, own), tol=1e-10)
-        if not found.success:
-            raise ValueError(f"friction of {name!r} finds no balance at {t:g} s: {found.message}")
-        rates = found.x
-        place += (rates[0] + 1j * rates[1]) * np.exp(1j * (heading + 0.5 * dt * rates[2] / LENGTH)) * dt
+        deformation = (shape(t + 0.5 * dt)[0] - shape(t - 0.5 * dt)[0]) / dt
+        solution = root(balance, rates, args=(points, tangents, deformation), tol=1e-10)
+        if not solution.success:
+            raise ValueError(f"friction of {name!r} finds no balance at {t:g} s: {solution.message}")
+        rates = solution.x
+        position += (rates[0] + 1j * rates[1]) * np.exp(1j * (heading + 0.5 * dt * rates[2] / LENGTH)) * dt
         heading += dt * rates[2] / LENGTH
-        places.append(place.real)
-    return places[-1] - places[-1 - steps]
+        path.append(position.real)
+    return path[-1] - path[-1 - steps]
 
 
 def check(result) -> list[ddg.Check]:
-    """How far crawlers get in the last period against the balance of friction, and the weight that the ground carries."""
+    """Check displacements in the last period against the balance of friction, and the ground force."""
     names = (
         "snake: way a period [m]",
         "even: way a period [m]",
@@ -158,22 +159,22 @@ def _checks(result, names) -> list[ddg.Check]:
     steps = round(PERIOD / result.dt)
     gone = {name: result.series[name][-1] - result.series[name][-1 - steps] for name in NAMES}
     mu = scene.touching.friction
-    late = np.array(result.series["carried"][-steps:])
+    carried = np.array(result.series["carried"][-steps:])
     return [
         ddg.Check(names[0], gone[SNAKE], advance(SNAKE, scene.betweens[0].friction), 0.02, BALANCE, True),
         ddg.Check(names[1], gone[EVEN], advance(EVEN, (mu, mu, mu)), 0.05, BALANCE, True),
         ddg.Check(names[2], gone[STANDING] / LENGTH, 0.0, 1e-4, "its mirror image goes the other way"),
-        ddg.Check(names[3], late.mean(), 1.0, 1e-3, "balance of forces"),
+        ddg.Check(names[3], carried.mean(), 1.0, 1e-3, "balance of forces"),
     ]
 
 
 def benchmark() -> ddg.bench.Study:
-    """The way of the snake over edges and steps."""
+    """Study the displacement of the snake over edges and steps."""
     return ddg.bench.Study({"n": (20, 40, 80), "steps": (75, 150, 300)}, "snake: way a period [m]", whole=True)
 
 
 def picture(result, frames) -> dict:
-    """The crawlers from above, as thick as they are at first and at the end."""
+    """Draw the crawlers from above, with actual thickness at the start and the end."""
     above = np.array([1.0, 1.0, 0.0])
     bodies = {t: _touching.tubes(result.model, frames[t]) for t in (min(frames), max(frames))}
     return {

@@ -1,8 +1,8 @@
-"""Whirling: a bowed shaft, turned at its ends, swings out as its rate nears the first bending frequency.
+"""Whirling: a bowed rotating shaft deflects as its rate nears the first bending frequency.
 
-With the deflection z = y + i z' in space and a bow a0 in its first mode the shaft obeys z" + w^2 z = w^2 a0 exp(i W t), w its first
-bending frequency: the bow turns with it (Jeffcott 1919). Below the critical rate W = w it can ride along at the amplitude
-a0 / (1 - (W / w)^2); let go unstretched at the rate W it beats around that; at W = w it grows without bound.
+With the deflection z = y + i z' in space and a bow a0 in its first mode the shaft obeys z" + w^2 z = w^2 a0 exp(i W t). Here w is
+its first bending frequency, and the bow rotates with it (Jeffcott 1919). Below the critical rate W = w it can rotate steadily at
+the amplitude a0 / (1 - (W / w)^2). Released unstretched at the rate W it beats around that; at W = w it grows without bound.
 """
 
 import numpy as np
@@ -20,15 +20,15 @@ EXACT = "shaft with one mode"
 def build(
     speed: float = 0.5, bow: float = 0.01, n: int = 40, periods: float = 4.0, steps: int = 120, start: str = "bowed"
 ) -> ddg.Scene:
-    """A shaft on hinges along x, one of which slides, turned at both ends.
+    """Build a hinged shaft along x with one sliding hinge, rotated at both ends.
 
     Args:
-        speed: rate of turning over the critical one
+        speed: rate of rotation over the critical one
         bow: largest deflection at rest over the length
         n: edges of the shaft, an even number
-        periods: of the first bending mode that the run lasts
-        steps: time steps in a period of that mode, or in a turn if that is shorter
-        start: bowed (in its shape at rest) or riding (at the amplitude that stays); both at the full rate
+        periods: duration of the run in periods of the first bending mode
+        steps: time steps in a period of that mode, or in a revolution if that is shorter
+        start: bowed (rest shape) or riding (steady amplitude), both at the full rate
     """
     if start not in ("bowed", "riding") or (start == "riding" and not speed < 1.0):
         raise ValueError(f"start {start!r} at speed {speed}: it is 'bowed', or 'riding' below the critical speed 1")
@@ -52,13 +52,13 @@ def build(
 
 
 def bending_rate() -> float:
-    """sqrt(EI / (rho A L^4)) [1/s]."""
+    """Return sqrt(EI / (rho A L^4)) [1/s]."""
     section = SECTION.stiffness(MATERIAL)
     return float(np.sqrt(section.EI1 / (section.mass_per_length * LENGTH**4)))
 
 
 def turning(model, rate: float, factor: float):
-    """The shaft with its bow times `factor`, turning about the x axis at `rate` [rad/s]."""
+    """Return the shaft with the bow times `factor`, rotating about the x axis at `rate` [rad/s]."""
     points = model.scene.batches[0].points[0].copy()
     points[:, 2] *= factor
     velocities = np.cross((rate, 0.0, 0.0), points)
@@ -66,7 +66,7 @@ def turning(model, rate: float, factor: float):
 
 
 def straight(support: str, n: int) -> ddg.Scene:
-    """A straight shaft at rest, held in one of the ways of CRITICAL."""
+    """Return a scene of a straight shaft at rest with a support of CRITICAL."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     points = np.zeros((n + 1, 3))
     points[:, 0] = np.linspace(0.0, LENGTH, n + 1)
@@ -81,7 +81,7 @@ def straight(support: str, n: int) -> ddg.Scene:
 
 
 def critical_rate(support: str, n: int, **options) -> float:
-    """Critical rate over sqrt(EI / (rho A L^4)), from the eigenvalues of the straight shaft; options of `Scene.build`."""
+    """Return the critical rate over sqrt(EI / (rho A L^4)), from eigenvalues of the straight shaft; options of `Scene.build`."""
     from ddg_warp.solve.stability import spectrum
 
     model = straight(support, n).build(**options)
@@ -89,20 +89,20 @@ def critical_rate(support: str, n: int, **options) -> float:
 
 
 def deflection(t, speed: float, frequency: float, bow: float, start: float):
-    """Exact deflection y + i z' over time in the turning frame, of the mode with `frequency`; starts at `start`, turning."""
+    """Return the exact deflection y + i z' over time in the rotating frame, of a mode with `frequency`, from `start`."""
     t, rate = np.asarray(t, float), speed * frequency
     if abs(speed - 1.0) < 1e-9:
         z = (start + 0.5 * bow * -1j * frequency * t) * np.exp(1j * rate * t)
         return (z + 0.5 * bow * np.sin(frequency * t) * 1j) * np.exp(-1j * rate * t)
     ride = bow / (1.0 - speed**2)
-    # What is left of the start swings freely, forwards and backwards: z(0) = start and z'(0) = i W start.
+    # The rest of the initial deflection swings freely, forwards and backwards: z(0) = start and z'(0) = i W start.
     forward, backward = 0.5 * (1.0 + speed) * (start - ride), 0.5 * (1.0 - speed) * (start - ride)
     free = forward * np.exp(1j * frequency * t) + backward * np.exp(-1j * frequency * t)
     return ride + free * np.exp(-1j * rate * t)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Amplitude of the middle [m], and the turns that the last edge has made about itself."""
+    """Return the amplitude of the middle [m], and the twist of the last edge in turns."""
     points = state.points().reshape(-1, 3)[: model.curves.counts[0]]
     edges = len(points) - 1
     return {
@@ -112,7 +112,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Amplitude over time against the exact one, the turns of the ends, and critical rates from eigenvalues."""
+    """Check amplitude over time, rotation of the ends, and critical rates from eigenvalues."""
     model, times = result.model, np.array(result.times)
     edges = int(model.curves.counts[0]) - 1
     points = model.scene.batches[0].points[0]
@@ -121,7 +121,7 @@ def check(result) -> list[ddg.Check]:
     frequency = critical_rate("pinned-pinned", edges, device=model.device) * bending_rate()
     amplitude = np.array(result.series["amplitude"])
     exact = np.abs(deflection(times, rate / frequency, frequency, bow, amplitude[0]))
-    # The midpoint rule slows a mode by (w h)^2 / 12, which adds up over the run; slopes change it in second order, too.
+    # The midpoint rule slows a mode by (w h)^2 / 12, which accumulates over the run; slopes have a second-order effect.
     slope = np.pi * np.abs(exact).max() / LENGTH
     slower = (max(frequency, rate) * result.dt) ** 2 / 12.0 * frequency * times[-1]
     tolerance = (2e-3 + 0.5 * slower + 2.0 * slope**2) * np.abs(exact).max() / bow
@@ -147,5 +147,5 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The amplitude over the steps of a turn and the nodes of the shaft."""
+    """Study the amplitude over the steps of a revolution and the nodes of the shaft."""
     return ddg.bench.Study({"steps": (30, 60, 120, 240), "n": (20, 40)}, "amplitude over the bow", series=("n",))

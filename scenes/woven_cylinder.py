@@ -1,11 +1,10 @@
-"""A tube, woven of strands along it and rings about it, is wrung: 12 strands and 8 rings, or 148 and 175.
+"""Woven cylinder: a tube woven of axial strands and rings is wrung: 12 strands and 8 rings, or 148 and 175.
 
-Strand i passes ring j on the outside where i + j is even and inside where it is odd: r = R + a (-1)^i cos(pi z / h) for strands and
-r = R - a (-1)^j cos(k phi / 2) for rings, with h between rings, k strands, and a so that surfaces are apart. The tube is free of stress
-as it is woven, as one is whose threads have been set by heat; otherwise it would unravel by itself. Both ends of the strands are held
-by rigid circles, which turn against each other; nothing but contact holds the rings, and in the end these buckle between the strands.
-The couples of the circles balance, the tube stays symmetric about its middle (half a turn about an axis through that brings it onto
-itself) until then, and it becomes narrow there.
+Strand i passes ring j on the outside for even i + j and inside for odd. With h between rings and k strands, strands have r = R + a
+(-1)^i cos(pi z / h) and rings r = R - a (-1)^j cos(k phi / 2). The amplitude a separates the surfaces. The woven shape is
+stress-free, as after heat setting; otherwise it would unravel by itself. Rigid circles clamp both ends of the strands and rotate in
+opposite directions. Rings are supported by contact alone, and finally buckle between the strands. The couples of the circles
+balance. Until buckling the tube is symmetric under half a rotation about an axis through its middle, and it narrows there.
 """
 
 import numpy as np
@@ -13,13 +12,13 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.scenes import _touching
 
-CELL = 0.02  # m, between strands at first
+CELL = 0.02  # m, initial distance of strands
 RADIUS = 1.5e-3  # m, of strands and rings
 RANGE = 3e-4  # m, activation distance
 AMPLITUDE = RADIUS + 0.75 * RANGE  # m, a
-BARE = 0.5  # of a cell, which strands reach beyond the first and last ring
+BARE = 0.5  # length of strands beyond the first and last ring, in cells
 THREAD = ddg.Material(young=2e6, density=1000.0, poisson=0.5)
-BUCKLED = 0.95  # radius of the narrowest ring over the first, below which rings have buckled
+BUCKLED = 0.95  # radius of the narrowest ring over the first, below which rings count as buckled
 LASTS = 1.0  # s
 PARTS = ("moment", "force")  # of reactions
 
@@ -35,14 +34,14 @@ def build(
     dt: float = 0.01,
     seed: int = -1,
 ) -> ddg.Scene:
-    """The tube about the axis z, its middle at the origin.
+    """Build the tube about the axis z, its middle at the origin.
 
     Args:
-        strands: along the tube, an even number; the large case has 148
-        rings: about the tube; the large case has 175
-        nodes: of a strand; the large case has 256, 0 takes 6 edges between rings
+        strands: strands along the tube, an even number; the large case has 148
+        rings: rings about the tube; the large case has 175
+        nodes: nodes of a strand; the large case has 256, 0 takes 6 edges between rings
         around: nodes of a ring, the same number between any two strands; the large case has 444, 0 takes 6 between strands
-        turns: of each end in a second, the run
+        turns: turns of each end in the run of one second
         friction: Coulomb friction coefficient
         damping: mass-proportional damping [1/s]
         dt: time step [s]
@@ -67,17 +66,17 @@ def build(
         initial=lambda model: _touching.jittered(model, seed),
     )
     section = {"section": ddg.Circle(RADIUS), "material": THREAD}
-    held = scene.add_rods(along, **section, name="strands")
+    clamped = scene.add_rods(along, **section, name="strands")
     scene.add_rods(about, **section, closed=True, name="rings")
     for edge, sign in ((0, -1.0), (-1, 1.0)):
-        turn = 2.0 * np.pi * sign * turns / LASTS
-        scene.clamp(held, edges=[edge], motion=ddg.Motion(angle=lambda t, turn=turn: turn * t))
+        rate = 2.0 * np.pi * sign * turns / LASTS
+        scene.clamp(clamped, edges=[edge], motion=ddg.Motion(angle=lambda t, rate=rate: rate * t))
     scene.contact(range=RANGE, friction=friction)
     return scene
 
 
 def woven(strands: int, rings: int, nodes: int, around: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points of strands (strands, nodes, 3) and rings (rings, around, 3) [m]; a node of each is at every crossing."""
+    """Return points of strands (strands, nodes, 3) and rings (rings, around, 3) [m], with nodes of both at every crossing."""
     each = (nodes - 3) // (rings - 1)
     beyond = nodes - 1 - each * (rings - 1)
     low, high = beyond // 2, beyond - beyond // 2
@@ -98,16 +97,16 @@ def woven(strands: int, rings: int, nodes: int, around: int) -> tuple[np.ndarray
 
 
 def rings_of(model, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Heights and mean radii of the rings (rings,) [m], where all nodes are at points (n, 3) [m]."""
+    """Return heights and mean radii of the rings (rings,) [m] from the points of all nodes (n, 3) [m]."""
     rings = model.scene.batches[1]
-    own = points[-rings.rods * rings.nodes :].reshape(rings.rods, rings.nodes, 3)
-    return own[..., 2].mean(axis=1), np.hypot(own[..., 0], own[..., 1]).mean(axis=1)
+    nodes = points[-rings.rods * rings.nodes :].reshape(rings.rods, rings.nodes, 3)
+    return nodes[..., 2].mean(axis=1), np.hypot(nodes[..., 0], nodes[..., 1]).mean(axis=1)
 
 
 def observe(model, state) -> dict[str, float]:
-    """See `_touching.observe`; couples [N m] and forces [N] of both ends, narrowest ring over the first, and how unlike halves are.
+    """Return `_touching.observe` with couples [N m] and forces [N] of both ends, narrowest ring over the first, and asymmetry.
 
-    The last is the largest difference in radius and height of two rings as far from the middle, over the radius.
+    The asymmetry is the largest difference in radius and height between mirrored rings, over the radius.
     """
     low, high = model.reactions(state, point=(0.0, 0.0, 0.0))
     (height, radius), woven_as = rings_of(model, state.points()), model.scene.batches[1].points
@@ -118,12 +117,12 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps, the ends' work covers the energy, their couples and forces balance, both halves and the waist."""
+    """Check that nothing interpenetrates, energy, couples and forces balance, and symmetry and waist."""
     series = {name: np.array(values) for name, values in result.series.items()}
     angle = np.array([result.model.scene.supports[1].motion.turned(t) for t in result.times])
     work = np.append(0.0, np.cumsum((series["moment_high"] - series["moment_low"])[1:] * np.diff(angle)))
-    late = np.array(result.times) > 0.1 * LASTS  # a jitter has died away
-    low, high = (np.stack([series[f"{part}_{end}"][late] for part in PARTS]) for end in ("low", "high"))
+    settled = np.array(result.times) > 0.1 * LASTS  # without the transient of the jitter
+    low, high = (np.stack([series[f"{component}_{end}"][settled] for component in PARTS]) for end in ("low", "high"))
     couples, forces = np.abs(low + high).max(axis=1) / np.abs(high).max(axis=1)
     unlike = series["unlike"][series["waist"] > BUCKLED].max()
     narrowest = 1.0 - np.cos(angle[-1])
@@ -144,7 +143,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The couple of the ends before rings buckle, over nodes of strands and of rings."""
+    """Study the couple of the ends before rings buckle, over nodes of strands and rings."""
     return ddg.bench.Study(
         {"nodes": (15, 31), "around": (24, 48)},
         lambda result: result.series["moment_high"][-1],
@@ -155,7 +154,7 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The tube as it is woven, as its rings buckle, and at the end."""
+    """Draw the tube as woven, as its rings buckle, and at the end."""
     times = sorted(frames)
     times = times[0], times[-2], times[-1]
     return {
