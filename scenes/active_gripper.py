@@ -22,7 +22,7 @@ STANDS = POST + RADIUS + 1e-3  # m, distance of the clamps from the axis of the 
 RISE = 0.02  # m, rise of the helices per radian around the post
 TIGHT = 0.8  # radius of the natural helices over that of fingers on the post
 RANGE = 2e-4  # m, activation distance
-WINDS, PULLS, END = 1.0, 1.5, 2.5  # s: end of muscle activation; start of the post's motion; end of the run
+WINDS, PULLS, END = 1.0, 1.5, 2.5  # s: end of muscle activation, start of the post's motion, end of the run
 SPEED = 0.02  # m/s, of the post
 VELOCITY = 1e-3  # m/s, stick threshold of friction
 

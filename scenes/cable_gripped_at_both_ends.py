@@ -12,9 +12,9 @@ import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
-FAR = 1.0e4  # m; distance at which the cable, extended along its end tangents, is closed
-HANG = 1.0  # s; end of the initial rest, in which the straight cable comes to hang
-BACK = 7.0  # s; end of the motion, back at the initial ends
+FAR = 1.0e4  # m, distance at which the cable, extended along its end tangents, is closed
+HANG = 1.0  # s, end of the initial rest, in which the straight cable comes to hang
+BACK = 7.0  # s, end of the motion, back at the initial ends
 LINK = "turns of the ends = twist + writhe (Calugareanu, White, Fuller)"
 MOTION = "prescribed motion"
 

@@ -1,8 +1,8 @@
-"""Cable on a table: a moving grip lays a cable in a sine, and friction keeps it there.
+"""Cable on a table: a moving grip lays a cable in a sine, and friction keeps the shape.
 
 The grip prescribes one end. The hanging length is a catenary under the horizontal pull w a, with the weight w per length. A length l
 reaches from the touchdown point to the height sqrt(a^2 + l^2) - a, a asinh(l / a) ahead along the tangent of the laid cable. This
-prescribes the path of the grip as l decreases. Friction keeps the laid cable in place: w a times the curvature of the path is less
+prescribes the path of the grip as l decreases. Friction fixes the laid cable: w a times the curvature of the path is less
 than mu w. Bending rounds off the touchdown over (EI / w)^(1/3), the scale of the tolerated deviation from the path.
 """
 

@@ -2,8 +2,8 @@
 
 A string wound about a drum by the angle phi slides at T2 = T1 exp(mu phi). Friction acts here on the centreline, between the
 closest points of rod and axis. It makes no couple, and the exponent is mu instead of the smaller one of surface friction. A rod with
-bending stiffness B leaves the drum, of radius R to its centreline, at an angle t to its line of pull T, with
-sin(t/2) = sqrt(B / T) / 2R, and the drum exerts a point force T sin(t) there:
+bending stiffness B leaves the drum, of radius R to its centreline, at an angle t to its line of pull T. With
+sin(t/2) = sqrt(B / T) / 2R the drum exerts a point force T sin(t) there:
 
     T2 (cos t2 - mu sin t2) = T1 (cos t1 + mu sin t1) exp(mu (phi - t1 - t2)) ,
 

@@ -9,7 +9,7 @@ Let back, it slides in reverse from its end on, where friction changes sign: wit
 
     u_0 - u = (F_0 - F)^2 / (4 EA mu w) ,
 
-so that the rod pushes back long before its end has returned. Every state is an equilibrium, found from the one before. Friction is
+so that the force reverses long before its end has returned. Every state is an equilibrium, found from the one before. Friction is
 fully mobilised, as all sliding is much faster than the stick threshold.
 """
 

@@ -15,8 +15,8 @@ import ddg_warp as ddg
 from ddg_warp.ask.buckled import buckled_points
 
 LENGTH = 1.0  # m
-B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2]; C only sets the end rotation
-EA = 1.0e9  # N; nearly inextensible
+B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2], of which C only sets the end rotation
+EA = 1.0e9  # N, nearly inextensible
 SOURCE = "Greenhill 1883, determinant for clamped ends"
 
 

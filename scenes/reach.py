@@ -22,8 +22,8 @@ WEIGHT = 0.4  # N, of the cable
 STIFFNESS = 0.01  # N m^2, EI; GJ is a quarter of it
 SHOWN = np.array(
     [[0.1, 0.06, 0.0, 0.3, 0.4, 0.7], [-0.15, -0.06, 0.08, 0.6, -0.3, 0.5]]
-)  # m, rad; poses of the demonstration
-MOVED = 1.0  # s; end of the grip motion
+)  # m, rad, poses of the demonstration
+MOVED = 1.0  # s, end of the grip motion
 END = 2.0  # s
 EDGES, DT = 16, 0.02  # edges and time step [s] of the fitted cable
 CLOSE = 2e-3  # m, from the goal

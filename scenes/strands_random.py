@@ -1,6 +1,6 @@
 """Random rods: many lengths, node counts, sections and materials in one scene; each rod moves as if alone.
 
-Rods that share a scene are sorted, padded and advanced together. None of that may have an effect: without contact a rod has the
+Rods of one scene are sorted, padded and advanced together. None of that may have an effect: without contact a rod has the
 same motion in the scene and alone. Helices of random size, clamped at one end, fall and swing.
 """
 

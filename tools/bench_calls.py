@@ -1,13 +1,13 @@
-"""What calls cost beside what they compute: small steps, changes of parameters, worlds, gradients, of this version or against another.
+"""Time the overhead of calls: small steps, parameter changes, worlds, gradients, of this version or against another.
 
     python tools/bench_calls.py [--cuda] [--json FILE]              milliseconds a call, of this version
     python tools/bench_calls.py --against FILE [--cuda] [--out DIR] with those of another version, measured just before: a table
 
-Rods of 12 nodes that a grip holds, 0.005 s a step: four of their own, joined, or that may touch. `step`: of an integrator; `set`: with
-a parameter that is changed before each; `worlds`: of 1,024 worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds;
-`parameter`, `poses`: with a tensor for every world; `forward`, `backward`: of roll-outs of ten steps with both. `error` is that of the
-gradient by the parameter against central differences. The least of several runs of calls in a row, after which alone the device is
-waited for. To compare versions run both in turn on one machine.
+Four rods of 12 nodes with a grip each, 0.005 s a step: uncoupled, joined, or with contact. `step`: of an integrator. `set`: with a
+parameter change before each step. `worlds`: of 1,024 worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds.
+`parameter`, `poses`: with a tensor for every world. `forward`, `backward`: of roll-outs of ten steps with both. `error`: relative
+error of the gradient by the parameter against central differences. Times are the least of several runs of consecutive calls, with
+one device synchronisation at the end. To compare versions alternate both on one machine.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def scene_of(kind: str) -> ddg.Scene:
 
 
 class Clock:
-    """Least milliseconds of a call among runs of several in a row."""
+    """Least milliseconds of a call among runs of several consecutive calls."""
 
     def __init__(self, device):
         self.device = device
@@ -94,12 +94,12 @@ def gradients(kind: str, model, clock):
     poses = torch.zeros(WORLDS, len(model.grips), 6, dtype=value.dtype, device=value.device)
     poses[..., 2], poses[..., 4] = 1e-3, 0.01
     with torch.no_grad():
-        for call, given in (
+        for call, inputs in (
             ("torch", (None, None)),
             ("parameter", ({NAME: value}, None)),
             ("poses", (None, {"poses": poses})),
         ):
-            yield {"kind": kind, "call": call, "ms": clock(lambda g=given: simulator.step(start, *g)), "error": ""}
+            yield {"kind": kind, "call": call, "ms": clock(lambda g=inputs: simulator.step(start, *g)), "error": ""}
 
     def loss(factor):
         states = simulator.rollout(
@@ -113,9 +113,14 @@ def gradients(kind: str, model, clock):
     forward = clock(lambda: loss(factor), 3)
     with torch.no_grad():
         near, far = (float(loss(factor + h) - loss(factor - h)) / (2.0 * h) for h in (1e-4, 2e-4))
-    (found,) = torch.autograd.grad(loss(factor), factor)
+    (gradient,) = torch.autograd.grad(loss(factor), factor)
     wanted = (4.0 * near - far) / 3.0
-    yield {"kind": kind, "call": "backward", "ms": whole - forward, "error": abs(float(found) - wanted) / abs(wanted)}
+    yield {
+        "kind": kind,
+        "call": "backward",
+        "ms": whole - forward,
+        "error": abs(float(gradient) - wanted) / abs(wanted),
+    }
 
 
 def main() -> None:
@@ -124,20 +129,20 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the rows")
     parser.add_argument("--against", type=Path, help="rows of another version")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    found = list(rows("cuda:0" if asked.cuda else "cpu"))
-    if asked.json:
-        write_json(asked.json, found)
-    if asked.against:
-        before = {(row["kind"], row["call"]): row for row in json.loads(asked.against.read_text())}
-        for row in found:
+    results = list(rows("cuda:0" if options.cuda else "cpu"))
+    if options.json:
+        write_json(options.json, results)
+    if options.against:
+        before = {(row["kind"], row["call"]): row for row in json.loads(options.against.read_text())}
+        for row in results:
             old = before[row["kind"], row["call"]]["ms"]
             row |= {"ms before": old, "ratio": row["ms"] / old}
-        stem = asked.out / f"calls_{'cuda' if asked.cuda else 'cpu'}"
-        write_table(stem, found, {"machine": machine(), "against": asked.against.stem})
-    print(table(found))
+        stem = options.out / f"calls_{'cuda' if options.cuda else 'cpu'}"
+        write_table(stem, results, {"machine": machine(), "against": options.against.stem})
+    print(table(results))
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
-"""Times the search for contact, by a tree of boxes and by a hash grid, and the filter of motions: strands packed as in a braid.
+"""Time broad and narrow phase, by a BVH and by a hash grid, and CCD: strands packed as in a braid.
 
     python tools/bench_contact.py [--device cuda:0] [--quick] [--out DIR]
 
-Strands of 64 edges lie side by side, waved by less than they are apart, so that an edge has about 1.5 others within reach. Prints a
-table; writes contact_search_DEVICE.csv and .json. `rebuild`, `refit`, `search` (boxes, tree and list of pairs) and `measure` are parts
-of `BroadPhase`; `watch` is what a step pays where the last search still holds. `filter` shortens motions, each strand's own, within
-what the last search allows for; `far` does for motions of five margins, `common` for one of fifty that all share beside motions of a
-tenth of a margin, both with the search along the way. `limited` is the share of strands that are shortened. `grid` is a `wp.HashGrid`
-of the edges' middles, built and asked for the same pairs, which are counted only. `moved` is a search after strands have moved by ten
-times their distance, with a tree built there; `moved_refit` with that from before. On CUDA the parts are captured graphs, timed by
-events; on the CPU the clock is that of this process.
+Strands of 64 edges lie side by side, with waves smaller than their distance, so that an edge has about 1.5 others within the search
+distance. Prints a table; writes contact_search_DEVICE.csv and .json. `rebuild`, `refit`, `search` (AABBs, BVH and candidate list)
+and `measure` are steps of `BroadPhase`. `watch` is the cost of a step while candidates stay valid. `filter` limits motions per
+strand within the validity of the last search. `far` does so for motions of five margins. `common` adds a rigid motion of fifty
+margins to motions of a tenth of a margin. The last two include a swept search. `limited` is the fraction of limited strands.
+
+`grid` is a `wp.HashGrid` of edge midpoints, built and queried for the same pairs, which are only counted. `moved` is a search after
+strands have moved by ten times their distance, with a rebuilt BVH; `moved_refit` with the refitted one. On CUDA the steps are
+captured graphs, timed by events; on the CPU the clock is process time.
 """
 
 import argparse
@@ -34,7 +35,7 @@ SIZES = (1_000, 10_000, 100_000, 1_000_000)
 
 
 def strands(edges: int) -> tuple[Shapes, np.ndarray]:
-    """So many edges, and their nodes (n, 3)."""
+    """Return shapes with about this number of edges, and nodes (n, 3)."""
     rods = max(1, edges // EDGES_A_ROD)
     side, nodes = int(np.ceil(np.sqrt(rods))), EDGES_A_ROD + 1
     rng = np.random.default_rng(0)
@@ -49,7 +50,11 @@ def strands(edges: int) -> tuple[Shapes, np.ndarray]:
 
 
 def grid_kernels(real):
-    """middles(...) of edges and count(...) of pairs through a hash grid of them."""
+    """Build the kernels of a hash grid of edges.
+
+    `middles`: compute midpoints of edges.
+    `count`: count pairs through the grid.
+    """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, may_touch, thickness, closest = pair_functions(EDGES, real)
     corners = corners_function(real)
@@ -83,7 +88,7 @@ def grid_kernels(real):
 
 
 def clocked(device, part, repeats: int) -> float:
-    """Milliseconds of one run of `part`."""
+    """Return the milliseconds of one run of `part`."""
     part()
     if not device.is_cuda:
         began = time.process_time()
@@ -103,16 +108,16 @@ def clocked(device, part, repeats: int) -> float:
 
 
 def measure(edges: int, device, repeats: int) -> dict:
-    """A row of the table."""
+    """Return a row of the table."""
     shapes, points = strands(edges)
     x = wp.array(points, dtype=wp.vec3d, device=device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
     arrays.load_kernels(search.kernels, device)
     pairs = search.lists[0]
-    number, found = pairs.first.count, int(pairs.count.numpy()[0])
+    number, number_of_pairs = pairs.first.count, int(pairs.count.numpy()[0])
     row = {
         "edges": number,
-        "pairs": found,
+        "pairs": number_of_pairs,
         "rebuild_ms": clocked(device, lambda: search.rebuild(x), repeats),
         "refit_ms": clocked(device, pairs.second.tree.refit, repeats),
         "search_ms": clocked(device, lambda: search.search(x), repeats),
@@ -123,7 +128,7 @@ def measure(edges: int, device, repeats: int) -> dict:
     middle = wp.zeros(number, dtype=wp.vec3, device=device)
     middles, count = grid_kernels(search.real)
     grid, total = wp.HashGrid(128, 128, 128, device=device), wp.zeros(1, dtype=int, device=device)
-    # middles of edges that are near are no farther apart than their length and thickness with all that is searched for
+    # midpoints of candidate edges are no farther apart than edge length, thickness and search distance
     lengths = np.linalg.norm(np.diff(points.reshape(-1, EDGES_A_ROD + 1, 3), axis=1), axis=2)
     reach = REACH + 1.001 * MARGIN
     cell = 1.0001 * (lengths.max() + 2.0 * RADIUS + reach)
@@ -137,8 +142,8 @@ def measure(edges: int, device, repeats: int) -> dict:
         wp.launch(count, number, [grid.id, pairs.sides, x, middle, cell, reach], [total], device=device)
 
     row["grid_build_ms"], row["grid_count_ms"] = clocked(device, build, repeats), clocked(device, ask, repeats)
-    if int(total.numpy()[0]) != found:
-        raise RuntimeError(f"the grid finds {total.numpy()[0]} pairs, the tree {found}")
+    if int(total.numpy()[0]) != number_of_pairs:
+        raise RuntimeError(f"the grid finds {total.numpy()[0]} pairs, the tree {number_of_pairs}")
     rng = np.random.default_rng(1)
     away = np.repeat(10.0 * APART * rng.normal(size=(len(points) // (EDGES_A_ROD + 1), 3)), EDGES_A_ROD + 1, axis=0)
     x.assign(points + away)
@@ -150,13 +155,17 @@ def measure(edges: int, device, repeats: int) -> dict:
 
 
 def _filtered(search: BroadPhase, x, repeats: int) -> dict:
-    """Times of filters, pairs that they need, and the share of strands that they shorten."""
+    """Return times of filters, numbers of candidates, and fractions of limited strands."""
     device, strands = search.device, len(search.shapes.names)
     unit = wp.array(np.repeat(np.arange(strands), EDGES_A_ROD + 1), dtype=int, device=device)
     rng, base, row = np.random.default_rng(2), x.numpy(), {}
-    own = np.repeat(MARGIN * rng.normal(size=(strands, 3)), EDGES_A_ROD + 1, axis=0)
+    motion = np.repeat(MARGIN * rng.normal(size=(strands, 3)), EDGES_A_ROD + 1, axis=0)
     common = 50.0 * MARGIN * np.array([0.0, 0.6, 0.8])
-    for name, move, together in (("filter", 0.1 * own, 0), ("far", 5.0 * own, 0), ("common", 0.1 * own + common, 1)):
+    for name, move, together in (
+        ("filter", 0.1 * motion, 0),
+        ("far", 5.0 * motion, 0),
+        ("common", 0.1 * motion + common, 1),
+    ):
         wish, q = wp.array(base + move, dtype=x.dtype, device=device), wp.empty_like(x)
         flags = wp.full(1, together, dtype=int, device=device)
 
@@ -176,11 +185,11 @@ def _filtered(search: BroadPhase, x, repeats: int) -> dict:
 
 
 def _by_refit(search: BroadPhase, points, x, device) -> float:
-    """Of a search at x with a tree that was built at `points`."""
-    pairs, place = search.lists[0], x.numpy().copy()
+    """Return the time of a search at x with a BVH built at `points` and refitted."""
+    pairs, position = search.lists[0], x.numpy().copy()
     x.assign(points)
     search.rebuild(x)
-    x.assign(place)
+    x.assign(position)
     still, shift, within = wp.zeros_like(x), wp.zeros(1, dtype=x.dtype, device=device), REACH + 1.001 * MARGIN
     never, lost = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
 
@@ -193,7 +202,7 @@ def _by_refit(search: BroadPhase, points, x, device) -> float:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--quick", action="store_true", help="the smallest size: does it run?")

@@ -1,18 +1,21 @@
-"""Times large scenes of contact, noodles, woven_cylinder, rod_pile and hair on a moving head, and contact where nothing touches.
+"""Time large contact scenes, noodles, woven_cylinder, rod_pile and hair on a moving head, and contact of separate rods.
 
     python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR] [--name NAME]
 
 Prints a table; writes NAME_DEVICE.csv and .json, crowds_apart_DEVICE, crowds_tolerance_DEVICE, and crowds_control_DEVICE. Each case
-runs to its end or for `limit` seconds of wall time; a row is a sixth of that, from start to the time `until`: seconds of wall time for
-each simulated one, means a step of solves (more than one where steps were taken in parts), of Newton and of conjugate gradient
-iterations and of searches, pairs in contact and the smallest gap over the range so far. `refused` are pairs that would have passed
-through each other in parts of steps that were not taken. What is said of errors: `rtol`, to which forces balance, over the weight of a
-rod, but those on `outliers`, a part of all rods; `astray`, the largest estimate of `StepControl` [m/s], by which the steps of some
-scenes are halved; `gained`, the energy that was created over what was lost so far, of the scenes that nothing drives. `dt` is the mean
-of steps [s]. `search_share` is what searches take of the wall time, from one that is timed after them. Of scenes in which nothing
-touches, the ratio of a step with contact to one without. Of tolerances, for noodles and hair that land, how far nodes are from where
-the tightest one has them, and where steps half as long have them, or those under control. Of control, the same for the first second of
-hair that hangs as drawn, by its errors and tolerances.
+runs to its end or for `limit` seconds of wall time. A row covers a sixth of that, up to the time `until`:
+
+- wall time a simulated second, and means a step of solves (above one with substeps), Newton and conjugate gradient iterations, and
+  searches; `dt` is the mean step [s]
+- pairs in contact, the smallest gap so far over the search distance, and `refused`, crossing pairs in rejected steps
+- `rtol`, residual tolerance over the weight of a rod, and `outliers`, the fraction of rods that may exceed it
+- `astray`, the largest local error estimate of `StepControl` [m/s], which halves the steps of some scenes
+- `gained`, energy created over energy lost so far, in scenes without driving
+- `search_share`, the fraction of wall time for searches, from one timed separately
+
+`apart`: ratio of a step with contact to one without, for separate rods. `tolerance`: for noodles and hair that land, deviations of
+nodes from the tightest tolerance, with half the step, and under step control. `control`: the same for the first second of sag-free
+hair, by local error and tolerance.
 """
 
 import argparse
@@ -27,13 +30,13 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.run.summary import machine, table, write_table
 
-# Of the weight of a rod, see `tolerances`: nodes err by a fifth of what steps half as long change, or less. By steps of 1/120 s 1e-1
-# is too much: noodles then seem to pass.
+# Relative to the weight of a rod. Measured, see `tolerances`: position errors are a fifth of the change by half the
+# step, or less. With steps of 1/120 s noodles report crossings at 1e-1.
 LARGE = ("hair_10000", "hair_10000_control", "hair_10000_sag_free")
 RTOL, OTHERWISE = {"noodles": 3e-1, "hair_512": 1e-1} | dict.fromkeys(LARGE, 3e-1), 3e-2
-# none otherwise: by these nodes err by a half of what steps half as long change
+# 0 otherwise. Measured: position errors are half of the change by half the step.
 OUTLIERS = dict.fromkeys(LARGE, 5e-2)
-# of `StepControl`, error [m/s] and halvings; steps of other cases are all of one length
+# error [m/s] and halvings of `StepControl`; other cases have constant steps
 CONTROL, ONE_LENGTH = {"noodles": (5e-3, 2)} | dict.fromkeys(LARGE[1:], (5e-3, 3)), (5e-3, 0)
 PARTS = 6  # rows of a case
 CASES = {  # scene, its arguments, longest step [s], duration [s], whether something drives it
@@ -59,11 +62,11 @@ CASES = {  # scene, its arguments, longest step [s], duration [s], whether somet
     ),
 }
 TOLERANCES = (1e-6, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1)
-LANDING = {  # arguments of a scene, steps of 1/960 s until things land, and that are compared, and outliers beside none
+LANDING = {  # arguments of a scene, steps of 1/960 s until landing and for comparison, and nonzero outliers
     "noodles": ({"count": 49, "nodes": 241, "bowl": 0.45}, 420, 40, ()),
     "strands": ({"count": 256, "contact": True}, 270, 40, (1e-2, 5e-2, 2e-1)),
 }
-CONTROLS = (  # error and halvings of `StepControl`, rtol, outliers; what others are compared with first
+CONTROLS = (  # error and halvings of `StepControl`, rtol, outliers; the first is the reference
     ((1e-3, 4), 3e-2, 0.0),
     ((2.5e-3, 4), 3e-1, 5e-2),
     ((5e-3, 3), 3e-1, 5e-2),
@@ -72,20 +75,20 @@ CONTROLS = (  # error and halvings of `StepControl`, rtol, outliers; what others
     ((1e-2, 3), 3e-1, 5e-2),
     ((2e-2, 3), 3e-1, 5e-2),
 )
-APART, NODES = (100, 1_000, 10_000), 50  # rods of so many nodes that do not touch
-WARM, TIMED, TURN = 64, 80, 5  # steps: before time counts, until all graphs are captured, that are timed, and in turn
+APART, NODES = (100, 1_000, 10_000), 50  # numbers of separate rods, and nodes of each
+WARM, TIMED, TURN = 64, 80, 5  # steps: warm-up until graphs are captured, timed steps, and steps of a block
 
 
 def run(name: str, device, limit: float) -> list[dict]:
-    """Rows of a case."""
-    scene_name, given, dt, duration, driven = CASES[name]
-    scene, rtol = import_module(f"ddg_warp.scenes.{scene_name}").build(**given), RTOL.get(name, OTHERWISE)
+    """Return rows of a case."""
+    scene_name, arguments, dt, duration, driven = CASES[name]
+    scene, rtol = import_module(f"ddg_warp.scenes.{scene_name}").build(**arguments), RTOL.get(name, OTHERWISE)
     model = scene.build(device)
     outliers = OUTLIERS.get(name, 0.0)
     integrator = ddg.Integrator(model, check_every=1, rtol=rtol, outliers=outliers)
     steps = ddg.StepControl(integrator, *CONTROL.get(name, ONE_LENGTH))
     state = scene.initial(model) if scene.initial else model.state()
-    contact = integrator._net.newton.contact  # for the time of a search, of which nothing public tells
+    contact = integrator._net.newton.contact  # for the time of a search, which has no public interface
     state = integrator.step(state, dt / 2**steps.halvings)
     wp.synchronize_device(device)
     rows, energies, astray = [], [sum(model.energies(state).values())], 0.0
@@ -93,15 +96,15 @@ def run(name: str, device, limit: float) -> list[dict]:
     before, since, taken = integrator.statistics(), state.time, steps.lengths.total()
     while state.time < duration - 0.5 * dt and time.perf_counter() - began < limit:
         state, astray = steps.advance(state, dt), max(astray, steps.estimate)
-        part = PARTS * max(state.time / duration, (time.perf_counter() - began) / limit)
-        if part < len(rows) + 1 and state.time < duration - 0.5 * dt:
+        progress = PARTS * max(state.time / duration, (time.perf_counter() - began) / limit)
+        if progress < len(rows) + 1 and state.time < duration - 0.5 * dt:
             continue
         wp.synchronize_device(device)
-        wall, found, number = time.perf_counter() - mark, integrator.statistics(), steps.lengths.total() - taken
+        wall, statistics, number = time.perf_counter() - mark, integrator.statistics(), steps.lengths.total() - taken
         energies.append(sum(model.energies(state).values()))
-        solves = _solves(found) - _solves(before)
-        newton = _newton(found) - _newton(before)
-        touching, earlier = found["contact"], before["contact"]
+        solves = _solves(statistics) - _solves(before)
+        newton = _newton(statistics) - _newton(before)
+        touching, earlier = statistics["contact"], before["contact"]
         rows.append(
             {
                 "case": name,
@@ -115,7 +118,7 @@ def run(name: str, device, limit: float) -> list[dict]:
                 "ms_per_step": 1e3 * wall / number,
                 "solves": solves / number,
                 "newton": newton / number,
-                "cg": (found["pcg_iterations"] - before["pcg_iterations"]) / number,
+                "cg": (statistics["pcg_iterations"] - before["pcg_iterations"]) / number,
                 "searches": (touching["searches"] - earlier["searches"]) / number,
                 "contacts": touching["contacts"]["last"],
                 "gap": touching["smallest_gap"] / contact.search.reach,
@@ -141,7 +144,7 @@ def _newton(statistics: dict) -> float:
 
 
 def _search_time(contact, state) -> float:
-    """Seconds of a search, captured as it is in a step, the least of some."""
+    """Return the least time of a captured search [s]."""
     search, times = contact.search, []
     with wp.ScopedCapture(device=search.device, force_module_load=False) as capture:
         search.search(state.net.q)
@@ -155,12 +158,12 @@ def _search_time(contact, state) -> float:
 
 
 def apart(device) -> list[dict]:
-    """Steps of rods that do not touch."""
+    """Return rows of steps of separate rods."""
     return [_apart(rods, device) for rods in APART]
 
 
 def _apart(rods: int, device) -> dict:
-    """A step of rods that do not touch, with contact and without, in turn, so that what else a machine does slows both."""
+    """Return a row of a step of separate rods with and without contact, in alternating blocks on one machine."""
     models = [_lattice(rods, touching).build(device) for touching in (False, True)]
     integrators, states = (
         [ddg.Integrator(model, check_every=1) for model in models],
@@ -168,19 +171,19 @@ def _apart(rods: int, device) -> dict:
     )
     times = [0.0, 0.0]
 
-    def go(which: int, steps: int) -> float:
+    def go(index: int, steps: int) -> float:
         wp.synchronize_device(device)
         began = time.perf_counter()
         for _ in range(steps):
-            states[which] = integrators[which].step(states[which], 1 / 240)
+            states[index] = integrators[index].step(states[index], 1 / 240)
         wp.synchronize_device(device)
         return 1e3 * (time.perf_counter() - began)
 
-    for which in range(2):
-        go(which, WARM)
+    for index in range(2):
+        go(index, WARM)
     for _ in range(TIMED // TURN):
-        for which in range(2):
-            times[which] += go(which, TURN) / TIMED
+        for index in range(2):
+            times[index] += go(index, TURN) / TIMED
     return {
         "rods": rods,
         "nodes": rods * NODES,
@@ -192,7 +195,7 @@ def _apart(rods: int, device) -> dict:
 
 
 def _lattice(rods: int, touching: bool) -> ddg.Scene:
-    """Rods of 0.2 m, held at one end, 5 cm from each other."""
+    """Return a scene of rods of 0.2 m, clamped at one end, 5 cm apart."""
     along, side = np.linspace(-0.1, 0.1, NODES), int(np.ceil(np.sqrt(rods)))
     centres = np.stack([0.25 * (np.arange(rods) % side), 0.05 * (np.arange(rods) // side), np.zeros(rods)], axis=1)
     shape = np.stack([along, 0.0 * along, 0.01 * np.cos(20.0 * along)], axis=1)
@@ -210,13 +213,13 @@ def _lattice(rods: int, touching: bool) -> ddg.Scene:
 
 
 def tolerances(device) -> list[dict]:
-    """What the tolerance of steps costs and does to noodles and hair that land, and what their length does."""
+    """Return rows of cost and error of tolerances and step lengths for landing noodles and hair."""
     return [row for name in LANDING for row in _tolerances(name, device)]
 
 
 def _tolerances(name: str, device) -> list[dict]:
-    given, before, count, few = LANDING[name]
-    scene = import_module(f"ddg_warp.scenes.{name}").build(**given)
+    arguments, before, count, few = LANDING[name]
+    scene = import_module(f"ddg_warp.scenes.{name}").build(**arguments)
     model = scene.build(device)
     start, dt = scene.initial(model) if scene.initial else model.state(), 1 / 960
     integrator = ddg.Integrator(model, rtol=OTHERWISE)
@@ -232,15 +235,15 @@ def _tolerances(name: str, device) -> list[dict]:
 
 
 def controls(device) -> list[dict]:
-    """What the error of `StepControl`, and tolerances, cost and do to hair on its moving head that hangs as drawn."""
+    """Return rows of cost and error of `StepControl` and tolerances for sag-free hair on a moving head."""
     count = 10_000 if device.is_cuda else 512
     model = import_module("ddg_warp.scenes.strands").build(count=count, contact=True, sag_free=True).build(device)
-    start = ddg.Integrator(model).step(model.state(), 1e-4)  # so that all is compiled
-    return _compared("strands", model, start, 1.0, [(*of, 1 / 240) for of in CONTROLS])
+    start = ddg.Integrator(model).step(model.state(), 1e-4)  # compiles everything
+    return _compared("strands", model, start, 1.0, [(*control, 1 / 240) for control in CONTROLS])
 
 
 def _compared(name: str, model, start, duration: float, settings: list[tuple]) -> list[dict]:
-    """Runs from a state by (error and halvings of `StepControl`, rtol, outliers, longest step), each compared with the first."""
+    """Run from a state by (error and halvings of `StepControl`, rtol, outliers, longest step); compare each with the first."""
     rows, points = [], None
     for control, rtol, outliers, length in settings:
         integrator, state, astray = ddg.Integrator(model, rtol=rtol, outliers=outliers), start, 0.0
@@ -251,7 +254,7 @@ def _compared(name: str, model, start, duration: float, settings: list[tuple]) -
             state = steps.advance(state, length)
             astray = max(astray, steps.estimate)
         wp.synchronize_device(model.device)
-        wall, found, number = time.perf_counter() - began, integrator.statistics(), steps.lengths.total()
+        wall, statistics, number = time.perf_counter() - began, integrator.statistics(), steps.lengths.total()
         points = state.points() if points is None else points
         off = np.linalg.norm(state.points() - points, axis=1)
         rows.append(
@@ -263,8 +266,8 @@ def _compared(name: str, model, start, duration: float, settings: list[tuple]) -
                 "dt": duration / number,
                 "astray": astray,
                 "wall": wall,
-                "newton": _newton(found) / number,
-                "cg": found["pcg_iterations"] / number,
+                "newton": _newton(statistics) / number,
+                "cg": statistics["pcg_iterations"] / number,
                 "off_median": float(np.median(off)),
                 "off_99": float(np.percentile(off, 99)),
                 "off_largest": float(off.max()),
@@ -277,7 +280,7 @@ OTHERS = {"apart": apart, "tolerance": tolerances, "control": controls}
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--only", nargs="+", choices=[*CASES, *OTHERS], default=[*CASES, *OTHERS])
@@ -287,18 +290,18 @@ def main() -> int:
     parser.add_argument("--name", default="crowds", help="of the table of cases (default: crowds)")
     chosen = parser.parse_args()
     device = wp.get_device(chosen.device)
-    own = "cuda" if device.is_cuda else "cpu"
+    kind = "cuda" if device.is_cuda else "cpu"
     command = " ".join(["python", "tools/bench_crowds.py", *sys.argv[1:]])
     about = {"command": command, "device": str(device), "machine": machine(chosen.commit)}
     rows = []
     for name in (name for name in chosen.only if name in CASES):
         rows += run(name, device, chosen.limit)
-        write_table(chosen.out / f"{chosen.name}_{own}", rows, about)
+        write_table(chosen.out / f"{chosen.name}_{kind}", rows, about)
     if rows:
         print(table(rows))
     for name in (name for name in chosen.only if name in OTHERS):
         rows = OTHERS[name](device)
-        write_table(chosen.out / f"crowds_{name}_{own}", rows, about)
+        write_table(chosen.out / f"crowds_{name}_{kind}", rows, about)
         print(table(rows))
     return 0
 

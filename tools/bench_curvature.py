@@ -1,12 +1,12 @@
-"""Curvature by the tangent, 2 tan(phi/2) / l, against curvature by the turning angle, phi / l: errors of rods with known answers.
+"""Compare curvature measures, 2 tan(phi/2) / l by the tangent and phi / l by the angle: errors of rods with known answers.
 
     python tools/bench_curvature.py [--quick] [--only NAME] [--out DIR]
 
-Each case is run over its edges with both. `error` is the largest of what it measures, relative where its check is, else in its unit;
-`seconds` the CPU time of the run, the least of four where it is short. References are closed forms, boundary value problems and
-critical loads (see the scenes and tests/accuracy); where there are none, a run of four times as many edges by the same curvature, in
-the same time steps. Prints orders, errors of the tangent over those of the angle, and what a step costs with either; writes
-curvature_cpu.csv, .json and .png, and curvature_cpu_time.png.
+Each case is run over its edges with both. `error` is the largest of its measured errors, relative where its check is, else in its
+unit. `seconds` is the CPU time of the run, the least of four for short ones. References are closed forms, boundary value problems
+and critical loads (see the scenes and tests/accuracy). Otherwise a run of four times as many edges by the same curvature, in the
+same time steps. Prints orders, ratios of errors, and costs of a step; writes curvature_cpu.csv, .json and .png, and
+curvature_cpu_time.png.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from ddg_warp.scenes import (
 )
 
 CHOICES = ("tangent", "angle")
-REPEATED, SHORT = 4, 3.0  # of how many runs the least time counts, where they take less than that together [s]
+REPEATED, SHORT = 4, 3.0  # number of runs for the least time, if these take less than this together [s]
 PLANAR = (8, 16, 32, 64, 128)
 # Weight over EI / L^3 -> tip (x, -z) [L] and its angle [rad] of the heavy elastica, by collocation and by a Legendre-Ritz method.
 HEAVY = {1.0: (0.9912463953, 0.123471402, 0.1651155605), 10.0: (0.6563537612, 0.7001997155, 1.052643117)}
@@ -52,15 +52,15 @@ HEAVY = {1.0: (0.9912463953, 0.123471402, 0.1651155605), 10.0: (0.6563537612, 0.
 
 @dataclass(frozen=True)
 class Case:
-    """Rods whose error is known.
+    """Rods with a known error.
 
     Attributes:
-        name: What it is called in the table.
+        name: Name in the table.
         scene: Module with `build(n, ...)`, and `check` where a check is measured.
         edges: Values of n.
-        measured: Beginnings of the names of the checks that are measured, or a function of a result.
+        measured: Beginnings of the names of measured checks, or a function of a result.
         fixed: Settings of all runs.
-        reference: Settings of the run that such a function is compared with.
+        reference: Settings of the reference run for such a function.
         own: Whether the scene has a parameter `curvature`.
         slow: Whether --quick leaves it out.
     """
@@ -76,7 +76,7 @@ class Case:
 
 
 def falling() -> SimpleNamespace:
-    """The cantilever of scenes/cantilever.py, held exactly at its first node."""
+    """Return the cantilever of scenes/cantilever.py, clamped exactly at its first node."""
 
     def build(n: int = 32) -> ddg.Scene:
         scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), analysis=ddg.Dynamics(dt=0.01, duration=0.5))
@@ -89,7 +89,7 @@ def falling() -> SimpleNamespace:
 
 
 def heavy(weight: float) -> SimpleNamespace:
-    """A cantilever under its own weight, at rest."""
+    """Return a cantilever in equilibrium under self-weight."""
 
     def build(n: int = 32) -> ddg.Scene:
         scene = ddg.Scene(gravity=(0.0, 0.0, -1.0), dimension=2, analysis=ddg.Statics(load_steps=8))
@@ -109,7 +109,7 @@ def heavy(weight: float) -> SimpleNamespace:
 
 
 def circle(turns: float) -> SimpleNamespace:
-    """A cantilever bent by a couple into an arc of so many turns."""
+    """Return a cantilever bent by a couple into an arc of `turns` turns."""
 
     def build(n: int = 32) -> ddg.Scene:
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2, analysis=ddg.Statics(load_steps=round(12 * turns)))
@@ -129,17 +129,17 @@ def circle(turns: float) -> SimpleNamespace:
 
 
 def pitchfork(result) -> np.ndarray:
-    """Lateral displacement [m] at which the arch leans over; its published reference is of a plate, not of a ribbon."""
+    """Return the lateral displacement [m] at the pitchfork; its published reference is a plate, not a ribbon."""
     return np.array([check.measured for check in ribbon_bistable.check(result)])
 
 
 def ends(result) -> np.ndarray:
-    """Where the first and the last node are [m]."""
+    """Return positions of the first and the last node [m]."""
     return result.state.points()[[0, -1]]
 
 
 def cases() -> list[Case]:
-    """What is compared."""
+    """Return all cases."""
     tight, midpoint = {"rtol": 1e-9}, {"scheme": "implicit_midpoint"}
     tip = ("tip x", "tip z")
     return [
@@ -177,7 +177,7 @@ def cases() -> list[Case]:
 
 
 def study_of(case: Case, choice: str) -> Study:
-    """The study of a case with one of the curvatures."""
+    """Return the study of a case with one of the curvatures."""
     fixed = {**case.fixed, **({"curvature": choice} if case.own else {})}
     if callable(case.measured):
         return Study({"n": case.edges}, case.measured, case.reference, fixed)
@@ -190,32 +190,34 @@ def study_of(case: Case, choice: str) -> Study:
 
 
 def rows_of(case: Case) -> list[dict]:
-    """Rows of the table: every number of edges with both curvatures."""
+    """Return rows of the table: every number of edges with both curvatures."""
     rows = []
     for choice in CHOICES:
         defaults = (getattr(ddg.Scene, name).__kwdefaults__ for name in ("add_rod", "add_rods"))
         with ExitStack() as stack:
-            for each in defaults:  # scenes, and what their checks build, say nothing of it
+            for each in defaults:  # scenes and their checks do not set it
                 stack.enter_context(patch.dict(each, curvature=choice))
             study = study_of(case, choice)
             runs = [measure(case.scene, study, device="cpu")[0]]
             while len(runs) < REPEATED and sum(row["seconds"] for row in runs[0]) < SHORT:
                 runs.append(measure(case.scene, study, device="cpu")[0])
-        same = [
-            row | {"seconds": min(one["seconds"] for one in (row, *others))} for row, *others in zip(*runs, strict=True)
+        fastest = [
+            row | {"seconds": min(one["seconds"] for one in (row, *repeats))}
+            for row, *repeats in zip(*runs, strict=True)
         ]
-        found = [row for row in same if row["n"] in case.edges]
-        order = orders(study, found).get("n")
+        rows_at_edges = [row for row in fastest if row["n"] in case.edges]
+        order = orders(study, rows_at_edges).get("n")
         kept = ("n", "error", "seconds", "newton_iterations", "failure")
         rows += [
-            {"case": case.name, "curvature": choice} | {k: row[k] for k in kept} | {"order": order} for row in found
+            {"case": case.name, "curvature": choice} | {k: row[k] for k in kept} | {"order": order}
+            for row in rows_at_edges
         ]
-        print(table(rows[-len(found) :]), file=sys.stderr, flush=True)
+        print(table(rows[-len(rows_at_edges) :]), file=sys.stderr, flush=True)
     return rows
 
 
 def step_cost(rods: int = 100, nodes: int = 50, steps: int = 20, blocks: int = 5) -> dict[str, float]:
-    """CPU time of a step [ms] of so many cantilevers with either curvature: medians of blocks, taken in turns."""
+    """Return CPU time of a step [ms] of cantilevers with either curvature: medians of alternating blocks."""
     points = np.zeros((rods, nodes, 3))
     points[..., 0] = np.linspace(0.0, 1.0, nodes)
     runs, times = {}, {choice: [] for choice in CHOICES}
@@ -225,7 +227,7 @@ def step_cost(rods: int = 100, nodes: int = 50, steps: int = 20, blocks: int = 5
         scene.clamp(scene.add_rods(points, section=ddg.Circle(0.02), material=material, curvature=choice))
         model = scene.build("cpu", "float64")
         runs[choice] = model, ddg.Integrator(model, rtol=1e-8, check_every=steps)
-    for block in range(blocks + 1):  # the first compiles
+    for block in range(blocks + 1):  # the first block compiles
         for choice, (model, integrator) in runs.items():
             state, began = model.state(), time.process_time()
             for _ in range(steps):
@@ -236,11 +238,13 @@ def step_cost(rods: int = 100, nodes: int = 50, steps: int = 20, blocks: int = 5
 
 
 def compared(rows: list[dict]) -> list[dict]:
-    """A row a case: errors at the finest edges, their ratio there and at the coarsest, and observed orders of both."""
+    """Return a row a case: errors at the finest edges, their ratio there and at the coarsest, and orders of both."""
     result = []
     for name in dict.fromkeys(row["case"] for row in rows):
-        of = {choice: {r["n"]: r for r in rows if (r["case"], r["curvature"]) == (name, choice)} for choice in CHOICES}
-        tangent, angle = (of[choice] for choice in CHOICES)
+        rows_of_choice = {
+            choice: {r["n"]: r for r in rows if (r["case"], r["curvature"]) == (name, choice)} for choice in CHOICES
+        }
+        tangent, angle = (rows_of_choice[choice] for choice in CHOICES)
         n = max(set(tangent) & set(angle))
         ratios = [
             tangent[k]["error"] / angle[k]["error"] for k in sorted(tangent) if k in angle and angle[k]["error"] > 0
@@ -260,7 +264,7 @@ def compared(rows: list[dict]) -> list[dict]:
 
 
 def plot(rows: list[dict], path: Path, across: str, label: str) -> None:
-    """Errors over a column of the table, a panel each a case; left out without matplotlib."""
+    """Plot errors over a column of the table, a panel a case; skipped without matplotlib."""
     try:
         from matplotlib.figure import Figure
         from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
@@ -274,11 +278,13 @@ def plot(rows: list[dict], path: Path, across: str, label: str) -> None:
         panel = figure.add_subplot(-(-len(names) // columns), columns, i + 1)
         panel.set_title(name, fontsize=9)
         for choice, line in zip(CHOICES, ("o-k", "s-r"), strict=True):
-            own = [row for row in rows if (row["case"], row["curvature"]) == (name, choice) and row["error"] > 0.0]
-            panel.loglog([row[across] for row in own], [row["error"] for row in own], line, markersize=4, label=choice)
+            points = [row for row in rows if (row["case"], row["curvature"]) == (name, choice) and row["error"] > 0.0]
+            panel.loglog(
+                [row[across] for row in points], [row["error"] for row in points], line, markersize=4, label=choice
+            )
         if across == "n":
-            panel.set_xticks([row["n"] for row in own], [str(row["n"]) for row in own])
-        else:  # of runs of much the same time, too
+            panel.set_xticks([row["n"] for row in points], [str(row["n"]) for row in points])
+        else:  # runs of similar times also need decades
             low, high = panel.get_xlim()
             panel.set_xlim(0.5 * low, 2.0 * high)
             panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
@@ -294,7 +300,7 @@ def plot(rows: list[dict], path: Path, across: str, label: str) -> None:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="leave out what takes long")
     parser.add_argument("--only", default="", help="cases whose names begin so")

@@ -1,11 +1,11 @@
-"""Searches for equilibria of hard cases: buckled, slack, hinged, crumpled, grown and stiff ones, at several lengths.
+"""Benchmark equilibria of hard cases: buckled, slack, hinged, crumpled, grown and stiff ones, at several lengths.
 
     python tools/bench_equilibria.py [--only WORD ...] [--solver direct pcg] [--limit 60] [--out DIR]
     python tools/bench_equilibria.py --read DIR/equilibria_cpu.csv
 
-Prints a table; writes equilibria_DEVICE.csv and .json. `newton` counts iterations of all load steps and halvings, `unbalanced` what of
-the loads supports miss; `error` compares `value` with a closed form or another independent reference, where there is one. A search that
-takes longer than `--limit` seconds is ended. Scenes with contact take the solver that serves it.
+Prints a table; writes equilibria_DEVICE.csv and .json. `newton` counts iterations of all load steps and halvings, `unbalanced` is
+the difference of loads and reactions. `error` compares `value` with a closed form or another independent reference, if any. A
+search longer than `--limit` seconds is ended. Scenes with contact use the solver for contact.
 """
 
 import argparse
@@ -28,17 +28,21 @@ from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 GRAVITY = 9.81
-# P L^2 / EI = K(k)^2 -> tip off the axis over L, 2 k / K(k), of a cantilever column without stretch (Timoshenko and Gere, 2.7)
+# P L^2 / EI = K(k)^2 -> lateral tip displacement over L, 2 k / K(k), of an inextensible column (Timoshenko and Gere,
+# 2.7)
 ELASTICA = {2.6: 0.39228, 20.0: 0.44674}
 
 
 @dataclass(frozen=True)
 class Case:
-    """A search.
+    """A search for an equilibrium.
 
     Attributes:
-        name: in the table; build: makes the scene, or the scene and a function of the model that sets its rest shape.
-        steps: load steps; value: of model and state, what is compared; reference: its right value, None if there is none.
+        name: name in the table.
+        build: returns the scene, or the scene and a function of the model that returns the initial state.
+        steps: load steps.
+        value: function of model and state for comparison.
+        reference: its right value, None if there is none.
     """
 
     name: str
@@ -51,7 +55,7 @@ class Case:
 def column(
     stretching: float, ratio: float = 1.0, load: float = 2.6, length: float = 1.0, dimension: int = 3
 ) -> ddg.Scene:
-    """A straight cantilever column under a dead load P L^2 / EI at its tip; EA L^2 / EI = `stretching`, EI2 / EI1 = `ratio`."""
+    """Return a straight cantilever column under a dead load P L^2 / EI; EA L^2 / EI = `stretching`, EI2 / EI1 = `ratio`."""
     scene = ddg.Scene(gravity=(0, 0, 0), dimension=dimension)
     bending = 1.0
     section = ddg.Stiffness(
@@ -64,12 +68,12 @@ def column(
 
 
 def off_axis(length: float, model, state) -> float:
-    """Distance of the tip from the x axis, over the length."""
+    """Return the distance of the tip from the x axis, over the length."""
     return float(np.hypot(*state.points()[-1, 1:]) / length)
 
 
 def cantilever(length: float) -> ddg.Scene:
-    """A cantilever under F L^2 / EI = 2 across its tip, r / L = 0.01."""
+    """Return a cantilever under a transverse tip force F L^2 / EI = 2, r / L = 0.01."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     section = ddg.Stiffness(EA=4.0 / (0.01 * length) ** 2, EI1=1.0, GJ=1.0)
     rod = scene.add_rod(np.linspace((0, 0, 0), (length, 0, 0), 21), section=section)
@@ -80,7 +84,7 @@ def cantilever(length: float) -> ddg.Scene:
 
 @dataclass(frozen=True)
 class Cable:
-    """A slack cable between the origin and (span, 0, rise): axial and bending stiffness [N, N m^2], weight per length [N/m]."""
+    """Slack cable between the origin and (span, 0, rise): axial and bending stiffness [N, N m^2], weight per length [N/m]."""
 
     span: float
     rise: float
@@ -91,7 +95,7 @@ class Cable:
     edges: int
 
     def catenary(self) -> np.ndarray:
-        """Tension along the span and vertical force at the first end [N], of the elastic catenary (Irvine, Cable structures, 1981)."""
+        """Return horizontal tension and vertical end force [N] of the elastic catenary (Irvine, Cable structures, 1981)."""
         from scipy.optimize import fsolve
 
         def missing(forces):
@@ -105,20 +109,24 @@ class Cable:
 
         return fsolve(missing, [0.5 * self.weight * self.length] * 2, xtol=1e-13)
 
-    def scene(self, how: str, bend: bool = True) -> ddg.Scene:
-        """Drawn as a V that hangs, as one that stands ("hill"), or straight and then with its end "moved" to its place."""
-        at, end, motion = np.linspace(0.0, self.length, self.edges + 1), np.array([self.span, 0.0, self.rise]), None
-        if how == "moved":
-            points = at[:, None] * [1.0, 0.0, 0.0]
-            way = end - points[-1]
-            motion = ddg.Motion(translation=lambda t: tuple(way * min(t, 1.0)))
+    def scene(self, shape: str, bend: bool = True) -> ddg.Scene:
+        """Return a scene drawn as a hanging V, a standing one ("hill"), or straight with a "moved" end."""
+        lengths, end, motion = (
+            np.linspace(0.0, self.length, self.edges + 1),
+            np.array([self.span, 0.0, self.rise]),
+            None,
+        )
+        if shape == "moved":
+            points = lengths[:, None] * [1.0, 0.0, 0.0]
+            displacement = end - points[-1]
+            motion = ddg.Motion(translation=lambda t: tuple(displacement * min(t, 1.0)))
         else:
             half, chord = 0.5 * self.length, 0.5 * np.hypot(self.span, self.rise)
             along = end / (2.0 * chord)
-            across = np.array([along[2], 0.0, -along[0]]) * (1.0 if how == "V" else -1.0)
+            across = np.array([along[2], 0.0, -along[0]]) * (1.0 if shape == "V" else -1.0)
             low = along * chord + across * np.sqrt(half**2 - chord**2)
-            points = np.minimum(at, half)[:, None] / half * low
-            points = points + np.maximum(at - half, 0.0)[:, None] / half * (end - low)
+            points = np.minimum(lengths, half)[:, None] / half * low
+            points = points + np.maximum(lengths - half, 0.0)[:, None] / half * (end - low)
         scene = ddg.Scene(gravity=(0, 0, -GRAVITY))
         section = ddg.Stiffness(
             EA=self.axial, EI1=self.bending, GJ=self.bending, mass_per_length=self.weight / GRAVITY,
@@ -132,7 +140,7 @@ class Cable:
         return scene
 
     def force_error(self, model, state) -> float:
-        """Largest relative error of the two forces."""
+        """Return the largest relative error of the two forces."""
         along, up = self.catenary()
         first, last = model.reactions(state)[:2]
         return float(max(abs(last.force[0] / along - 1.0), abs(first.force[2] / up - 1.0)))
@@ -144,7 +152,7 @@ LINE = Cable(400.0, 50.0, 410.0, 1e8, 1e4, 100.0, 100)
 
 
 def hinged_bars(load_across: float) -> ddg.Scene:
-    """Three hinged bars of 1 m, nearly rigid, between supports 2 m apart, drawn as a square arch and loaded down at its corners."""
+    """Return three nearly rigid hinged bars of 1 m between supports 2 m apart, loaded at the corners of a square arch."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     section = ddg.Stiffness(EA=1e6, EI1=1e3, GJ=1e3)
     corners = np.array([[0.0, 0, 0], [0.5, 0, np.sqrt(0.75)], [1.5, 0, np.sqrt(0.75)], [2.0, 0, 0]])
@@ -161,7 +169,7 @@ def hinged_bars(load_across: float) -> ddg.Scene:
 
 
 def hanging(bend: bool) -> ddg.Scene:
-    """A limp chain, drawn level and fixed at one end, that comes to hang."""
+    """Return a limp rod, drawn level and fixed at one end, that comes to hang."""
     scene = ddg.Scene(gravity=(0, 0, -GRAVITY))
     section = ddg.Stiffness(EA=1e4, EI1=1e-6, GJ=1e-6, mass_per_length=0.01, rotary_inertia=1e-8)
     rod = scene.add_rod(np.linspace((0, 0, 0), (1.0, 0, 0), 41), section=section, **({} if bend else dict(bend=False)))
@@ -172,7 +180,7 @@ def hanging(bend: bool) -> ddg.Scene:
 
 
 def crumpled(size: float, cells: int = 24, bending: str = "midedge_dof") -> ddg.Scene:
-    """A flat square whose vertices start anywhere within `size` cells of their places, clamped along one side, without loads."""
+    """Return a flat square, clamped at a side, whose vertices start displaced at random by up to `size` cells."""
     flat, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0, 0, 0))
     start = flat + size / cells * np.random.default_rng(1).uniform(-1.0, 1.0, flat.shape)
@@ -186,12 +194,12 @@ def crumpled(size: float, cells: int = 24, bending: str = "midedge_dof") -> ddg.
 
 
 def not_flat(model, state) -> float:
-    """Largest distance of a vertex from where it was drawn [m]."""
+    """Return the largest displacement of a vertex from the drawn sheet [m]."""
     return float(np.abs(state.points() - model.state().points()).max())
 
 
 def bilayer(growth: float) -> ddg.Scene:
-    """A clamped strip of 0.1 m whose layers grow apart by `growth`, all at once."""
+    """Return a clamped strip of 0.1 m with a growth difference of both layers in one step."""
     flat, triangles = meshes.rectangle(30, 4, (0.1, 0.01), "alternating")
     scene = ddg.Scene(gravity=(0, 0, 0))
     strip = scene.add_shell(flat, triangles, thickness=5e-4, material=ddg.Material(1e6, 0.45, density=1000.0))
@@ -210,7 +218,7 @@ def bilayer(growth: float) -> ddg.Scene:
 
 
 def stepped(edges: int, ratio: float = 1e6) -> ddg.Scene:
-    """A cantilever whose outer half is `ratio` times as stiff, under 1e-5 N at its tip."""
+    """Return a cantilever under a tip force of 1e-5 N, with an outer half `ratio` times as stiff."""
     bending = np.where(np.arange(edges) < edges // 2, 1.0, ratio)
     scene = ddg.Scene(gravity=(0, 0, 0))
     rod = scene.add_rod(
@@ -223,12 +231,12 @@ def stepped(edges: int, ratio: float = 1e6) -> ddg.Scene:
 
 
 def carried(model, state) -> float:
-    """Reaction over load of a cantilever under a force of 1e-5 N across."""
+    """Return reaction over load of a cantilever under a transverse force of 1e-5 N."""
     return float(-model.reactions(state)[0].force[2] / 1e-5)
 
 
 def of_scene(name: str, **parameters) -> Case:
-    """A scene of the package, with its first check."""
+    """Return a case of a scene of the package."""
     module = load_scene(name)
     scene = module.build(**parameters)
     label = " ".join([name, *(f"{key} {value}" for key, value in parameters.items())])
@@ -236,7 +244,7 @@ def of_scene(name: str, **parameters) -> Case:
 
 
 def cases() -> list[Case]:
-    """All of them."""
+    """Return all cases."""
     tip = partial(off_axis, 1.0)
     result = []
     for stretching in (1e3, 1e5, 1e7, 1e9):
@@ -305,10 +313,10 @@ def cases() -> list[Case]:
 
 
 def search(case: Case, solver: str, device: str) -> dict:
-    """A row of the table."""
+    """Return a row of the table."""
     row = {"case": case.name, "solver": solver, "steps": case.steps}
-    made = case.build()
-    scene, start = made if isinstance(made, tuple) else (made, lambda model: model.state())
+    built = case.build()
+    scene, start = built if isinstance(built, tuple) else (built, lambda model: model.state())
     equilibrium, began = None, time.perf_counter()
     try:
         model = scene.build(device, "float64")
@@ -341,28 +349,28 @@ def search(case: Case, solver: str, device: str) -> dict:
 
 
 def _serve(pipe, device: str) -> None:
-    """Send a row for every (case, solver) that a pipe brings."""
-    known = {case.name: case for case in cases()}
+    """Send a row for every (case, solver) received from a pipe."""
+    by_name = {case.name: case for case in cases()}
     while True:
         try:
             name, solver = pipe.recv()
-        except EOFError:  # there are no more
+        except EOFError:  # the pipe is closed
             return
-        pipe.send(search(known[name], solver, device))
+        pipe.send(search(by_name[name], solver, device))
 
 
 class Worker:
-    """A process that searches; one that takes too long is ended, and another one goes on."""
+    """Process that searches; it is replaced after a search that takes too long."""
 
     def __init__(self, device: str):
         self.device, self.process = device, None
 
     def row(self, case: Case, solver: str, limit: float) -> dict:
-        """`search` within so many seconds."""
+        """Return a row of `search` within `limit` seconds."""
         if self.process is None:
-            self.pipe, other = multiprocessing.Pipe()
+            self.pipe, remote = multiprocessing.Pipe()
             self.process = multiprocessing.get_context("spawn").Process(
-                target=_serve, args=(other, self.device), daemon=True
+                target=_serve, args=(remote, self.device), daemon=True
             )
             self.process.start()
         self.pipe.send((case.name, solver))
@@ -392,7 +400,7 @@ COLUMNS = (
 
 
 def main() -> None:
-    """See the module."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", default=[""])
     parser.add_argument("--solver", nargs="*", default=["direct"])

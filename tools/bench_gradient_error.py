@@ -1,12 +1,12 @@
-"""Error of gradients of roll-outs: against Newton's tolerance, against the step, and in mixed precision.
+"""Measure errors of gradients of roll-outs: against Newton's tolerance, against the step, and in mixed precision.
 
     python tools/bench_gradient_error.py [--out DIR]
 
-A cantilever of 24 nodes, clamped at its first edge, released straight and thrown sideways, for 0.2 s; the loss is the mean square
-distance of its nodes from where it started. Gradients are by the bending stiffness of every element and by the velocities at the
-start, their errors relative to the norm of the reference: of `rtol`, the gradient at rtol 1e-13 in float64 with the same steps; of
-`dt`, that of the limit dt -> 0, from the two smallest steps by the order of the scheme. `iterations` are those of Newton, a step.
-Prints a table; writes gradient_error_cpu.csv, .json and two plots.
+A cantilever of 24 nodes, clamped at its first edge, starts straight with a transverse velocity and moves for 0.2 s. The loss is the
+mean square displacement of its nodes. Gradients are by the bending stiffness of every element and by the initial velocities, with
+errors relative to the norm of the reference. For `rtol` the reference is the gradient at rtol 1e-13 in float64 with the same steps.
+For `dt` it is the limit dt -> 0, extrapolated from the two smallest steps by the order of the scheme. `iterations`: Newton
+iterations a step. Prints a table; writes gradient_error_cpu.csv, .json and two plots.
 """
 
 import argparse
@@ -31,7 +31,7 @@ INPUTS = ("stiffness", "velocities")
 
 
 def scene() -> ddg.Scene:
-    """A planar cantilever, as the midpoint rule of rods with twist has no gradients."""
+    """Return a planar cantilever, as the midpoint rule of rods with twist has no gradients."""
     result = ddg.Scene(gravity=(0.0, 0.0, -9.81), dimension=2)
     points = np.zeros((NODES, 3))
     points[:, 0] = np.linspace(0.0, 1.0, NODES)
@@ -41,7 +41,7 @@ def scene() -> ddg.Scene:
 
 
 def gradients(scheme: str, steps: int, rtol: float, precision: str = "float64") -> tuple[list[np.ndarray], float]:
-    """Derivatives of the loss by the inputs, and Newton iterations a step."""
+    """Return derivatives of the loss by the inputs, and Newton iterations a step."""
     simulator = Simulator(scene().build("cpu", precision), TIME / steps, scheme=scheme, rtol=rtol)
     rest = simulator.initial_state()
     stiffness = simulator.parameter("planar_bend.stiffness").clone().requires_grad_()
@@ -51,45 +51,45 @@ def gradients(scheme: str, steps: int, rtol: float, precision: str = "float64") 
     state = simulator.initial_state(velocities=thrown)
     *_, state = simulator.rollout(state, {"planar_bend.stiffness": stiffness}, steps=steps)
     loss = ((state.positions - rest.positions) ** 2).sum(-1).mean()
-    found = torch.autograd.grad(loss, [stiffness, thrown])
+    derivatives = torch.autograd.grad(loss, [stiffness, thrown])
     newton = simulator.engine(1).integrator.statistics()["newton_iterations"]["mean"]
-    return [value.double().numpy() for value in found], newton
+    return [value.double().numpy() for value in derivatives], newton
 
 
-def errors(found: list[np.ndarray], reference: list[np.ndarray]) -> dict:
-    """Relative errors by input."""
-    pairs = zip(INPUTS, found, reference, strict=True)
+def errors(derivatives: list[np.ndarray], reference: list[np.ndarray]) -> dict:
+    """Return relative errors by input."""
+    pairs = zip(INPUTS, derivatives, reference, strict=True)
     return {f"error by {name}": float(np.linalg.norm(a - b) / np.linalg.norm(b)) for name, a, b in pairs}
 
 
 def against_tolerance() -> list[dict]:
-    """Rows of every tolerance and precision."""
+    """Return rows of every tolerance and precision."""
     rows, steps = [], round(TIME / DT)
     for scheme in ORDER:
         exact, _ = gradients(scheme, steps, EXACT)
         for precision in ("float64", "mixed"):
             for rtol in RTOLS:
-                found, newton = gradients(scheme, steps, rtol, precision)
+                derivatives, newton = gradients(scheme, steps, rtol, precision)
                 rows.append({"study": "rtol", "scheme": scheme, "precision": precision, "rtol": rtol, "dt": DT})
-                rows[-1] |= {"iterations": newton} | errors(found, exact)
+                rows[-1] |= {"iterations": newton} | errors(derivatives, exact)
     return rows
 
 
 def against_step() -> list[dict]:
-    """Rows of every step of both schemes."""
+    """Return rows of every step of both schemes."""
     rows = []
     for scheme, order in ORDER.items():
-        found = {steps: gradients(scheme, steps, EXACT) for steps in STEPS}
-        fine, coarse = found[STEPS[-1]][0], found[STEPS[-2]][0]
+        by_steps = {steps: gradients(scheme, steps, EXACT) for steps in STEPS}
+        fine, coarse = by_steps[STEPS[-1]][0], by_steps[STEPS[-2]][0]
         limit = [a + (a - b) / (2**order - 1) for a, b in zip(fine, coarse, strict=True)]
-        for steps, (own, newton) in found.items():
+        for steps, (derivatives, newton) in by_steps.items():
             rows.append({"study": "dt", "scheme": scheme, "precision": "float64", "rtol": EXACT, "dt": TIME / steps})
-            rows[-1] |= {"iterations": newton} | errors(own, limit)
+            rows[-1] |= {"iterations": newton} | errors(derivatives, limit)
     return rows
 
 
 def main() -> int:
-    """Measure, print, write and draw."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
@@ -102,12 +102,12 @@ def main() -> int:
         drawn = [
             {
                 name: row[study],
-                "relative error": row[f"error by {given}"],
-                "of": f"{row['scheme']}, {row['precision']}, {given}",
+                "relative error": row[f"error by {name_of_input}"],
+                "of": f"{row['scheme']}, {row['precision']}, {name_of_input}",
             }
             for row in rows
             if row["study"] == study
-            for given in INPUTS
+            for name_of_input in INPUTS
         ]
         error_plot(
             options.out / f"gradient_error_{study}.png", drawn, name, "relative error", "of", "gradients of a roll-out"

@@ -1,11 +1,12 @@
-"""What gradients of joined rods and of shells cost: a step from torch, and its reverse.
+"""Time gradients of joined rods and of shells: a step from torch, and its reverse.
 
     python tools/bench_gradient_nets.py [--device cuda:0] [--worlds 1 64] [--small] [--out DIR]
 
-Implicit Euler, 0.01 s a step. `forward`, `backward`: of a step of `Simulator`, with gradients by positions, rates and a stiffness of
-every element; `iterations`: of the conjugate gradients of the latter, in its slowest world; `failed`: worlds that they did not solve.
-`factors`: a reverse by sparse factors on the host, of systems of at most 200,000 dofs; `error`: what gradients differ from those,
-largest entry over largest entry. Times are the least of some runs [ms]. Prints a table; writes gradient_nets_DEVICE.csv and .json.
+Implicit Euler, 0.01 s a step. `forward`, `backward`: of a step of `Simulator`, with gradients by positions, rates and a stiffness
+of every element. `iterations`: conjugate gradient iterations of the latter, in its slowest world. `failed`: worlds without
+convergence. `factors`: a reverse by sparse factors on the host, of systems of at most 200,000 dofs. `error`: deviation of gradients
+from it, largest entry over largest entry. Times are the least of some runs [ms]. Prints a table; writes gradient_nets_DEVICE.csv
+and .json.
 """
 
 import argparse
@@ -24,25 +25,25 @@ from ddg_warp.scenes import gridshell_dome, hanging_sheet
 from ddg_warp.torch import Simulator
 
 DT = 0.01  # s
-WARM, RUNS = 5, 5  # steps after which everything moves, and reverses of one
+WARM, RUNS = 5, 5  # warm-up steps, and reverses of one step
 LARGEST = 200_000  # dofs of a system that the host factorises
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 
 
 def branched(count: int) -> ddg.Scene:
-    """`count` rods of 12 edges: every other one is clamped, and has the next one joined to its middle."""
+    """Return `count` rods of 12 edges: every other one is clamped, and has the next one joined to its middle."""
     scene, t = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.linspace(0.0, 0.3, 13)
     for i in range(count // 2):
         base = np.array([0.05 * (i % 10), 0.05 * (i // 10), 0.0])
         points = base + np.stack([t, 0.1 * t * t, 0.05 * np.sin(5.0 * t)], 1)
         twig = points[6] + np.outer(t, (0.3, 0.3, 0.2))
-        rods = [scene.add_rod(of, section=ddg.Circle(0.002), material=RUBBER) for of in (points, twig)]
+        rods = [scene.add_rod(line, section=ddg.Circle(0.002), material=RUBBER) for line in (points, twig)]
         scene.clamp(rods[0])
         scene.join([(rods[0], 6), (rods[1], 0)])
     return scene
 
 
-# scene, sizes: rods in all, rods each way, or cells a side
+# scene, sizes: total number of rods, rods in each direction, or cells a side
 CASES = {
     "rods that branch": (branched, (10, 100, 600)),
     "gridshell": (lambda n: gridshell_dome.build(rods=n), (3, 7, 15)),
@@ -56,53 +57,53 @@ MEASURED = {
 
 
 def from_torch(model, name: str) -> dict:
-    """Times of a step and of its reverse, after some steps."""
-    device, own = model.wp_device, Simulator(model, DT)
-    state = own.initial_state()
+    """Return times of a step and of the reverse, after some steps."""
+    device, simulator = model.wp_device, Simulator(model, DT)
+    state = simulator.initial_state()
     for _ in range(WARM):
-        state = own.step(state)
+        state = simulator.step(state)
     blocks = state.values[:2]  # and their rates
-    inputs = [value.requires_grad_() for value in (*blocks, own.parameter(name))]
+    inputs = [value.requires_grad_() for value in (*blocks, simulator.parameter(name))]
     forward, backward = [], []
     for _ in range(RUNS):
         wp.synchronize_device(device)
         began = time.perf_counter()
-        loss = (own.step(state, {name: inputs[2]}).positions ** 2).sum()
+        loss = (simulator.step(state, {name: inputs[2]}).positions ** 2).sum()
         wp.synchronize_device(device)
         middle = time.perf_counter()
         torch.autograd.grad(loss, inputs)
         wp.synchronize_device(device)
         forward.append(middle - began)
         backward.append(time.perf_counter() - middle)
-    system = own.engine(model.worlds).adjoint.net.solve.system
+    system = simulator.engine(model.worlds).adjoint.net.solve.system
     times = {"forward": 1e3 * min(forward), "backward": 1e3 * min(backward)}
     times["ratio"] = times["backward"] / times["forward"]
     return times | {"iterations": int(system.iterations.numpy().max()), "failed": int(system.failed.numpy().sum())}
 
 
 def by_factors(model) -> dict:
-    """Time of such a reverse by factors, and what gradients by conjugate gradients differ from it."""
+    """Return the time of the reverse by factors, and the deviation of gradients by conjugate gradients."""
     integrator, state = ddg.Integrator(model), model.state()
     for _ in range(WARM):
         state = integrator.step(state, DT)
     adjoint = Adjoint(integrator)
     after, tape = adjoint.step(state, DT)
-    given = model.empty_state()
-    wp.copy(given.net.q, after.net.q)  # the loss is half the sum of squares
-    found, seconds = [], []
+    cotangent = model.empty_state()
+    wp.copy(cotangent.net.q, after.net.q)  # the loss is half the sum of squares
+    gradients, seconds = [], []
     for factors in (False, True, True):
         began = time.perf_counter()
-        start, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, given, DT, factors)
+        start, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, cotangent, DT, factors)
         wp.synchronize_device(model.wp_device)
         seconds.append(time.perf_counter() - began)
-        found.append([np.array(values.numpy()) for values in (start.net.q, start.net.v, *inputs[-1].parameters)])
-    pairs = [(a, b) for a, b in zip(*found[:2], strict=True) if np.abs(b).max() > 0.0]
+        gradients.append([np.array(values.numpy()) for values in (start.net.q, start.net.v, *inputs[-1].parameters)])
+    pairs = [(a, b) for a, b in zip(*gradients[:2], strict=True) if np.abs(b).max() > 0.0]
     error = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
     return {"factors": 1e3 * min(seconds[1:]), "error": error}
 
 
 def measure(name: str, size: int, worlds: int, device: str, precision: str) -> dict:
-    """A row of the table."""
+    """Return a row of the table."""
     build, _ = CASES[name]
     model = build(size).build(device, precision, worlds=worlds)
     dofs = worlds * int((~model.net.host.fixed).sum())
@@ -115,7 +116,7 @@ def measure(name: str, size: int, worlds: int, device: str, precision: str) -> d
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--worlds", type=int, nargs="*", default=[1])

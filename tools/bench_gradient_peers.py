@@ -1,14 +1,14 @@
-"""Differentiable simulators of rods beside each other, in one run on a CPU: error of a gradient against what it costs.
+"""Compare differentiable rod simulators in one run on a CPU: error of a gradient against its cost.
 
     pip install soromox
     python tools/bench_gradient_peers.py [--out DIR]
 
-A rod of 1 m, clamped and straight, swings under its weight for 0.2 s, a third of its period; the loss is how far its tip has sunk,
-and its derivative that by the logarithm of Young's modulus. All are given the same rod: it bends, twists and stretches, without shear.
-ddg_warp steps by the implicit midpoint rule; SoRoMoX (https://github.com/tud-phi/soromox), constant strains on segments in JAX, by
-Tsit5 with steps chosen for a tolerance, and gradients by reverse mode through recomputed checkpoints (diffrax). `compile` is what a
-first gradient takes beyond a second one: kernels of Warp are kept on disk, functions of JAX are made anew in every process. Errors are
-against ddg_warp with 256 edges in 4,096 steps, right to some 1e-4. Prints a table; writes gradient_peers_cpu.csv and .json.
+A rod of 1 m, clamped and straight, swings under its weight for 0.2 s, a third of its period. The loss is the height of its tip, and
+its derivative is by the logarithm of Young's modulus. All have the same rod: it bends, twists and stretches, without shear.
+ddg_warp steps by the implicit midpoint rule. SoRoMoX (https://github.com/tud-phi/soromox), constant strains on segments in JAX,
+steps by Tsit5 with adaptive steps, and its gradients use reverse mode through recomputed checkpoints (diffrax). `compile` is the
+additional time of the first gradient: kernels of Warp are cached on disk, functions of JAX are compiled in every process. Errors
+are against ddg_warp with 256 edges in 4,096 steps, accurate to about 1e-4. Prints a table; writes gradient_peers_cpu.csv and .json.
 """
 
 import argparse
@@ -29,7 +29,7 @@ RUNS = 3
 
 
 def timed(call) -> tuple[float, float, object]:
-    """Seconds of the first call beyond the least of some more, that least, and what it returned."""
+    """Return extra seconds of the first call, the least seconds of later ones, and the result."""
     seconds = []
     for _ in range(RUNS + 1):
         started = time.perf_counter()
@@ -40,7 +40,7 @@ def timed(call) -> tuple[float, float, object]:
 
 
 def ours(edges: int, steps: int) -> dict:
-    """Of a rod of so many edges, in so many steps."""
+    """Return a row for a rod of `edges` edges, in `steps` steps."""
     points = np.zeros((edges + 1, 3))
     points[:, 0] = np.linspace(0.0, LENGTH, edges + 1)
     scene = ddg.Scene(gravity=(0.0, 0.0, -GRAVITY))
@@ -56,8 +56,8 @@ def ours(edges: int, steps: int) -> dict:
 
     def gradient():
         loss = sunk()
-        by = torch.autograd.grad(loss, parameters.parameters())
-        return float(loss), float(sum(value.sum() for value in by))
+        derivatives = torch.autograd.grad(loss, parameters.parameters())
+        return float(loss), float(sum(value.sum() for value in derivatives))
 
     with torch.no_grad():
         _, forward, _ = timed(sunk)
@@ -66,7 +66,7 @@ def ours(edges: int, steps: int) -> dict:
 
 
 def soromox(segments: int, tolerance: float) -> dict:
-    """Of a rod of so many segments of constant strain."""
+    """Return a row for a rod of `segments` segments of constant strain."""
     import jax
     import jax.numpy as jnp
     from diffrax import PIDController
@@ -86,22 +86,24 @@ def soromox(segments: int, tolerance: float) -> dict:
         poisson_ratio=POISSON,
     )
     sheared = PCSStructure(num_gauss_points=5, strain_selector=jnp.array([1, 1, 1, 1, 0, 0] * segments, bool))
-    # its rods point along z
+    # its rods are along z
     robot = PCS.from_links([link] * segments, structure=sheared, gravity=jnp.array([-GRAVITY, 0.0, 0.0]))
 
     def sunk(logarithm):
         young = YOUNG * jnp.exp(logarithm)
-        own = robot.with_isotropic_material(IsotropicMaterialParams(young_modulus=young, poisson_ratio=POISSON))
-        end = own.rollout_to(
-            SystemState(t=jnp.array(0.0), y=jnp.zeros(own.state_size)),
+        robot_with_young = robot.with_isotropic_material(
+            IsotropicMaterialParams(young_modulus=young, poisson_ratio=POISSON)
+        )
+        end = robot_with_young.rollout_to(
+            SystemState(t=jnp.array(0.0), y=jnp.zeros(robot_with_young.state_size)),
             t1=END,
             solver_dt=1e-4,
             save_ts=jnp.array([END]),
             stepsize_controller=PIDController(rtol=tolerance, atol=tolerance),
             max_steps=16**4,
         )
-        q, _, _ = own.split_state(end.y[-1])
-        return own.forward_kinematics(q, jnp.array(LENGTH))[0, 3]
+        q, _, _ = robot_with_young.split_state(end.y[-1])
+        return robot_with_young.forward_kinematics(q, jnp.array(LENGTH))[0, 3]
 
     forward, both = jax.jit(sunk), jax.jit(jax.value_and_grad(sunk))
     _, seconds, _ = timed(lambda: forward(0.0).block_until_ready())
@@ -110,13 +112,13 @@ def soromox(segments: int, tolerance: float) -> dict:
 
 
 def row(name: str, elements: int, forward: float, both: float, first: float, value: float, slope: float) -> dict:
-    """A row of the table, before errors are known."""
-    found = {"simulator": name, "elements": elements, "forward [s]": forward, "with gradient [s]": both}
-    return found | {"compile [s]": first, "tip [m]": value, "by log(E) [m]": slope}
+    """Return a row of the table without errors."""
+    result = {"simulator": name, "elements": elements, "forward [s]": forward, "with gradient [s]": both}
+    return result | {"compile [s]": first, "tip [m]": value, "by log(E) [m]": slope}
 
 
 def main() -> int:
-    """Measure, print and write."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
@@ -124,9 +126,9 @@ def main() -> int:
     for segments, tolerance in ((2, 1e-4), (4, 1e-4), (4, 1e-6), (6, 1e-4)):
         rows.append(soromox(segments, tolerance))
         print(rows[-1], flush=True)
-    for own in rows:
+    for result in rows:
         for name in ("tip", "by log(E)"):
-            own[f"error of {name}"] = abs(own[f"{name} [m]"] / exact[f"{name} [m]"] - 1.0)
+            result[f"error of {name}"] = abs(result[f"{name} [m]"] / exact[f"{name} [m]"] - 1.0)
     print(table(rows))
     origin = {"command": "python tools/bench_gradient_peers.py", "device": "cpu", "machine": machine()}
     origin |= {"soromox": version("soromox"), "jax": version("jax")}

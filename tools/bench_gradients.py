@@ -1,17 +1,16 @@
-"""What gradients cost: a step of many cantilevers from torch, forward and backward, against the integrator's step alone.
+"""Time gradients of many cantilevers from torch, forward and backward, against the integrator's step alone.
 
     python tools/bench_gradients.py [--cuda] [--out DIR]
     python tools/bench_gradients.py --scaling [--cuda] [--out DIR]      against worlds, nodes and steps
 
 Rods of 24 nodes, clamped at their first edge and released straight, 0.01 s a step, implicit Euler, as rods of one world or a world
-each.
-`step`: `Integrator.step`; `torch`: `Simulator.step` without gradients; `forward`, `backward`: with them, by state and the bending
-stiffness of every element. `error` is that of the gradient along a direction against central differences in float64 (of the smallest
-model). Time is the least of some runs, a step of ten in a row, after which alone the device is waited for. Prints a table; writes
-gradients_DEVICE.csv and .json.
+each. `step`: `Integrator.step`. `torch`: `Simulator.step` without gradients. `forward`, `backward`: with gradients by state and
+bending stiffness of every element. `error`: error of the gradient along a direction against central differences in float64 (of the
+smallest model). Time is the least of some runs, a step of ten consecutive ones, with one device synchronisation at the end. Prints
+a table; writes gradients_DEVICE.csv and .json.
 
-Scaling is that of roll-outs of a world a rod, in the precision that a device has by default: seconds of all steps and of their reverse,
-the least of three runs, and what torch holds of them at most [MB], the states between steps, with and without checkpoints. It writes
+Scaling covers roll-outs of one rod a world, in the default precision of a device. It measures seconds of all steps and of their
+reverse, the least of three runs, and the peak memory of torch [MB], with and without checkpoints. It writes
 gradients_scaling_DEVICE.csv, .json and a plot of each study.
 """
 
@@ -34,12 +33,12 @@ from ddg_warp.torch import Simulator
 DT, NODES = 0.01, 24  # [s]
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 NAME = "rod_bend_twist.stiffness_1"
-WARM = 20  # steps after which rods are on their way
-ROW = 10  # steps in a row
+WARM = 20  # warm-up steps until rods move
+ROW = 10  # consecutive steps
 
 
 def model_of(count: int, worlds: bool, device: str, precision: str):
-    """Cantilevers, each a world or all in one."""
+    """Return a model of cantilevers, each a world or all in one."""
     scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
     points = np.zeros((1 if worlds else count, NODES, 3))
     points[:, :, 0] = np.linspace(0.0, 1.0, NODES)
@@ -48,13 +47,13 @@ def model_of(count: int, worlds: bool, device: str, precision: str):
 
 
 class Clock:
-    """Least seconds of what runs, by name."""
+    """Least seconds of calls, by name."""
 
     def __init__(self, device):
         self.device, self.best = device, {}
 
     def __call__(self, name: str, call):
-        """What a call returns, timed."""
+        """Return the result of a call and record the time."""
         wp.synchronize_device(self.device)
         started = time.perf_counter()
         result = call()
@@ -64,7 +63,7 @@ class Clock:
 
 
 def measure(count: int, worlds: bool, device: str, precision: str, runs: int) -> dict:
-    """Milliseconds of every way of making a step."""
+    """Return milliseconds of every variant of a step."""
     model = model_of(count, worlds, device, precision)
     simulator, clock = Simulator(model, DT), Clock(model.wp_device)
     integrator, plain = ddg.Integrator(model), model.state()
@@ -77,9 +76,9 @@ def measure(count: int, worlds: bool, device: str, precision: str, runs: int) ->
     before = torch.cuda.max_memory_allocated() if device.startswith("cuda") else 0
 
     def plainly():
-        own = plain
+        current = plain
         for _ in range(ROW):
-            own = integrator.step(own, DT)
+            current = integrator.step(current, DT)
 
     def rolled(parameters: dict | None = None):
         return simulator.rollout(state, parameters, steps=ROW, save=ROW)[0]
@@ -91,16 +90,16 @@ def measure(count: int, worlds: bool, device: str, precision: str, runs: int) ->
         after = clock("forward", lambda: rolled({NAME: stiffness}))
         loss = (after.positions[..., 2] ** 2).sum()
         clock("backward", lambda loss=loss: torch.autograd.grad(loss, stiffness))
-    found = {"rods": count, "worlds": batch, "precision": precision}
-    found |= {f"{name} [ms]": 1e3 * seconds / ROW for name, seconds in clock.best.items()}
-    found["backward over step"] = clock.best["backward"] / clock.best["step"]
+    row = {"rods": count, "worlds": batch, "precision": precision}
+    row |= {f"{name} [ms]": 1e3 * seconds / ROW for name, seconds in clock.best.items()}
+    row["backward over step"] = clock.best["backward"] / clock.best["step"]
     if device.startswith("cuda"):
-        found["torch memory a rod [kB]"] = (torch.cuda.max_memory_allocated() - before) / count / 1e3
-    return found
+        row["torch memory a rod [kB]"] = (torch.cuda.max_memory_allocated() - before) / count / 1e3
+    return row
 
 
 def roll_out(worlds: int, nodes: int, steps: int, every: int | None, device: str) -> dict:
-    """Seconds and memory of a roll-out and of its reverse."""
+    """Return seconds and memory of a roll-out and of the reverse."""
     scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
     points = np.linspace(0.0, nodes / NODES, nodes)[:, None] * np.array([1.0, 0.0, 0.0])
     scene.clamp(scene.add_rod(points, section=ddg.Circle(0.02), material=RUBBER))
@@ -122,18 +121,18 @@ def roll_out(worlds: int, nodes: int, steps: int, every: int | None, device: str
         if device.startswith("cuda"):
             held = torch.cuda.max_memory_allocated() - before
 
-    for _ in range(2):  # in which graphs are captured
+    for _ in range(2):  # captures graphs
         run(2)
     clock.best.clear()
     for _ in range(3):
         run(steps)
-    found = {"worlds": worlds, "nodes": nodes, "steps": steps, "checkpoint every": every or 0}
-    found |= {f"{name} [s]": seconds for name, seconds in clock.best.items()}
-    return found | {"memory [MB]": held / 1e6}
+    row = {"worlds": worlds, "nodes": nodes, "steps": steps, "checkpoint every": every or 0}
+    row |= {f"{name} [s]": seconds for name, seconds in clock.best.items()}
+    return row | {"memory [MB]": held / 1e6}
 
 
 def memory(device: str) -> int:
-    """Bytes that torch holds; on the CPU those of this process."""
+    """Return the bytes allocated by torch; on the CPU the resident memory of this process."""
     if device.startswith("cuda"):
         return torch.cuda.memory_allocated()
     gc.collect()
@@ -142,7 +141,7 @@ def memory(device: str) -> int:
 
 
 def scaling(device: str, out: Path) -> list[dict]:
-    """Rows of all studies, and their plots."""
+    """Return rows of all studies, and write plots."""
     cuda, rows = device.startswith("cuda"), []
     studies = {
         "worlds": [(2**k, 24, 20, None) for k in range(0, 18 if cuda else 9, 2)],
@@ -153,15 +152,15 @@ def scaling(device: str, out: Path) -> list[dict]:
         for case in cases:
             rows.append({"study": study} | roll_out(*case, device))
             print(rows[-1], flush=True)
-        own = [row for row in rows if row["study"] == study]
-        for what, columns in (("time", ("forward [s]", "backward [s]")), ("memory", ("memory [MB]",))):
+        study_rows = [row for row in rows if row["study"] == study]
+        for quantity, columns in (("time", ("forward [s]", "backward [s]")), ("memory", ("memory [MB]",))):
             drawn = [
-                {study: row[study], what: row[column], "of": f"{column}{_checkpoints(row)}"}
-                for row in own
+                {study: row[study], quantity: row[column], "of": f"{column}{_checkpoints(row)}"}
+                for row in study_rows
                 for column in columns
             ]
-            picture = out / f"gradients_{what}_by_{study}_{device.partition(':')[0]}.png"
-            figure.error_plot(picture, drawn, study, what, "of", "roll-outs")
+            picture = out / f"gradients_{quantity}_by_{study}_{device.partition(':')[0]}.png"
+            figure.error_plot(picture, drawn, study, quantity, "of", "roll-outs")
     return rows
 
 
@@ -171,7 +170,7 @@ def _checkpoints(row: dict) -> str:
 
 
 def error(device: str, precision: str) -> float:
-    """Relative error of the gradient of sixty steps by a factor of all stiffnesses, against differences in float64."""
+    """Return the relative error of a gradient of sixty steps by a stiffness factor, against differences in float64."""
 
     def loss(factor: torch.Tensor, precision: str) -> torch.Tensor:
         simulator = Simulator(model_of(4, True, device, precision), DT, rtol=1e-10)
@@ -179,16 +178,16 @@ def error(device: str, precision: str) -> float:
         return (state.positions[:, -1, 2] ** 2).sum()
 
     one = torch.ones((), dtype=torch.float64, requires_grad=True)
-    (found,) = torch.autograd.grad(loss(one, precision), one)
+    (gradient,) = torch.autograd.grad(loss(one, precision), one)
     with torch.no_grad():
         values = {x: float(loss(one + x, "float64")) for x in (-2e-2, -1e-2, 1e-2, 2e-2)}
     near, far = ((values[x] - values[-x]) / (2.0 * x) for x in (1e-2, 2e-2))
     reference = (4.0 * near - far) / 3.0
-    return abs(float(found) - reference) / abs(reference)
+    return abs(float(gradient) - reference) / abs(reference)
 
 
 def main() -> int:
-    """Measure, print and write."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cuda", action="store_true")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")

@@ -1,12 +1,12 @@
-"""Times the scene `hair` at the sizes and steps of large scenes, and compares its nodes with float64's at a tolerance of 1e-10.
+"""Time the scene `hair` at sizes and steps of large scenes, and compare its nodes with float64 at a tolerance of 1e-10.
 
     python tools/bench_hair.py --device cuda:0 [--label after] [--against DIR/hair_steps_before.csv] [--out DIR]
     python tools/bench_hair.py --device cpu
 
-Prints a table; writes hair_steps_LABEL.csv and .json, and with --against a table of both. The clock starts after 0.1 s and runs over
-0.5 s; the time a step is the mean, the lowest of two runs. `error` is the largest distance of a node from where it is in float64 at
-rtol 1e-10 after steps of the same length, over FIRST strands (strands do not touch each other). Only what a user calls is called, so
-that the file also runs with other versions of the package.
+Prints a table; writes hair_steps_LABEL.csv and .json, and with --against a table of both. The clock starts after 0.1 s and runs
+over 0.5 s; the time a step is the mean, the lowest of two runs. `error` is the largest distance of a node from float64 at rtol
+1e-10 after steps of the same length, over FIRST strands (there is no contact). Only the public interface is used, so that the file
+also runs with other versions of the package.
 """
 
 import argparse
@@ -26,12 +26,12 @@ from ddg_warp.scenes import hair
 SIZES = {"cuda": ((10_000, 32), (10_000, 64), (100_000, 32)), "cpu": ((512, 32), (512, 64))}
 STEPS = (1.0 / 240.0, 1.0 / 60.0)
 BEGIN, RUN = 0.1, 0.5  # s
-FIRST = 256  # strands that are compared
+FIRST = 256  # compared strands
 COMPARED = ("newton_mean", "newton_max", "retries", "linear", "ms_per_step", "error")
 
 
 def run(strands: int, nodes: int, dt: float, device, precision: str | None, **options):
-    """Points at the end, seconds a step, and the statistics."""
+    """Return points at the end, seconds a step, and the statistics."""
     model = hair.build(strands, nodes).build(device, precision)
     integrator, state = ddg.Integrator(model, check_every=10**9, **options), model.state()
     for _ in range(round(BEGIN / dt)):
@@ -49,12 +49,12 @@ def run(strands: int, nodes: int, dt: float, device, precision: str | None, **op
 
 
 def measure(strands: int, nodes: int, dt: float, device, precision: str | None, label: str) -> dict:
-    """A row of the table."""
+    """Return a row of the table."""
     first = min(strands, FIRST)
     exact, _, _ = run(first, nodes, dt, device, "float64", rtol=1e-10)
     rounds = [run(strands, nodes, dt, device, precision) for _ in range(2)]
     points, _, statistics = rounds[0]
-    # roots stand on a grid whose side depends on the number of strands
+    # roots lie on a grid whose side depends on the number of strands
     error = np.linalg.norm((points[:first] - points[:first, :1]) - (exact - exact[:, :1]), axis=-1).max()
     return {
         "label": label,
@@ -69,7 +69,7 @@ def measure(strands: int, nodes: int, dt: float, device, precision: str | None, 
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default=None, help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--precision", default=None, help="default: mixed on CUDA, float64 on the CPU")
@@ -85,7 +85,7 @@ def main() -> int:
     for (strands, nodes), dt in itertools.product(SIZES["cuda" if device.is_cuda else "cpu"], STEPS):
         rows.append(measure(strands, nodes, dt, device, chosen.precision, chosen.label))
         print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)
-        write_table(chosen.out / f"hair_steps_{chosen.label}", rows, origin)  # what is cut short leaves what it has
+        write_table(chosen.out / f"hair_steps_{chosen.label}", rows, origin)  # an interrupted run keeps its rows
     if chosen.against:
         rows = side_by_side(read_rows(chosen.against), rows, COMPARED)
         write_table(chosen.out / f"hair_steps_{chosen.against.stem.split('_')[-1]}_{chosen.label}", rows, origin)

@@ -1,14 +1,14 @@
-"""Runs hard cases of rods in time steps: stiff, thin, fine, curled, shaken, folded, wound, thrown about, pulled, pushed and joined.
+"""Run hard cases of rods in time steps: stiff, thin, fine, curled, shaken, folded, twisted, displaced, stretched and joined.
 
     python tools/bench_hard.py --label before [--only WORD ...] [--device cpu] [--precision float64] [--out DIR]
     python tools/bench_hard.py --label after --against DIR/hard_before.csv      the same, and both side by side
     python tools/bench_hard.py --read DIR/hard_after.csv --against DIR/hard_before.csv     side by side, without a run
 
-Prints a table; writes hard_LABEL.csv and .json; side by side hard_BEFORE_AFTER.csv and .json. Only what a user calls is called, so that
-the file also runs with other versions of the package. Every case is run twice: first for counts and physics, then for time (the lowest
-of a few runs; on the CPU that of this process), when kernels are loaded and steps captured. `moved` is the root of the mean square of
-what nodes have moved at the end, by which two versions are told apart. `check` says what is wrong: the largest change of an edge's
-length (`stretch`) is beyond its bound, or a step made energy though no support moves (`gain`, over the largest energy).
+Prints a table. Writes hard_LABEL.csv and .json, side by side hard_BEFORE_AFTER.csv and .json. Only the public interface is used, so
+that the file also runs with other versions of the package. Every case is run twice: first for counts and physics, then for time
+(the lowest of a few runs; on the CPU process time), with loaded kernels and captured steps. `moved` is the root mean square
+displacement of nodes at the end, which distinguishes two versions. `check` names the failure: the largest change of an edge's
+length (`stretch`) is beyond its bound, or a step created energy without moving supports (`gain`, over the largest energy).
 """
 
 import argparse
@@ -27,8 +27,8 @@ import ddg_warp as ddg
 from ddg_warp.run.summary import machine, table, write_table
 
 GRAVITY = (0.0, 0.0, -9.81)
-GAIN = 1e-8  # energy that a step may make by rounding and the tolerance, over the largest
-ENOUGH, MOST = 0.3, 5  # seconds that short cases are timed for, and at most so often
+GAIN = 1e-8  # relative energy that rounding and tolerance may create in a step
+ENOUGH, MOST = 0.3, 5  # seconds of timing for short cases, and largest number of runs
 STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
@@ -38,15 +38,15 @@ SHOWN = ("case", "dt", "steps", *COMPARED[:-2], "stretch", "gain", *COMPARED[-2:
 
 @dataclass(frozen=True)
 class Case:
-    """A run of rods.
+    """Run of rods.
 
     Attributes:
-        name: What it is called in the table; the same in all versions.
-        build: Makes the scene.
+        name: Name in the table, the same in all versions.
+        build: Returns the scene.
         dt, steps: Length [s] and number of steps.
-        stretch: Largest change of an edge's length there may be, relative.
-        options: Of the integrator.
-        start: Nodes (n, 3) [m] that the run starts from, instead of rest.
+        stretch: Largest allowed relative change of an edge's length.
+        options: Options of the integrator.
+        start: Initial nodes (n, 3) [m], instead of rest.
     """
 
     name: str
@@ -59,19 +59,19 @@ class Case:
 
 
 def straight(nodes: int, length: float = 1.0) -> np.ndarray:
-    """Nodes along x."""
+    """Return nodes along x."""
     return np.linspace(0.0, length, nodes)[:, None] * np.array([1.0, 0.0, 0.0])
 
 
 def cantilever(nodes: int, section, material=None, **options) -> ddg.Scene:
-    """A rod of 1 m along x, clamped at its first end."""
+    """Return a rod of 1 m along x, clamped at its first end."""
     scene = ddg.Scene(gravity=GRAVITY)
     scene.clamp_end(scene.add_rod(straight(nodes), section=section, material=material, **options))
     return scene
 
 
 def folded(gap: float) -> np.ndarray:
-    """Folded back at node 10 of 21 and spread by an angle of about `gap` at the fold."""
+    """Return a rod folded back at node 10 of 21 and spread by an angle of about `gap` at the fold."""
     points = straight(21)
     points[11:, 0] = 1.0 - points[11:, 0]
     points[11:, 2] = gap * np.arange(1, 11) / 20.0
@@ -79,18 +79,18 @@ def folded(gap: float) -> np.ndarray:
 
 
 def wound(nodes: int, turns: float) -> ddg.Scene:
-    """Wound up at its last end within a second."""
+    """Return a rod twisted at the last end within a second."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3), mass_damping=1.0)
     section = ddg.Stiffness(EA=1e3, EI1=1e-2, GJ=0.8e-2, mass_per_length=0.01, rotary_inertia=1e-7)
     rod = scene.add_rod(straight(nodes), section=section)
     scene.clamp_end(rod)
-    turn = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * min(t, 1.0), axis=(1.0, 0.0, 0.0))
-    scene.clamp_end(rod, "last", motion=turn)
+    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * min(t, 1.0), axis=(1.0, 0.0, 0.0))
+    scene.clamp_end(rod, "last", motion=motion)
     return scene
 
 
 def gripped(material, last: ddg.Motion, first: ddg.Motion | None = None) -> ddg.Scene:
-    """A rod of 1 m and 4 mm, clamped at both ends, which move."""
+    """Return a rod of 1 m and 4 mm with moving clamps at both ends."""
     scene = ddg.Scene(gravity=GRAVITY)
     rod = scene.add_rod(straight(64), section=ddg.Circle(2e-3), material=material)
     scene.clamp_end(rod, motion=first)
@@ -99,20 +99,20 @@ def gripped(material, last: ddg.Motion, first: ddg.Motion | None = None) -> ddg.
 
 
 def thrown(nodes: int, amplitude: float) -> np.ndarray:
-    """A rod of which all nodes but the clamped ones are displaced at random [m]."""
+    """Return nodes of a rod, displaced at random by `amplitude` [m] except the clamped ones."""
     points = straight(nodes)
     points[2:] += amplitude * np.random.default_rng(2).normal(size=(nodes - 2, 3))
     return points
 
 
 def curling(turns: int, nodes: int) -> ddg.Scene:
-    """A straight rod that is a helix by nature, let go."""
+    """Return a straight rod with a natural helix, released."""
     natural = (2.0 * np.pi * turns, 0.0, 6.0 * np.pi)
     return cantilever(nodes, ddg.Circle(2e-3), ddg.Material(1e9, 0.5, 1000.0), natural=natural)
 
 
 def buckling(times: float, radius: float = 2e-3) -> ddg.Scene:
-    """A cantilever, straight but for a millionth, pushed at its free end by a multiple of Euler's load, pi^2 EI / 4 L^2."""
+    """Return a nearly straight cantilever compressed by a multiple of Euler's load, pi^2 EI / 4 L^2."""
     points = straight(64)
     points[:, 2] = 1e-6 * points[:, 0] ** 2
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -124,13 +124,13 @@ def buckling(times: float, radius: float = 2e-3) -> ddg.Scene:
 
 
 def curls(strands: int, nodes: int, length: float, curl: float, pitch: float = 0.08) -> np.ndarray:
-    """Hanging strands that curl from their middle on with radius `curl` [m], each turned by the golden angle, (R, n, 3) [m]."""
+    """Return hanging strands (R, n, 3) [m] that curl from their middle on with radius `curl` [m], rotated by golden angles."""
     down = np.linspace(0.0, 1.2 * length, 20001)
     radius, phase = curl * np.minimum(1.0, 2.0 * down / length), 2.0 * np.pi * down / pitch
     line = np.column_stack([radius * np.cos(phase), radius * np.sin(phase), -down])
     arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
-    places = np.linspace(0.0, length, nodes)
-    points = np.column_stack([np.interp(places, arc, line[:, d]) for d in range(3)])
+    arc_lengths = np.linspace(0.0, length, nodes)
+    points = np.column_stack([np.interp(arc_lengths, arc, line[:, d]) for d in range(3)])
     angle, side = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(strands), int(np.ceil(np.sqrt(strands)))
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     x, y, z = points.T
@@ -139,24 +139,28 @@ def curls(strands: int, nodes: int, length: float, curl: float, pitch: float = 0
 
 
 def sway(amplitude: float, frequency: float, axis: int = 0) -> ddg.Motion | None:
-    """To and fro along an axis by `amplitude` [m] with `frequency` [Hz]; None without amplitude."""
+    """Return an oscillation along an axis by `amplitude` [m] with `frequency` [Hz]; None without amplitude."""
     direction = np.eye(3)[axis] * amplitude
     return ddg.Motion(translation=lambda t: direction * np.sin(2.0 * np.pi * frequency * t)) if amplitude else None
 
 
-def ramp(way: float) -> ddg.Motion:
-    """Along x within a second [m]."""
-    return ddg.Motion(translation=lambda t: (way * min(t, 1.0), 0.0, 0.0))
+def ramp(displacement: float) -> ddg.Motion:
+    """Return a motion along x by `way` [m] within a second."""
+    return ddg.Motion(translation=lambda t: (displacement * min(t, 1.0), 0.0, 0.0))
 
 
 def hair(
     nodes=32, shake=0.05, frequency=2.0, material=HAIR, radius=4e-5, length=0.3, curl=0.01, strands=32, held="root"
 ) -> ddg.Scene:
-    """Curled strands, by default of hair, in their natural shape, shaken by `shake` [m] at `frequency` [Hz].
+    """Return curled strands, by default of hair, in their natural shape, shaken by `shake` [m] at `frequency` [Hz].
 
-    `held` says where: "root", "tip": at this edge, which is clamped; "both": at the tip, with the root clamped, too; "pulled": the
-    same, along the strand; "rigid", "hung", "hinge": at a stub that the root is joined to, so that all are one net, rigidly, by a
-    hinge, or by a hinge with the root shaken, too.
+    `held` names the support:
+
+    - "root", "tip": a clamp at this edge.
+    - "both": a clamp at the tip, with the root clamped, too.
+    - "pulled": like "both", shaken along the strand.
+    - "rigid", "hung", "hinge": a stub joined to the root, so that all are one coupled system, rigidly, by a hinge, or by a hinge
+      with the root shaken, too.
     """
     scene, points = ddg.Scene(gravity=GRAVITY, mass_damping=0.5), curls(strands, nodes, length, curl)
     kind = {"section": ddg.Circle(radius), "material": material}
@@ -170,13 +174,13 @@ def hair(
     if held in ("hinge", "rigid", "hung"):
         stubs = scene.add_rods(points[:, :1] + np.linspace(0.02, 0.0, 3)[:, None] * [0.0, 0.0, 1.0], **kind)
         scene.clamp(stubs, edges=[0, 1], motion=motion)
-        for one, other in zip(rods, stubs, strict=True):
-            scene.join([(int(one), 0), (int(other), -1)], rigid=held == "rigid")
+        for strand, stub in zip(rods, stubs, strict=True):
+            scene.join([(int(strand), 0), (int(stub), -1)], rigid=held == "rigid")
     return scene
 
 
 def rings(shake: float, strands: int = 8, nodes: int = 64, radius: float = 0.05) -> ddg.Scene:
-    """Closed rings of hair that hang from one node, at first to its side."""
+    """Return closed rings of hair that hang from one node, initially sideways."""
     angle = 2.0 * np.pi * np.arange(nodes) / nodes
     ring = radius * np.column_stack([1.0 - np.cos(angle), 0.0 * angle, np.sin(angle)])
     scene = ddg.Scene(gravity=GRAVITY, mass_damping=0.5)
@@ -187,22 +191,22 @@ def rings(shake: float, strands: int = 8, nodes: int = 64, radius: float = 0.05)
 
 
 def cases() -> list[Case]:
-    """What is run."""
+    """Return all cases."""
     steel_sags, rubber_sags = (50.0 * one.density * 9.81 / one.young for one in (STEEL, RUBBER))  # 50 weights over EA
     t30, t60, t240 = 1.0 / 30.0, 1.0 / 60.0, 1.0 / 240.0
     wire = partial(hair, material=ddg.Material(2e11, 0.4, 1300.0, viscosity=1e-3), radius=5e-4, length=1.0, curl=0.05)
     hose = partial(hair, material=ddg.Material(1e7, 0.4, 1300.0), radius=2e-3, length=1.0, curl=0.02)
     rubber = partial(cantilever, section=ddg.Circle(0.01), material=RUBBER)
     fold = partial(cantilever, 21, ddg.Circle(0.02), RUBBER)
-    found = []
+    result = []
     for axial in (1e4, 1e6, 1e8, 1e10, 1e12):
         section = ddg.Stiffness(EA=axial, EI1=1.0, GJ=0.7, mass_per_length=1.0, rotary_inertia=1e-6)
         stiff = partial(cantilever, 64, section)
-        found.append(Case(f"EA L^2 / EI = {axial:.0e}", stiff, 0.01, 20, 50.0 / axial + 1e-12))
+        result.append(Case(f"EA L^2 / EI = {axial:.0e}", stiff, 0.01, 20, 50.0 / axial + 1e-12))
     for ratio in (1e-3, 1e-4, 1e-5):
         thin = partial(cantilever, 64, ddg.Circle(ratio), STEEL)
-        found.append(Case(f"steel, r / L = {ratio:.0e}", thin, 0.01, 20, steel_sags))
-    found += [
+        result.append(Case(f"steel, r / L = {ratio:.0e}", thin, 0.01, 20, steel_sags))
+    result += [
         Case("steel, 512 nodes", partial(cantilever, 512, ddg.Circle(2e-3), STEEL), t30, 30, steel_sags),
         Case("rubber, 512 nodes", partial(cantilever, 512, ddg.Circle(2e-3), RUBBER), t30, 30, rubber_sags),
         Case("hair, 32 nodes, 1/240 s", hair, t240, 72, 0.01),
@@ -228,17 +232,17 @@ def cases() -> list[Case]:
         (3, 41, 110),
         (20, 101, 110),
         (60, 201, 45),
-    ):  # the last is slow, and not wound up to its end
-        found.append(Case(f"wound up, {turns} turns a second", partial(wound, nodes, turns), 0.01, steps, 0.2))
-    found.append(Case("rubber pulled to three times", partial(gripped, RUBBER, ramp(2.0)), 0.01, 100, 2.05))
-    for way in (0.1, 0.25):
-        pushed = partial(gripped, STEEL, ramp(-way), ramp(way))
-        found.append(Case(f"steel pushed by {2.0 * way:.0%}", pushed, 0.01, 100, 1e-3))
+    ):  # the last is slow and ends before it is fully twisted
+        result.append(Case(f"wound up, {turns} turns a second", partial(wound, nodes, turns), 0.01, steps, 0.2))
+    result.append(Case("rubber pulled to three times", partial(gripped, RUBBER, ramp(2.0)), 0.01, 100, 2.05))
+    for displacement in (0.1, 0.25):
+        pushed = partial(gripped, STEEL, ramp(-displacement), ramp(displacement))
+        result.append(Case(f"steel pushed by {2.0 * displacement:.0%}", pushed, 0.01, 100, 1e-3))
     for steps in (5.0, 2.5):
         for name, material in (("steel", STEEL), ("rubber", RUBBER)):
             slack = partial(gripped, material, sway(0.05, 100.0 / steps))
-            found.append(Case(f"{name} slack and taut in {steps:g} steps", slack, 0.01, 20, 0.2))
-    found += [
+            result.append(Case(f"{name} slack and taut in {steps:g} steps", slack, 0.01, 20, 0.2))
+    result += [
         Case("thrown about by 0.1 m", partial(rubber, 64), 0.01, 50, start=thrown(64, 0.1)),
         Case("thrown about by 1 m", partial(rubber, 16), 0.01, 2, start=thrown(16, 1.0)),
         Case("thrown about by 1 m, 64 nodes", partial(rubber, 64), 1e-4, 2, start=thrown(64, 1.0)),
@@ -246,20 +250,20 @@ def cases() -> list[Case]:
     for turns, nodes, dt, steps in ((5, 51, 1e-3, 30), (30, 301, 1e-4, 50)):
         for name, options in (("", {}), (", Gauss-Newton", {"psd": "gauss_newton"}), (", exact", {"psd": "none"})):
             curl = partial(curling, turns, nodes)
-            found.append(Case(f"curls up, {turns} turns{name}", curl, dt, steps, 0.1, options))
+            result.append(Case(f"curls up, {turns} turns{name}", curl, dt, steps, 0.1, options))
     for times in (4, 40):
-        found.append(Case(f"buckles under {times} of Euler's load", partial(buckling, times), 0.1, 20, 1e-3))
-    return found
+        result.append(Case(f"buckles under {times} of Euler's load", partial(buckling, times), 0.1, 20, 1e-3))
+    return result
 
 
 def total(model, state) -> float:
-    """Energy with that of dead loads [J]."""
+    """Return the energy with the potential of dead loads [J]."""
     points = state.points()
     return sum(model.energies(state).values()) - sum(points[load.node] @ load.force for load in model.scene.loads)
 
 
 def stretch_of(scene: ddg.Scene, points: np.ndarray) -> float:
-    """Largest change of an edge's length, relative, of the rods added first."""
+    """Return the largest relative change of an edge's length of the first rods."""
     batch = scene.batches[0]
 
     def lengths(nodes):
@@ -271,7 +275,7 @@ def stretch_of(scene: ddg.Scene, points: np.ndarray) -> float:
 
 
 def steps_of(case: Case, model, integrator, each: Callable | None = None) -> tuple[object, str, int]:
-    """The last good state of a run, why it ended early (or "reached"), and the steps tried; `each` is told every state."""
+    """Return the last good state of a run, the reason of its end (or "reached"), and the steps tried; `each` receives all states."""
     state = model.state() if case.start is None else model.state(points=case.start)
     for count in range(1, case.steps + 1):
         try:
@@ -284,19 +288,19 @@ def steps_of(case: Case, model, integrator, each: Callable | None = None) -> tup
 
 
 def seconds_of(case: Case, model, integrator) -> float:
-    """Time of a step [s], the lowest of a few runs."""
-    clock, found = time.perf_counter if model.wp_device.is_cuda else time.process_time, []
-    while not found or (sum(found) < ENOUGH and len(found) < MOST):
+    """Return the time of a step [s], the lowest of a few runs."""
+    clock, times = time.perf_counter if model.wp_device.is_cuda else time.process_time, []
+    while not times or (sum(times) < ENOUGH and len(times) < MOST):
         wp.synchronize_device(model.wp_device)
         began = clock()
         _, _, count = steps_of(case, model, integrator)
         wp.synchronize_device(model.wp_device)
-        found.append(clock() - began)
-    return min(found) / count
+        times.append(clock() - began)
+    return min(times) / count
 
 
 def measure(case: Case, label: str, device: str, precision: str) -> dict:
-    """A row of the table."""
+    """Return a row of the table."""
     scene = case.build()
     model = scene.build(device, precision)
     integrator, state = ddg.Integrator(model, check_every=1, **case.options), model.state(points=case.start)
@@ -327,12 +331,12 @@ def measure(case: Case, label: str, device: str, precision: str) -> dict:
         "stretch": max(stretch),
         "gain": gain,
         "moved": moved,
-        "check": ", ".join(name for name, found in wrong.items() if found) or "good",
+        "check": ", ".join(name for name, failed in wrong.items() if failed) or "good",
     }
 
 
 def side_by_side(before: list[dict], after: list[dict], compared: tuple = COMPARED) -> list[dict]:
-    """What two runs found in the columns `compared`, by case; empty where one of them lacks it."""
+    """Return the columns `compared` of two runs by case, empty where a run lacks it."""
     first, second = ({row["case"]: row for row in rows} for rows in (before, after))
     labels = before[0]["label"], after[0]["label"]
     return [
@@ -347,12 +351,12 @@ def side_by_side(before: list[dict], after: list[dict], compared: tuple = COMPAR
 
 
 def shown(rows: list[dict]) -> str:
-    """The columns that fit a terminal."""
+    """Return the columns that fit a terminal."""
     return table([{name: "" if row[name] is None else row[name] for name in SHOWN} for row in rows])
 
 
 def read_rows(path: Path) -> list[dict]:
-    """The rows of a table, numbers as such."""
+    """Return the rows of a table, numbers as floats."""
 
     def value(text):
         try:
@@ -365,7 +369,7 @@ def read_rows(path: Path) -> list[dict]:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--label", default="now", help="name of the run (default: now)")
     parser.add_argument("--only", nargs="+", default=[""], metavar="WORD", help="cases whose name has one of these")
@@ -384,15 +388,15 @@ def main() -> int:
     for case in [] if chosen.read else picked:
         rows.append(measure(case, chosen.label, chosen.device, chosen.precision))
         print(f"{len(rows)} of {len(picked)}: {shown(rows[-1:]).splitlines()[1]}", file=sys.stderr, flush=True)
-        write_table(chosen.out / f"hard_{chosen.label}", rows, origin)  # what is cut short leaves what it has
+        write_table(chosen.out / f"hard_{chosen.label}", rows, origin)  # an interrupted run keeps its rows
     if not rows:
         parser.error(f"no case has {' or '.join(chosen.only)} in its name")
     if chosen.against:
-        other = read_rows(chosen.against)
-        if other[0]["label"] == rows[0]["label"]:
+        baseline = read_rows(chosen.against)
+        if baseline[0]["label"] == rows[0]["label"]:
             parser.error(f"both runs are called {rows[0]['label']}; give another --label")
-        both = side_by_side(other, rows)
-        write_table(chosen.out / f"hard_{other[0]['label']}_{rows[0]['label']}", both, origin)
+        both = side_by_side(baseline, rows)
+        write_table(chosen.out / f"hard_{baseline[0]['label']}_{rows[0]['label']}", both, origin)
         print(table([{name: row[name] for name in row if not name.startswith(("others", "end"))} for row in both]))
     else:
         print(shown(rows))

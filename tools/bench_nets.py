@@ -1,9 +1,9 @@
-"""Times steps of nets of rods with different preconditioners, at several numbers of edges between joints.
+"""Time steps of joined rods with different preconditioners, at several numbers of edges between joints.
 
     python tools/bench_nets.py [--device cuda:0] [--edges 8 32 128] [--out DIR]
 
-Prints a table; writes nets_DEVICE.csv and .json. On the CPU the clock is that of this process. The error is the largest distance of
-a node from where the same steps lead at a residual a ten-thousandth as large.
+Prints a table; writes nets_DEVICE.csv and .json. On the CPU the clock is process time. The error is the largest distance of
+a node from the same steps at a residual a ten-thousandth as large.
 """
 
 import argparse
@@ -25,7 +25,7 @@ LINEAR = ("block_jacobi", "chain")
 
 
 def tree(edges: int, levels: int = 2) -> ddg.Scene:
-    """A clamped trunk of steel, 2 m high, that forks `levels` times; every limb has as many edges."""
+    """Return a clamped trunk of steel, 2 m high, that forks `levels` times; every limb has `edges` edges."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
 
     def grow(base, direction, length, level):
@@ -36,7 +36,7 @@ def tree(edges: int, levels: int = 2) -> ddg.Scene:
             side = np.cross(direction, [0.3, 1.0, 0.2])
             forks = [0.85 * direction + 0.5 * sign * side / np.linalg.norm(side) for sign in (1.0, -1.0)]
             limbs = [grow(tip, fork / np.linalg.norm(fork), 0.7 * length, level - 1) for fork in forks]
-            scene.join([(limb, -1), *((other, 0) for other in limbs)])
+            scene.join([(limb, -1), *((branch, 0) for branch in limbs)])
         return limb
 
     scene.clamp_end(grow(np.zeros(3), np.array([0.0, 0.0, 1.0]), 2.0, levels))
@@ -44,7 +44,7 @@ def tree(edges: int, levels: int = 2) -> ddg.Scene:
 
 
 def frame(edges: int, storeys: int = 1) -> ddg.Scene:
-    """Four columns of steel and the beams of `storeys` storeys, 3 m each, under their weight and a sideways pull."""
+    """Return four columns of steel and the beams of `storeys` storeys, 3 m each, under weight and a sideways pull."""
     scene = ddg.Scene(gravity=(1.0, 0.5, -9.81))
     meets = {}
 
@@ -61,10 +61,10 @@ def frame(edges: int, storeys: int = 1) -> ddg.Scene:
             column = member((x, y, z), (x, y, z + 1))
             if z == 0:
                 scene.clamp_end(column)
-        for one, other in zip(corners, corners[1:] + corners[:1], strict=True):
-            member((*one, z + 1), (*other, z + 1))
-    for place, members in meets.items():
-        if place[2] > 0:
+        for corner, neighbour in zip(corners, corners[1:] + corners[:1], strict=True):
+            member((*corner, z + 1), (*neighbour, z + 1))
+    for position, members in meets.items():
+        if position[2] > 0:
             scene.join(members)
     return scene
 
@@ -78,7 +78,7 @@ SCENES = {
 
 
 def settled(model, steps: int) -> np.ndarray:
-    """Nodes [m] after so many steps from rest that are solved far beyond what is asked for."""
+    """Return nodes [m] after steps from rest at a far tighter tolerance."""
     integrator, state = ddg.Integrator(model, linear="chain", rtol=1e-10, check_every=1), model.state()
     for _ in range(steps):
         state = integrator.step(state, DT)
@@ -86,7 +86,7 @@ def settled(model, steps: int) -> np.ndarray:
 
 
 def measure(name: str, edges: int, model, linear: str, steps: int, exact: np.ndarray) -> dict:
-    """A row of the table: `steps` steps from rest."""
+    """Return a row of the table: `steps` steps from rest."""
     device = model.wp_device
     integrator, state = ddg.Integrator(model, linear=linear, check_every=1), model.state()
     for _ in range(2):  # compiles and captures
@@ -114,7 +114,7 @@ def measure(name: str, edges: int, model, linear: str, steps: int, exact: np.nda
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--edges", type=int, nargs="*", default=SIZES, help="edges between joints")

@@ -1,13 +1,13 @@
-"""Times steps of many rods side by side, and checks in the same run that they are right.
+"""Time steps of many rods side by side, and check their accuracy in the same run.
 
     python tools/bench_rods.py --cpu  [--quick] [--out DIR]     CPU time a step, tip against published numbers
     python tools/bench_rods.py --cuda [--quick] [--out DIR]     1 to 100,000 rods in every precision
     python tools/bench_rods.py --long [--quick] [--out DIR]     one rod of 10,000 nodes and 100 m
-    python tools/bench_rods.py --build [--quick] [--out DIR]    rods, a net and a sheet on the CPU, from a scene to a first step
+    python tools/bench_rods.py --build [--quick] [--out DIR]    rods, joined rods and a sheet on the CPU, from a scene to a first step
 
-Prints a table; writes rods_NAME.csv, .json and, if matplotlib is there, .png; of builds, builds_cpu.csv and .json. Fails where a
-rod was given up, or a float64 or mixed run is off. Times are medians of blocks of steps after a warm-up; nothing inside of a block
-waits for the device. The CPU's clock is that of this process, which others on the machine leave alone.
+Prints a table. Writes rods_NAME.csv, .json and, with matplotlib, .png, and for builds builds_cpu.csv and .json. Fails if a solve of
+a rod failed, or a float64 or mixed run is inaccurate. Times are medians of blocks of steps after a warm-up, without device
+synchronisation inside a block. The CPU's clock is process time, independent of other processes.
 """
 
 import argparse
@@ -26,7 +26,7 @@ import ddg_warp as ddg
 from ddg_warp.ask.report import bytes_per_node
 from ddg_warp.run.summary import machine, table, write_table
 
-EXACT_RTOL = 1e-12  # of the reference, which rounding ends
+EXACT_RTOL = 1e-12  # of the reference, limited by rounding
 DEVIATION = 1e-5  # largest error of a node [m per m of rod]
 NEVER = 10**9  # steps between readings of the outcomes
 SHOWN = (
@@ -37,19 +37,19 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Case:
-    """Equal rods side by side, held at their first edge and released straight.
+    """Equal rods side by side, clamped at their first edge and released straight.
 
     Attributes:
-        study: What the case belongs to.
+        study: Study of the case.
         rods, nodes: Number of rods, nodes of each.
         solver: The integrator's `linear`.
-        precision, rtol, dt: Of the integrator; dt [s].
-        radius, length: Of a rod [m].
+        precision, rtol, dt: Options of the integrator; dt [s].
+        radius, length: Size of a rod [m].
         gravity: Acceleration [m/s^2].
         axis: Direction of the straight rods.
-        warm_up, blocks, block: Steps before the clock, blocks, steps of a block.
-        tip: Published x and z of the tip [m] after `tip_step` steps; without, one rod solved to rounding is the measure.
-        island: Whether all share one Newton loop: each root is joined to a stub that is held.
+        warm_up, blocks, block: Warm-up steps, number of timed blocks, steps of a block.
+        tip: Published x and z of the tip [m] after `tip_step` steps; by default one rod solved to rounding is the reference.
+        island: Whether all rods form one island: each root is joined to a clamped stub.
     """
 
     study: str
@@ -71,7 +71,7 @@ class Case:
     island: bool = False
 
     def scene(self) -> ddg.Scene:
-        """The rods, apart by five radii."""
+        """Return a scene of the rods, five radii apart."""
         points = np.zeros((self.rods, self.nodes, 3))
         points += np.linspace(0.0, self.length, self.nodes)[:, None] * np.array(self.axis)
         points[:, :, 1] += 5.0 * self.radius * np.arange(self.rods)[:, None]
@@ -82,8 +82,8 @@ class Case:
         if self.island:
             stubs = scene.add_rods(points[:, :3] - points[:, 2:3] + points[:, :1], **kind)
             scene.clamp(stubs, edges=[0, 1])
-            for one, other in zip(long, stubs, strict=True):
-                scene.join([(int(one), 0), (int(other), -1)], rigid=False)
+            for rod, stub in zip(long, stubs, strict=True):
+                scene.join([(int(rod), 0), (int(stub), -1)], rigid=False)
         return scene
 
 
@@ -103,7 +103,7 @@ PUBLISHED = Case(
 
 
 def cpu_cases(quick: bool) -> list[Case]:
-    """The published cantilever a hundred times, and how its cost grows with rods and with nodes a rod."""
+    """Return the published cantilever a hundred times, and growth of its cost with rods and with nodes a rod."""
     growth = replace(PUBLISHED, tip=None, tip_step=0, warm_up=5, blocks=3, block=10)
     if quick:
         few = replace(growth, warm_up=2, blocks=2, block=2)
@@ -122,7 +122,7 @@ def cpu_cases(quick: bool) -> list[Case]:
 
 
 def cuda_cases(quick: bool) -> list[Case]:
-    """Rods in every precision at two tolerances, nodes a rod, and rods in one island beside the same on their own."""
+    """Return rods in every precision at two tolerances, nodes a rod, and rods in one island next to uncoupled ones."""
     counts = (1, 10) if quick else (1, 100, 1_000, 10_000, 100_000)
     base = Case("rods", 1, 64, warm_up=4, blocks=2, block=4) if quick else Case("rods", 1, 64)
     cases = [
@@ -150,14 +150,14 @@ def cuda_cases(quick: bool) -> list[Case]:
 
 
 def long_cases(quick: bool, cuda: bool) -> list[Case]:
-    """One rod with edges of 1 cm that hangs from its clamp and is pulled aside by gravity."""
+    """Return one clamped hanging rod with edges of 1 cm under tilted gravity."""
     nodes = 200 if quick else 10_000
     hanging = Case("long", 1, nodes, length=nodes / 100.0, axis=(0.0, 0.0, -1.0), warm_up=4, blocks=3, block=5)
     return [replace(hanging, precision=precision) for precision in (("mixed", "float64") if cuda else ("float64",))]
 
 
 def clock_of(device) -> Callable[[], float]:
-    """Time of this process on the CPU; wall time, once the device has finished, on CUDA."""
+    """Return a clock: process time on the CPU, wall time after synchronisation on CUDA."""
     if not device.is_cuda:
         return time.process_time
 
@@ -169,16 +169,16 @@ def clock_of(device) -> Callable[[], float]:
 
 
 def shapes(case: Case, state) -> np.ndarray:
-    """Each rod as seen from its first node, (R, n, 3) [m]."""
+    """Return rods relative to the first node of each, (R, n, 3) [m]."""
     points = state.points()[: case.rods * case.nodes].reshape(case.rods, case.nodes, 3)
     return points - points[:, :1]
 
 
 def largest_residual(integrator: ddg.Integrator, state) -> float:
-    """Largest residual of a dof [N or N m] that the last step left: evaluates the last iterates of rods on their own once more.
+    """Return the largest residual of a dof [N or N m] after the last step, by another evaluation of uncoupled rods.
 
-    Their solver keeps the residual that it last took a step from. Rods that rest at an earlier state are taken up again by
-    this, so it comes after everything else.
+    Their solver keeps the residual before its last update. The evaluation resumes rods that failed at an earlier state, so call it
+    last.
     """
     worst = [] if integrator._net is None else [np.abs(integrator._net.newton.right.numpy()).max()]
     for chain in integrator._chains:
@@ -194,14 +194,14 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
 
 
 def iterations(integrator: ddg.Integrator) -> tuple[float, int]:
-    """Newton iterations of all solves so far, and the number of these solves."""
+    """Return Newton iterations of all solves so far, and the number of these solves."""
     statistics = integrator.statistics()
     solves = sum(statistics["outcomes"].values())
     return statistics["newton_iterations"]["mean"] * solves, solves
 
 
 def used_memory(device) -> int:
-    """Bytes in use on the device; 0 where it does not count them."""
+    """Return bytes in use on the device; 0 without a counter."""
     return wp.get_mempool_used_mem_current(device) if device.is_cuda and device.is_mempool_enabled else 0
 
 
@@ -209,7 +209,7 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
     """Build, step and time a case.
 
     Returns:
-        What was measured, without the error; and each rod's shape, (R, n, 3) [m], after `tip_step` steps, or after all.
+        Measured values without the error, and each rod's shape, (R, n, 3) [m], after `tip_step` steps, or after all.
     """
     clock = clock_of(device)
     gc.collect()
@@ -228,14 +228,14 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
     for _ in range(case.warm_up - 2):
         state = integrator.step(state, case.dt)
     earlier = iterations(integrator)
-    times, found = [], None
+    times, shapes_at_tip_step = [], None
     for k in range(1, case.blocks + 1):
         started = clock()
         for _ in range(case.block):
             state = integrator.step(state, case.dt)
         times.append((clock() - started) / case.block)
         if case.warm_up + k * case.block == case.tip_step:
-            found = shapes(case, state)
+            shapes_at_tip_step = shapes(case, state)
     failure = ""
     try:
         integrator.check(state)
@@ -269,30 +269,30 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
         "measured_bytes_per_node": memory / nodes,
         "failure": failure,
     }
-    found = shapes(case, state) if found is None else found
-    return row | {"residual": largest_residual(integrator, state)}, found
+    shapes_at_tip_step = shapes(case, state) if shapes_at_tip_step is None else shapes_at_tip_step
+    return row | {"residual": largest_residual(integrator, state)}, shapes_at_tip_step
 
 
 def measure(case: Case, device, exact: dict) -> dict:
-    """A row of the table: times, counts, and the error [m] of the tip where it is published, else of the worst node."""
-    row, found = run(case, device)
+    """Return a row of the table: times, counts, and the error [m] of the published tip, else of the worst node."""
+    row, rod_shapes = run(case, device)
     if case.tip is not None:
-        error = np.abs(found[:, -1, [0, 2]] - case.tip).max()
+        error = np.abs(rod_shapes[:, -1, [0, 2]] - case.tip).max()
     else:
-        # The rods are alike and apart, so that one of them, in float64 and swept to rounding, stands for all.
+        # Rods are equal and uncoupled, so that one of them, in float64 and solved to rounding, stands for all.
         alone = replace(case, study="", rods=1, island=False, solver="sweep", precision="float64", rtol=EXACT_RTOL)
         if alone not in exact:
             exact[alone] = run(alone, device)[1]
-        error = np.linalg.norm(found - exact[alone], axis=2).max()
-    good = error <= DEVIATION * case.length and not row["failure"]  # a NaN is not good
-    return row | {"error": float(error), "passed": bool(good)}
+        error = np.linalg.norm(rod_shapes - exact[alone], axis=2).max()
+    passed = error <= DEVIATION * case.length and not row["failure"]  # a NaN is not good
+    return row | {"error": float(error), "passed": bool(passed)}
 
 
 def builds(quick: bool, device, repeats: int = 3) -> list[dict]:
-    """Rows of the table of builds: medians of seconds of this process on the CPU, once kernels are loaded.
+    """Return rows of the table of builds: medians of process time [s] on the CPU, with loaded kernels.
 
-    `scene_s` is for the calls that describe it, `build_s` for the `Model`, `model_s` for both; `integrator_s` for the `Integrator`,
-    which allocates what steps work with, `state_s` for the first state; `first_step_s`, to a coarse rtol of 0.5, captures the step.
+    `scene_s`: calls that describe the scene. `build_s`: the `Model`. `model_s`: both. `integrator_s`: the `Integrator` with its
+    buffers. `state_s`: the first state. `first_step_s`: captures the step, to a coarse rtol of 0.5.
     """
     scenes = {
         "rods of 64 nodes": (lambda count: Case("build", count, 64).scene(), 10 if quick else 100_000),
@@ -325,7 +325,7 @@ def builds(quick: bool, device, repeats: int = 3) -> list[dict]:
 
 
 def plot(rows: list[dict], path: Path, title: str) -> None:
-    """Time of a step over rods and over nodes a rod, beside lines of proportional growth."""
+    """Plot time of a step over rods and over nodes a rod, next to lines of proportional growth."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -334,7 +334,7 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
         return
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, study, other in zip(
+    for axes, study, fixed in zip(
         figure.subplots(1, 2, sharey=True), ("rods", "nodes"), ("nodes", "rods"), strict=True
     ):
         growth = [row for row in rows if row["study"] == study]
@@ -344,14 +344,14 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
             x, y = ([row[name] for row in cases] for name in (study, "ms_per_step"))
             axes.loglog(x, y, marker=marker, markersize=5, linewidth=1.3, label=f"{line[0]}, rtol {line[1]:g}")
         if growth:
-            # through the slowest case: where growth is proportional in the end
+            # through the slowest case, where growth is proportional
             top = max(growth, key=lambda row: row["ms_per_step"])
             x = np.array(sorted({row[study] for row in growth}))
             axes.loglog(x, top["ms_per_step"] * x / top[study], "--", color="0.6", linewidth=1.0, label="proportional")
             axes.set_xticks(x, labels=[f"{value:,}" for value in x])
             axes.minorticks_off()
-            held = f"{growth[0][other]} {'nodes a rod' if other == 'nodes' else 'rods'}"
-            axes.set_title(held, loc="left", fontsize=10)
+            title_of_axes = f"{growth[0][fixed]} {'nodes a rod' if fixed == 'nodes' else 'rods'}"
+            axes.set_title(title_of_axes, loc="left", fontsize=10)
             axes.legend(frameon=False, fontsize=8)
         axes.set_xlabel("rods" if study == "rods" else "nodes a rod")
         axes.grid(which="major", color="0.85", linewidth=0.7)
@@ -362,7 +362,7 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
 
 
 def write(rows: list[dict], stem: Path, device, commit: str) -> None:
-    """The rows as CSV and, with where they come from, as JSON; a plot if there is growth to show."""
+    """Write the rows as CSV and, with their origin, as JSON, and a plot of growth studies."""
     command = " ".join(["python", "tools/bench_rods.py", *sys.argv[1:]])
     origin = machine(commit)
     write_table(stem, rows, {"command": command, "device": str(device), "machine": origin})
@@ -371,12 +371,12 @@ def write(rows: list[dict], stem: Path, device, commit: str) -> None:
 
 
 def shown(rows: list[dict]) -> str:
-    """The columns that fit a terminal."""
+    """Return the columns that fit a terminal."""
     return table([{name: row[name] for name in SHOWN} for row in rows])
 
 
 def main() -> int:
-    """Run what the command line asks for; 0 where all float64 and mixed cases passed."""
+    """Run the command line; return 0 if all float64 and mixed cases passed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cpu", action="store_true", help="the published cantilever on the CPU")
     parser.add_argument("--cuda", action="store_true", help="many rods on a GPU")
@@ -410,12 +410,12 @@ def main() -> int:
     for case in cases:
         rows.append(measure(case, device, exact))
         print(f"{len(rows)} of {len(cases)}: {shown(rows[-1:]).splitlines()[1]}", file=sys.stderr, flush=True)
-        write(rows, stem, device, chosen.commit)  # after every case: what is cut short leaves what it has
+        write(rows, stem, device, chosen.commit)  # an interrupted run keeps its rows
     print(shown(rows))
-    bad = [row for row in rows if not row["passed"] and row["precision"] != "float32"]
-    for row in bad:
+    failed = [row for row in rows if not row["passed"] and row["precision"] != "float32"]
+    for row in failed:
         print(f"FAILED: {row['rods']} rods of {row['nodes']} nodes, {row['precision']}: off by {row['error']:g} m")
-    return 1 if bad else 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

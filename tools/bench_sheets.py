@@ -1,10 +1,10 @@
-"""Times a hanging sheet: elements, assembly, an iteration of conjugate gradients, a step; each with its floor by memory traffic.
+"""Time a hanging sheet: elements, assembly, an iteration of conjugate gradients, a step, each with its floor by memory traffic.
 
     python tools/bench_sheets.py [--device cuda:0] [--quick] [--statics] [--out DIR]
 
 Prints a table; writes sheets_DEVICE.csv and .json. With --statics: equilibria of a clamped plate under pressure by factors and by
-conjugate gradients, in statics_DEVICE.csv and .json. On CUDA the parts are captured graphs, timed by events over many launches; on
-the CPU the clock is that of this process. The floor counts what a part must read and write once, at 4.8 TB/s of an H200.
+conjugate gradients, in statics_DEVICE.csv and .json. On CUDA the stages are captured graphs, timed by events over many launches; on
+the CPU the clock is process time. The floor counts data that a stage must read and write once, at 4.8 TB/s of an H200.
 """
 
 import argparse
@@ -27,7 +27,7 @@ SIZES = {"hinge": (32, 70, 223, 707), "midedge": (32, 70, 223, 707), "midedge_do
 
 
 def sheet(cells: int, bending: str) -> ddg.Scene:
-    """A square of 1 m and 1 mm, of rubber, held at two corners and released flat."""
+    """Return a square of 1 m and 1 mm, of rubber, fixed at two corners and released flat."""
     points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     material = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
@@ -41,7 +41,7 @@ def sheet(cells: int, bending: str) -> ddg.Scene:
 
 
 def plate(cells: int, pressure: float) -> ddg.Scene:
-    """A square of 1 m and 10 mm, of rubber, clamped all around, under a pressure [Pa]; 2 kPa deflect it by 8 thicknesses."""
+    """Return a clamped rubber square of 1 m and 10 mm under a pressure [Pa]; 2 kPa deflect it by 8 thicknesses."""
     points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     material = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
@@ -53,7 +53,7 @@ def plate(cells: int, pressure: float) -> ddg.Scene:
 
 
 def equilibrium(cells: int, pressure: float, solver: str, device) -> dict:
-    """A row of the table of equilibria."""
+    """Return a row of the table of equilibria."""
     model = plate(cells, pressure).build(device.alias, "mixed" if device.is_cuda else "float64")
     small = plate(4, pressure).build(device.alias, model.precision)
     Equilibrium(small, StaticsOptions(solver=solver)).load(small.state(), 1)  # compiles
@@ -77,7 +77,7 @@ def equilibrium(cells: int, pressure: float, solver: str, device) -> dict:
 
 
 def equilibria(chosen, device) -> list[dict]:
-    """Rows of the table of equilibria: membrane forces carry the first pressure, bending the second."""
+    """Return rows of the table of equilibria: membrane forces carry the first pressure, bending the second."""
     rows = []
     for pressure, sizes in ((2e3, (32, 70, 140, 223)), (5.0, (32, 70))):
         for cells in sizes[:1] if chosen.quick else sizes:
@@ -89,18 +89,18 @@ def equilibria(chosen, device) -> list[dict]:
 
 
 def floors(newton) -> dict[str, float]:
-    """Bytes that elements with assembly, and an iteration of conjugate gradients, must move at least."""
+    """Return least bytes moved by elements with assembly, and by an iteration of conjugate gradients."""
     net, linear = newton.net, 4 if newton.linear is wp.float32 else 8
     blocks, real = newton.all, 8 if newton.real is wp.float64 else 4
     matrix = 9 * linear * newton.system.entries * newton.worlds
     geometry = blocks * 3 * real
-    data = sum(4 * part.slots.size + real * part.parameters.buffer.size for part in net.sets)
+    data = sum(4 * elements.slots.size + real * elements.parameters.buffer.size for elements in net.sets)
     vectors = blocks * 3 * linear
     return {"assembly": matrix + geometry + data, "iteration": matrix + 9 * vectors + 9 * linear * blocks}
 
 
 def clocked(device, part, repeats: int) -> float:
-    """Seconds of one run of `part`."""
+    """Return the seconds of one run of `part`."""
     part()
     if not device.is_cuda:
         began = time.process_time()
@@ -120,7 +120,7 @@ def clocked(device, part, repeats: int) -> float:
 
 
 def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
-    """A row of the table."""
+    """Return a row of the table."""
     began = time.perf_counter()
     model = sheet(cells, bending).build(device.alias, "mixed" if device.is_cuda else "float64")
     integrator = ddg.Integrator(model, linear=linear, check_every=1)
@@ -174,7 +174,7 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
 
 
 def steps(chosen, device) -> list[dict]:
-    """Rows of the table of steps."""
+    """Return rows of the table of steps."""
     rows = []
     for bending in chosen.bending:
         for cells in SIZES[bending][:1] if chosen.quick else SIZES[bending]:
@@ -185,7 +185,7 @@ def steps(chosen, device) -> list[dict]:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")

@@ -1,12 +1,12 @@
-"""What few strands that take many iterations cost among many that take few: hair of which some strands are whipped.
+"""Time few strands of many iterations among many of few: hair of which some strands are whipped.
 
     python tools/bench_stragglers.py --cuda [--commit HASH] [--out DIR]
     python tools/bench_stragglers.py --cpu
 
-Strands of the scene `hair`, of 32 nodes, hang from roots at rest; every so many-th is whipped, its root moved by 0.2 m at 5 Hz.
-Steps of 1/60 s; the clock starts after 0.1 s and runs over 0.5 s, and the time a step is the mean, the lowest of two runs, with
-everything that the host does. `ms_alone` and `newton_alone` are of the whipped strands without the others. Means of iterations are over
-all strands and steps, `newton_max` is the most of one. Prints a table; writes stragglers_DEVICE.csv and .json.
+Strands of the scene `hair`, of 32 nodes, hang from still roots. Every so many-th is whipped, its root moved by 0.2 m at 5 Hz.
+Steps of 1/60 s; the clock starts after 0.1 s and runs over 0.5 s. The time a step is the mean, the lowest of two runs, host work
+included. `ms_alone` and `newton_alone` are of the whipped strands alone. Means of iterations are over all strands and steps,
+`newton_max` is the largest of one. Prints a table; writes stragglers_DEVICE.csv and .json.
 """
 
 import argparse
@@ -25,18 +25,18 @@ from ddg_warp.scenes import hair
 STRANDS = {"cuda": (10_000, 100_000), "cpu": (64, 512)}
 WHIPPED = {"cuda": (0, 1, 10, 100, 1_000, 10_000, 100_000), "cpu": (0, 1, 8, 64, 512)}
 NODES, DT = 32, 1.0 / 60.0  # s
-BEGIN, RUN, RUNS = 0.1, 0.5, 2  # s, s, and how often
+BEGIN, RUN, RUNS = 0.1, 0.5, 2  # s, s, and number of runs
 AMPLITUDE, FREQUENCY = 0.2, 5.0  # m, Hz
 
 
 def scene_of(strands: int, whipped: int) -> ddg.Scene:
-    """Hair of which as many strands, evenly spread, are whipped."""
+    """Return hair with `whipped` evenly spread whipped strands."""
     scene = hair.build(strands, NODES, step=DT)
     scene.supports.clear()
     moved = np.zeros(strands, bool)
     moved[np.arange(whipped) * strands // max(1, whipped)] = True
-    turn = 2.0 * np.pi * FREQUENCY
-    whip = ddg.Motion(translation=lambda t: (AMPLITUDE * np.sin(turn * t), 0.0, 0.0))
+    rate = 2.0 * np.pi * FREQUENCY
+    whip = ddg.Motion(translation=lambda t: (AMPLITUDE * np.sin(rate * t), 0.0, 0.0))
     for rods, motion in ((np.flatnonzero(moved), whip), (np.flatnonzero(~moved), None)):
         if len(rods):
             scene.clamp(rods, edges=[0], motion=motion)
@@ -44,7 +44,7 @@ def scene_of(strands: int, whipped: int) -> ddg.Scene:
 
 
 def run(strands: int, whipped: int, name: str) -> tuple[float, dict]:
-    """Seconds a step, and the statistics."""
+    """Return seconds a step, and the statistics."""
     device = wp.get_device(name)
     model = scene_of(strands, whipped).build(device)
     integrator, state = ddg.Integrator(model, check_every=10**9), model.state()
@@ -63,7 +63,7 @@ def run(strands: int, whipped: int, name: str) -> tuple[float, dict]:
 
 @cache
 def measure(strands: int, whipped: int, name: str) -> dict:
-    """Time and iterations, the lowest time of some runs."""
+    """Return time and iterations, the lowest time of some runs."""
     rounds = [run(strands, whipped, name) for _ in range(RUNS)]
     statistics = rounds[0][1]
     return {
@@ -76,14 +76,14 @@ def measure(strands: int, whipped: int, name: str) -> dict:
 
 
 def row(strands: int, whipped: int, name: str) -> dict:
-    """A row of the table."""
-    found = {"strands": strands, "whipped": whipped, **measure(strands, whipped, name)}
+    """Return a row of the table."""
+    result = {"strands": strands, "whipped": whipped, **measure(strands, whipped, name)}
     alone = measure(whipped, whipped, name) if whipped else {"ms_per_step": 0.0, "newton_mean": 0.0}
-    return found | {"ms_alone": alone["ms_per_step"], "newton_alone": alone["newton_mean"]}
+    return result | {"ms_alone": alone["ms_per_step"], "newton_alone": alone["newton_mean"]}
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--cuda", action="store_const", const="cuda", dest="name", help="10,000 and 100,000 strands")
@@ -99,7 +99,7 @@ def main() -> int:
         for whipped in (k for k in WHIPPED[chosen.name] if k <= strands):
             rows.append(row(strands, whipped, chosen.name))
             print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)
-            write_table(chosen.out / f"stragglers_{chosen.name}", rows, origin)  # what is cut short leaves what it has
+            write_table(chosen.out / f"stragglers_{chosen.name}", rows, origin)  # an interrupted run keeps its rows
     print(table(rows))
     return 0
 

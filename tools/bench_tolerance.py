@@ -1,11 +1,10 @@
-"""What a tolerance means: the error in position against rtol, of rods alone and in one net, and of sheets, at several sizes.
+"""Measure position errors against rtol, of uncoupled rods, joined rods and sheets, at several sizes.
 
     python tools/bench_tolerance.py [--cuda] [--quick] [--out DIR]
 
-The reference is the same motion with rtol 1e-12, which rounding ends. `error` is the root of the mean square over nodes of their
-distances at the end, `largest` the largest of these: the motion makes it larger where it is unstable, as slack edges of a sheet are
-that wrinkle. Prints a table; writes tolerance_DEVICE.csv and .json. On the CPU: sheets of up to 128 cells a side, with --cuda of up to
-512, and 10,000 rods.
+The reference is the same motion with rtol 1e-12, limited by rounding. `error` is the root mean square over nodes of their distances
+at the end, `largest` the largest of these. Unstable motion amplifies it, such as slack wrinkling edges of a sheet. Prints a table;
+writes tolerance_DEVICE.csv and .json. On the CPU: sheets of up to 128 cells a side, with --cuda of up to 512, and 10,000 rods.
 """
 
 import argparse
@@ -29,7 +28,7 @@ RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 
 
 def rods(count: int, joined: bool, nodes: int = 13) -> ddg.Scene:
-    """Cantilevers of 1 m and 1 cm, released straight; `joined`: all in one net, each at its root to a stub that is held."""
+    """Return cantilevers of 1 m and 1 cm, released straight; `joined`: one coupled system, each root joined to a clamped stub."""
     scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
     points = np.zeros((count, nodes, 3))
     points[:, :, 0] = np.linspace(0.0, 1.0, nodes)
@@ -40,26 +39,26 @@ def rods(count: int, joined: bool, nodes: int = 13) -> ddg.Scene:
     if joined:
         stubs = scene.add_rods(points[:, :3] - points[:, 2:3] + points[:, :1], **kind)
         scene.clamp(stubs, edges=[0, 1])
-        for one, other in zip(long, stubs, strict=True):
-            scene.join([(int(one), 0), (int(other), -1)])
+        for rod, stub in zip(long, stubs, strict=True):
+            scene.join([(int(rod), 0), (int(stub), -1)])
     return scene
 
 
 def sheet(cells: int, bending: str = "hinge", side: bool = False) -> ddg.Scene:
-    """A square of 1 m and 1 mm, held at two corners, or along the `side` between them, and released flat."""
+    """Return a square of 1 m and 1 mm, fixed at two corners, or along the `side` between, and released flat."""
     points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     shell = scene.add_shell(points, triangles, thickness=1e-3, material=RUBBER, bending=bending)
-    held = points[:, 0] == points[:, 0].min()
+    fixed = points[:, 0] == points[:, 0].min()
     if not side:
-        held &= np.isin(points[:, 1], [points[:, 1].min(), points[:, 1].max()])
-    scene.hold(shell, np.flatnonzero(held))
+        fixed &= np.isin(points[:, 1], [points[:, 1].min(), points[:, 1].max()])
+    scene.hold(shell, np.flatnonzero(fixed))
     return scene
 
 
 @dataclass(frozen=True)
 class Study:
-    """Scenes of one kind at several sizes; the same rtol is to mean the same error at all of them."""
+    """Scenes of one kind at several sizes; the same rtol shall mean the same error at all of them."""
 
     name: str
     build: object
@@ -67,7 +66,7 @@ class Study:
 
 
 def studies(cuda: bool, quick: bool) -> list[Study]:
-    """What is compared."""
+    """Return all studies."""
     many = (1, 4) if quick else (1, 100, 10_000) if cuda else (1, 100)
     cells = (8, 16) if quick else (32, 64, 128, 256, 512) if cuda else (32, 64, 128)
     return [
@@ -79,7 +78,7 @@ def studies(cuda: bool, quick: bool) -> list[Study]:
 
 
 def motion(model, rtol: float, steps: int) -> tuple[np.ndarray, dict, float]:
-    """Positions at the end (P, 3) [m], statistics, and the time of a step [s]."""
+    """Return positions at the end (P, 3) [m], statistics, and the time of a step [s]."""
     integrator, state = ddg.Integrator(model, rtol=rtol, check_every=steps), model.state()
     began = time.perf_counter()
     for _ in range(steps):
@@ -89,7 +88,7 @@ def motion(model, rtol: float, steps: int) -> tuple[np.ndarray, dict, float]:
 
 
 def rows_of(study: Study, device, rtols=RTOL, steps: int = STEPS) -> list[dict]:
-    """Rows of the table: every size with every rtol."""
+    """Return rows of the table: every size with every rtol."""
     rows = []
     for size in study.sizes:
         model = study.build(size).build(device.alias, "mixed" if device.is_cuda else "float64")
@@ -116,7 +115,7 @@ def rows_of(study: Study, device, rtols=RTOL, steps: int = STEPS) -> list[dict]:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cuda", action="store_true", help="on a GPU, with the largest sizes")
     parser.add_argument("--quick", action="store_true", help="small sizes")

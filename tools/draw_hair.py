@@ -1,4 +1,4 @@
-"""Draw speed against error of the scene `hair` before and after stiff rods took turned steps, from the tables of `ddg-warp bench hair`.
+"""Draw speed against error of the scene `hair` before and after edge-rotation updates, from the tables of `ddg-warp bench hair`.
 
 python tools/draw_hair.py
 

@@ -1,4 +1,4 @@
-"""Draw which way positive natural curvatures and twist bend a rod: tools/results/natural_curvature.png.
+"""Draw the direction of positive natural curvatures and twist of a rod: tools/results/natural_curvature.png.
 
 python tools/draw_natural_curvature.py
 """
@@ -20,7 +20,7 @@ COLORS = ("#c0392b", "#2471a3")
 
 
 def shape(natural):
-    """Points and directors of a rod along x, clamped at its first end with director y, that has its natural shape."""
+    """Return points and directors of a rod in natural shape, clamped at the first end along x with director y."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 25)
     section = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=1.0)
@@ -34,8 +34,8 @@ def main() -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 3.2), layout="constrained")
-    for place, (title, natural) in enumerate(CASES.items(), 1):
-        plot = figure.add_subplot(1, len(CASES), place, projection="3d")
+    for number, (title, natural) in enumerate(CASES.items(), 1):
+        plot = figure.add_subplot(1, len(CASES), number, projection="3d")
         points, first = shape(natural)
         edges = np.diff(points, axis=0)
         tangents = edges / np.linalg.norm(edges, axis=1)[:, None]

@@ -1,18 +1,18 @@
-"""Lint for the kernels: what Warp gets wrong in silence, and what the house does not want.
+"""Lint of kernels: silent errors of Warp, and rules of the house.
 
     python tools/lint_kernels.py [FILE or FOLDER ...]      (default: kernels/)
 
 tuple-index       `t = g(x); t[0]`: reverse mode of an indexed tuple is zero. Unpack it.
 self-overwrite    `q[0] = q[0] * a`, or `q[0] += a` on a vector: reverse mode reads the new value. Write each component
-                  once. Only where code is differentiated: kernels with enable_backward=True, what wp.grad takes, all
-                  that these call, and the files that a differentiated file imports.
-annotations       `from __future__ import annotations` turns the types of kernel arguments into strings.
+                  once. Differentiated code only: kernels with enable_backward=True, arguments of wp.grad, their callees,
+                  and imports of a differentiated file.
+annotations       `from __future__ import annotations` makes strings of the types of kernel arguments.
 enable-backward   Every kernel says whether it has an adjoint, which doubles to quadruples its compile time.
 cpu-options       Every kernel names its module_options: Warp's own flags for the CPU miscompile large ones (kernels/threads.py).
 float-literal     A bare literal is float32: write real(0.5) or linear(0.5).
-static-variable   `wp.static(places[i])` of a loop variable: Warp resolves it by generating the code of the whole kernel each time
-                  it is defined, and hashes a function otherwise once that has happened, so that it is compiled twice. Index a
-                  constant vector, or let a function take the rest by calling itself.
+static-variable   `wp.static(places[i])` of a loop variable: Warp resolves it by generating the code of the whole kernel for each
+                  definition, and then hashes a function differently, so that it is compiled twice. Index a
+                  constant vector, or let a function recurse on the remainder.
 """
 
 import ast
@@ -27,7 +27,7 @@ CASTS = {"real", "linear", "wp.static", "wp.float64", "wp.float32"}
 
 @dataclass(frozen=True, order=True)
 class Finding:
-    """A violation of a rule at a place."""
+    """Violation of a rule at a line of a file."""
 
     path: Path
     line: int
@@ -39,7 +39,7 @@ class Finding:
 
 
 class Source:
-    """A kernel file: its tree, its device functions, what it imports."""
+    """Kernel file: its tree, device functions and imports."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -52,7 +52,7 @@ class Source:
 
     @cached_property
     def tuple_functions(self) -> set[str]:
-        """Names of functions that return a tuple: by their return statement, or because a call of them is unpacked."""
+        """Names of functions that return a tuple, by a return statement or by an unpacked call."""
         returning = {
             function.name
             for function in self.device_functions
@@ -69,7 +69,7 @@ class Source:
 
     @cached_property
     def has_adjoint(self) -> bool:
-        """Whether something in this file is differentiated."""
+        """True if something in this file is differentiated."""
         in_package = {"measures", "densities"} & set(self.path.parts)
         return bool(in_package or any(map(_backward, self.device_functions)) or self._under_grad)
 
@@ -82,12 +82,12 @@ class Source:
 
     @cached_property
     def _under_grad(self) -> set[str]:
-        """Names that wp.grad takes."""
+        """Names of arguments of wp.grad."""
         calls = [node for node in ast.walk(self.tree) if isinstance(node, ast.Call) and node.args]
         return {ast.unparse(call.args[0]) for call in calls if ast.unparse(call.func) == "wp.grad"}
 
     def differentiated(self) -> list[ast.FunctionDef]:
-        """Device functions that may run in reverse: all but kernels without adjoint and what only those call."""
+        """Return device functions that may run in reverse: all except kernels without adjoint and their callees."""
         callers: dict[str, set[str]] = {}
         for function in self.device_functions:
             for node in ast.walk(function):
@@ -101,11 +101,11 @@ class Source:
 
 
 def lint(paths: list[Path]) -> list[Finding]:
-    """All findings in files and folders."""
+    """Return all findings in files and folders."""
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
     sources = [Source(file) for file in files]
     differentiated = [source for source in sources if source.has_adjoint]
-    for source in differentiated:  # grows while it is walked
+    for source in differentiated:  # grows during iteration
         differentiated += [s for s in sources if s.path.stem in source.imported and s not in differentiated]
     return sorted(finding for source in sources for finding in _lint_file(source, source in differentiated))
 
@@ -134,21 +134,21 @@ def _lint_file(source: Source, differentiated: bool) -> Iterator[Finding]:
 
 
 def _indexed_tuples(function: ast.FunctionDef, tuple_functions: set[str]) -> Iterator[ast.Subscript]:
-    """Subscripts of a call that returns a tuple, or of a name that holds its result."""
+    """Yield subscripts of a call that returns a tuple, or of a name of its result."""
 
     def is_tuple(node: ast.AST) -> bool:
         return isinstance(node, ast.Call) and ast.unparse(node.func) in tuple_functions
 
     assigned = [node for node in ast.walk(function) if _is_call(node) and is_tuple(node.value)]
-    held = {target.id for node in assigned for target in node.targets if isinstance(target, ast.Name)}
+    names = {target.id for node in assigned for target in node.targets if isinstance(target, ast.Name)}
     for node in ast.walk(function):
         if isinstance(node, ast.Subscript):
-            if is_tuple(node.value) or (isinstance(node.value, ast.Name) and node.value.id in held):
+            if is_tuple(node.value) or (isinstance(node.value, ast.Name) and node.value.id in names):
                 yield node
 
 
 def _late_statics(function: ast.FunctionDef) -> Iterator[ast.Call]:
-    """wp.static of what depends on the variable of a loop."""
+    """Yield calls of wp.static that depend on a loop variable."""
     loops = [node for node in ast.walk(function) if isinstance(node, ast.For)]
     variables = {name.id for loop in loops for name in ast.walk(loop.target) if isinstance(name, ast.Name)}
     for node in ast.walk(function):
@@ -158,7 +158,7 @@ def _late_statics(function: ast.FunctionDef) -> Iterator[ast.Call]:
 
 
 def _bare_floats(node: ast.AST) -> Iterator[ast.Constant]:
-    """Float literals in the body of a function that no cast and no wp.static encloses."""
+    """Yield float literals in the body of a function outside casts and wp.static."""
     for child in node.body if isinstance(node, ast.FunctionDef) else ast.iter_child_nodes(node):
         if isinstance(child, ast.Constant) and isinstance(child.value, float):
             yield child
@@ -167,7 +167,7 @@ def _bare_floats(node: ast.AST) -> Iterator[ast.Constant]:
 
 
 def _overwrites(function: ast.FunctionDef) -> Iterator[ast.stmt]:
-    """Assignments to a component that they read; `+=` on an array is an atomic addition, which has an adjoint."""
+    """Yield assignments that read and overwrite a component; `+=` on an array is an atomic addition with an adjoint."""
     arrays = {a.arg for a in function.args.args if a.annotation and ast.unparse(a.annotation).startswith("wp.array")}
     for node in ast.walk(function):
         if isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Subscript):
@@ -175,29 +175,31 @@ def _overwrites(function: ast.FunctionDef) -> Iterator[ast.stmt]:
                 yield node
         elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript):
             written = ast.unparse(node.targets[0])
-            if any(isinstance(part, ast.Subscript) and ast.unparse(part) == written for part in ast.walk(node.value)):
+            if any(
+                isinstance(child, ast.Subscript) and ast.unparse(child) == written for child in ast.walk(node.value)
+            ):
                 yield node
 
 
 def _is_call(node: ast.AST) -> bool:
-    """Whether a node assigns the result of a call."""
+    """Return True if a node assigns the result of a call."""
     return isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
 
 
 def _decorator(function: ast.FunctionDef) -> str:
-    """`wp.func`, `wp.kernel`, or nothing."""
+    """Return `wp.func`, `wp.kernel`, or an empty string."""
     names = (ast.unparse(d.func if isinstance(d, ast.Call) else d) for d in function.decorator_list)
     return next((name for name in names if name in ("wp.func", "wp.kernel")), "")
 
 
 def _keyword(function: ast.FunctionDef, name: str) -> ast.expr | None:
-    """Value of a keyword in the decorators of a function."""
+    """Return the value of a keyword in the decorators of a function."""
     calls = (decorator for decorator in function.decorator_list if isinstance(decorator, ast.Call))
     return next((keyword.value for call in calls for keyword in call.keywords if keyword.arg == name), None)
 
 
 def _backward(function: ast.FunctionDef) -> bool:
-    """Whether a kernel has an adjoint; one that leaves it open, or to a variable, may have."""
+    """Return True if a kernel may have an adjoint, also if the keyword is missing or a variable."""
     if _decorator(function) != "wp.kernel":
         return False
     value = _keyword(function, "enable_backward")
@@ -205,7 +207,7 @@ def _backward(function: ast.FunctionDef) -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the findings; 1 if there are any."""
+    """Print the findings; return 1 if there are any."""
     paths = [Path(argument) for argument in arguments] or [Path(__file__).resolve().parent.parent / "kernels"]
     findings = lint(paths)
     for finding in findings:

@@ -1,8 +1,8 @@
-"""Writes scenes/data/strands.usdc: 512 curled strands on a round head, the groom that scenes and tests read.
+"""Write scenes/data/strands.usdc: 512 curled strands on a round head, the groom of scenes and tests.
 
 Strands of 32 vertices, 0.3 m long and 2 mm thick, rise along the normals of a spherical cap, curl and droop outwards.
 As many grooms do, the file has y up and centimetres, and the head stands below a transform.
-Always the same file:  python tools/make_groom.py
+The output is deterministic:  python tools/make_groom.py
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ STRANDS, VERTICES = 512, 32
 HEAD_RADIUS, LENGTH, STRAND_RADIUS = 0.10, 0.30, 0.001  # metres
 CAP_ANGLE = np.radians(68.0)
 CURL_RADIUS, CURL_TURNS = 0.007, 3.0  # metres, turns along a strand
-FINE = 512  # points of the curve that a strand is sampled from
+FINE = 512  # sample points of the curve of a strand
 CENTIMETRES = 100.0
 HEAD_HEIGHT = 1.6  # metres
 
 
 def roots() -> np.ndarray:
-    """Unit normals spread evenly over the cap, y up, shape (STRANDS, 3): a golden-angle spiral."""
+    """Return unit normals on an even golden-angle spiral over the cap, y up, shape (STRANDS, 3)."""
     k = np.arange(STRANDS) + 0.5
     height = 1.0 - (1.0 - np.cos(CAP_ANGLE)) * k / STRANDS
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * k
@@ -31,7 +31,7 @@ def roots() -> np.ndarray:
 
 
 def strands(seed: int = 7) -> np.ndarray:
-    """Points of the strands in the head's frame [m], y up, shape (STRANDS, VERTICES, 3)."""
+    """Return points of the strands in the head's frame [m], y up, shape (STRANDS, VERTICES, 3)."""
     rng = np.random.default_rng(seed)
     normal = roots()
     droop = rng.uniform(0.75, 1.15, STRANDS)
@@ -41,33 +41,35 @@ def strands(seed: int = 7) -> np.ndarray:
 
 
 def _shapes(normal: np.ndarray, droop: np.ndarray, phase: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Plane curves that leave along the normals and bend over, with a helix around them [m], (STRANDS, FINE, 3).
+    """Return plane curves along the normals that bend over, with a helix around each [m], (STRANDS, FINE, 3).
 
     Args:
         normal: Unit normals of the head, shape (STRANDS, 3).
-        droop: How early a strand bends over, shape (STRANDS,).
+        droop: Rate of the bend of a strand, shape (STRANDS,).
         phase: Angle of the helix at the root, shape (STRANDS,).
-        size: Its radius over CURL_RADIUS, shape (STRANDS,).
+        size: Radius of the helix over CURL_RADIUS, shape (STRANDS,).
     """
     s = np.linspace(0.0, 1.0, FINE)
     fallen = 0.45 * _unit(normal * [1.0, 0.0, 1.0]) - [0.0, 1.0, 0.0]
     binormal = _unit(np.cross(normal, fallen))
     bend = np.arccos(np.sum(normal * _unit(fallen), axis=1))
-    share = np.clip(droop[:, None] * s, 0.0, 1.0)
-    angle = (bend[:, None] * share**2 * (3.0 - 2.0 * share))[..., None]
+    progress = np.clip(droop[:, None] * s, 0.0, 1.0)
+    angle = (bend[:, None] * progress**2 * (3.0 - 2.0 * progress))[..., None]
     tangent = np.cos(angle) * normal[:, None] + np.sin(angle) * np.cross(binormal, normal)[:, None]
     guide = np.cumsum(tangent, axis=1) * (1.1 * LENGTH / FINE)
 
-    turn = (2.0 * np.pi * CURL_TURNS * s + phase[:, None])[..., None]
+    helix_angle = (2.0 * np.pi * CURL_TURNS * s + phase[:, None])[..., None]
     growth = (CURL_RADIUS * size[:, None] * np.clip(s / 0.35, 0.0, 1.0) ** 2)[..., None]
-    return guide + growth * (np.cos(turn) * binormal[:, None] + np.sin(turn) * np.cross(tangent, binormal[:, None]))
+    return guide + growth * (
+        np.cos(helix_angle) * binormal[:, None] + np.sin(helix_angle) * np.cross(tangent, binormal[:, None])
+    )
 
 
 def _resampled(curve: np.ndarray) -> np.ndarray:
-    """VERTICES points at equal steps over the first LENGTH metres of a curve."""
+    """Return VERTICES points at equal steps over the first LENGTH metres of a curve."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    at = np.linspace(0.0, LENGTH, VERTICES)
-    return np.stack([np.interp(at, length, curve[:, k]) for k in range(3)], axis=1)
+    positions = np.linspace(0.0, LENGTH, VERTICES)
+    return np.stack([np.interp(positions, length, curve[:, k]) for k in range(3)], axis=1)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -75,7 +77,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def write(path: Path) -> None:
-    """Writes the groom as a DCC program would."""
+    """Write the groom as a DCC program would."""
     from pxr import Gf, Usd, UsdGeom, Vt
 
     path.parent.mkdir(parents=True, exist_ok=True)
