@@ -203,9 +203,8 @@ def moved(window: Window, parts: int, values: dict, mass: float, dt: float) -> d
 def held_paths(window: Window, parts: int) -> np.ndarray:
     """Return positions of gripped nodes in every frame (F, nodes, 3) [m]; the first frame is the estimated initial state."""
     nodes, _ = held(len(window.points), parts)
-    markers = np.where(
-        np.isfinite(window.markers), window.markers, 0.0
-    )  # markers of grips are finite, and straight lines join them
+    # markers of grips are finite, and straight lines join them
+    markers = np.where(np.isfinite(window.markers), window.markers, 0.0)
     paths = along(markers, parts)[:, nodes]
     paths[0] = along(window.points, parts)[nodes]
     return paths

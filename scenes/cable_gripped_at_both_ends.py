@@ -1,6 +1,6 @@
 """Gripped cable: two grips approach and rotate, loops form, and the cable returns as they separate.
 
-Position and frame of both end nodes are prescribed. One end rotates about the axis of the cable by several counted turns while the
+Position and frame of both end nodes are prescribed. One end rotates about the axis of the cable by counted revolutions while the
 ends approach. A rod without self-crossing keeps its link (Calugareanu 1959, White 1969, Fuller 1971): relative end rotation equals
 twist plus writhe, however much of it the loops take up. The motion is slow and damped, so that it ends in the initial equilibrium.
 The cable has no self-contact: at five turns its loops close and pass through themselves, which loses two turns for good.
@@ -28,7 +28,7 @@ def build(
     """Build the cable along x, under its weight.
 
     Args:
-        turns: turns of the last end about x, at half the time
+        turns: revolutions of the last end about x, at half the time
         approach: approach of the ends over the length of the cable, at half the time
         n: edges of the cable
         stiffness: EI [N m^2]; GJ is a quarter of it, as of a stranded cable
@@ -89,7 +89,7 @@ def writhe(points: np.ndarray) -> float:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return rotation of the last end in turns, twist and writhe, and the position error of end nodes [m]."""
+    """Return revolutions of the last end, twist and writhe, and the position error of end nodes [m]."""
     from ddg_warp.ask.inquiry import total_twist
 
     points = state.points().reshape(-1, 3)[: model.curves.counts[0]]

@@ -17,9 +17,7 @@ MATERIAL = ddg.Material(young=3e5, poisson=0.3, density=500.0, viscosity=5e-3)
 RADIUS = 0.2  # m, of the ball
 RANGE = 2e-3  # m, activation distance
 RESTS = 1.0  # s, time at which the damped cloth is at rest
-REFUSED = (
-    20  # pairs: where a vertex slides around a fold, the straight line between both ends of its motion cuts the fold
-)
+REFUSED = 20  # pairs: the straight motion of a vertex that slides around a fold cuts the fold
 
 
 def build(
@@ -64,7 +62,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Check that nothing interpenetrates, and that ball and floor carry the weight at rest, part of it by friction."""
+    """Check that nothing interpenetrates, and that ball and floor carry the weight at rest, partly by friction."""
     names = ("force of obstacles less inertia over weight",)
     checks = _touching.checks(result, REFUSED)
     return checks + once_reached(result, RESTS, names, lambda: [_touching.weight_check(result, 0.1)])

@@ -31,7 +31,7 @@ def build(
     Args:
         around: cells around the cylinder
         along: cells along it
-        turns: turns of each end, at the end of the run
+        turns: revolutions of each end, at the end of the run
         dt: time step [s]
         friction: Coulomb friction coefficient
         law: barrier or penalty

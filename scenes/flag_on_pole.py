@@ -1,7 +1,7 @@
 """Flag on a pole: a wind veers and dies; the flag moves around the pole, presses against it, and hangs in folds.
 
 The hoist of the flag is sewn to a rope with fixed ends next to the pole. The wind is a uniform dead force on the cloth. It blows away
-from the pole first and rotates by half a turn, so that cloth and rope press against the pole. In calm air the flag falls onto itself
+from the pole first and rotates by 180 degrees, so that cloth and rope press against the pole. In calm air the flag falls onto itself
 and the pole. At every time the pole and the ends of the rope carry weight and inertia.
 """
 

@@ -108,9 +108,7 @@ def check(result) -> list[ddg.Check]:
 def in_time(result, measured: np.ndarray, names) -> list[ddg.Check]:
     """Check frequency and damping of the run against the eigenmode of nearest frequency."""
     factor, phase = step_factor(result.series["tip_x"])
-    frequency = (
-        2.0 * np.tan(0.5 * phase) / result.dt * np.sqrt(LENGTH / GRAVITY)
-    )  # inverse of the phase of a midpoint step
+    frequency = 2.0 * np.tan(0.5 * phase) / result.dt * np.sqrt(LENGTH / GRAVITY)  # inverse of the midpoint phase
     nearest = measured[np.abs(measured - frequency).argmin()]
     return [
         ddg.Check(names[0], frequency / nearest, 1.0, 1e-4, "eigenvalue"),

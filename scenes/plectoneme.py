@@ -41,7 +41,7 @@ def build(
 
     Args:
         angle: angle between strands and axis that sets the tension [rad]
-        turns: turns of the end
+        turns: revolutions of the end
         tail: initial length of the rod on either side over its radius
         edge: length of an edge over the radius of the rod
         steps: time steps

@@ -18,7 +18,7 @@ def build(turns: float = 1.0, n: int = 200) -> ddg.Scene:
     """Build the cantilever along x, rolled towards z.
 
     Args:
-        turns: turns of the end
+        turns: revolutions of the end
         n: edges of the rod
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2, analysis=ddg.Statics(load_steps=max(2, round(10 * turns))))

@@ -22,9 +22,7 @@ REST = 2.0  # s; end of the head motion
 TURN = 0.9  # rad
 # Pa, of strands that sag, and of sag-free ones: softer ones flip over (`sag_free_groom`)
 YOUNG = {False: 4.0e7, True: 1.5e8}
-CROWD = (
-    512  # strands, from which on contact radii shrink, so that radii with the activation distance fill an equal volume
-)
+CROWD = 512  # strands, above which contact radii shrink to fill a constant volume with the activation distance
 # Relative to the weight of a strand. Measured: in contact position errors are a sixth of the change by half the step.
 RTOL = {False: 1e-6, True: 1e-1}
 # Measured: float64 matrices take a sixth more time in contact on the CPU. States differ by 1e-5 m at 0.5 s, and by 9e-3

@@ -39,10 +39,8 @@ def random_rod(rng: np.random.Generator) -> dict:
     nodes = int(rng.integers(8, 65))
     length = rng.uniform(0.1, 0.6)  # m
     s = np.linspace(0.0, length, nodes)[:, None]
-    turns, winding = (
-        rng.uniform(0.2, 2.0),
-        rng.uniform(0.2, 0.8),
-    )  # number of turns of the helix; fraction of the length along the circumference
+    # number of turns of the helix, and fraction of the length along the circumference
+    turns, winding = rng.uniform(0.2, 2.0), rng.uniform(0.2, 0.8)
     phase = 2.0 * np.pi * turns * s / length
     across, along = winding * length / (2.0 * np.pi * turns), np.sqrt(1.0 - winding**2)
     shape = np.hstack([across * np.cos(phase), across * np.sin(phase), along * s])

@@ -91,9 +91,8 @@ def modes(model, state, count: int = 24) -> dict[str, tuple[np.ndarray, np.ndarr
     eigen = spectrum(model, state, count, tangent=tangent)
     nodes = slice(int(model.chains[0].first[0]), int(model.chains[0].first[0] + model.chains[0].own[0]))
     shapes = eigen.modes.reshape(-1, 4, eigen.modes.shape[1])
-    fractions = (tangent.mass.reshape(-1, 4)[..., None] * shapes**2).sum(
-        axis=0
-    )  # fractions of kinetic energy of x, y, z and the twist angle
+    # fractions of kinetic energy of x, y, z and the twist angle
+    fractions = (tangent.mass.reshape(-1, 4)[..., None] * shapes**2).sum(axis=0)
     x, y, z, twist = shapes[nodes].transpose(1, 0, 2)
     rotation = 0.5 * np.arctan2(2.0 * (y * z).sum(axis=0), ((z * z) - (y * y)).sum(axis=0))  # principal axis of (y, z)
     kinds = {

@@ -102,7 +102,7 @@ def deflection(t, speed: float, frequency: float, bow: float, start: float):
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return the amplitude of the middle [m], and the twist of the last edge in turns."""
+    """Return the amplitude of the middle [m], and the revolutions of the last edge."""
     points = state.points().reshape(-1, 3)[: model.curves.counts[0]]
     edges = len(points) - 1
     return {

@@ -41,7 +41,7 @@ def build(
         rings: rings about the tube; the large case has 175
         nodes: nodes of a strand; the large case has 256, 0 takes 6 edges between rings
         around: nodes of a ring, the same number between any two strands; the large case has 444, 0 takes 6 between strands
-        turns: turns of each end in the run of one second
+        turns: revolutions of each end in the run of one second
         friction: Coulomb friction coefficient
         damping: mass-proportional damping [1/s]
         dt: time step [s]

@@ -177,7 +177,7 @@ def shapes(case: Case, state) -> np.ndarray:
 def largest_residual(integrator: ddg.Integrator, state) -> float:
     """Return the largest residual of a dof [N or N m] after the last step, by another evaluation of uncoupled rods.
 
-    Their solver keeps the residual before its last update. The evaluation resumes rods that failed at an earlier state, so call it
+    Their solver keeps the residual before its last update. The evaluation resumes rods that stopped at an earlier state, so call it
     last.
     """
     worst = [] if integrator._net is None else [np.abs(integrator._net.newton.right.numpy()).max()]
