@@ -63,7 +63,7 @@ WORDS = {
     "W12": (r"\b(rests|resting)\b", "sleeping, lies at rest"),
     "W13": (r"\bshares?\b", "step fraction, weight"),
     "W14": (r"\bslots?\b", "local node index"),
-    "W15": (r"\bplaces?\b", "index, position, path node"),
+    "W15": (r"(?<!in )\bplaces?\b", "index, position, path node"),
     "W16": (r"\bheld\b", "fixed, prescribed"),
     "W17": (r"\b(brings?|brought)\b", "contributes, adds"),
     "W18": (r"\bpush(es|ed)?\b|\btouch(es|ed|ing)?\b", "in contact"),
@@ -143,13 +143,13 @@ def comments(source: str) -> Iterator[tuple[int, str]]:
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type != tokenize.COMMENT:
             continue
-        line = token.start[0]
-        if line != last + 1 or not block:
+        line, trailing = token.start[0], token.line[: token.start[1]].strip() != ""
+        if line != last + 1 or trailing or not block:
             if block:
                 yield start, "\n".join(block)
             block, start = [], line
         block.append(token.string.lstrip("# "))
-        last = line
+        last = -1 if trailing else line
     if block:
         yield start, "\n".join(block)
 

@@ -1,4 +1,7 @@
-"""Central differences of steps and equilibria by every input of theirs, for the tests of gradients."""
+"""Central differences of steps and equilibria by every input, for the tests of gradients."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,6 +13,9 @@ DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
 TIGHT = {"rtol": 1e-13}
 CLOSE = 1e-6  # relative error of a gradient, as asked
+# A difference of fourth order: so many steps along a direction, each a world of one model, and the weights of the losses there.
+SIDES, WEIGHTS = (2.0, 1.0, -1.0, -2.0), (-1.0 / 12.0, 2.0 / 3.0, -2.0 / 3.0, 1.0 / 12.0)
+LARGEST = 1e-3  # relative change of a parameter by a step of differences
 
 
 def built(scene):
@@ -104,15 +110,59 @@ def along(gradient: np.ndarray, meant: np.ndarray) -> np.ndarray:
     return np.where(gradient < 0.0, -1.0, 1.0) * np.abs(meant)
 
 
+@dataclass
+class Shift:
+    """A direction in one array that a step reads.
+
+    Attributes:
+        name: of the array.
+        values: of one world, the world's axis included.
+        gradient: derivatives of the loss by the values.
+        direction: of the same shape, along which nothing in the gradient cancels.
+        write: `write(model, state, values)` puts the values of all worlds into a model of several worlds, or a state of that model.
+        axis: of the worlds; None of an array without worlds.
+    """
+
+    name: str
+    values: np.ndarray
+    gradient: np.ndarray
+    direction: np.ndarray
+    write: Callable
+    axis: int | None
+
+    @property
+    def slope(self) -> float:
+        """Derivative of the loss along the direction."""
+        return float((self.gradient * self.direction).sum())
+
+    def by_worlds(self, step: float) -> np.ndarray:
+        """Values of all worlds, shifted by SIDES steps."""
+        return np.concatenate([self.values + side * step * self.direction for side in SIDES], self.axis)
+
+
+def world_axis(model, name: str, values: np.ndarray) -> int | None:
+    """Axis of the worlds of an array of a state; None of a placeholder, which is one for all worlds."""
+    group, _, name = name.partition("/")
+    if group != "net":
+        axis = 2 if name in ("frame", "last") else 1
+        columns = model.groups[int(group)].columns
+        return axis if values.ndim > axis and values.shape[axis] == columns else None
+    if name in ("q", "v", "a"):
+        return 0
+    elements = model.net.edges if name == "frame" else model.net.sets[int(name.rpartition("_")[2])].elements
+    return 1 if values.shape[1] == model.worlds * elements else None
+
+
 class Difference:
     """The loss `product(after, weights)` of steps from a state, as a function of what they read.
 
     Args:
         advance: state -> state after all steps, with a solver of its own.
+        advancing: model -> `advance` of a model with the same scene.
     """
 
-    def __init__(self, model, state, weights, advance):
-        self.model, self.state, self.weights, self.advance = model, state, weights, advance
+    def __init__(self, model, state, weights, advance, advancing=None):
+        self.model, self.state, self.weights, self.advance, self.advancing = model, state, weights, advance, advancing
 
     def loss(self) -> float:
         return product(self.advance(self.state.copy()), self.weights)
@@ -127,21 +177,27 @@ class Difference:
         near, far = ((values[side] - values[-side]) / (2.0 * side * step) for side in (1.0, 2.0))
         return (4.0 * near - far) / 3.0
 
-    def by_entry(self, name: str, direction: np.ndarray, about: float) -> float:
-        """Along a direction in an array of the first state, where it is `about` as large; by steps that change the loss by CHANGE."""
-        array, step = entries(self.state)[name], CHANGE / max(abs(about), 1e-6)
-        values = arrays.download(array)
-        return self.by(lambda x: arrays.assign(array, values + x * direction), step)
-
-    def by_parameter(self, table, name: str, direction: np.ndarray, step: float) -> float:
-        """Along a direction in the values of a parameter of a group or an element set."""
-        values = table[name].copy()
-
-        def change(x):
-            table.set(**{name: values + x * direction})
-            self.model.version += 1
-
-        return self.by(change, step)
+    def along(self, shifts: list[Shift], step: float) -> float:
+        """Derivative, of fourth order, along the sum of directions: SIDES steps of it are the worlds of one model."""
+        wide = self.model.scene.build(device=DEVICE, precision="float64", worlds=len(SIDES))
+        state = wide.state()
+        state.time = self.state.time
+        axes = {}
+        for name, array in self.state.arrays().items():
+            values, new = arrays.download(array), state.arrays()[name]
+            size = arrays.download(new).shape
+            axes[name] = world_axis(self.model, name, values) if size != values.shape else None
+            arrays.assign(new, np.tile(values, [all_ // one for all_, one in zip(size, values.shape, strict=True)]))
+        for name, array in (self.model.net.touching if self.model.net else {}).items():
+            wide.net.touching[name].assign(np.tile(array.numpy(), (len(SIDES),) + (1,) * (array.ndim - 1)))
+        for shift in (shift for shift in shifts if shift.axis is not None):
+            shift.write(wide, state, shift.by_worlds(step))
+        after, losses = self.advancing(wide)(state), np.zeros(len(SIDES))
+        for name, array in entries(after).items():
+            if axes[name] is not None:
+                pieces = np.split(arrays.download(array), len(SIDES), axes[name])
+                losses += [float((piece * self.weights[name]).sum()) for piece in pieces if name in self.weights]
+        return float(losses @ WEIGHTS) / step
 
     def by_length(self, dt: float, step: float, scheme: str = "implicit_euler") -> float:
         """By the length of the one step from the state, dt long; each length is one integrator's."""
@@ -175,13 +231,16 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
 def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
     """Derivatives of the loss of some steps by the first state, what each step read, the last first, and the loss's `Difference`."""
     weights = directions(model, state, 5)
-    # one for all differences, as a graph takes longer than its steps
-    integrator = ddg.Integrator(model, scheme=scheme, **TIGHT)
 
-    def advance(start):
-        for _ in range(steps):
-            start = integrator.step(start, dt)
-        return start
+    def advancing(model):
+        integrator = ddg.Integrator(model, scheme=scheme, **TIGHT)
+
+        def advance(start):
+            for _ in range(steps):
+                start = integrator.step(start, dt)
+            return start
+
+        return advance
 
     adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
     tapes, at = [], state
@@ -192,20 +251,90 @@ def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
     for tape in reversed(tapes):
         given, read = adjoint.pull(tape, given)
         inputs.append(read)
-    return given, inputs, Difference(model, state.copy(), weights, advance)
+    return given, inputs, Difference(model, state.copy(), weights, advancing(model), advancing)
+
+
+def tables(model) -> list:
+    """Parameter tables of all parts."""
+    return [group.parameters for group in model.groups] + (
+        [part.parameters for part in model.net.sets] if model.net else []
+    )
+
+
+def by_parameters(model, inputs: list) -> list[np.ndarray]:
+    """Derivatives by the parameters of each table, (rows, ...)."""
+    found = [arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
+    return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.net else [])
+
+
+def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
+    """Sum derivatives of elements to the shape of the values, elements along the first axis."""
+    for axis in (0, 1):
+        if shape[axis] == 1:
+            values = values.sum(axis, keepdims=True)
+    return values
+
+
+def state_shifts(model, gradient, state) -> list[Shift]:
+    """Return a direction in every array of the first state."""
+    shifts = []
+    for name, meant in directions(model, state, 7).items():
+        values, slopes = arrays.download(entries(state)[name]), arrays.download(entries(gradient)[name])
+
+        def write(_model, wide, new, name=name):
+            arrays.assign(wide.arrays()[name], new)
+
+        shifts.append(Shift(name, values, slopes, along(slopes, meant), write, world_axis(model, name, values)))
+    return shifts
+
+
+def parameter_shifts(model, inputs: list, names=None, seed: int = 11) -> list[Shift]:
+    """Return a direction in every parameter of every table, or in the named ones; `inputs` were read by the steps."""
+    shifts, random = [], np.random.default_rng(seed)
+    per_step = [by_parameters(model, read) for read in inputs]
+    for number, table in enumerate(tables(model)):
+        total = sum(read[number] for read in per_step)
+        of_rods = number < len(model.groups)
+        for row, (name, values) in enumerate(table.values.items()):
+            if names is not None and name not in names:
+                continue
+            own = total[row] if of_rods else total[row].reshape(model.worlds, -1)
+            worlds = 1 if of_rods else 0
+            if of_rods:  # a column a rod, of every world
+                values = np.broadcast_to(values, (values.shape[0], own.shape[1]))
+            slopes = shared(own, values.shape)
+            size = random.uniform(0.5, 1.0, values.shape) * (np.abs(values).max() or 1.0)
+
+            def write(wide, _state, new, number=number, name=name):
+                wide.note_change(tables(wide)[number].set(**{name: new}))
+
+            shifts.append(Shift(f"{number}: {name}", values, slopes, along(slopes, size), write, worlds))
+    return shifts
+
+
+def check(difference: "Difference", shifts: list[Shift]) -> None:
+    """Compare the derivative along the sum of all directions, each of one size in the loss, with the difference along it.
+
+    A parameter changes by at most LARGEST a step and so may count for less. Where the two differ, each direction is tried alone.
+    """
+    for shift in shifts:
+        slope = abs(shift.slope)
+        largest = LARGEST / CHANGE if ":" in shift.name else np.inf
+        shift.direction = shift.direction * (min(1.0 / slope, largest) if slope > 1e-9 else 1.0)
+    wanted = sum(shift.slope for shift in shifts)
+    found = difference.along(shifts, CHANGE)
+    if not close(wanted, found):
+        alone = {shift.name: (shift.slope, difference.along([shift], CHANGE)) for shift in shifts}
+        raise AssertionError(f"gradient {wanted:.12g}, difference {found:.12g}; each alone: {alone}")
 
 
 def close(found: float, wanted: float, scale: float = 0.0) -> bool:
     return abs(found - wanted) <= CLOSE * max(abs(wanted), scale)
 
 
-def check_state(model, gradient, difference) -> None:
-    """By every array of the first state, along a direction in which nothing cancels."""
-    for entry, meant in directions(model, difference.state, 7).items():
-        values = arrays.download(entries(gradient)[entry])
-        direction = along(values, meant)
-        found = float((values * direction).sum())
-        assert close(found, difference.by_entry(entry, direction, found)), entry
+def check_state(model, gradient, difference, *others: Shift) -> None:
+    """Check the derivatives by every array of the first state, and by others."""
+    check(difference, [*state_shifts(model, gradient, difference.state), *others])
 
 
 def check_length(own, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:

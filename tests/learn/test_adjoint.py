@@ -4,21 +4,19 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import arrays
 from ddg_warp.compile import precision
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.learn.adjoint import Adjoint
 from tests.learn.differences import (
     TIGHT,
-    along,
     built,
     check_length,
     check_state,
     close,
-    directions,
     entries,
     lively,
+    parameter_shifts,
     pulled,
 )
 
@@ -131,27 +129,6 @@ SCENES = {
 }
 
 
-def tables(model) -> list:
-    """Parameter tables of all parts."""
-    return [group.parameters for group in model.groups] + (
-        [part.parameters for part in model.net.sets] if model.net else []
-    )
-
-
-def by_parameters(model, inputs: list) -> list[np.ndarray]:
-    """Derivatives by the parameters of each table, (rows, ...)."""
-    found = [arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
-    return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.net else [])
-
-
-def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
-    """Derivatives of every element summed to those of values of this shape, elements along their first axis."""
-    for axis in (0, 1):
-        if shape[axis] == 1:
-            values = values.sum(axis, keepdims=True)
-    return values
-
-
 def differentiated(name: str, scheme: str, steps: int):
     model = built(SCENES[name]())
     return model, *pulled(model, lively(model, scheme=scheme), DT, steps, scheme)
@@ -161,26 +138,9 @@ CASES = [(name, scheme) for name in SCENES for scheme in ("implicit_euler", "imp
 
 
 @pytest.mark.parametrize(("name", "scheme"), CASES)
-def test_a_step_by_its_state(name, scheme):
-    model, gradient, _, difference = differentiated(name, scheme, 1)
-    check_state(model, gradient, difference)
-
-
-@pytest.mark.parametrize(("name", "scheme"), CASES)
-def test_a_step_by_its_parameters(name, scheme):
-    model, _, (inputs,), difference = differentiated(name, scheme, 1)
-    random = np.random.default_rng(11)
-    for number, (table, found) in enumerate(zip(tables(model), by_parameters(model, inputs), strict=True)):
-        for row, (parameter, values) in enumerate(table.values.items()):
-            size = np.abs(values).max()
-            own = found[row] if number < len(model.groups) else found[row].reshape(model.worlds, -1)
-            gradient = shared(own, values.shape)
-            direction = along(gradient, random.uniform(0.5, 1.0, values.shape) * (size or 1.0))
-            reference = difference.by_parameter(table, parameter, direction, 1e-3)
-            scale = 1e-4 * abs(
-                difference.loss()
-            )  # what is less than a change of that much by as much again is not seen
-            assert close(float((gradient * direction).sum()), reference, scale), parameter
+def test_a_step_by_its_state_and_parameters(name, scheme):
+    model, gradient, inputs, difference = differentiated(name, scheme, 1)
+    check_state(model, gradient, difference, *parameter_shifts(model, inputs))
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
@@ -206,12 +166,7 @@ LONG += [(name, "implicit_midpoint") for name in ("twisted", "planar", "joined")
 @pytest.mark.parametrize(("name", "scheme"), LONG)
 def test_twenty_steps(name, scheme):
     model, gradient, inputs, difference = differentiated(name, scheme, 20)
-    check_state(model, gradient, difference)
-    table = tables(model)[0]
-    row, (parameter, values) = 1, list(table.values.items())[1]
-    found = sum(by_parameters(model, read)[0][row].sum() for read in inputs)
-    reference = difference.by_parameter(table, parameter, np.ones_like(values), 1e-4 * values.max())
-    assert close(float(found), reference, scale=1e-4 * abs(difference.loss()) / values.max())
+    check_state(model, gradient, difference, *parameter_shifts(model, inputs))
 
 
 def test_gradients_repeat_bit_by_bit():
@@ -352,19 +307,7 @@ def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
     """Both are found at the start of a solve, by velocities there, and by nodes there or where the step is predicted to lead."""
     monkeypatch.setattr(precision, "TURNED", 1e-3)
     model, gradient, inputs, difference = differentiated(name, scheme, 2)
-    for entry, meant in directions(model, difference.state, 7).items():
-        values = arrays.download(entries(gradient)[entry])
-        if not np.abs(values * meant).max() > 1e-9:  # as by velocities without inertia
-            assert abs(difference.by_entry(entry, meant, 1.0)) < 1e-3, entry
-            continue
-        direction = along(values, meant)
-        found = float((values * direction).sum())
-        assert close(found, difference.by_entry(entry, direction, found)), entry
-    table = tables(model)[0]
-    row, (parameter, values) = 1, list(table.values.items())[1]
-    found = sum(by_parameters(model, read)[0][row].sum() for read in inputs)
-    reference = difference.by_parameter(table, parameter, np.ones_like(values), 1e-4 * values.max())
-    assert close(float(found), reference, scale=1e-4 * abs(difference.loss()) / values.max())
+    check_state(model, gradient, difference, *parameter_shifts(model, inputs))
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])

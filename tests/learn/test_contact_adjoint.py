@@ -11,7 +11,18 @@ from ddg_warp.learn.adjoint import Adjoint
 from ddg_warp.learn.net_solve import NetSolve
 from ddg_warp.solve.net.exact import ExactSystem
 from tests.learn.contact_cases import DT, SCENES, scene_of, touching
-from tests.learn.differences import CHANGE, TIGHT, built, check_length, check_state, close, entries, pulled
+from tests.learn.differences import (
+    TIGHT,
+    Shift,
+    along,
+    built,
+    check,
+    check_length,
+    check_state,
+    entries,
+    parameter_shifts,
+    pulled,
+)
 
 RUBBING = {"friction": 0.3, "velocity": 0.05}  # what slides does so at twice the velocity, what turns slower
 SLIDING = 0.1  # [m/s]
@@ -42,25 +53,25 @@ def by_number(inputs: list, name: str) -> np.ndarray:
     return 0.5 * (found + found.swapaxes(1, 2))
 
 
-def check_numbers(model, inputs: list, difference, names: tuple) -> None:
-    """Along a change of each in which nothing cancels."""
+def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
+    """Return a direction in each number of contact."""
+    shifts = []
     for name in names:
-        own, gradient = model.net.touching[name], by_number(inputs, name)
-        values = own.numpy().copy()
-        direction = np.where(gradient < 0.0, -1.0, 1.0) * values
-        found = float((gradient * direction).sum())
-        assert found != 0.0, name
-        step = min(1e-3, 0.3 * CHANGE / abs(found))
-        reference = difference.by(lambda x, a=own, v=values, d=direction: a.assign(v + x * d), step)
-        assert close(found, reference, scale=1e-4 * abs(difference.loss())), (name, found, reference)
+        values, gradient = model.net.touching[name].numpy(), by_number(inputs, name)
+        assert gradient.any(), name
+
+        def write(wide, _state, new, name=name):
+            wide.net.touching[name].assign(new)
+
+        shifts.append(Shift(f"contact: {name}", values, gradient, along(gradient, values), write, 0))
+    return shifts
 
 
 @each_law
 @each_scene
 def test_a_step_by_its_state_and_numbers(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 1)
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("stiffness", "range", "radius"))
+    check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius")))
 
 
 @each_law
@@ -68,8 +79,9 @@ def test_a_step_by_its_state_and_numbers(name, law):
 @each_scene
 def test_a_step_that_rubs(name, law, form):
     model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **RUBBING)
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
+    check_state(
+        model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
+    )
 
 
 @pytest.mark.parametrize(("lags", "law"), [(2, "penalty"), (3, "barrier")])
@@ -77,8 +89,9 @@ def test_a_step_that_rubs(name, law, form):
 def test_friction_that_is_lagged_anew(name, law, lags):
     """Two steps of some solves each, which lag what is of the one before."""
     model, gradient, inputs, difference = differentiated(name, law, 2, SLIDING, lags=lags, **RUBBING)
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
+    check_state(
+        model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
+    )
 
 
 @lagged_once_or_twice
@@ -88,8 +101,9 @@ def test_friction_that_rolls_rods(name, lags):
     model, gradient, inputs, difference = differentiated(
         name, "barrier", 2, SLIDING, lags=lags, rolling=True, **RUBBING
     )
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
+    check_state(
+        model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
+    )
 
 
 @pytest.mark.parametrize("lags", [2, 3])
@@ -119,24 +133,21 @@ def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):
 def test_friction_by_direction(name, speed, ways, lags):
     """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
     model, gradient, inputs, difference = differentiated(name, "barrier", 2, speed, ways, lags=lags, **RUBBING)
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("radius", "friction"))
+    check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
 @each_law
 @pytest.mark.parametrize("name", ["crossing rods", "rod on ball", "rod on mesh", "sheets"])
 def test_eight_steps_of_sliding(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **RUBBING)
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("stiffness", "radius", "friction"))
+    check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "radius", "friction")))
 
 
 @pytest.mark.parametrize("name", ["parallel rods", "rod on plane"])
 def test_what_sticks_creeps(name):
     """At a tenth of the speed that slides: friction is then all but its bound times the slip."""
     model, gradient, inputs, difference = differentiated(name, "barrier", 3, friction=0.8, velocity=0.5)
-    check_state(model, gradient, difference)
-    check_numbers(model, inputs, difference, ("friction",))
+    check_state(model, gradient, difference, *number_shifts(model, inputs, ("friction",)))
 
 
 @lagged_once_or_twice
@@ -152,11 +163,7 @@ def test_a_step_by_its_length(name, lags):
 def test_elements_of_what_touches(lags):
     """Stiffnesses of rods and sheets, as without contact."""
     model, _, inputs, difference = differentiated("rod on sheet", "barrier", 2, SLIDING, lags=lags, **RUBBING)
-    for part, found in zip(model.net.sets, zip(*(read[-1].parameters for read in inputs), strict=True), strict=True):
-        row, (parameter, values) = 1, list(part.parameters.values.items())[1]
-        total = float(sum(own.numpy()[row].sum() for own in found))
-        reference = difference.by_parameter(part.parameters, parameter, np.ones_like(values), 1e-4 * values.max())
-        assert close(total, reference, scale=1e-4 * abs(difference.loss()) / values.max()), parameter
+    check(difference, parameter_shifts(model, inputs))
 
 
 @lagged_once_or_twice

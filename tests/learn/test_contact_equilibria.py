@@ -12,10 +12,9 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.learn.adjoint import EquilibriumAdjoint
 from tests.learn import differences
 from tests.learn.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
-from tests.learn.differences import Difference, along, built, close, cotangent
-from tests.learn.test_adjoint import by_parameters, shared, tables
-from tests.learn.test_contact_adjoint import check_numbers
-from tests.learn.test_equilibrium_adjoint import RTOL, check_load, position_weights
+from tests.learn.differences import built, check, cotangent, parameter_shifts
+from tests.learn.test_contact_adjoint import number_shifts
+from tests.learn.test_equilibrium_adjoint import RTOL, check_load, difference_of, position_weights
 
 slow = pytest.mark.slow
 WAY = np.linspace(-0.05, 0.05, 7)
@@ -72,25 +71,17 @@ def solved(name: str, law: str):
     assert np.abs(model.contacts(state).force).max() > 1e-4
     weights = position_weights(model, state)
     inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
-    solver = statics.Equilibrium(model, statics.StaticsOptions(rtol=RTOL))
-    difference = Difference(model, state, weights, lambda start: solver.load(start, start=1.0))
-    return model, inputs, difference
+    return model, inputs, difference_of(model, state, weights, start=1.0)
 
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
 @pytest.mark.parametrize("name", CASES)
 def test_an_equilibrium_in_contact_by_its_parameters(name, law):
     model, inputs, difference = solved(name, law)
-    random = np.random.default_rng(11)
-    for table, found in zip(tables(model), by_parameters(model, inputs), strict=True):
-        for row, (parameter, values) in enumerate(table.values.items()):
-            if parameter.endswith("viscosity"):
-                continue
-            gradient, size = shared(found[row].reshape(model.worlds, -1), values.shape), np.abs(values).max()
-            direction = along(gradient, random.uniform(0.5, 1.0, values.shape) * (size or 1.0))
-            reference = difference.by_parameter(table, parameter, direction, 1e-4)
-            assert close(float((gradient * direction).sum()), reference, 1e-3 * abs(difference.loss())), parameter
-    check_numbers(model, [inputs], difference, ("stiffness", "range", "radius"))
+    check(
+        difference,
+        [*parameter_shifts(model, [inputs]), *number_shifts(model, [inputs], ("stiffness", "range", "radius"))],
+    )
 
 
 @pytest.mark.parametrize("name", ["ball", "crossing rods"])
@@ -107,9 +98,7 @@ def rubbing(name: str, law: str, velocity: float, **contact):
     weights = {name: values * (name == "net/q") for name, values in position_weights(model, state).items()}
     weights["net/q"][np.arange(len(weights["net/q"])) % model.net.blocks >= model.net.host.nodes] = 0.0
     inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
-    solver = statics.Equilibrium(model, statics.StaticsOptions(rtol=RTOL))
-    difference = Difference(model, model.state(), weights, solver.load)
-    return model, state, inputs, difference
+    return model, state, inputs, difference_of(model, model.state(), weights)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +116,7 @@ def test_an_equilibrium_that_rubs(name, velocity, law):
     touching = model.contacts(state)
     share = np.linalg.norm(touching.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(touching.force, axis=1), 1e-12)
     assert share.max() > (0.05 if velocity == 1e-4 else 1e-3)
-    check_numbers(model, [inputs], difference, ("stiffness", "range", "radius", "friction"))
+    check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
     place = model.net.host.rods[-1].nodes[3] if model.net.host.rods else model.net.host.shells[0].nodes[-1]
     check_load(model.net.host, place, inputs[-1].load.numpy()[place], difference)
 
@@ -138,13 +127,13 @@ def test_an_equilibrium_that_rubs(name, velocity, law):
 def test_an_equilibrium_with_rods_that_roll(name, velocity):
     """Edges turn in space on their way, by which frames turn beside those that are carried there straight."""
     model, _, inputs, difference = rubbing(name, "barrier", velocity, rolling=True)
-    check_numbers(model, [inputs], difference, ("stiffness", "range", "radius", "friction"))
+    check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
 
 
 @pytest.mark.parametrize("name", ["plane", "ball"])
 def test_an_equilibrium_that_rubs_by_direction(name):
     model, _, inputs, difference = rubbing(name, "barrier", 1e-4, ways=(0.2, 0.5, 0.3))
-    check_numbers(model, [inputs], difference, ("stiffness", "radius", "friction"))
+    check(difference, number_shifts(model, [inputs], ("stiffness", "radius", "friction")))
 
 
 def test_the_way_has_to_be_known():
@@ -186,7 +175,7 @@ def test_gradients_go_through_all_load_steps(name):
     """By poses at the end of the way, which all load steps have a part of, by forces, and numbers of contact."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
-    from tests.learn.test_torch import check
+    from tests.learn.test_torch import check as check_along
 
     model, poses = gripped(*GRIPPED[name])
     own = Simulator(model, 0.01)
@@ -204,7 +193,7 @@ def test_gradients_go_through_all_load_steps(name):
     }
     given |= {"poses": torch.tensor(poses), "forces": 1e-4 * force}
     sizes = {"contact_stiffness": 0.05, "contact_friction": 1e-3, "contact_radius": 1e-6 * RADIUS}
-    check(loss, given, sizes | {"poses": 1e-5, "forces": 1e-6})
+    check_along(loss, given, sizes | {"poses": 1e-5, "forces": 1e-6})
 
 
 @pytest.mark.parametrize("name", ["plane", "rolling"])
