@@ -1,1 +1,1 @@
-"""From a description to arrays: storages, dofs, elements, conditions."""
+"""Compilation of a scene to arrays: dof maps, element sets, boundary conditions."""

@@ -1,8 +1,8 @@
-"""From a meridian, its material and its supports to element sets, masses and loads of a shell of revolution.
+"""Element sets, masses and loads of a shell of revolution from its meridian, material and supports.
 
-Kirchhoff and Love's shell with St. Venant and Kirchhoff's law (Reissner 1950; Libai and Simmonds, The Nonlinear Theory of Elastic
-Shells, 1998, chapter 5): the membrane on edges, where both stretches are known in the middle, and the bending on nodes, where
-the turning of the tangent is. Every node has half of its edges' surface; at poles and rims it is that of the one edge.
+Kirchhoff-Love shell with the St. Venant-Kirchhoff law (Reissner 1950; Libai and Simmonds, The Nonlinear Theory of Elastic Shells, 1998,
+chapter 5). Membrane elements are edges, with both stretches at the midpoint. Bending elements are nodes, with the rotation of the
+tangent. A node has half of the surface of each adjacent edge.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from ddg_warp.kernels.terms import AXISYMMETRIC
 
 @dataclass
 class NetMeridian:
-    """A shell of revolution of the net: blocks of its nodes (n,), and its geometry and material at rest.
+    """Shell of revolution in the coupled system: dof blocks of its nodes (n,), rest geometry and material.
 
     Attributes:
-        radius, length: of edges, natural (n - 1,) [m].
+        radius, length: natural radius and length of edges (n - 1,) [m].
         halves: natural surface of either half of every edge (n - 1, 2) [m^2].
         curvature: natural curvatures at nodes, along and around (n, 2) [1/m].
-        tangent: direction of the meridian at its ends (2, 2), extrapolated or as a clamp has it.
-        kind: of the ends, "pole", "clamped" or "free".
-        supports: places among the scene's of the ring supports that clamp the ends (2,), -1 without.
+        tangent: direction of the meridian at its ends (2, 2), extrapolated or prescribed by a clamp.
+        kind: kinds of the ends, "pole", "clamped" or "free".
+        supports: indices of the ring supports that clamp the ends (2,), -1 without.
     """
 
     nodes: np.ndarray
@@ -44,28 +44,28 @@ class NetMeridian:
 
     @property
     def ends(self) -> np.ndarray:
-        """Blocks at the ends of every edge (n - 1, 2)."""
+        """Dof blocks of both nodes of every edge (n - 1, 2)."""
         return np.column_stack([self.nodes[:-1], self.nodes[1:]])
 
     @property
     def node_radius(self) -> np.ndarray:
-        """Natural radius of nodes (n,) [m]."""
+        """Natural radii of nodes (n,) [m]."""
         radius = self.points[:, 0]
         return radius * at_nodes(2.0 * self.radius / (radius[1:] + radius[:-1]), len(radius))
 
     @property
     def mass(self) -> np.ndarray:
-        """Of every node (n,) [kg]."""
-        share = self.halves * (self.material.density * self.thickness)[:, None]
-        return np.append(share[:, 0], 0.0) + np.append(0.0, share[:, 1])
+        """Masses of nodes (n,) [kg]."""
+        half_mass = self.halves * (self.material.density * self.thickness)[:, None]
+        return np.append(half_mass[:, 0], 0.0) + np.append(0.0, half_mass[:, 1])
 
 
 @dataclass
 class BandPressure(Load):
-    """Pressure [Pa] on the surface of meridian edges (E, 2) that follows it.
+    """Follower pressure [Pa] on the surface of meridian edges (E, 2).
 
-    Forces are consistent with straight edges: work 2 pi p r (-dz, dr) . dx, with r and dx linear along the edge. They have a
-    potential, the enclosed volume, but for the axial force on a moving rim.
+    Forces are consistent with straight edges: work 2 pi p r (-dz, dr) . dx, with r and dx linear along the edge. The enclosed volume
+    is their potential, except for the axial force on a moving rim.
     """
 
     places: np.ndarray
@@ -102,10 +102,10 @@ class BandPressure(Load):
 
 
 def meridian(shell, index: int, supports, nodes: np.ndarray) -> NetMeridian:
-    """Geometry at rest of one `AxisymmetricShell`.
+    """Return the rest geometry of one `AxisymmetricShell`.
 
     Raises:
-        SceneError: the rest forms do not fit.
+        SceneError: the rest forms are invalid.
     """
     points, n = shell.points, len(shell.points)
     edges = np.diff(points, axis=0)
@@ -119,23 +119,23 @@ def meridian(shell, index: int, supports, nodes: np.ndarray) -> NetMeridian:
     first, last = points[:-1, 0], points[1:, 0]
     halves = np.column_stack([3.0 * first + last, first + 3.0 * last]) * (0.25 * np.pi * length)[:, None]
     halves *= np.sqrt(metric[:, 1])[:, None]
-    held = np.full(2, -1)
+    clamps = np.full(2, -1)
     kind, tangent = ["pole" if points[end, 0] == 0.0 else "free" for end in (0, -1)], _end_tangents(edges)
     for end, k in enumerate((0, n - 1)):
-        for place, support in enumerate(supports):
+        for number, support in enumerate(supports):
             if support.shell == index and support.clamped and k in support.nodes:
                 if kind[end] == "pole":
                     raise SceneError(
                         f"axisymmetric shell '{shell.name}': a pole has its direction; hold it, do not clamp it"
                     )
-                kind[end], held[end] = "clamped", place
+                kind[end], clamps[end] = "clamped", number
                 if support.tangent is not None:
                     tangent[end] = support.tangent / np.linalg.norm(support.tangent)
         if kind[end] == "pole":
             tangent[end] = (1.0, 0.0) if end == 0 else (-1.0, 0.0)
     thickness = np.broadcast_to(shell.thickness, (n - 1,))
     result = NetMeridian(
-        nodes, points, radius, length, halves, curvature, tangent, tuple(kind), held, thickness, shell.material
+        nodes, points, radius, length, halves, curvature, tangent, tuple(kind), clamps, thickness, shell.material
     )
     if isinstance(shell.rest, str) and shell.rest == "shape":
         result.curvature = _curvature(result, edges)
@@ -155,7 +155,7 @@ def _explicit(shell, n: int):
 
 
 def _end_tangents(edges: np.ndarray) -> np.ndarray:
-    """Directions at the ends, from those in the middle of the two nearest edges (2, 2)."""
+    """Return end tangents (2, 2), extrapolated from the two nearest edges."""
     result = []
     for near, next_one in ((edges[0], edges[1]), (edges[-1], edges[-2])):
         a, b = np.linalg.norm(near), np.linalg.norm(next_one)
@@ -167,13 +167,13 @@ def _end_tangents(edges: np.ndarray) -> np.ndarray:
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """2 tan(phi / 2), phi the angle from a to b (., 2)."""
+    """Return 2 tan(phi / 2), phi the angle from a to b (., 2)."""
     norms = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
     return 2.0 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / (norms + np.sum(a * b, -1))
 
 
 def _curvature(shell: NetMeridian, edges: np.ndarray) -> np.ndarray:
-    """Curvatures of the points at nodes, as the measures have them (n, 2) [1/m]."""
+    """Return the curvatures of the points at nodes, consistent with the strain measures (n, 2) [1/m]."""
     result, sines, length = np.zeros((len(shell.points), 2)), edges[:, 1] / np.linalg.norm(edges, axis=1), shell.length
     R = shell.node_radius
     result[1:-1, 0] = _turn(edges[:-1], edges[1:]) / (0.5 * (length[1:] + length[:-1]))
@@ -188,9 +188,9 @@ def _curvature(shell: NetMeridian, edges: np.ndarray) -> np.ndarray:
 
 
 def element_sets(shell: NetMeridian) -> list[ElementSet]:
-    """Membrane of edges, bending of inner nodes, bending of both ends; nodes counted along the meridian.
+    """Return membrane of edges, bending of inner nodes and of both ends; nodes counted along the meridian.
 
-    The last of a rim's `normals`, the directions that clamps give, is 0 at the first end and 1 at the last.
+    The last entry of the `normals` of a rim (tangents prescribed by clamps) is 0 at the first end and 1 at the last.
     """
     n, material = len(shell.points), shell.material
     k, R = np.arange(n), shell.node_radius
@@ -238,9 +238,9 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
         rest, D, poisson = shell.curvature[node].copy(), bend[edge], nu
         if kind == "pole":
             weights = [along, along, 0.0, 0.0]
-        elif kind == "clamped":  # around the axis the curvature is that of the clamp
+        elif kind == "clamped":  # the circumferential curvature is prescribed by the clamp
             weights = [along, 0.0, 0.0, 1.0 / R[node]]
-        else:  # the curvature along the meridian is such that there is no moment
+        else:  # the meridional moment vanishes, which eliminates that curvature
             tangent, weights = (0.0, 0.0), [0.0, 0.0, 1.0 / shell.radius[edge], 0.0]
             rest[0], D, poisson = 0.0, D * (1.0 - nu**2), 0.0
         area = shell.halves[edge, :1] if end == 0 else shell.halves[edge, 1:]
@@ -253,12 +253,12 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
 
 
 def check_gravity(gravity) -> None:
-    """Refuse gravity across the axis."""
+    """Refuse gravity components across the axis."""
     if gravity[0] != 0.0 or gravity[1] != 0.0:
         raise SceneError(f"gravity = {tuple(gravity)}: with axisymmetric shells it is along z, their axis")
 
 
 def at_nodes(values, n: int) -> np.ndarray:
-    """Means of edge values at n nodes, those of the end edges at the ends."""
+    """Return means of edge values at n nodes, the values of the end edges at the ends."""
     values = np.broadcast_to(values, (n - 1,))
     return 0.5 * (np.append(values, values[-1]) + np.append(values[0], values))

@@ -1,4 +1,4 @@
-"""What may touch what, and by which numbers."""
+"""Collision bodies of a scene and the contact parameters of pairs of groups."""
 
 from dataclasses import dataclass, field
 
@@ -11,8 +11,15 @@ ROD = "rod"
 
 @dataclass
 class Body:
-    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes, which shell it
-    is, -1 for none, the markers of one that spins, and the angles of the edges of one that friction may roll."""
+    """Collision body: a rod, shell or obstacle.
+
+    Attributes:
+        nodes, cells: nodes, and cells of nodes.
+        kind, radius: kind of body and radius [m].
+        name: name of the group; label: name in messages.
+        shell: index of the shell, -1 without.
+        markers: carried nodes of a rotating surface; angles: twist angles of edges with rolling contact.
+    """
 
     nodes: np.ndarray
     kind: str
@@ -29,16 +36,16 @@ class Body:
 
 @dataclass
 class Touching:
-    """Contact of a net.
+    """Contact of the coupled system.
 
     Attributes:
-        law: what the scene says; bodies: what may touch, obstacles at last.
-        names: of the groups that numbers are of, one a name; group (bodies,): number of that of each.
-        friction, stiffness [N/m], range [m]: of two groups (groups, groups).
-        inertia: masses [kg] of two groups (groups, groups); times the square of a rate the least stiffness of a step that had no room;
-            zero where the stiffness is given.
-        ways: what friction is multiplied by where a rod slides forwards, backwards and across (groups, groups, 3).
-        ignored: pairs of groups that pass through each other.
+        law: contact description of the scene; bodies: collision bodies, obstacles last.
+        names: names of the groups with common parameters; group (bodies,): index of the group of each body.
+        friction, stiffness [N/m], range [m]: parameters of pairs of groups (groups, groups).
+        inertia: masses [kg] of pairs of groups (groups, groups). Divided by the step squared, they bound the stiffness of a step that
+            ended at the minimum gap from below; zero for a given stiffness.
+        ways: anisotropic friction multipliers for sliding forwards, backwards and across a rod (groups, groups, 3).
+        ignored: pairs of groups without contact.
     """
 
     law: Contact
@@ -54,13 +61,13 @@ class Touching:
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:
-        """What may differ from world to world, by name: of two groups (groups, groups), and the "radius" of bodies (bodies,)."""
+        """Parameters that may differ per world, by name: of pairs of groups (groups, groups), and "radius" (bodies,)."""
         named = {name: getattr(self, name) for name in ("stiffness", "range", "friction")}
         return named | {"radius": np.array([body.radius for body in self.bodies])}
 
     @property
     def meeting(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two groups each, of which something may touch."""
+        """Pairs of groups that may come into contact, as two index arrays."""
         moving = np.zeros(len(self.names), bool)
         moving[self.group[[not body.still for body in self.bodies]]] = True
         meet = np.triu(moving[:, None] | moving)
@@ -70,15 +77,15 @@ class Touching:
 
     @property
     def rubs(self) -> bool:
-        """Whether there is friction."""
+        """True if there is friction."""
         return bool(self.friction.any())
 
     @property
     def reach(self) -> float:
-        """Largest range [m]."""
+        """Largest activation distance [m]."""
         return float(self.range.max())
 
     @property
     def size(self) -> float:
-        """Typical radius of what is not an obstacle [m]."""
+        """Median radius of bodies other than obstacles [m]."""
         return float(np.median([body.radius for body in self.bodies if not body.still]))

@@ -1,4 +1,4 @@
-"""From a scene to chains: rods sorted into groups of one kind and similar length, padded, in arrays (node, rod)."""
+"""Compile uncoupled rods to rod groups: one kind, similar length, padded arrays (node, rod)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,20 +20,22 @@ PADDING = 1.25  # longest over shortest rod of a group
 
 @dataclass(kw_only=True, eq=False)
 class ChainGroup(Storage):
-    """Rods of one kind and similar length, on the host. R rods, n nodes of the longest. Node k of rod r has the place k R + r.
+    """Rod group on the host: R rods of one kind and similar length, n nodes of the longest.
+
+    Node k of rod r has the index k R + r.
 
     Attributes:
         kind: dimension, twist, closedness and terms.
-        rods: scene's indices of the rods (R,).
+        rods: indices of the rods in the scene (R,).
         first: number of ghosts before the first node (R,).
-        own: nodes of the rods (R,); count: the same with ghosts (R,).
+        own: number of nodes without ghosts (R,); count: with ghosts (R,).
         x: positions (n, R, dim) [m].
         frame: first director, tangent (n, R, 3) each and reference twist (n, R) [rad] of every edge, as (7, n, R).
-        mass: of nodes (n, R) [kg]; rotary: inertia of edges about the tangent (n, R) [kg m^2].
-        fixed: bits of the held components of a node; the bit after the components is the angle (n, R).
-        length: of the rod (R,) [m].
-        drag: coefficients of the drag on edges (rows, n, R), in the order of `kernels.drag`; None without.
-        parameters: of all terms, "term.parameter", each broadcastable to (n, R).
+        mass: mass of nodes (n, R) [kg]; rotary: inertia of edges about the tangent (n, R) [kg m^2].
+        fixed: bits of the fixed components of a node; the bit after the components is the twist angle (n, R).
+        length: rod lengths (R,) [m].
+        drag: drag coefficients of edges (rows, n, R), in the order of `kernels.drag`; None without.
+        parameters: parameters of all terms, "term.parameter", each broadcastable to (n, R).
     """
 
     kind: ChainKind
@@ -52,7 +54,7 @@ class ChainGroup(Storage):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Nodes of the longest rod, rods."""
+        """(nodes of the longest rod, rods)."""
         return self.mass.shape
 
     @property
@@ -80,7 +82,7 @@ class ChainGroup(Storage):
 
     @property
     def anchored(self) -> np.ndarray:
-        """Which nodes are held in all directions (n, R) bool."""
+        """Mask of nodes fixed in all directions (n, R) bool."""
         every = (1 << self.kind.dim) - 1
         return ((self.fixed & every) == every) & (np.arange(self.shape[0])[:, None] < self.count)
 
@@ -104,9 +106,9 @@ class ChainGroup(Storage):
         return np.stack([first, np.where(seam, column, first + len(self.rods))], -1)
 
     def holding(self, nodes: np.ndarray) -> np.ndarray:
-        held = np.ones((*nodes.shape, 3), bool)
-        held[..., self.axes] = (self.fixed.ravel()[nodes][..., None] >> np.arange(self.kind.dim)) & 1 == 1
-        return held
+        fixed = np.ones((*nodes.shape, 3), bool)
+        fixed[..., self.axes] = (self.fixed.ravel()[nodes][..., None] >> np.arange(self.kind.dim)) & 1 == 1
+        return fixed
 
     def dofs(self, places: np.ndarray) -> np.ndarray:
         dim, angle = self.kind.dim, places >= self.nodes
@@ -119,18 +121,18 @@ class ChainGroup(Storage):
 
     def name(self, place: int) -> str:
         k, column = divmod(int(self.index(place)), len(self.rods))
-        what = "node" if place < self.nodes else "edge"
-        return f"{what} {k - self.first[column]} of rod {self.rods[column]}"
+        kind = "node" if place < self.nodes else "edge"
+        return f"{kind} {k - self.first[column]} of rod {self.rods[column]}"
 
 
 def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[ChainGroup]:
-    """Groups of a scene's rods on their own, with what the scene puts on them.
+    """Return the groups of uncoupled rods of a scene, with boundary conditions, masses and loads.
 
     Args:
-        chosen: of other rods instead, as if they were on their own (R,) bool.
+        chosen: rods to compile as if they were uncoupled (R,) bool; by default the uncoupled ones.
 
     Raises:
-        SceneError: the scene is no simulation; the message names the object and its index.
+        SceneError: the scene is invalid; the message names the object and its index.
     """
     if not scene.batches and not scene.shells and not scene.axisymmetric_shells:
         raise SceneError(
@@ -162,10 +164,10 @@ def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
     count = np.concatenate([np.full(len(part.rods), part.nodes) for part in parts])
     n, total = int(count.max()), len(rods)
     x, frame = np.zeros((n, total, kind.dim)), np.zeros((kind.lagged_rows, n, total))
-    mass, rotary, length, parameters, at = np.zeros((n, total)), np.zeros((n, total)), np.zeros(total), [], 0
+    mass, rotary, length, parameters, start = np.zeros((n, total)), np.zeros((n, total)), np.zeros(total), [], 0
     coefficients = np.zeros((DRAG_ROWS, n, total)) if kind.drag else None
     for run in (run for part in parts for run in part.runs):
-        piece, columns = piece_of(run, ghosts, laws), slice(at, at + len(run.rods))
+        piece, columns = piece_of(run, ghosts, laws), slice(start, start + len(run.rods))
         edges = piece.rotary.shape[1]
         x[: run.nodes, columns] = piece.x.swapaxes(0, 1)
         mass[: run.nodes, columns], rotary[:edges, columns] = piece.mass.T, piece.rotary.T
@@ -174,7 +176,7 @@ def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
             frame[6, : piece.reference_twist.shape[1], columns] = piece.reference_twist.T
         if kind.drag:
             coefficients[:, :edges, columns] = piece.drag.T
-        length[columns], at = piece.length, columns.stop
+        length[columns], start = piece.length, columns.stop
         parameters.append((len(run.rods), piece.parameters))
     fixed = np.zeros((n, total), np.uint8)
     if kind.twist and not kind.closed:
@@ -199,11 +201,11 @@ def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
 
 
 def _join_parameter(values: list[tuple[int, np.ndarray]], n: int) -> np.ndarray:
-    """One parameter of runs of so many rods each as (node, rod), with size 1 along what it does not depend on."""
+    """Return a parameter of runs of rods as (node, rod), with size 1 along an axis on which it does not depend."""
     along = any(value.shape[1] > 1 for _, value in values)
-    out, at = np.zeros((n if along else 1, sum(rods for rods, _ in values))), 0
+    out, start = np.zeros((n if along else 1, sum(rods for rods, _ in values))), 0
     for rods, value in values:
-        columns, at = slice(at, at + rods), at + rods
+        columns, start = slice(start, start + rods), start + rods
         out[: value.shape[1], columns] = value.T
         out[value.shape[1] :, columns] = value.T[-1:]
     return compress(out.T).T

@@ -1,4 +1,4 @@
-"""What a scene puts on its rods: supports, masses and loads."""
+"""Boundary conditions, masses and loads of rods."""
 
 import numpy as np
 
@@ -7,19 +7,19 @@ from ddg_warp.compile.storage import FREE, Held, Storage
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
 
-STILL = FREE - 1  # instead of a pose, of a dof that is held still
+STILL = FREE - 1  # pose index of a dof fixed at rest
 
 _NONE = np.zeros(0, int)
 
 
 def scene_motions(scene) -> list:
-    """The different motions of a scene's supports, in order of appearance."""
+    """Return the distinct prescribed motions of a scene, in order of appearance."""
     supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 
 def pose_starts(motions: list) -> np.ndarray:
-    """First pose of every motion, among those of all: one a motion, or one for each node that it displaces."""
+    """Return the index of the first pose of every motion; a motion has one pose, or one for each node."""
     return np.cumsum([0, *(motion.count or 1 for motion in motions)])
 
 
@@ -45,26 +45,26 @@ def load_rods(scene, storage: Storage) -> None:
 
 
 def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
-    """Hold what the supports of rods name."""
+    """Fix the dofs that supports of rods name."""
     places = storage.places
     for support in scene.supports:
-        found, rows = places.among(support.rods)
+        positions, rows = places.among(support.rods)
         nodes = [places.node(rows, node) for node in support.nodes]
         angles = [places.edge(rows, edge)[0][0][:, 2] for edge in support.edges]
         if support.end:
             last, twisted = support.end == "last", rows[places.twist[rows]]
             nodes += [places.nodes(rows, k) for k in ((places.own[rows] - 1, places.own[rows]) if last else (0, -1))]
             angles.append(places.angles(twisted, places.own[twisted] - 1 if last else -1))
-        owners = np.tile(found, len(nodes))
-        nth = owners * len(support.nodes) + np.repeat(np.arange(len(nodes)), len(found))
+        owners = np.tile(positions, len(nodes))
+        nth = owners * len(support.nodes) + np.repeat(np.arange(len(nodes)), len(positions))
         claims.take(support, np.concatenate([_NONE, *nodes]), nth, owners, np.concatenate([_NONE, *angles]))
 
 
 class Claims:
-    """Which pose moves each held dof of a storage; a dof that two poses, or one and a still support, claim is refused.
+    """Assignment of poses to fixed dofs; conflicting poses of a dof are refused.
 
-    A motion that leaves one of the components where it is that its support names claims it as a still support does: one about y is no
-    conflict with a plane of symmetry "y". One that moves none of them is taken at its word.
+    A component named by a support that its motion never changes counts as fixed at rest. So a motion about y does not conflict with a
+    symmetry plane "y". A motion that changes none of the named components claims all of them.
     """
 
     def __init__(self, scene, storage: Storage):
@@ -72,13 +72,13 @@ class Claims:
         self._duration = getattr(scene.analysis, "duration", None) or 1.0
         starts = pose_starts(self.motions)
         self._start = {id(motion): int(start) for motion, start in zip(self.motions, starts, strict=False)}
-        self._moved = {}  # motion, and components that it is to move, by number of the support
-        self._claims = []  # places, components, poses, number of the support and owners, of each support
+        self._moved = {}  # (motion, components named) by number of the support
+        self._claims = []  # (indices, components, poses, number, owners) of each support
 
     def take(self, support, nodes: np.ndarray, nth: np.ndarray, owners: np.ndarray, angles: np.ndarray = _NONE) -> None:
-        """Hold nodes, which a support names as its `nth`, along its components, and angles.
+        """Fix nodes along the components of a support, and twist angles; `nth` numbers the nodes of the support.
 
-        `owners` tell apart what nodes are named for: joined rods that share one may each displace it, the last counts.
+        `owners` are the rods for which nodes are named: joined rods may each displace a common node, and the last counts.
         """
         storage, motion = self.storage, support.motion
         along = [d for d in range(3) if "xyz"[d] in support.components]
@@ -89,35 +89,37 @@ class Claims:
         if self.motions:
             poses = np.full(len(places), STILL if motion is None else self._start[id(motion)])
             if motion is not None and motion.count is not None:
-                poses += np.tile(nth, len(along))  # such a motion turns no edge
+                poses += np.tile(nth, len(along))  # such a motion rotates no edge
             self._moved[len(storage.held)] = motion, along
-            known = np.isin(components, storage.axes)
+            stored = np.isin(components, storage.axes)
             owners = np.concatenate([np.tile(owners, len(along)), angles])
             claims = places, components, poses, np.full(len(places), len(storage.held)), owners
-            self._claims.append([values[known] for values in claims])
+            self._claims.append([values[stored] for values in claims])
 
     def finish(self) -> None:
-        """Leave what moves to the storage.
+        """Write the moving nodes and angles to the storage.
 
         Raises:
-            SceneError: two supports would have a dof in two places; names it.
+            SceneError: two supports prescribe different motions of a dof; names the dof.
         """
         if not self._claims:
             return
         claims = [np.concatenate(values) for values in zip(*self._claims, strict=True)]
         order = np.argsort(3 * claims[0] + claims[1], kind="stable")  # claims of one dof stay in order
         places, components, poses, supports, owners = (values[order] for values in claims)
-        dofs, given = 3 * places + components, poses.copy()
+        dofs, original_poses = 3 * places + components, poses.copy()
         again = np.diff(dofs) == 0
         differ = np.isin(dofs, dofs[1:][again & (np.diff(poses) != 0)]) & (places < self.storage.nodes) & (poses > FREE)
         for support in np.unique(supports[differ]):
-            here = differ & (supports == support)
-            poses[here] = np.where(self._kept(support)[components[here]], STILL, poses[here])
+            conflicting = differ & (supports == support)
+            poses[conflicting] = np.where(self._kept(support)[components[conflicting]], STILL, poses[conflicting])
         shared = (np.diff(supports) == 0) & (np.diff(owners) != 0)
         clash = np.flatnonzero(again & (np.diff(poses) != 0) & ~shared)
         if clash.size:
             first = clash[np.argmin(order[clash + 1])]
-            self._refuse(places[first], components[first], min(given[first], given[first + 1]) == STILL)
+            self._refuse(
+                places[first], components[first], min(original_poses[first], original_poses[first + 1]) == STILL
+            )
         moves = np.append(~again, True) & (poses > FREE)
         places, components, poses = (values[moves] for values in (places, components, poses))
         node = places < self.storage.nodes
@@ -127,15 +129,15 @@ class Claims:
         self.storage.moving, self.storage.turning = moving, np.column_stack([places[~node], poses[~node]])
 
     def _kept(self, support: int) -> np.ndarray:
-        """Which components (3,) of nodes the motion of a support leaves where they are."""
+        """Return the mask of components (3,) that the motion of a support never changes."""
         motion, along = self._moved[support]
         if isinstance(motion, Grip) or motion.count is not None:
             return np.zeros(3, bool)
         moves = motion.moves(self._duration)
         return ~moves & moves[along].any()
 
-    def _refuse(self, place: int, component: int, still: bool) -> None:
-        where, axis = self.storage.name(place), f" along {'xyz'[component]}" if place < self.storage.nodes else ""
+    def _refuse(self, index: int, component: int, still: bool) -> None:
+        where, axis = self.storage.name(index), f" along {'xyz'[component]}" if index < self.storage.nodes else ""
         if still:
             raise SceneError(
                 f"{where} is held still by one support and moved by another{axis}; leave one of them out, give the moving one "

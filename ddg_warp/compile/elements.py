@@ -1,4 +1,4 @@
-"""Elements of one term on any nodes: what a net gathers by index."""
+"""Elements of one term on arbitrary nodes, for assembly in the coupled system."""
 
 from dataclasses import dataclass, field
 
@@ -9,16 +9,16 @@ from ddg_warp.kernels.terms import Term
 
 @dataclass(frozen=True)
 class ElementSet:
-    """Elements of one term, on the host.
+    """Element set of one term, on the host.
 
     Attributes:
         term: measure and density.
-        nodes: node of each place in the stencil (E, n) int.
-        angles: angle of each place (E, a) int, counted by whoever makes the elements; of a surface, its edges.
-        data: constant data as the measure's s (E, d) float.
-        parameters: by name, as `Term.bind` gives them, each broadcastable to (E,).
-        normals: (element, first of three columns of its data, mesh edge) of every normal among the data that a support of that
-            edge gives (n, 3) int.
+        nodes: node of each local node index (E, n) int.
+        angles: angle of each local angle index (E, a) int, in a numbering of the caller; of a surface, its edges.
+        data: constant data, the argument s of the measure (E, d) float.
+        parameters: parameters by name, as from `Term.bind`, each broadcastable to (E,).
+        normals: (element, first of three columns of data, mesh edge) of every normal in the data that a support of that edge
+            prescribes (n, 3) int.
     """
 
     term: Term

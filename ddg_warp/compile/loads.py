@@ -1,8 +1,8 @@
-"""Loads on the places of a storage: dead ones, and those that follow what they act on, with their derivatives.
+"""Dead and follower loads on the dof blocks of a storage, with load stiffness.
 
-What follows has `places` (E, m) of its elements and gives, at their points x (E, m, 3), `forces` (E, m, 3) [N], moments in component 0
-of angles, and their `derivative` (E, m, 3, m, 3). Whether that is symmetric is seen of all together: pressure is conservative on a
-closed surface, not on each of its triangles. `kernel` names what does the same on a device, from three `values` (E, 3) an element.
+A follower load has the dof blocks `places` (E, m) of its elements. At their points x (E, m, 3) it returns `forces` (E, m, 3) [N], with
+moments in component 0 of angles, and their `derivative` (E, m, 3, m, 3). Symmetry is a property of the sum: pressure is conservative
+on a closed surface, not on each triangle. `kernel` names the device counterpart, which reads three `values` (E, 3) an element.
 """
 
 from collections.abc import Callable
@@ -14,16 +14,16 @@ from ddg_warp import arguments
 
 
 class Load:
-    """A load that an `amplitude`, a function of the time or None, multiplies."""
+    """Load scaled by an `amplitude`, a function of time or None."""
 
     amplitude: Callable[[float], float] | None
 
     def sizes(self, x: np.ndarray) -> np.ndarray:
-        """How much the forces at points x (E, m, 3) count among those that residuals are compared with (E, m) [N]."""
+        """Return the contribution of forces at points x (E, m, 3) to the load scale (E, m) [N]."""
         return np.abs(self.forces(x)).sum(-1)
 
     def at(self, t: float, otherwise: float) -> float:
-        """Its amplitude at t, or `otherwise` if it has none.
+        """Return the amplitude at time t, or `otherwise` without one.
 
         Raises:
             SolverError: the amplitude is not finite; names the function and the time.
@@ -33,7 +33,7 @@ class Load:
 
 @dataclass
 class DeadLoad(Load):
-    """Forces (n, 3) [N] on nodes, moments [N m] in component 0 of angles, at places (n,)."""
+    """Dead forces (n, 3) [N] on nodes, moments [N m] in component 0 of angles, at dof blocks `places` (n,)."""
 
     places: np.ndarray
     force: np.ndarray
@@ -42,7 +42,7 @@ class DeadLoad(Load):
 
 @dataclass
 class Pressure(Load):
-    """Pressure [Pa] on triangles of nodes (T, 3) that follows them."""
+    """Follower pressure [Pa] on triangles of nodes (T, 3)."""
 
     places: np.ndarray
     pressure: np.ndarray
@@ -59,7 +59,7 @@ class Pressure(Load):
         return np.repeat((self.pressure / 6.0)[:, None, None] * area[:, None], 3, axis=1)
 
     def derivative(self, x: np.ndarray) -> np.ndarray:
-        """d/dx_j of (x1 - x0) x (x2 - x0) is the edge opposite to j, crossed."""
+        """Return the load stiffness: d/dx_j of (x1 - x0) x (x2 - x0) is the cross matrix of the edge opposite to j."""
         edges = np.stack([x[:, (j + 2) % 3] - x[:, (j + 1) % 3] for j in range(3)], 1)
         block = (self.pressure / 6.0)[:, None, None, None] * np.moveaxis(_cross(edges), 1, 2)
         return np.repeat(block[:, None], 3, axis=1)
@@ -67,10 +67,10 @@ class Pressure(Load):
 
 @dataclass
 class Couple(Load):
-    """A couple M (3,) [N m], its axis fixed in space, on rod edges: first node, second node and, with twist, angle (C, 3 or 2).
+    """Couple M (3,) [N m] with an axis fixed in space on rod edges: both nodes and, with twist, the angle (C, 3 or 2).
 
-    On an edge e it is the force M x e / |e|^2 on the second node, the opposite one on the first, and the moment M . t about it. It
-    counts as a force at the end of its rod (`length` (C,) [m]), however short its edge is.
+    On an edge e it is the force M x e / |e|^2 on the second node, the opposite force on the first, and the moment M . t about the edge.
+    Its load scale is a force at the end of the rod (`length` (C,) [m]), independent of the edge length.
     """
 
     places: np.ndarray
@@ -94,7 +94,7 @@ class Couple(Load):
         return np.stack([-pair, pair, np.outer(about, [1.0, 0.0, 0.0])], 1)[:, : self.places.shape[1]]
 
     def derivative(self, x: np.ndarray) -> np.ndarray:
-        """Symmetric only in the plane."""
+        """Return the load stiffness, symmetric only in the plane."""
         e, cross = x[:, 1] - x[:, 0], _cross(self.couple)
         square = _dot(e, e)[:, None, None]
         pair = (cross - 2.0 * (e @ cross.T)[:, :, None] * e[:, None] / square) / square
@@ -110,11 +110,11 @@ class Couple(Load):
 
 @dataclass
 class EdgeCouple(Load):
-    """Couples about boundary edges of a shell: places (C, 4) of the edge as its triangle runs it, the corner opposite, the angle.
+    """Couples about boundary edges of a shell, on both edge nodes, the opposite corner and the angle (C, 4).
 
-    `moment` (C,) [N m] by the right hand about the edge, `sign` (C,) that of the angle. The normal at the edge spins with its triangle
-    and by the angle, hence the forces M / h along the normal on the corner at the height h, in balance with those at the ends, and the
-    moment M on the angle. They count as forces over the `length` of the shell [m].
+    Edges are oriented as in their triangle. `moment` (C,) [N m] is right-handed about the edge, `sign` (C,) is the sign of the angle.
+    The normal at the edge rotates with the triangle and by the angle. Hence the moment M acts on the angle, and the force M / h along
+    the normal on the corner at height h, balanced at the edge nodes. The load scale is the moment over the `length` of the shell [m].
     """
 
     places: np.ndarray
@@ -164,22 +164,22 @@ class EdgeCouple(Load):
 
 
 def accumulate(total: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
-    """Add values (n, 3) to the rows `places` of a total (P, 3); a row may come twice. NumPy is fast at this in one dimension."""
+    """Add values (n, 3) to the rows `places` of a total (P, 3); rows may repeat. NumPy is fast at this in one dimension."""
     np.add.at(total.reshape(-1), (3 * places[..., None] + np.arange(3)).ravel(), values.ravel())
 
 
 def _first(sizes: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Sizes (E,) of elements at the first of their places (E, m)."""
+    """Return zeros (E, m) with the sizes (E,) of elements in column 0."""
     result = np.zeros(places.shape)
     result[:, 0] = sizes
     return result
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products along the last axis."""
+    """Return scalar products along the last axis."""
     return np.sum(a * b, -1)
 
 
 def _cross(e: np.ndarray) -> np.ndarray:
-    """Matrices of e x (..., 3, 3)."""
+    """Return the cross-product matrices of e (..., 3, 3)."""
     return np.swapaxes(np.cross(e[..., None, :], np.eye(3)), -1, -2)

@@ -1,4 +1,4 @@
-"""Memory that a model and an integrator of it need, against what a device has left: told before anything is allocated."""
+"""Memory check before allocation: bytes that a model and an integrator need against free bytes of the device."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,18 +6,23 @@ from pathlib import Path
 
 from ddg_warp.errors import SceneError, SolverError
 
-# Least bytes that a block of three dofs takes in float64, constant arrays, states and solver together: of rods on their own, and of
-# what is joined or touches. Measured: 600 to 750, and 1340 (joined rods) to 3360 (contact).
+# Least bytes of a dof block in float64, constant arrays, states and solver together: of uncoupled rods and of the coupled system.
+#
+# Measured: 600 to 750 for uncoupled rods, 1340 (joined rods) to 3360 (contact).
 ALONE, COUPLED = 550, 1300
-LESS = {"float64": 1.0, "mixed": 0.6, "float32": 0.5}  # of that; 0.58 to 0.81 measured in mixed precision
-MOST = 2**31 - 1  # what an index on a device counts to
+LESS = {
+    "float64": 1.0,
+    "mixed": 0.6,
+    "float32": 0.5,
+}  # fraction of the bytes in float64; measured: 0.58 to 0.81 in mixed precision
+MOST = 2**31 - 1  # largest index on a device
 
 
 def require(scene, coupled: bool, worlds: int, precision: str, device) -> None:
-    """Refuse worlds of a scene that the memory of a device cannot hold, or that its indices do not count.
+    """Refuse more worlds than the memory or the index range of a device allows.
 
     Raises:
-        SceneError: names the bytes needed and the bytes there, and how many worlds there is room for.
+        SceneError: names the bytes needed, the bytes free and the largest number of worlds.
     """
     blocks = _blocks(scene)
     if worlds * blocks > MOST:
@@ -26,19 +31,19 @@ def require(scene, coupled: bool, worlds: int, precision: str, device) -> None:
             f"{MOST // blocks} worlds at most, in several models if need be"
         )
     each = blocks * (COUPLED if coupled else ALONE) * LESS[precision]
-    there = free_bytes(device)
-    if worlds * each > there:
-        fits = int(there // each)
+    free = free_bytes(device)
+    if worlds * each > free:
+        fits = int(free // each)
         fewer = f"build {fits} worlds at most" if fits else "coarsen what is in the scene"
         raise SceneError(
             f"worlds = {worlds}: the model and an integrator of it need {_size(worlds * each)} at least, and {device} has "
-            f"{_size(there)} left; {fewer}, take precision 'mixed' or 'float32', or free what is held"
+            f"{_size(free)} left; {fewer}, take precision 'mixed' or 'float32', or free what is held"
         )
 
 
 @contextmanager
-def named(what: str, device) -> Iterator[None]:
-    """Name what runs out of memory, and how much is left.
+def named(label: str, device) -> Iterator[None]:
+    """Name the allocation that runs out of memory, and the free bytes.
 
     Raises:
         SceneError: an allocation failed.
@@ -51,13 +56,13 @@ def named(what: str, device) -> Iterator[None]:
         if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise
         raise SceneError(
-            f"{what}: out of memory ({error}); {device} has {_size(free_bytes(device))} left; build fewer worlds, take precision "
+            f"{label}: out of memory ({error}); {device} has {_size(free_bytes(device))} left; build fewer worlds, take precision "
             "'mixed' or 'float32', or free what is held"
         ) from error
 
 
 def free_bytes(device) -> float:
-    """Return the bytes of memory that a device has left; infinite where nobody tells."""
+    """Return the bytes of memory that a device has left; infinite if unknown."""
     if device.is_cuda:
         return float(device.free_memory)
     group = "/sys/fs/cgroup/memory"
@@ -67,7 +72,7 @@ def free_bytes(device) -> float:
 
 
 def _blocks(scene) -> int:
-    """Nodes of rods, shells and meridians, and angles of edges with twist, in a world."""
+    """Return the number of nodes and twist angles in a world."""
     rods = sum(batch.rods * batch.nodes * (2 if batch.twist else 1) for batch in scene.batches)
     return rods + sum(len(shell.points) for shell in (*scene.shells, *scene.axisymmetric_shells))
 

@@ -32,34 +32,32 @@ PRECISIONS = {
 
 
 def choose(name: str | None, device) -> Precision:
-    """By default "mixed" on CUDA and "float64" on the CPU.
+    """Return the precision of this name; by default "mixed" on CUDA and "float64" on the CPU.
 
     Raises:
-        SceneError: there is no such precision.
+        SceneError: unknown precision.
     """
     if name is None:
         name = "mixed" if device.is_cuda else "float64"
     return PRECISIONS[arguments.choice("precision", name, PRECISIONS)]
 
 
-FLOAT32_LIMIT = (
-    0.02  # relative error of a direction that Newton still corrects quickly; beyond it a state in float32 is doubtful
-)
-STIFF = 5e4  # ratio of stiffnesses from which on rods always turn their edges, and take second derivatives
-CARRIED = 1e-3  # error up to which a float32 matrix takes a stiffness; see `kernels.solve.tension`
-FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
+FLOAT32_LIMIT = 0.02  # relative error of a search direction that Newton still corrects quickly; beyond it float32 states are doubtful
+STIFF = 5e4  # stiffness ratio from which rods always use edge-rotation updates and full Hessians
+CARRIED = 1e-3  # error up to which a float32 matrix includes a stiffness; see `kernels.solve.tension`
+FLOAT32_LOST = 0.1  # relative error beyond which rounding decides the motion
 
 
 def stiffnesses(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> tuple[np.ndarray, ...]:
-    """Of rods of one kind: of stretching an edge, of bending at a node, and of the softest mode, each (R,) [N/m].
+    """Return the stiffnesses of edge stretch, of bending at a node and of the softest mode, each (R,) [N/m].
 
-    The last is inertia over the step of s [s] and the lowest bending mode; at rest, s = inf, that alone. A law that names no stiffness
-    is taken for the worst: of stretching without a bound, of bending without any.
+    The softest mode is inertia over a step of s [s] plus the lowest bending mode, without inertia at rest, s = inf. A law without a
+    named stiffness counts as the worst case: infinite in stretch, zero in bending.
 
     Args:
         kind: `ChainKind` of the rods.
-        mass: mean of their nodes (R,) [kg]; length: (R,) [m].
-        parameters: of all terms, "term.parameter", each broadcastable to (n, R).
+        mass: mean nodal mass (R,) [kg]; length: (R,) [m].
+        parameters: parameters of all terms, "term.parameter", each broadcastable to (n, R).
     """
     softest, bending = mass / s**2, np.zeros_like(length)
     for term in kind.terms:
@@ -70,41 +68,42 @@ def stiffnesses(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s:
             stretching = (stiffness / measure).max(0)
         else:
             softest = softest + (stiffness * measure).min(0) * (np.pi / length) ** 4
-            bending = (16.0 * stiffness / measure**3).max(0)  # a node to and fro between its neighbours
+            bending = (16.0 * stiffness / measure**3).max(0)  # zigzag mode of a node between its neighbours
     return np.broadcast_to(stretching, length.shape), np.broadcast_to(bending, length.shape), softest
 
 
 def float32_error(stiffest, softest) -> np.ndarray:
-    """Estimate of the relative error that a float32 solution makes in a direction.
+    """Return the estimated relative error of a search direction solved in float32.
 
-    The rounding unit times the ratio of the stiffest to the softest mode [N/m]. For a curved steel rod of r/L = 2e-3 (64 nodes,
-    1/240 s) it gives 0.1, where 9 % were measured.
+    The estimate is half the rounding unit times the ratio of the stiffest to the softest mode [N/m].
+
+    Measured: 9 % for a curved steel rod of r/L = 2e-3 (64 nodes, 1/240 s), for which the estimate is 0.1.
     """
     with np.errstate(divide="ignore"):
         return 0.5 * float(np.finfo(np.float32).eps) * np.asarray(stiffest) / softest
 
 
 def largest_carried(softest: np.ndarray) -> np.ndarray:
-    """The stiffness that a float32 matrix carries beside the softest mode, within an error of CARRIED [N/m]."""
+    """Return the largest stiffness that a float32 matrix resolves with an error of CARRIED [N/m]."""
     return CARRIED / float32_error(1.0, 1.0) * softest
 
 
 def straight_turns(errors: np.ndarray) -> np.ndarray:
-    """Largest turn of an edge that a step takes straight [rad], of rods with such errors; 0: they always turn their edges.
+    """Return the largest edge rotation of a straight update [rad], for rods with such errors.
 
-    A straight step stretches an edge that it turns by an angle a by a^2 / 2, and leaves the force of that to the next iteration. Soft
-    rods need no more iterations for it, and a straight step is cheaper. See `kernels.turns`.
+    0 means that every update rotates edges. A straight update that rotates an edge by a stretches it by a^2 / 2, and leaves that force
+    to the next iteration. Soft rods need no more iterations for it, and a straight update is cheaper. See `kernels.turns`.
     """
     return np.where(stiff(errors), 0.0, TURNED)
 
 
 def stiff(errors: np.ndarray) -> np.ndarray:
-    """Which rods with such errors are STIFF times as stiff along their edges as across, or more."""
+    """Return the mask of rods with such errors at least STIFF times as stiff in stretch as in bending."""
     return errors > float32_error(STIFF, 1.0)
 
 
 def rounding(model, s: float = np.inf) -> tuple[float, str]:
-    """The largest such error in a model over a step of s [s], or at rest; and where it is."""
+    """Return the largest float32 error of a model over a step of s [s], or at rest, and the name of its rod or shell."""
     worst = [(0.0, "")]
     for group in model.groups:
         errors = group.float32_errors(s)
@@ -122,7 +121,7 @@ def rounding(model, s: float = np.inf) -> tuple[float, str]:
 
 
 def warn_of_rounding(model, analysis) -> None:
-    """Warn where a state in float32 is doubtful over the steps of an analysis, or at rest if it has none."""
+    """Warn if a float32 state is doubtful over the steps of an analysis, or at rest without one."""
     s = getattr(analysis, "dt", np.inf) * (0.5 if getattr(analysis, "scheme", "") == "implicit_midpoint" else 1.0)
     error, where = rounding(model, s) if model.precision == "float32" else (0.0, "")
     if error > FLOAT32_LIMIT:
@@ -130,10 +129,10 @@ def warn_of_rounding(model, analysis) -> None:
 
 
 def lost_in_rounding(model, s: float = np.inf, state=None) -> bool:
-    """Whether rounding decides what a model in float32 does over a step of s [s], or at rest; of one built to allow that.
+    """Return True if rounding decides the motion of a float32 model over a step of s [s], or at rest.
 
     Raises:
-        SolverError: it does, and the model was not built to allow that; names the worst rod or shell.
+        SolverError: rounding decides, and the model is not built with allow_rounding; names the worst rod or shell.
     """
     error, where = rounding(model, s) if model.precision == "float32" else (0.0, "")
     if error > FLOAT32_LOST and not model.allow_rounding:

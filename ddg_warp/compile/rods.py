@@ -1,4 +1,4 @@
-"""From rods of a batch to their arrays: positions, frames, masses and the parameters of their terms, ghosts included."""
+"""Arrays of the rods of a batch: positions, frames, masses and term parameters, ghosts included."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -21,7 +21,7 @@ from ddg_warp.scene.validate import check_batch
 
 @dataclass(frozen=True)
 class Alike:
-    """Rods of one batch with the same ghosts, all with drag or none."""
+    """Rods of one batch with equal ghosts, all with drag or all without."""
 
     batch: RodBatch
     rows: np.ndarray  # of the batch
@@ -30,23 +30,23 @@ class Alike:
 
     @property
     def nodes(self) -> int:
-        """Nodes of a rod, with ghosts."""
+        """Number of nodes of a rod, with ghosts."""
         return self.batch.nodes + sum(self.ghosts)
 
     @property
     def rods(self) -> np.ndarray:
-        """The scene's indices."""
+        """Indices of the rods in the scene."""
         return self.batch.first + self.rows
 
     @property
     def runs(self) -> list["Alike"]:
-        """The same rods, a few at a time, so that what is computed on the way to their arrays stays in the processor's cache."""
+        """Runs of a few rods each, so that intermediate arrays stay in the cache."""
         return [replace(self, rows=rows) for rows in self.batch.runs(self.rows)]
 
 
 @dataclass
 class Piece:
-    """A run of rods of one batch with the same ghosts: arrays (R, ...) including ghosts; see `ChainGroup` for their meaning."""
+    """Arrays (R, ...) of a run of rods with equal ghosts, ghosts included; attributes as in `ChainGroup`."""
 
     batch: RodBatch
     rods: np.ndarray
@@ -61,11 +61,11 @@ class Piece:
     length: np.ndarray
     parameters: dict[str, np.ndarray]
     stiffness: list[np.ndarray]  # EI1, EI2 and GJ of the section, each broadcastable to (R, edges)
-    drag: np.ndarray | None  # coefficients of its law (R, edges, rows), None without
+    drag: np.ndarray | None  # coefficients of the drag law (R, edges, rows), None without
 
 
 def net_rods(scene: Scene) -> np.ndarray:
-    """Which rods belong to the scene's net: those that are joined or attached to something, magnetised, or touch (R,) bool."""
+    """Return the mask of coupled rods (R,) bool: joined, attached, magnetised or in contact."""
     members = [rod for joint in scene.joints for rod, _ in joint.members]
     members += [attachment.rod for attachment in scene.attachments]
     chosen = np.zeros(scene.rod_count, bool)
@@ -80,7 +80,7 @@ def net_rods(scene: Scene) -> np.ndarray:
 
 
 def alike(dimension: int, batch: RodBatch, ghosts: Ghosts, laws: drag.Laws, chosen: np.ndarray) -> list[Alike]:
-    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag."""
+    """Return the chosen rods (R,) of a batch, grouped by ghosts and drag."""
     check_batch(batch, dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
     flags = ghosts.count[batch.first : batch.first + batch.rods]
@@ -114,13 +114,13 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
 
 
 def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
-    """The arrays of some rods.
+    """Return the arrays of some rods.
 
     Raises:
-        SceneError: a director, a law or a rest shape that they cannot have; names the first rod.
+        SceneError: a director, a law or a rest shape is impossible; names the first rod.
     """
     batch, rows, rods, kind, (before, after) = part.batch, part.rows, part.rods, part.kind, part.ghosts
-    points = np.asfortranarray(batch.points[rows])  # as what is made of it: components of vectors lie together
+    points = np.asfortranarray(batch.points[rows])  # as all derived arrays: components of vectors are contiguous
     if kind.dim == 2:
         points = points * [1.0, 0.0, 1.0]
     if before:
@@ -134,34 +134,34 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
     section = batch.section
 
     def on_edges(value):
-        """A stiffness on all edges with ghosts, (1, 1) where it is uniform."""
+        """Return a section property on all edges with ghosts, (1, 1) where uniform."""
         value = np.asarray(value, float)
         if value.ndim == 0:
             return value[None, None]
         full = np.broadcast_to(np.atleast_2d(value), (batch.rods, lengths[:, real].shape[1]))[rows]
         return np.pad(full, ((0, 0), (before, after)), mode="edge")
 
-    own = np.zeros_like(lengths)
-    own[:, real] = lengths[:, real]
-    line_mass = on_edges(section.mass_per_length) * own
+    rod_lengths = np.zeros_like(lengths)
+    rod_lengths[:, real] = lengths[:, real]
+    line_mass = on_edges(section.mass_per_length) * rod_lengths
     mass = np.zeros_like(points[..., 0])
     if batch.closed:
         mass += 0.5 * (line_mass + np.roll(line_mass, 1, axis=1))
     else:
         mass[:, :-1] += 0.5 * line_mass
         mass[:, 1:] += 0.5 * line_mass
-    given = batch.director
-    if given is not None and given.ndim > 1:
-        given = np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows]
+    director = batch.director
+    if director is not None and director.ndim > 1:
+        director = np.broadcast_to(director, (batch.rods, *director.shape[1:]))[rows]
     frames = np.zeros_like(tangents)
     if kind.twist:
-        frames[:, real] = polyline.directors(tangents[:, real], given)
+        frames[:, real] = polyline.directors(tangents[:, real], director)
         for end, neighbour in ((0, 1),) * before + ((-1, -2),) * after:
             frames[:, end] = end_director(end, neighbour, lengths, tangents, frames, outside.director[rods, end])
-            bad = np.flatnonzero(~np.isfinite(frames[:, end]).all(1))
-            if bad.size:
+            failed = np.flatnonzero(~np.isfinite(frames[:, end]).all(1))
+            if failed.size:
                 raise SceneError(
-                    f"rod {rods[bad[0]]} ('{batch.name}'): the director or tangent prescribed at its {'last' if end else 'first'} "
+                    f"rod {rods[failed[0]]} ('{batch.name}'): the director or tangent prescribed at its {'last' if end else 'first'} "
                     "end lies along the other or points back; give a tangent along the rod and a director across it"
                 )
     twist = polyline.reference_twist(tangents, frames, batch.closed) if kind.twist else np.zeros((len(rows), 0))
@@ -182,9 +182,9 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
         else:
             stiffness = [cells.stiffness(on_edges(value)) for value in _bending(section, kind)]
             rest, weight, spread = natural, voronoi, cells.viscosity(damping)
-        given = {"measure": weight, "stiffness": stiffness, "rest": rest, "viscosity": spread}
+        inputs = {"measure": weight, "stiffness": stiffness, "rest": rest, "viscosity": spread}
 
-        values = _bound(batch, term, given, on_edges, None if stretch else cells)
+        values = _bound(batch, term, inputs, on_edges, None if stretch else cells)
         parameters |= {f"{term.name}.{name}": compress(np.atleast_2d(v)) for name, v in values.items()}
     return Piece(
         batch,
@@ -196,32 +196,35 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
         frames,
         twist,
         mass,
-        on_edges(section.rotary_inertia) * own,
-        own.sum(1),
+        on_edges(section.rotary_inertia) * rod_lengths,
+        rod_lengths.sum(1),
         parameters,
         [on_edges(value) for value in (section.EI1, section.EI2, section.GJ)],
-        laws.coefficients(rods, batch, on_edges(np.nan if section.radius is None else section.radius), own)
+        laws.coefficients(rods, batch, on_edges(np.nan if section.radius is None else section.radius), rod_lengths)
         if kind.drag
         else None,
     )
 
 
-def _bound(batch: RodBatch, term: Term, given: dict, on_edges, cells: HalfCells | None) -> dict[str, np.ndarray]:
-    """Parameters of a term by name, from what the rod gives and what its law says: on edges, or at the vertices of `cells`."""
+def _bound(batch: RodBatch, term: Term, inputs: dict, on_edges, cells: HalfCells | None) -> dict[str, np.ndarray]:
+    """Return the parameters of a term by name, from the rod and its law: on edges, or at the vertices of `cells`."""
 
     def along(family, value):
         return on_edges(value) if cells is None else cells.along(family, on_edges(value))
 
-    where, families = f"rod {batch.first} ('{batch.name}'), {term.name}", {known.family for known in term.parameters}
+    where, families = (
+        f"rod {batch.first} ('{batch.name}'), {term.name}",
+        {parameter.family for parameter in term.parameters},
+    )
     law = batch.laws.get(term.name)
     unstrained = 1.0 if term.measure.span == 1 else 0.0
-    bent = (np.abs((value - unstrained) * given["measure"]).max() > 1e-9 for value in given["rest"])
+    bent = (np.abs((value - unstrained) * inputs["measure"]).max() > 1e-9 for value in inputs["rest"])
     if law is not None and "rest" not in families and any(bent):
         raise SceneError(f"{where}: the law {term.density.name!r} has no strains at rest; give natural='straight'")
-    given = {family: value for family, value in given.items() if family in families}
+    inputs = {family: value for family, value in inputs.items() if family in families}
     for family, value in law.values.items() if law else ():
         try:
-            given[family] = (
+            inputs[family] = (
                 [along(family, v) for v in value] if isinstance(value, list | tuple) else along(family, value)
             )
         except (TypeError, ValueError):
@@ -229,13 +232,13 @@ def _bound(batch: RodBatch, term: Term, given: dict, on_edges, cells: HalfCells 
                 f"{where}: {family} = {value!r}; give numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
             ) from None
     try:
-        values = term.bind(**given)
+        values = term.bind(**inputs)
     except TypeError as error:
         raise SceneError(f"{where}: law {term.density.name!r}: {error}; give it with Law(density, ...)") from None
-    for known in term.parameters if law else ():
-        rule, holds = known.valid
-        if not np.all(np.isfinite(values[known.name]) & holds(values[known.name])):
-            raise SceneError(f"{where}: {known.name} = {values[known.name]}; it is finite and {rule}")
+    for parameter in term.parameters if law else ():
+        rule, holds = parameter.valid
+        if not np.all(np.isfinite(values[parameter.name]) & holds(values[parameter.name])):
+            raise SceneError(f"{where}: {parameter.name} = {values[parameter.name]}; it is finite and {rule}")
     return values
 
 
@@ -246,7 +249,7 @@ def _bending(section, kind: ChainKind) -> list:
 
 
 def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi) -> list[np.ndarray]:
-    """Strains at rest of the bending term, (R, vertices) each [1/m]."""
+    """Return the rest strains of the bending term, (R, vertices) each [1/m]."""
     if isinstance(batch.natural, str) and batch.natural == "straight":
         return [np.zeros((1, 1))] * (1 if kind.dim == 2 else 3)
     if kind.dim == 2:
@@ -264,12 +267,12 @@ def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi)
     if isinstance(batch.natural, str):
         return [value / voronoi for value in shape]
     vertices = voronoi.shape[1] - sum(ghosts)
-    given = [np.broadcast_to(np.asarray(value, float), (batch.rods, vertices))[rows] for value in batch.natural]
-    return [np.pad(value, ((0, 0), ghosts), mode="edge") for value in given]
+    strains = [np.broadcast_to(np.asarray(value, float), (batch.rods, vertices))[rows] for value in batch.natural]
+    return [np.pad(value, ((0, 0), ghosts), mode="edge") for value in strains]
 
 
 def compress(values: np.ndarray) -> np.ndarray:
-    """(1, 1) for one number, (1, vertices) where all rods are alike, (R, 1) where rods are uniform."""
+    """Drop constant axes: (1, 1) for one number, (1, vertices) if rods are equal, (R, 1) if uniform along rods."""
     if np.all(values == values[:1, :1]):
         return values[:1, :1]
     if np.all(values == values[:1]):

@@ -1,20 +1,20 @@
-"""From a surface, its material and its supports to the element sets of a shell: membrane and bending.
+"""Element sets of a shell: membrane and bending, from surface, material and supports.
 
-The bending models, and what exact shapes and linear plates say about them (tests/kernels/test_shell_orders.py, test_shell_plates.py):
+Bending models, with errors against exact shapes and linear plates (tests/kernels/test_shell_orders.py, test_shell_plates.py):
 
-    midedge_dof       mid-edge normals that turn about every edge; order 2 on every mesh and support, exact for uniform bending and
+    midedge_dof       mid-edge normals that rotate about every edge; order 2 on every mesh and support, exact for uniform bending and
                       twist of flat plates. Soft: the deflection of a square plate under pressure, h = 1/16 of its side, is
-                      1.3 % high if supported, 8.6 % if clamped. As many angles as edges. The default. An edge holds any fold
+                      1.3 % high if supported, 8.6 % if clamped. As many angles as edges. The default. An edge supports any fold
                       below 180 degrees: its moment grows with the fold, D t for t rad along the diagonal of a square.
-    midedge_boundary  the same, turning at free edges only, for meshes that are alike everywhere (right or equilateral triangles):
-                      order 2 with half the error of midedge_dof (0.5 % and 4.7 %). On others the error of `midedge` inside.
-    midedge           averaged normals without angles, for meshes alike everywhere and clamped all around; of order 1 with free or
+    midedge_boundary  midedge_dof with rotation at free edges only, for uniform meshes (right or equilateral triangles):
+                      order 2 with half the error of midedge_dof (0.5 % and 4.7 %). On other meshes the interior error of `midedge`.
+    midedge           averaged normals without angles, for uniform meshes clamped all around; of order 1 with free or
                       supported edges (-5.3 %). Elsewhere it does not converge: 5 to 35 % too stiff on irregular meshes, 65 %
                       (cylinder) to 186 % (twist) where diagonals alternate.
     hinge             dihedral angles with k = D / 3: right for cylinders on equilateral triangles, where the Poisson's ratio is
-                      -1/3 whatever the material's; on right triangles three times too stiff along their diagonals, and four times in
-                      twist. Cheap and robust, for looks and for coarse folding; not for numbers.
-    isometric         the same energy for small angles, quadratic in the positions: flat, inextensible sheets.
+                      -1/3 for every material; on right triangles three times too stiff along their diagonals, and four times in
+                      twist. Cheap and robust, for rendering and for coarse folding; not for numbers.
+    isometric         hinge energy for small angles, quadratic in the positions: flat, inextensible sheets.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ from ddg_warp.geometry.shell_forms import (
 )
 from ddg_warp.kernels.terms import SHELLS
 
-FOLDED = 1e-6  # rad short of a fold by pi at which an edge has no angle
+FOLDED = 1e-6  # distance to a fold by pi at which an edge has no angle [rad]
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Plate:
     Attributes:
         abar: rest metric (T, 3) [m^2].
         bbar: rest second fundamental form (T, 3) [m].
-        angle: rest angle of every edge for the triangle on either side, dihedral or tilt (E, 2) [rad]; None if the rest shape
-            is explicit and curved.
+        angle: rest angle of every edge for the triangle on either side, dihedral or tilt (E, 2) [rad]; None for an explicit
+            curved rest shape.
         thickness: (T,) [m].
         young: Young's modulus (T,) [Pa].
         poisson: Poisson's ratio (T,).
@@ -88,13 +88,13 @@ class Plate:
 
 
 def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest="shape", viscosity=None) -> Plate:
-    """Rest shape and material of a shell.
+    """Return the rest shape and material of a shell.
 
     Args:
         surface: topology.
         positions: (P, 3) [m].
         thickness, young, poisson: numbers, or one for each triangle [m], [Pa], [1].
-        kinds: of the edges.
+        kinds: kinds of the edges.
         rest: "shape" (metric and curvature of the positions), "flat" (metric of the positions, no curvature), or explicit
             arrays (abar, bbar), each (T, 3) [m^2], [m].
         viscosity: retardation time of strain-rate damping, number or one for each triangle [s]; None for none.
@@ -137,7 +137,7 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
 
 
 def _refuse_folds(surface, angle: np.ndarray) -> None:
-    """Refuse two triangles that lie on each other: their angle is as well +pi as -pi, and the curvature between them infinite."""
+    """Refuse two triangles folded onto each other: the sign of the angle is undefined, the curvature infinite."""
     folded = (~surface.boundary[:, None] & (np.abs(angle) > np.pi - FOLDED)).any(1)
     for edge in np.flatnonzero(folded)[:1]:
         first, second = surface.edge_triangles[edge]
@@ -148,7 +148,7 @@ def _refuse_folds(surface, angle: np.ndarray) -> None:
 
 
 def membrane(surface, plate: Plate) -> ElementSet:
-    """Membrane of all triangles."""
+    """Return the membrane elements of all triangles."""
     none = np.zeros((len(surface.triangles), 0))
     term = _term("shell_stretch", plate)
     law = _law(term, plate, plate.membrane_stiffness, 0.5 * plate.abar)
@@ -156,7 +156,7 @@ def membrane(surface, plate: Plate) -> ElementSet:
 
 
 def curved_membrane(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
-    """Membrane of all triangles with the lengths of arcs over their sides, by the mid-edge normals that turn."""
+    """Return membrane elements with arc lengths over the sides of triangles, by rotating mid-edge normals."""
     b11, b12, b22 = plate.bbar.T
     squares = np.stack([b11**2, 0.5 * (b11**2 + b22**2 - (b11 + b22 - 2.0 * b12) ** 2), b22**2], -1)
     term = _term("shell_stretch_curved", plate)
@@ -166,7 +166,7 @@ def curved_membrane(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
 
 
 def mid_edge_bending(surface, plate: Plate, kinds: EdgeKinds, angles: bool) -> ElementSet:
-    """Bending of all triangles by mid-edge normals; with `angles` they turn, by angles numbered as the edges of the surface."""
+    """Return bending elements by mid-edge normals; with `angles` normals rotate, by angles numbered as the edges."""
     kind, vector = kinds.of_triangles(surface)
     data = [kind, vector.reshape(-1, 9)] + ([surface.triangle_signs] if angles else [])
     supported, side = np.nonzero(kind >= CLAMPED)
@@ -182,7 +182,7 @@ def mid_edge_bending(surface, plate: Plate, kinds: EdgeKinds, angles: bool) -> E
 
 
 def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
-    """Bending by dihedral angles: hinges at interior edges, tilts at clamped edges and symmetry planes."""
+    """Return bending by dihedral angles: hinges at interior edges, tilts at clamped edges and symmetry planes."""
     if plate.angle is None:
         raise SceneError("hinges have no rest angle in an explicit curved rest shape; use bending 'midedge_dof'")
     edges, nodes = _hinges(surface, kinds)
@@ -208,7 +208,7 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
 
 
 def isometric_bending(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
-    """Quadratic bending of a sheet that is flat at rest; no clamped edges or symmetry planes."""
+    """Return quadratic bending of a sheet with a flat rest shape; no clamped edges or symmetry planes."""
     if (kinds.kind >= CLAMPED).any():
         raise SceneError("bending 'isometric' has no clamped or symmetry edges; use 'hinge' or 'midedge_dof'")
     if plate.angle is None or np.abs(plate.angle).max() > 1e-6:
@@ -216,10 +216,14 @@ def isometric_bending(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
     edges, nodes = _hinges(surface, kinds)
     sides = surface.edge_triangles[edges]
     squares = plate.lengths_squared
-    cotangent = (squares.sum(1, keepdims=True) - 2.0 * squares) / (4.0 * plate.area[:, None])  # of the corners (T, 3)
-    at = [[_at(surface.triangles, sides[:, i], nodes[:, j], cotangent) for i in range(2)] for j in range(2)]
-    K1 = at[0][0] + at[0][1]
-    data = np.stack([K1, -at[0][0] - at[1][0], -at[0][1] - at[1][1]], -1)
+    cotangent = (squares.sum(1, keepdims=True) - 2.0 * squares) / (4.0 * plate.area[:, None])  # at the corners (T, 3)
+    corner_cotangents = [
+        [_at(surface.triangles, sides[:, i], nodes[:, j], cotangent) for i in range(2)] for j in range(2)
+    ]
+    K1 = corner_cotangents[0][0] + corner_cotangents[0][1]
+    data = np.stack(
+        [K1, -corner_cotangents[0][0] - corner_cotangents[1][0], -corner_cotangents[0][1] - corner_cotangents[1][1]], -1
+    )
     term = _term("shell_isometric", plate)
     law = _quadratic(term, 3.0 / plate.area[sides].sum(1), plate, sides, np.zeros(len(edges)))
     return ElementSet(term, nodes, np.zeros((len(edges), 0), int), data, law)
@@ -228,10 +232,10 @@ def isometric_bending(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
 def shell_elements(
     surface, plate: Plate, kinds: EdgeKinds, bending: str = "midedge_dof", membrane_model: str = "flat"
 ) -> list[ElementSet]:
-    """Membrane and bending of a shell. Where there are angles, those of edges that are not `turning` must be fixed.
+    """Return membrane and bending of a shell. Angles of edges outside `turning` must be fixed.
 
     Raises:
-        SceneError: no such model of bending or membrane, or one that the rest shape, the supports or the other do not fit.
+        SceneError: unknown bending or membrane model, or one incompatible with rest shape, supports or the other model.
     """
     if bending not in MODELS:
         raise SceneError(f"bending = {bending!r}; it is one of {', '.join(MODELS)}")
@@ -249,7 +253,7 @@ def shell_elements(
 
 
 def triangles_beside(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.ndarray]:
-    """Triangles whose mean stiffness the elements of bending at edges have, by term: two of hinges, one of tilts (., 2 or 1)."""
+    """Return, by term, the triangles that give bending elements at edges a mean stiffness: two of hinges, one of tilts."""
     hinges = surface.edge_triangles[_hinges(surface, kinds)[0]]
     if bending == "isometric":
         return {"shell_isometric": hinges}
@@ -257,31 +261,31 @@ def triangles_beside(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.nd
 
 
 def turning(kinds: EdgeKinds, bending: str) -> np.ndarray:
-    """Edges whose angle is a dof of a bending model (E,) bool."""
+    """Return the mask of edges with an angle dof in a bending model (E,) bool."""
     return (kinds.kind == FREE) & (bending == "midedge_boundary") | (kinds.kind <= NEIGHBOUR) & (
         bending == "midedge_dof"
     )
 
 
 def _hinges(surface, kinds: EdgeKinds) -> tuple[np.ndarray, np.ndarray]:
-    """Interior edges without support, and the nodes of their hinges (., 4)."""
+    """Return interior edges without support, and the nodes of each hinge (., 4)."""
     edges = np.flatnonzero(kinds.kind == NEIGHBOUR)
     return edges, np.concatenate([surface.edges[edges], surface.edge_opposite[edges]], axis=1)
 
 
 def _tilts(surface, kinds: EdgeKinds) -> tuple[np.ndarray, np.ndarray]:
-    """Clamped edges and symmetry planes, once for each triangle that they bound, and its side (.,)."""
+    """Return clamped and symmetry edges, once for each adjacent triangle, and the side of that triangle (.,)."""
     edges, side = np.nonzero((kinds.kind >= CLAMPED)[:, None] & (surface.edge_triangles >= 0))
     return edges, side
 
 
 def _length_squared(surface, plate: Plate, edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Squared rest length that a triangle gives to one of its edges (.,) [m^2]."""
+    """Return the squared rest length of an edge in a triangle (.,) [m^2]."""
     return _at(surface.triangle_edges, triangles, edges, plate.lengths_squared)
 
 
 def _at(table: np.ndarray, triangles: np.ndarray, entry: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """values (T, 3) of each triangle where its row of the table (T, 3) has the entry."""
+    """Return values (T, 3) of triangles at the column where the row of the table (T, 3) equals the entry."""
     return np.sum(np.where(table[triangles] == entry[:, None], values[triangles], 0.0), -1)
 
 
@@ -290,14 +294,14 @@ def _term(name: str, plate: Plate):
 
 
 def _law(term, plate: Plate, stiffness: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:
-    """Parameters of St. Venant and Kirchhoff's law by name."""
+    """Return the parameters of the St. Venant-Kirchhoff law by name."""
     shape = {"metric": [*plate.abar.T], "rest": [*rest.T]}
     viscosity = {} if plate.viscosity is None else {"viscosity": plate.viscosity}
     return term.bind(measure=plate.area, stiffness=stiffness, poisson=plate.poisson, **shape, **viscosity)
 
 
 def _quadratic(term, measure: np.ndarray, plate: Plate, sides: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:
-    """Parameters of the quadratic law of hinges between the triangles `sides` (., 1 or 2), k = D / 3, by name."""
+    """Return the parameters of the quadratic hinge law, k = D / 3 of the triangles `sides` (., 1 or 2), by name."""
     D, n = plate.bending_stiffness, len(term.measure.strains)
     stiffness = D[sides].mean(1) / 3.0
     viscosity = {}
@@ -307,7 +311,7 @@ def _quadratic(term, measure: np.ndarray, plate: Plate, sides: np.ndarray, rest:
 
 
 def _by_triangle(name: str, values, count: int, valid, text: str) -> np.ndarray:
-    """A number, or one for each triangle, as (T,); refuses what is not valid."""
+    """Return a number, or one for each triangle, as (T,); refuse invalid values."""
     values = np.asarray(values, float)
     if values.shape not in ((), (count,)):
         raise SceneError(f"{name} has shape {values.shape}; it is a number or has one for each of {count} triangles")

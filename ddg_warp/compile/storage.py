@@ -1,6 +1,7 @@
-"""Storages, a group of rods on their own or a net, as what a scene puts on them sees them: places with three components each.
+"""Common interface of rod groups and the coupled system, for boundary conditions, masses and loads.
 
-Places are numbered nodes first, then angles. The components of a node are those of its position; an angle is component 0 of its own.
+A storage has dof blocks of three components, numbered nodes first, then twist angles. The components of a node are its position; a
+twist angle is component 0 of its block.
 """
 
 from dataclasses import dataclass, field
@@ -10,30 +11,32 @@ import numpy as np
 
 from ddg_warp.compile.loads import DeadLoad, accumulate
 
-FREE = -1  # instead of a pose, of a dof that no motion moves
+FREE = -1  # pose index of a dof without prescribed motion
 
 
 @dataclass(frozen=True)
 class Along:
-    """Places along rods: number k of row r is `start[r] + step * k`, or what `table` has there."""
+    """Index map along rods: entry k of row r is `start[r] + step * k`, or the entry of `table` at that position."""
 
     start: np.ndarray
     step: int = 1
     table: np.ndarray | None = None
 
     def __call__(self, rows: np.ndarray, k) -> np.ndarray:
-        at = self.start[rows] + self.step * k
-        return at if self.table is None else self.table[at]
+        index = self.start[rows] + self.step * k
+        return index if self.table is None else self.table[index]
 
 
 @dataclass(frozen=True)
 class RodPlaces:
-    """Where the rods of a storage are, one a row.
+    """Dof map of the rods of a storage, one a row.
 
     Attributes:
-        rods: scene's indices (R,).
-        own: nodes without ghosts (R,); closed, twist: (R,) bool; length: at rest (R,) [m].
-        nodes, angles: places of nodes and of the angles of edges, counted from the first own one; ghosts are -1 and `own`.
+        rods: indices in the scene (R,).
+        own: number of nodes without ghosts (R,).
+        closed, twist: flags (R,) bool.
+        length: rest length (R,) [m].
+        nodes, angles: indices of nodes and of twist angles, counted from the first that is no ghost; ghosts are -1 and `own`.
     """
 
     rods: np.ndarray
@@ -46,39 +49,39 @@ class RodPlaces:
 
     @cached_property
     def _row(self) -> np.ndarray:
-        """Of every rod of the scene up to the last one here, and of one beyond; -1 of those that are elsewhere."""
+        """Row of each rod of the scene up to the last one of this storage, and of one more; -1 for rods of other storages."""
         row = np.full(self.rods.max(initial=-1) + 2, -1)
         row[self.rods] = np.arange(len(self.rods))
         return row
 
     def among(self, rods: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which of some rods are here, and their rows."""
+        """Return (positions among `rods`, rows) of the rods in this storage."""
         rows = self._row[np.minimum(rods, len(self._row) - 1)]
-        found = np.flatnonzero(rows >= 0)
-        return found, rows[found]
+        positions = np.flatnonzero(rows >= 0)
+        return positions, rows[positions]
 
     def node(self, rows: np.ndarray, k: int) -> np.ndarray:
-        """Places of node k, from the last if negative."""
+        """Return the indices of node k, counted from the last if negative."""
         return self.nodes(rows, k % self.own[rows])
 
     def edge(self, rows: np.ndarray, k: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Places of both nodes of edge k and of its angle (n, 3) of the rods with twist; of both nodes (n, 2) of those without.
+        """Return the indices of edge k and the rod lengths (n,), for rods with twist and for rods without.
 
-        Each with the lengths of the rods (n,).
+        Indices are of both nodes and the twist angle (n, 3) with twist, of both nodes (n, 2) without.
         """
-        found = []
+        result = []
         for twist in (True, False):
             some = rows[self.twist[rows] == twist]
             first = k % (self.own[some] - np.where(self.closed[some], 0, 1))
             ends = [self.nodes(some, first), self.nodes(some, (first + 1) % self.own[some])]
             places = np.column_stack([*ends, self.angles(some, first)] if twist else ends)
-            found.append((places, self.length[some]))
-        return found
+            result.append((places, self.length[some]))
+        return result
 
 
 @dataclass(frozen=True)
 class Held:
-    """Dofs that a support holds: (place, component) pairs; or the nodes on an oblique plane with this normal."""
+    """Dofs fixed by a support: (index, component) pairs, or the nodes of a skew support with this normal."""
 
     places: np.ndarray
     components: np.ndarray
@@ -87,14 +90,15 @@ class Held:
 
 @dataclass(kw_only=True, eq=False)
 class Storage:
-    """What a scene puts on a group of rods or on a net.
+    """Boundary conditions and loads of a rod group or of the coupled system.
 
     Attributes:
-        held: what each support holds here: of the rods, then of the shells and rings of a net.
-        moving: nodes that supports move, and the pose of each component, `FREE` of those that none does (n, 4).
-        turning: angles that supports turn, and their pose (n, 2).
-        dead: loads that follow nothing; followers: those that do, see `compile.loads`.
-        size: number of places; nodes: of nodes among them; places: where its rods are; axes: components that nodes have.
+        held: dofs fixed by each support: of the rods, then of the shells and rings of the coupled system.
+        moving: nodes with prescribed motion and the pose of each component, `FREE` without (n, 4).
+        turning: twist angles with prescribed motion and their pose (n, 2).
+        dead: dead loads; followers: follower loads, see `compile.loads`.
+        size: number of dof blocks; nodes: number of nodes.
+        places: dof map of the rods; axes: components of nodes.
     """
 
     held: list[Held] = field(default_factory=list)
@@ -107,44 +111,44 @@ class Storage:
     axes = (0, 1, 2)
 
     def add_load(self, places: np.ndarray, force, amplitude=None) -> None:
-        """Add a dead load of (3,) or (n, 3) on places."""
+        """Add a dead load of (3,) or (n, 3) at indices `places` (n,)."""
         if len(places):
             self.dead.append(DeadLoad(places, np.broadcast_to(np.asarray(force, float), (len(places), 3)), amplitude))
 
     @cached_property
     def constant(self) -> DeadLoad:
-        """All loads that neither change nor follow, as one."""
+        """All constant dead loads as one."""
         loads = [load for load in self.dead if load.amplitude is None]
         places = np.concatenate([np.zeros(0, int), *(load.places for load in loads)])
         return DeadLoad(places, np.concatenate([np.zeros((0, 3)), *(load.force for load in loads)]))
 
     @property
     def loaded(self) -> bool:
-        """Whether there is any load."""
+        """True if there is any load."""
         return bool(self.dead or self.followers)
 
     def constant_loads(self) -> np.ndarray:
-        """Constant forces on all places (size, 3) [N], moments [N m] in component 0 of angles."""
+        """Return the constant dead loads of all dof blocks (size, 3) [N], moments [N m] in component 0 of angles."""
         result = np.zeros((self.size, 3))
         accumulate(result, self.constant.places, self.constant.force)
         return result
 
     @property
     def timed(self) -> list[DeadLoad]:
-        """Loads that change and follow nothing."""
+        """Dead loads with an amplitude."""
         return [load for load in self.dead if load.amplitude is not None]
 
     @property
     def moves(self) -> bool:
-        """Whether supports move something."""
+        """True if a support has a prescribed motion."""
         return bool(len(self.moving) or len(self.turning))
 
     def index(self, places: np.ndarray) -> np.ndarray:
-        """Where places are in the array that has them, which of chains is another one for angles."""
+        """Return array positions of indices; rod groups store nodes and angles in separate arrays."""
         return places
 
     def fix(self, nodes: np.ndarray, along: list[int], angles: np.ndarray) -> None:
-        """Hold nodes along some components, and angles."""
+        """Fix nodes along some components, and angles."""
         raise NotImplementedError
 
     def add_mass(self, places: np.ndarray, mass: float) -> None:
@@ -152,26 +156,26 @@ class Storage:
         raise NotImplementedError
 
     def points(self, nodes: np.ndarray) -> np.ndarray:
-        """Positions of nodes at rest (n, 3) [m]."""
+        """Return the rest positions of nodes (n, 3) [m]."""
         raise NotImplementedError
 
     def name(self, place: int) -> str:
-        """A place, as a message has it."""
+        """Return the name of a dof block for messages."""
         raise NotImplementedError
 
     def edge_ends(self, angles: np.ndarray) -> np.ndarray:
-        """Nodes of the rod edges whose angles these are (n, 2)."""
+        """Return both nodes of each rod edge, by twist angle (n, 2)."""
         raise NotImplementedError
 
     def holding(self, nodes: np.ndarray) -> np.ndarray:
-        """Which components of nodes (..., 3) are held, or not there."""
+        """Return the mask of fixed or absent components of nodes (..., 3) bool."""
         raise NotImplementedError
 
     def dofs(self, places: np.ndarray) -> np.ndarray:
-        """Dofs of the components of places (..., 3) as a `Tangent` counts them in one world; -1 where there is none."""
+        """Return the dofs of dof blocks (..., 3) as numbered by `Tangent` in one world; -1 for absent components."""
         raise NotImplementedError
 
 
 def gathered(values: np.ndarray, dofs: np.ndarray) -> np.ndarray:
-    """Values of dofs, zero where there is none (-1)."""
+    """Return the values of dofs, zero for absent ones (-1)."""
     return np.where(dofs < 0, 0.0, values[dofs])

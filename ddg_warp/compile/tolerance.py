@@ -1,32 +1,35 @@
-"""How large a residual may be: an error of the inner forces, compared with the loads of what a dof belongs to.
+"""Residual tolerance: bound the error of internal forces relative to the load of the body.
 
-Every rod, shell and meridian is a *body* with the sum W of its own outer forces, as if nothing else were there. A residual is what
-inner forces fail to carry. In a rod or meridian, |sum of r| <= rtol W over every part, single nodes included, bounds the error of the
-axial force by rtol W. In a shell inner forces are per length: over a part with share a of its area, |sum of r| <= rtol W sqrt(a), but
-large parts, whose residuals move the whole and add up from step to step, are held to a tenth of W. Both are independent of refinement
-and of what else is in the net: a smooth residual, which displaces most, is caught by its sum over the whole, a rough one, which stiff
-edges carry, node by node. Moments are compared over the length L of the body (of a shell, the root of its area). Parts are the nodes,
-eight of them, eight of these, and so on, along a rod, or along a curve that fills a shell. A whole Newton step along an exact direction
-leaves a remainder of second order, whose sums need no look: of rods on their own, and of joined ones where elimination is exact.
+Every rod, shell and meridian is a *body* with the load scale W, the sum of its external forces alone. Clusters are single nodes, eight
+nodes, eight such clusters, and so on: along a rod, or along a space-filling curve of a shell.
 
-A body with less load than the mean of those it is connected with is given that mean, since it may carry theirs.
+- Rods and meridians: |sum of r| <= rtol W over every cluster bounds the error of the axial force by rtol W.
+- Shells: internal forces are per length. Over a cluster with the fraction a of the area, |sum of r| <= rtol W sqrt(a). Large clusters
+  are limited to a tenth of W, since their residuals move the whole shell and accumulate over steps.
+
+Both bounds are independent of refinement and of other bodies. Smooth residuals, which displace most, are caught by their sum over the
+body; rough ones, which stiff edges carry, by single nodes. Moments are divided by the length L of the body (shells: root of the area).
+A full Newton step along an exact direction leaves a second-order remainder, so subset sums are not tested. This holds for uncoupled
+rods, and for joined rods where elimination is exact.
+
+The load scale of a body is at least the mean over connected bodies, since it may carry their loads.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-FAN = 8  # parts that a larger part is made of
-SMOOTH = 0.1  # what residuals of large parts of a shell may add up to, over rtol W
+FAN = 8  # clusters that form a larger cluster
+SMOOTH = 0.1  # limit of residual sums over large clusters of a shell, over rtol W
 
 
 @dataclass
 class Level:
-    """Parts of one size.
+    """Clusters of one size.
 
     Attributes:
-        starts: where the children of each part start among `items` of the level below (at first, of the blocks).
-        weight: what its residuals may add up to [N, N m], over the load of its body [N]; body: which that is.
+        starts: offsets of the children of each cluster in `items`, indices of the level below (at first, of dof blocks).
+        weight: limit of the residual sum [N, N m] over the load scale of the body [N]; body: index of the body.
     """
 
     starts: np.ndarray
@@ -36,23 +39,23 @@ class Level:
 
 
 class Bodies:
-    """What the blocks of a net belong to.
+    """Bodies of the coupled system, by which residuals are normalised.
 
     Attributes:
         count: number of bodies: rods, shells, meridians.
-        owner: body of each block (N,), the first where they are joined; arm: what moments are divided by, 1 at nodes [m].
-        levels: parts, from small to large.
+        owner: body of each dof block (N,), the first where several are joined; arm: divisor of moments, 1 at nodes [m].
+        levels: clusters, from small to large.
         shortest: length of the shortest rod, or root of the area of the smallest shell [m].
     """
 
     def __init__(self, host):
         self.host, self.count = host, len(host.rods) + len(host.shells) + len(host.meridians)
-        blocks, body, share, arm, family = [], [], [], [], []
+        blocks, body, fraction, arm, family = [], [], [], [], []
 
-        def add(index, where, part, length=1.0, sums=True):
+        def add(index, where, weights, length=1.0, sums=True):
             blocks.append(where)
             body.append(np.full(len(where), index))
-            share.append(np.broadcast_to(part, len(where)))
+            fraction.append(np.broadcast_to(weights, len(where)))
             arm.append(np.full(len(where), length))
             family.append(np.full(len(where), len(family) if sums else -1))
 
@@ -65,14 +68,14 @@ class Bodies:
             order = _along_curve(shell.surface.points)
             corners = np.bincount(shell.surface.triangles.ravel(), np.repeat(areas / 3.0, 3), len(shell.nodes))
             add(index, shell.nodes[order], corners[order] / areas.sum())
-            turning = shell.edges >= 0  # the sign of these residuals depends on the edge: sums of them mean nothing
+            turning = shell.edges >= 0  # residual signs depend on the edge orientation: sums are meaningless
             sides = np.bincount(shell.surface.triangle_edges.ravel(), np.repeat(areas / 3.0, 3), len(shell.edges))
             add(index, shell.edges[turning], sides[turning] / areas.sum(), float(np.sqrt(areas.sum())), sums=False)
         for index, meridian in enumerate(host.meridians, len(lines) + len(host.shells)):
             add(index, meridian.nodes, 1.0)
-        blocks, body, share, arm, family = (
+        blocks, body, fraction, arm, family = (
             np.concatenate([np.zeros(0, type_), *values])
-            for values, type_ in ((blocks, int), (body, int), (share, float), (arm, float), (family, int))
+            for values, type_ in ((blocks, int), (body, int), (fraction, float), (arm, float), (family, int))
         )
         sizes = [length for *_, length in lines] + [np.sqrt(_areas(shell.surface).sum()) for shell in host.shells]
         sizes += [np.ptp(meridian.points, axis=0).max() for meridian in host.meridians]
@@ -81,7 +84,7 @@ class Bodies:
         self._blocks, self._body = blocks, body
         self._line = np.concatenate([np.zeros(0, int), *(nodes for nodes, *_ in lines)])
         self._line_body = np.repeat(np.arange(len(lines)), [len(nodes) for nodes, *_ in lines])
-        self._weight = _weight(is_shell, share) * arm
+        self._weight = _weight(is_shell, fraction) * arm
         self.owner, self.arm = np.zeros(host.blocks, int), np.ones(host.blocks)
         self.owner[blocks[::-1]], self.arm[blocks[::-1]] = body[::-1], arm[::-1]
         self._spins(lines)
@@ -92,11 +95,11 @@ class Bodies:
         self._component = connected_components(graph, directed=False)[1][host.blocks :]
         inside = family >= 0
         self.levels = _levels(
-            blocks[inside], family[inside], body[inside], share[inside], arm[inside], is_shell[inside]
+            blocks[inside], family[inside], body[inside], fraction[inside], arm[inside], is_shell[inside]
         )
 
     def _spins(self, lines: list) -> None:
-        """Rotations of joints, which belong to the rods that meet there."""
+        """Assign the rotations of rigid joints to the rods of the joint."""
         first = self.host.nodes + self.host.angles
         for part in self.host.sets if self.host.spins else ():
             spin = part.slots[(part.slots >= first).argmax(0), np.arange(len(part))]
@@ -108,49 +111,49 @@ class Bodies:
             self.owner[spin[joints]], self.arm[spin[joints]] = bodies, lengths
 
     def loads(self, force: np.ndarray, least: np.ndarray | float = 0.0) -> np.ndarray:
-        """What residuals of bodies are compared with (count,) [N]: W, or the mean of those that are connected where that is more.
+        """Return the load scale of bodies (count,) [N]: W, at least the mean over connected bodies.
 
         Args:
-            force: sizes of the outer forces on blocks (N,) [N, N m].
-            least: of each body, what W is not below [N].
+            force: absolute external forces on dof blocks (N,) [N, N m].
+            least: lower bound of W of each body [N].
         """
-        own = np.maximum(np.bincount(self.owner, force / self.arm, self.count), least)
-        total = np.bincount(self._component, own) / np.maximum(1, np.bincount(self._component))
-        return np.maximum(own, np.where(total > 0.0, total, own.mean())[self._component])
+        body_loads = np.maximum(np.bincount(self.owner, force / self.arm, self.count), least)
+        total = np.bincount(self._component, body_loads) / np.maximum(1, np.bincount(self._component))
+        return np.maximum(body_loads, np.where(total > 0.0, total, body_loads.mean())[self._component])
 
     @property
     def components(self) -> np.ndarray:
-        """Number of what every body is connected with (count,)."""
+        """Index of the connected component of every body (count,)."""
         return self._component
 
     def limit_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Blocks, bodies and weights of which `limits` takes the largest product of weight and load."""
+        """Return (dof blocks, bodies, weights); `limits` is the largest product of weight and load scale of a block."""
         return self._blocks, self._body, self._weight
 
     def support(self, force: np.ndarray) -> np.ndarray:
-        """The largest support force of every body (count,) [N], from the forces on held nodes (N, 3), zero elsewhere."""
+        """Return the largest support force of every body (count,) [N], from forces on fixed nodes (N, 3), zero elsewhere."""
         result = support_forces(force[self._line], self._line_body, self.count)
         sheets = np.isin(self.owner, np.unique(self._line_body), invert=True)
         np.maximum.at(result, self.owner[sheets], np.abs(force[sheets]).max(1))
         return result
 
     def limits(self, loads: np.ndarray) -> np.ndarray:
-        """Residual at rtol = 1 of every block (N,) [N, N m], of bodies with such loads (count,)."""
+        """Return the residual limit at rtol = 1 of every dof block (N,) [N, N m], for load scales of bodies (count,)."""
         result = np.zeros(self.host.blocks)
         np.maximum.at(result, self._blocks, loads[self._body] * self._weight)
-        result[self.host.of_obstacles] = 1.0  # of no body, and held
+        result[self.host.of_obstacles] = 1.0  # of no body, and fixed
         return result
 
 
 def outer_forces(host, gravity) -> np.ndarray:
-    """Sizes of the outer forces on every block of a net (N,) [N, N m], those that change at their full amplitude."""
+    """Return absolute external forces on every dof block (N,) [N, N m], with loads in time at full amplitude."""
     dead = host.constant_loads()
     dead[: host.nodes] += host.mass[: host.nodes] * np.asarray(gravity, float)
     return np.abs(dead).sum(1) + changing_forces(host)
 
 
 def changing_forces(host) -> np.ndarray:
-    """Of these, the sizes of loads that change, at their full amplitude, or follow, and of a magnetic field."""
+    """Return absolute forces of loads in time (full amplitude), follower loads and magnetic fields (N,) [N, N m]."""
     force = np.zeros(host.blocks)
     for load in host.timed:
         np.add.at(force, load.places, np.abs(load.force).sum(-1))
@@ -163,7 +166,7 @@ def changing_forces(host) -> np.ndarray:
 
 
 def _magnetic_forces(host, part) -> np.ndarray:
-    """Sizes of what a field at rest does to edges (E,) [N]: a couple per length is like a force at the end of the rod."""
+    """Return equivalent magnetic forces on edges at rest (E,) [N]; a couple is divided by the rod length."""
     lengths = {rod.rod: rod.piece.length[rod.row] for rod in host.rods}
     length = np.array([lengths[rod] for rod in part.owner[0]])
     field, gradient = np.split(np.abs(part.data[-part.term.measure.field :]), [3])
@@ -172,11 +175,11 @@ def _magnetic_forces(host, part) -> np.ndarray:
 
 
 def largest_excess(levels: list[Level], loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
-    """Whether the sums of residuals (N, 3) over all parts are small, and by how much the worst exceeds rounding.
+    """Return (True if all cluster sums of residuals (N, 3) are small, largest excess over limit and rounding).
 
     Args:
-        loads: of the bodies (count,) [N].
-        floor: what rounding leaves of the residual of each block (N,), which adds up like independent numbers.
+        loads: load scales of the bodies (count,) [N].
+        floor: rounding floor of each dof block (N,), summed like independent random numbers.
     """
     small, excess, square = True, -np.inf, floor**2
     for level in levels:
@@ -188,27 +191,27 @@ def largest_excess(levels: list[Level], loads: np.ndarray, rtol: float, residual
 
 
 def support_forces(force: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
-    """The largest force that neighbouring held nodes carry together, of every body (count,) [N].
+    """Return the largest force that neighbouring fixed nodes carry together, per body (count,) [N].
 
-    The two nodes of a clamp carry its moment as a pair of forces that grows as edges shrink; over the length it is a force, too.
+    The two nodes of a clamp carry its moment as a force couple that grows as edges shrink; divided by the rod length it counts, too.
 
     Args:
-        force: on the nodes along rods, one after the other (n, d) [N], zero at free nodes.
-        body: of these nodes (n,).
+        force: forces on the nodes of rods in order (n, d) [N], zero at free nodes.
+        body: body of each node (n,).
     """
-    held = np.flatnonzero(force.any(1))
+    fixed = np.flatnonzero(force.any(1))
     result = np.zeros(count)
-    if held.size:
-        first = (np.diff(held, prepend=-2) != 1) | (np.diff(body[held], prepend=-1) != 0)
-        together = np.abs(np.add.reduceat(force[held], np.flatnonzero(first), axis=0)).max(1)
-        np.maximum.at(result, body[held][first], together)
-        np.maximum.at(result, body[held], np.abs(force[held]).max(1) / np.bincount(body)[body[held]])
+    if fixed.size:
+        first = (np.diff(fixed, prepend=-2) != 1) | (np.diff(body[fixed], prepend=-1) != 0)
+        together = np.abs(np.add.reduceat(force[fixed], np.flatnonzero(first), axis=0)).max(1)
+        np.maximum.at(result, body[fixed][first], together)
+        np.maximum.at(result, body[fixed], np.abs(force[fixed]).max(1) / np.bincount(body)[body[fixed]])
     return result
 
 
-def _weight(is_shell: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """What residuals of parts may add up to, over rtol W, of parts of a shell by their share of its area."""
-    return np.where(is_shell, np.minimum(np.sqrt(share), SMOOTH), 1.0)
+def _weight(is_shell: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Return the limit of cluster residual sums over rtol W, for shells by the area fraction of the cluster."""
+    return np.where(is_shell, np.minimum(np.sqrt(fraction), SMOOTH), 1.0)
 
 
 def _areas(surface) -> np.ndarray:
@@ -217,7 +220,7 @@ def _areas(surface) -> np.ndarray:
 
 
 def _along_curve(points: np.ndarray) -> np.ndarray:
-    """Order of points along Morton's curve, on which neighbours in the order are neighbours in space."""
+    """Return the order of points along a Morton curve, which keeps neighbours close."""
     cells = (1023 * (points - points.min(0)) / max(1e-300, np.ptp(points, axis=0).max())).astype(np.int64)
     key = np.zeros(len(points), np.int64)
     for bit in range(10):
@@ -226,16 +229,16 @@ def _along_curve(points: np.ndarray) -> np.ndarray:
     return np.argsort(key, kind="stable")
 
 
-def _levels(blocks, family, body, share, arm, is_shell) -> list[Level]:
-    """Parts of families of blocks, until each family is one."""
+def _levels(blocks, family, body, fraction, arm, is_shell) -> list[Level]:
+    """Return clusters of families of dof blocks, until each family is one cluster."""
     levels, items = [], blocks
     while len(family) and (not levels or (np.bincount(family) > 1).any()):
         first = np.flatnonzero(np.diff(family, prepend=-1))
-        place = np.arange(len(family)) - np.repeat(first, np.diff(np.append(first, len(family))))
-        starts = np.flatnonzero(place % FAN == 0)
-        share = np.add.reduceat(share, starts)
+        position = np.arange(len(family)) - np.repeat(first, np.diff(np.append(first, len(family))))
+        starts = np.flatnonzero(position % FAN == 0)
+        fraction = np.add.reduceat(fraction, starts)
         family, body, arm, is_shell = family[starts], body[starts], arm[starts], is_shell[starts]
-        weight = _weight(is_shell, share) * arm
+        weight = _weight(is_shell, fraction) * arm
         levels.append(Level(np.append(starts, len(items)), items, weight, body))
         items = np.arange(len(starts))
     return levels

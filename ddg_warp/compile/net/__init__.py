@@ -1,1 +1,1 @@
-"""Of nets: everything by index of a block."""
+"""Compilation of the coupled system, with dofs addressed by index."""

@@ -1,6 +1,6 @@
-"""From a scene to its net: nodes of joined rods and attached vertices become one.
+"""Compile a scene to the coupled system; nodes of joined rods and attached vertices are merged.
 
-In a scene of dimension 2 the net is the planar one of three-dimensional elements.
+A scene of dimension 2 gives three-dimensional elements constrained to the plane.
 """
 
 from dataclasses import replace
@@ -23,14 +23,14 @@ from ddg_warp.scene.structures import COINCIDE
 
 
 def compile_net(scene, along: bool = False) -> Net | None:
-    """The net of a scene, None if it has none.
+    """Return the coupled system of a scene, None without one.
 
     Args:
-        along: whether nodes, angles and elements are numbered rod by rod, as suits a CPU, which walks along them. Else come the first
-            of all rods, then the second, ...: neighbouring threads of a GPU then touch neighbouring memory.
+        along: number nodes, angles and elements rod by rod, for sequential access on a CPU. Else number the first of all rods, then
+            the second, ..., for coalesced access on a GPU.
 
     Raises:
-        SceneError: something cannot be joined, held or loaded as described; the message names it.
+        SceneError: a joint, support or load is impossible; the message names the object.
     """
     chosen = net_rods(scene)
     if not chosen.any() and not scene.shells and not scene.axisymmetric_shells:
@@ -54,7 +54,7 @@ def compile_net(scene, along: bool = False) -> Net | None:
 
 
 def _spatial(batch):
-    """A planar batch as rods in space with twist, which the net holds in the plane."""
+    """Return a planar batch as rods in space with twist, to be constrained to the plane."""
     section = batch.section
     natural = batch.natural
     if not isinstance(natural, str):
@@ -68,7 +68,7 @@ def _spatial(batch):
 
 
 class _Builder:
-    """Collects raw nodes and elements, then merges what is shared."""
+    """Builder of the coupled system: collects raw nodes and elements, then merges common nodes."""
 
     def __init__(self, scene, along: bool):
         self.scene, self.along = scene, along
@@ -79,19 +79,19 @@ class _Builder:
         self.meridians: list[np.ndarray] = []
         self.obstacles: list[np.ndarray] = []
         self.markers: list[np.ndarray] = []
-        self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # of the nodes and of the angles of some rods
+        self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # (nodes, angles) of some rods
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
         self.stiffness: list[np.ndarray] = []
         self.ends: list[np.ndarray] = []
 
     def add_rods(self, piece: Piece) -> None:
-        """Number the nodes and angles of rods."""
+        """Number the nodes and twist angles of rods."""
         (rods, n, _), closed, (before, after) = piece.x.shape, piece.kind.closed, piece.ghosts
         order = "C" if self.along else "F"
 
         def rows(values):
-            """Those of all rods (R, n, c), in the order of their numbers."""
+            """Return values (R, n, c) as rows in the order of the numbering."""
             return (values if self.along else values.swapaxes(0, 1)).reshape(-1, values.shape[-1])
 
         nodes = self._number(rows(piece.x)).reshape(rods, n, order=order)
@@ -105,13 +105,13 @@ class _Builder:
             self.stiffness.append(rows(stiffness).T)
             self.ends.append(rows(np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1)))
         self.numbers.append((nodes, angles))
-        own, own_edges = nodes[:, before : n - after], angles[:, before : edges - after]
+        rod_nodes, rod_edges = nodes[:, before : n - after], angles[:, before : edges - after]
         for row, rod in enumerate(piece.rods.tolist()):
-            places = nodes[row], angles[row]
-            self.rods[rod] = NetRod(rod, own[row], own_edges[row], before, piece, row, *places)
+            all_dofs = nodes[row], angles[row]
+            self.rods[rod] = NetRod(rod, rod_nodes[row], rod_edges[row], before, piece, row, *all_dofs)
 
     def add_shell(self, shell) -> None:
-        """Number a shell's vertices."""
+        """Number the vertices of a shell."""
         self.shells.append((shell.surface, self._number(shell.points)))
 
     def add_meridian(self, shell) -> None:
@@ -120,7 +120,7 @@ class _Builder:
         self.meridians.append(self._number(np.column_stack([radius, 0.0 * radius, height])))
 
     def add_obstacle(self, obstacle) -> None:
-        """Number the points of an obstacle, and markers of one that spins."""
+        """Number the points of an obstacle, and carried nodes of a rotating surface."""
         points, radius = obstacle.shape.points, obstacle.shape.radius
         self.obstacles.append(self._number(points))
         self.markers.append(self._number(points[0] + radius * np.eye(3 if obstacle.spins else 0, 3)))
@@ -131,14 +131,14 @@ class _Builder:
         return np.arange(self.count - len(points), self.count)
 
     def finish(self) -> Net:
-        """Everything joined and numbered for good."""
+        """Merge joined nodes, number dof blocks and return the coupled system."""
         scene, points = self.scene, np.concatenate(self.points)
         merged = self._merge(points)
         rest_nodes = np.zeros((merged.max() + 1, 3))
-        rest_nodes[merged[::-1]] = points[::-1]  # the first of the merged nodes says where
+        rest_nodes[merged[::-1]] = points[::-1]  # the first of the merged nodes gives the position
         nodes = len(rest_nodes)
-        for numbers, places in self.numbers:  # which the rods look at
-            numbers[:], places[:] = merged[numbers], places + nodes
+        for numbers, angle_blocks in self.numbers:  # views in the rods
+            numbers[:], angle_blocks[:] = merged[numbers], angle_blocks + nodes
         ends = merged[np.concatenate([np.zeros((0, 2), int), *self.ends])]
         shells, mesh_edges = [], 0
         for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
@@ -200,24 +200,24 @@ class _Builder:
         return net
 
     def _merge(self, points: np.ndarray) -> np.ndarray:
-        """New number of every node; joined ones share theirs."""
-        pairs, what = [], []
+        """Return the new number of every node, equal for joined nodes."""
+        pairs, labels = [], []
         for number, joint in enumerate(self.scene.joints):
-            first, *others = (self.rods[rod].nodes[node] for rod, node in joint.members)
-            pairs += [(first, other) for other in others]
-            what += [f"joint {number}: its members"] * len(others)
+            first, *partners = (self.rods[rod].nodes[node] for rod, node in joint.members)
+            pairs += [(first, partner) for partner in partners]
+            labels += [f"joint {number}: its members"] * len(partners)
         for link in self.scene.attachments:
             nodes, vertices = self.rods[link.rod].nodes[link.nodes], self.shells[link.shell][1][link.vertices]
             pairs += zip(nodes, vertices, strict=True)
-            places = zip(link.nodes, link.vertices, strict=True)
-            what += [f"node {node} of rod {link.rod} and vertex {vertex}" for node, vertex in places]
+            named = zip(link.nodes, link.vertices, strict=True)
+            labels += [f"node {node} of rod {link.rod} and vertex {vertex}" for node, vertex in named]
         if not pairs:
             return np.arange(len(points))
         first, second = np.array(pairs).T
         gap = np.linalg.norm(points[first] - points[second], axis=1)
         size = np.abs(points[np.array(pairs)]).max(axis=(1, 2))
         for i in np.flatnonzero(gap > COINCIDE * np.maximum(1e-300, size))[:1]:
-            raise SceneError(f"{what[i]} lie {gap[i]:.3g} m apart at rest; what is joined starts at one point")
+            raise SceneError(f"{labels[i]} lie {gap[i]:.3g} m apart at rest; what is joined starts at one point")
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -225,11 +225,11 @@ class _Builder:
         return connected_components(graph, directed=False)[1]
 
     def _kinds(self, surface: Surface, index: int) -> tuple[shell_forms.EdgeKinds, np.ndarray]:
-        """What holds the normals at mesh edges, those whose two vertices a support names; and the place of that support."""
+        """Return the kinds of mesh edges, and the support that prescribes the normal of an edge with both vertices."""
         clamped, symmetry, supports = {}, {}, np.full(len(surface.edges), -1)
         corners = surface.points[surface.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        for place, support in enumerate(self.scene.shell_supports):
+        for number, support in enumerate(self.scene.shell_supports):
             if support.shell != index or not support.edges:
                 continue
             inside = np.isin(surface.edges, support.vertices).all(1)
@@ -237,13 +237,13 @@ class _Builder:
                 for edge in np.flatnonzero(inside & surface.boundary):
                     symmetry[int(edge)] = support.normal
                     if int(edge) not in clamped:
-                        supports[edge] = place
+                        supports[edge] = number
             else:
                 for edge in np.flatnonzero(inside):
                     sides = surface.edge_triangles[edge]
                     total = normals[sides[sides >= 0]].sum(0)
                     clamped[int(edge)] = total / np.linalg.norm(total)
-                    supports[edge] = place
+                    supports[edge] = number
         for edge in set(clamped) & set(symmetry):
             del symmetry[edge]
         return shell_forms.edge_kinds(surface, clamped, symmetry), supports

@@ -1,4 +1,4 @@
-"""What a scene puts on its net: masses, supports and loads."""
+"""Boundary conditions, masses and loads of the coupled system."""
 
 import numpy as np
 
@@ -19,8 +19,8 @@ def add_masses(scene, net: Net) -> None:
     for shell in net.meridians:
         axisymmetric.check_gravity(scene.gravity)
         lumps.append((shell.nodes, shell.mass))
-    places, lumped = (np.concatenate(values) for values in zip(*lumps, strict=True))
-    net.mass += np.bincount(places, lumped, net.blocks)[:, None]
+    blocks, lumped = (np.concatenate(values) for values in zip(*lumps, strict=True))
+    net.mass += np.bincount(blocks, lumped, net.blocks)[:, None]
     for rod in net.rods:
         if rod.all_edges.size:
             net.mass[rod.all_edges, 0] += rod.piece.rotary[rod.row]
@@ -28,7 +28,7 @@ def add_masses(scene, net: Net) -> None:
 
 
 def hold(scene, net: Net) -> None:
-    """Mark held dofs; remember what each support holds and what moves."""
+    """Fix dofs; record the dofs and the motion of each support."""
     claims = Claims(scene, net)
     conditions.hold_rods(scene, net, claims)
     normals: dict[int, list] = {}
@@ -43,7 +43,7 @@ def hold(scene, net: Net) -> None:
         each = np.arange(len(nodes))
         claims.take(support, nodes, each, each)
     for obstacle, nodes, markers in zip(scene.obstacles, net.obstacles, net.markers, strict=True):
-        each = np.append(np.arange(len(nodes)), 0 * markers)  # markers go with the first point
+        each = np.append(np.arange(len(nodes)), 0 * markers)  # carried nodes move with the first point
         nodes = np.append(nodes, markers)
         claims.take(obstacle, nodes, each, each)
     claims.finish()
@@ -53,24 +53,26 @@ def hold(scene, net: Net) -> None:
 def load(scene, net: Net) -> None:
     """Add the loads of rods, shells and rings."""
     conditions.load_rods(scene, net)
-    for given in scene.shell_loads:
-        net.add_load(net.shells[given.shell].nodes[given.vertices], given.force, given.amplitude)
-    for given in scene.pressures:
-        shell = net.shells[given.shell]
-        triangles = shell.nodes[shell.surface.triangles[given.triangles]]
-        _press(net, Pressure(triangles, given.pressure, given.amplitude), given.dead)
-    for given in scene.edge_couples:
-        net.followers.append(_edge_couple(net.shells[given.shell], given))
-    for given in scene.ring_loads:
-        force = np.column_stack([given.force[:, 0], 0.0 * given.force[:, 0], given.force[:, 1]])
-        net.add_load(net.meridians[given.shell].nodes[given.nodes], force, given.amplitude)
-    for given in scene.ring_pressures:
-        ends = net.meridians[given.shell].ends[given.edges]
-        _press(net, axisymmetric.BandPressure(ends, given.pressure, given.amplitude), given.dead)
+    for description in scene.shell_loads:
+        net.add_load(
+            net.shells[description.shell].nodes[description.vertices], description.force, description.amplitude
+        )
+    for description in scene.pressures:
+        shell = net.shells[description.shell]
+        triangles = shell.nodes[shell.surface.triangles[description.triangles]]
+        _press(net, Pressure(triangles, description.pressure, description.amplitude), description.dead)
+    for description in scene.edge_couples:
+        net.followers.append(_edge_couple(net.shells[description.shell], description))
+    for description in scene.ring_loads:
+        force = np.column_stack([description.force[:, 0], 0.0 * description.force[:, 0], description.force[:, 1]])
+        net.add_load(net.meridians[description.shell].nodes[description.nodes], force, description.amplitude)
+    for description in scene.ring_pressures:
+        ends = net.meridians[description.shell].ends[description.edges]
+        _press(net, axisymmetric.BandPressure(ends, description.pressure, description.amplitude), description.dead)
 
 
 def _press(net: Net, pressure, dead: bool) -> None:
-    """Add a pressure that follows the surface, or is dead: keeps its forces at rest."""
+    """Add a pressure as a follower load, or as a dead load with the forces at rest."""
     if dead:
         forces = pressure.forces(net.rest[pressure.places])
         net.add_load(pressure.places.ravel(), forces.reshape(-1, 3), pressure.amplitude)
@@ -78,18 +80,18 @@ def _press(net: Net, pressure, dead: bool) -> None:
         net.followers.append(pressure)
 
 
-def _edge_couple(shell, given) -> EdgeCouple:
-    """A couple about boundary edges, which nothing may hold."""
-    surface, edges = shell.surface, given.edges
+def _edge_couple(shell, description) -> EdgeCouple:
+    """Return a couple about boundary edges; refuse clamped and symmetry edges."""
+    surface, edges = shell.surface, description.edges
     for edge in edges[shell.kinds.kind[edges] != FREE_EDGE][:1]:
         raise SceneError(
             "add_edge_couple: the normal at the edge between the vertices {} and {} of shell {} is held, by a clamp or a plane of "
-            "symmetry, which would take the couple; load a free edge".format(*surface.edges[edge], given.shell)
+            "symmetry, which would take the couple; load a free edge".format(*surface.edges[edge], description.shell)
         )
-    side = np.where(surface.edge_triangles[edges, 0] >= 0, 0, 1)  # the triangle runs the edge forwards or backwards
+    side = np.where(surface.edge_triangles[edges, 0] >= 0, 0, 1)  # orientation of the edge in its triangle
     ends = np.where(side[:, None] == 0, surface.edges[edges], surface.edges[edges, ::-1])
     corners = np.column_stack([ends, surface.edge_opposite[edges, side]])
     length = np.linalg.norm(np.diff(surface.points[ends], axis=1)[:, 0], axis=1)
-    places = np.column_stack([shell.nodes[corners], shell.edges[edges]])
+    blocks = np.column_stack([shell.nodes[corners], shell.edges[edges]])
     size = float(np.ptp(surface.points, axis=0).max())
-    return EdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, size, given.amplitude)
+    return EdgeCouple(blocks, description.couple * length, 1.0 - 2.0 * side, size, description.amplitude)

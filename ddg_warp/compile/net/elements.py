@@ -1,4 +1,4 @@
-"""Elements of a net: of rods, rigid joints, magnetised edges, shells and meridians, gathered by term."""
+"""Element sets of the coupled system by term: rods, rigid joints, magnetised edges, shells, meridians."""
 
 from collections import Counter
 
@@ -17,7 +17,7 @@ from ddg_warp.kernels.terms import JOINTS, term_key
 
 
 def element_sets(scene, net: Net, along: bool) -> list[NetSet]:
-    """Elements of a net by term, numbered `along` rods or not (`compile_net`); marks the dofs that none of them has."""
+    """Return element sets by term, numbered `along` rods or not (`compile_net`); fix dofs without elements."""
     joints = _joint_places(scene, net)
     rods = [*_rod_sets(net, joints, along), *_joint_sets(net, joints), *glue_sets(scene, net)]
     magnets = magnet_sets(scene, net) if scene.magnets else []
@@ -25,12 +25,12 @@ def element_sets(scene, net: Net, along: bool) -> list[NetSet]:
 
 
 def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
-    """Of each rigid joint: node, block of its rotation, and its edges as (rod, edge with ghosts, sign)."""
+    """Return (node, rotation block, edges) of each rigid joint, edges as (rod, edge with ghosts, sign)."""
     by_rod = {rod.rod: rod for rod in net.rods}
     result = []
     for number, joint in enumerate(joint for joint in scene.joints if joint.rigid):
         members, node = [], -1
-        for index, at in joint.members:
+        for index, local_node in joint.members:
             rod = by_rod[index]
             if not rod.edges.size:
                 raise SceneError(f"rigid joint {number}: rod {index} has no twist; join it with rigid=False")
@@ -39,7 +39,7 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
                     f"rigid joint {number}: rod {index} bends by a law of its own, and half cells at joints know the quadratic one; "
                     "join it with rigid=False"
                 )
-            k = rod.first + (at if at >= 0 else len(rod.nodes) + at)
+            k = rod.first + (local_node if local_node >= 0 else len(rod.nodes) + local_node)
             node = rod.all_nodes[k]
             count, closed = len(rod.all_nodes), rod.piece.kind.closed
             if closed or k < count - 1:
@@ -51,7 +51,7 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
 
 
 def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
-    """Stretch and bending of the rods, numbered as their nodes are; vertices at rigid joints are left to these."""
+    """Return stretch and bending of rods in the order of nodes, except vertices at rigid joints."""
     skipped = np.array([rod.rod * net.nodes + node for node, _, members in joints for rod, _, _ in members], int)
     alike: dict[int, list[NetRod]] = {}
     for rod in net.rods:
@@ -59,7 +59,7 @@ def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
     sets = []
     for rods in alike.values():  # all rods of a piece
         piece, kind = rods[0].piece, rods[0].piece.kind
-        nodes, edges = (np.array([getattr(rod, what) for rod in rods]) for what in ("all_nodes", "all_edges"))
+        nodes, edges = (np.array([getattr(rod, attribute) for rod in rods]) for attribute in ("all_nodes", "all_edges"))
         n = nodes.shape[1]
         for term in kind.terms:
             span = term.measure.span
@@ -70,17 +70,17 @@ def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
                 row, k = row[~joined], k[~joined]
             values = {}
             for name in term.parameter_names:
-                given = piece.parameters[f"{term.name}.{name}"]
-                values[name] = given[row % len(given), k % given.shape[1]]
-            slots = [nodes[row, (k + i) % n] for i in range(span + 1)]
+                stored = piece.parameters[f"{term.name}.{name}"]
+                values[name] = stored[row % len(stored), k % stored.shape[1]]
+            blocks = [nodes[row, (k + i) % n] for i in range(span + 1)]
             lag = np.zeros((0, len(k)))
             if term.measure.angles:
-                slots += [edges[row, k], edges[row, (k + 1) % n]]
+                blocks += [edges[row, k], edges[row, (k + 1) % n]]
                 lag = piece.reference_twist[row, k][None]
             sets.append(
                 NetSet(
                     term,
-                    np.array(slots),
+                    np.array(blocks),
                     lag,
                     np.zeros((0, len(k))),
                     values,
@@ -92,34 +92,36 @@ def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
 
 
 def _joint_sets(net: Net, joints) -> list[NetSet]:
-    """Bending and twist of the half cells between rigid joints and the edges that meet them.
+    """Return bending and twist of the half cells between rigid joints and adjacent edges.
 
-    The joint holds each rod by the frame that the rod has at the node: between its edges there, or extrapolated at an end.
+    A joint clamps each rod by the rod's frame at the node: between adjacent edges, or extrapolated at an end.
     """
-    members = [(node, spin, *member) for node, spin, found in joints for member in found]
+    members = [(node, spin, *member) for node, spin, edges in joints for member in edges]
     kinds = [[member for member in members if member[2].piece.batch.by_angle == by_angle] for by_angle in (False, True)]
-    return [_half_cells(net, found, by_angle) for by_angle, found in enumerate(kinds) if found]
+    return [_half_cells(net, edges, by_angle) for by_angle, edges in enumerate(kinds) if edges]
 
 
 def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
-    """Those of rods of one kind of curvature."""
+    """Return the half cells of rods with one curvature measure."""
     term = JOINTS[term_key("rigid_joint", by_angle)]
     node, spin, rods, k, sign = zip(*members, strict=True)
     node, spin, k, sign = map(np.array, (node, spin, k, sign))
     edges = np.array([len(rod.all_edges) for rod in rods])
     closed = np.array([rod.piece.kind.closed for rod in rods])
-    across = (k - sign).astype(int)  # the rod's edge on the other side of the node; at an end there is none
+    across = (k - sign).astype(int)  # edge on the other side of the node; none at an end
     across = np.where(closed, across % edges, across)
     inside = (across >= 0) & (across < edges)
-    beside = np.where(inside, across, (k + sign).astype(int))
-    angles, others = (np.array([rod.all_edges[e] for rod, e in zip(rods, of, strict=True)]) for of in (k, beside))
-    here, there = angles - net.nodes, others - net.nodes
+    neighbour = np.where(inside, across, (k + sign).astype(int))
+    angles, neighbour_angles = (
+        np.array([rod.all_edges[e] for rod, e in zip(rods, e_k, strict=True)]) for e_k in (k, neighbour)
+    )
+    edge, neighbour_edge = angles - net.nodes, neighbour_angles - net.nodes
     frames, tangents = net.frame[:3].T, net.frame[3:].T
     lengths = polyline.length(np.diff(net.rest[net.ends], axis=1)[:, 0])
-    ends = [(frames[e], tangents[e], lengths[e]) for e in (there, here)]
+    ends = [(frames[e], tangents[e], lengths[e]) for e in (neighbour_edge, edge)]
     tangent, director = polyline.frames_at_nodes(*ends, np.where(inside, -1.0, 1.0))
-    half, along = 0.5 * lengths[here], sign[:, None]
-    pair = np.stack([along * tangent, along * tangents[here]], 1), np.stack([director, frames[here]], 1)
+    half, along = 0.5 * lengths[edge], sign[:, None]
+    pair = np.stack([along * tangent, along * tangents[edge]], 1), np.stack([director, frames[edge]], 1)
     twist = polyline.reference_twist(*pair, False)[:, 0]
     rest = np.stack([*(value[:, 0] for value in polyline.curvatures(*pair, False, by_angle)), twist]) / half
     for i, rod in enumerate(rods):
@@ -127,13 +129,13 @@ def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
             natural = _natural_at(rod.piece, rod.row, k[i] if sign[i] > 0 else k[i] + 1)
             rest[:, i] = natural * [1.0, sign[i], 1.0]
     lag = np.concatenate([director.T, (along * tangent).T, [twist]])
-    parameters = term.bind(measure=half, stiffness=[*net.stiffness[:, here]], rest=[*rest])
-    slots = np.array([node, net.ends[here, np.where(sign > 0, 1, 0)], angles, spin])
-    return NetSet(term, slots, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
+    parameters = term.bind(measure=half, stiffness=[*net.stiffness[:, edge]], rest=[*rest])
+    blocks = np.array([node, net.ends[edge, np.where(sign > 0, 1, 0)], angles, spin])
+    return NetSet(term, blocks, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
 
 
 def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
-    """Natural curvatures and twist of the rod's bending term at a node, at an end those of the vertex next to it [1/m]."""
+    """Return natural curvatures and twist of a rod at a node, at an end of the adjacent vertex [1/m]."""
     for term in piece.kind.terms:
         if term.measure.angles:
             rest = [piece.parameters[f"{term.name}.{name}"] for name in term.rest]
@@ -173,27 +175,30 @@ def _meridian_sets(net: Net, scene) -> list[NetSet]:
 
 def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
     count = len(elements.nodes)
-    slots = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
+    blocks = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
     parameters = {name: np.broadcast_to(p, (count,)) for name, p in elements.parameters.items()}
     owner = np.array([np.full(count, index), np.arange(count)])
-    return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters, owner)
+    return NetSet(elements.term, blocks, np.zeros((0, count)), elements.data.T, parameters, owner)
 
 
 def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
-    """One set a term; damped where one of its parts is."""
+    """Merge sets of one term; the merged set is damped if a member is."""
     result = []
     for law in dict.fromkeys(s.term.law for s in sets if len(s)):
         same = [s for s in sets if s.term.law == law and len(s)]
         term = next((s.term for s in same if s.term.density.lagged), same[0].term)
-        join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
+        join = [
+            np.concatenate([getattr(s, attribute) for s in same], axis=1)
+            for attribute in ("slots", "lag", "data", "owner")
+        ]
         still = [np.zeros(len(s)) for s in same]
         parameters = {
-            known.name: np.concatenate(
-                [s.parameters.get(known.name, zero) for s, zero in zip(same, still, strict=True)]
+            parameter.name: np.concatenate(
+                [s.parameters.get(parameter.name, zero) for s, zero in zip(same, still, strict=True)]
             )
-            for known in term.parameters
+            for parameter in term.parameters
         }
         first = np.cumsum([0] + [len(s) for s in same])
-        normals = [s.normals + [[at], [0], [0]] for s, at in zip(same, first, strict=False)]
+        normals = [s.normals + [[offset], [0], [0]] for s, offset in zip(same, first, strict=False)]
         result.append(NetSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1), same[0].along))
     return result

@@ -1,4 +1,4 @@
-"""Elements of magnetised rod edges in the applied field, and of pairs of them."""
+"""Elements of magnetised rod edges in the applied field, and dipole pairs."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,17 @@ from ddg_warp.scene.descriptions import Dynamics
 
 @dataclass(frozen=True)
 class _Magnets:
-    """The magnetised edges of a rod: ends (2, E) and angles (E,) as blocks, volume [m^3], unit direction (3, E) in the material
-    frame and size [A/m] of the magnetisation.
+    """Magnetised edges of a rod.
+
+    Attributes:
+        k: edges of the rod (E,).
+        ends: dof blocks of both nodes (2, E).
+        volume: (E,) [m^3].
+        direction, size: unit vector (3, E) in the material frame and size (E,) [A/m] of the magnetisation.
     """
 
     rod: NetRod
-    k: np.ndarray  # edges of the rod
+    k: np.ndarray
     ends: np.ndarray
     volume: np.ndarray
     direction: np.ndarray
@@ -25,7 +30,7 @@ class _Magnets:
 
     @property
     def along(self) -> bool:
-        """Whether all are magnetised along their tangents, which takes no frames."""
+        """True if all edges are magnetised along the tangent, so that frames do not matter."""
         return not self.direction[:2].any()
 
     @property
@@ -38,19 +43,19 @@ class _Magnets:
 
 
 def magnet_sets(scene, net: Net) -> list[NetSet]:
-    """Elements of magnetised edges in the applied field, and of pairs of them."""
-    magnets = [found for rod in net.rods if len((found := _magnets(scene, net, rod)).k)]
+    """Return the elements of magnetised edges in the applied field, and of dipole pairs."""
+    magnets = [edges for rod in net.rods if len((edges := _magnets(scene, net, rod)).k)]
     sets = _pairs(scene, net, magnets) if scene.dipoles else []
     if scene.applied_field is None:
         return sets
-    # a state that no solver has made stands at the start of the run, where loads of statics are zero
+    # an initial state is at the start of the run, where loads of statics are zero
     field = scene.applied_field.at(0.0, float(isinstance(scene.analysis, Dynamics)), SceneError)
     for magnet in magnets:
         term = MAGNETS["magnetic_tangent" if magnet.along else "magnetic"]
-        slots = magnet.ends if magnet.along else np.concatenate([magnet.ends, magnet.angles[None]])
+        blocks = magnet.ends if magnet.along else np.concatenate([magnet.ends, magnet.angles[None]])
         data = np.concatenate([magnet.direction, np.repeat(field[:, None], len(magnet.k), axis=1)])
         values = term.bind(measure=magnet.volume, magnetisation=magnet.size)
-        sets.append(NetSet(term, slots, np.zeros((0, len(magnet.k))), data, values, magnet.owner))
+        sets.append(NetSet(term, blocks, np.zeros((0, len(magnet.k))), data, values, magnet.owner))
     return sets
 
 
@@ -69,11 +74,11 @@ def _magnets(scene, net: Net, rod: NetRod) -> _Magnets:
 
 
 def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
-    """Elements of all pairs of magnetised edges that are listed."""
+    """Return the elements of all listed pairs of magnetised edges."""
     from scipy.spatial import cKDTree
 
-    def joined(what):
-        return np.concatenate([getattr(magnet, what) for magnet in magnets], axis=-1)
+    def joined(attribute):
+        return np.concatenate([getattr(magnet, attribute) for magnet in magnets], axis=-1)
 
     ends, owner, volume, direction, size = map(joined, ("ends", "owner", "volume", "direction", "size"))
     counts = [len(magnet.k) for magnet in magnets]
@@ -83,15 +88,15 @@ def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
     middle, pairs = net.rest[ends].mean(0), []
     for listed in scene.dipoles:
         chosen = np.arange(len(angle)) if listed.rods is None else np.flatnonzero(np.isin(owner[0], listed.rods))
-        reach = min(listed.cutoff, 2.0 * np.ptp(middle, axis=0).max())
-        pairs.append(chosen[cKDTree(middle[chosen]).query_pairs(reach, output_type="ndarray")])
+        cutoff = min(listed.cutoff, 2.0 * np.ptp(middle, axis=0).max())
+        pairs.append(chosen[cKDTree(middle[chosen]).query_pairs(cutoff, output_type="ndarray")])
     a, b = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0).T
-    apart = (ends[:, None, a] != ends[None, :, b]).all((0, 1))
-    a, b = a[apart], b[apart]
+    disjoint = (ends[:, None, a] != ends[None, :, b]).all((0, 1))
+    a, b = a[disjoint], b[disjoint]
     if not a.size:
         raise SceneError("add_dipoles: no two magnetised edges are within the cutoff of each other; take a larger one")
     for i in np.flatnonzero(np.linalg.norm(middle[a] - middle[b], axis=1) <= 1e-9 * np.abs(middle).max())[:1]:
-        names = " and ".join("edge {1} of rod {0}".format(*owner[:, at]) for at in (a[i], b[i]))
+        names = " and ".join("edge {1} of rod {0}".format(*owner[:, magnet_index]) for magnet_index in (a[i], b[i]))
         raise SceneError(f"add_dipoles: {names} have their middles at one point, where dipoles attract without bound")
     along, framed = along[a] & along[b], framed[a] & framed[b]
     for i in np.flatnonzero(~along & ~framed)[:1]:
@@ -102,10 +107,10 @@ def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
     sets = []
     for name, chosen in (("dipoles_tangent", along), ("dipoles", ~along)):
         i, j, term = a[chosen], b[chosen], MAGNETS[name]
-        slots = np.concatenate(
+        blocks = np.concatenate(
             [ends[:, i], ends[:, j], *([] if name == "dipoles_tangent" else [angle[None, i], angle[None, j]])]
         )
         values = term.bind(measure=volume[i] * volume[j], magnetisation=[size[i], size[j]])
         data = np.concatenate([direction[:, i], direction[:, j]])
-        sets.append(NetSet(term, slots, np.zeros((0, len(i))), data, values, owner[:, i]))
+        sets.append(NetSet(term, blocks, np.zeros((0, len(i))), data, values, owner[:, i]))
     return sets

@@ -1,7 +1,7 @@
-"""The net of a scene on the host: shells, joined rods and what they share, as blocks of three dofs and element sets.
+"""Coupled system of a scene on the host: dof blocks and element sets of shells and coupled rods.
 
-Blocks are numbered nodes first, then angles (of rod edges, then of mesh edges), then rotations of rigid joints. See
-`ddg_warp.compile.net.blocks` for how a scene becomes a net.
+Dof blocks are numbered nodes first, then angles (of rod edges, then of mesh edges), then rotations of rigid joints.
+`ddg_warp.compile.net.blocks` compiles them.
 """
 
 from dataclasses import dataclass, field
@@ -25,46 +25,48 @@ from ddg_warp.scene import drag
 
 @dataclass
 class NetRod:
-    """A rod of the net: blocks of its own nodes, angles of its own edges (indices of blocks; empty without twist)."""
+    """Rod of the coupled system: dof blocks of nodes and of twist angles (empty without twist), ghosts excluded."""
 
     rod: int
     nodes: np.ndarray
     edges: np.ndarray
-    first: int  # ghosts before its first node
+    first: int  # number of ghosts before the first node
     piece: Piece
-    row: int  # of the piece
+    row: int  # row in the piece
     all_nodes: np.ndarray  # with ghosts
     all_edges: np.ndarray
 
     @property
     def ends(self) -> np.ndarray:
-        """Nodes of all its edges (E, 2), those of ghosts included."""
+        """Nodes of all edges (E, 2), ghosts included."""
         pairs = np.column_stack([self.all_nodes, np.roll(self.all_nodes, -1)])
         return pairs if self.piece.kind.closed else pairs[:-1]
 
 
 @dataclass
 class NetShell:
-    """A shell of the net: blocks of its vertices, block of the angle of each mesh edge (-1 without)."""
+    """Shell of the coupled system: dof blocks of vertices and of mesh-edge angles (-1 without)."""
 
     surface: Surface
     nodes: np.ndarray
     edges: np.ndarray
     kinds: shell_forms.EdgeKinds
-    supports: np.ndarray  # place among the scene's of the support that gives the normal at each mesh edge, -1 without
+    supports: np.ndarray  # index of the support that prescribes the normal at each mesh edge, -1 without
     plate: shell_terms.Plate
     corner_mass: np.ndarray  # a third of the mass of each triangle [kg]
-    first: dict[str, int] = field(default_factory=dict)  # its first element in the set of each of its terms
+    first: dict[str, int] = field(default_factory=dict)  # first element in the set of each term
 
 
 @dataclass
 class NetSet:
-    """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`.
+    """Element set of one term on dof blocks: lagged rows (m, E), data (d, E), parameters as in `ElementSet`.
 
-    `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge. `normals` (3, n) are
-    element, first row of the data and support, counted over those of shells and then of rings, of every direction among the data
-    that a support gives: the normal at a mesh edge, or the tangent of a meridian. Those `along` rods have the slots of as many nodes
-    in a row as their measure spans edges, and one more, then the angles of these edges.
+    Attributes:
+        slots: dof block of each local index (n, E).
+        owner: rod or shell of each element, and the index of its edge, vertex, triangle or hinge (2, E).
+        normals: (element, first row of data, support) of every direction that a support prescribes in the data (3, n): normals at
+            mesh edges, tangents of meridians. Supports are numbered over shells, then rings.
+        along: True for rod elements: consecutive nodes, one more than the edges of the measure, then the angles of these edges.
     """
 
     term: object
@@ -82,19 +84,21 @@ class NetSet:
 
 @dataclass(kw_only=True, eq=False)
 class Net(Storage):
-    """A scene's net on the host: N blocks of three dofs.
+    """Coupled system of a scene on the host: N dof blocks of three components.
 
     Attributes:
-        rest: blocks at rest (N, 3): positions, then zeros.
-        nodes, angles, spins: how many blocks of each kind; rod_edges: how many of the angles belong to rods.
-        rods, shells, meridians: what the net was made from.
-        sets: elements by term.
-        ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
-        stiffness: EI1, EI2 and GJ of its section (3, rod_edges) [N m^2].
-        mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        obstacles: nodes of each, which are held; markers: three more of each that spins, as far from its first one as its radius, along
-            x, y and z at rest; touching: contact, None without.
-        frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `compile.net.planes`.
+        rest: dof blocks at rest (N, 3): positions, then zeros.
+        nodes, angles, spins: number of dof blocks of each kind.
+        rods, shells, meridians: members of the system.
+        sets: element sets by term.
+        ends: nodes of every rod edge (rod_edges, 2).
+        frame: director and tangent of rod edges (6, rod_edges).
+        stiffness: EI1, EI2 and GJ of rod edges (3, rod_edges) [N m^2].
+        mass: of every dof (N, 3) [kg, kg m^2]; fixed: mask of fixed dofs (N, 3).
+        obstacles: nodes of each obstacle, all fixed.
+        markers: carried nodes of each rotating surface, at one radius from its first node along x, y and z at rest.
+        touching: contact, None without.
+        frames: nodal frames, orthonormal rows (3, 3), of nodes on skew supports, by node; see `compile.net.planes`.
     """
 
     rest: np.ndarray
@@ -117,7 +121,7 @@ class Net(Storage):
 
     @property
     def blocks(self) -> int:
-        """Number of blocks."""
+        """Number of dof blocks."""
         return len(self.rest)
 
     @property
@@ -126,12 +130,12 @@ class Net(Storage):
 
     @property
     def of_obstacles(self) -> np.ndarray:
-        """Nodes of all obstacles, markers included, which belong to no body."""
+        """Nodes of all obstacles, carried nodes included, which belong to no body."""
         return np.concatenate([np.zeros(0, int), *self.obstacles, *self.markers])
 
     @property
     def holds(self) -> np.ndarray:
-        """Whether something of every dof in space is held (N, 3) bool."""
+        """Mask of spatial dofs that a constraint involves (N, 3) bool."""
         result = self.fixed.copy()
         for block, frame in self.frames.items():
             result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
@@ -183,68 +187,70 @@ class Net(Storage):
 
     @cached_property
     def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Edges that feel drag: their nodes (2, E), block of their angle (E,), -1 without, coefficients (rows, E); None without any."""
-        found = []
+        """(nodes (2, E), angle block or -1 (E,), coefficients (rows, E)) of edges with drag; None without any."""
+        pieces = []
         for rod in self.rods:
             if rod.piece.kind.drag:
                 coefficients = rod.piece.drag[rod.row]
                 ends = rod.ends[: len(coefficients)].T
                 angles = rod.all_edges if rod.all_edges.size else np.full(len(coefficients), -1)
-                found.append((ends, angles, coefficients.T))
-        return tuple(np.concatenate(parts, -1) for parts in zip(*found, strict=True)) if found else None
+                pieces.append((ends, angles, coefficients.T))
+        return tuple(np.concatenate(parts, -1) for parts in zip(*pieces, strict=True)) if pieces else None
 
     @cached_property
     def outwards(self) -> Outwards:
-        """The order in which steps that turn edges place its rods."""
-        held = self.fixed.all(1)
+        """Order of rods for edge-rotation updates."""
+        anchors = self.fixed.all(1)
         for shell in (*self.shells, *self.meridians):
-            held[shell.nodes] = True
-        return outwards([rod.all_nodes for rod in self.rods], held)
+            anchors[shell.nodes] = True
+        return outwards([rod.all_nodes for rod in self.rods], anchors)
 
     @cached_property
     def bodies(self) -> Bodies:
-        """What its blocks belong to."""
+        """Bodies of the residual tolerance."""
         return Bodies(self)
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """Nodes of the edges whose turns limit a step (E, 2): of rods, meshes and meridians; of rods without twist, of all elements."""
+        """Nodes of edges under the rotation cap (E, 2): rods, meshes, meridians; without any, of all elements."""
         shells, meridians = (s.nodes[s.surface.edges] for s in self.shells), (m.ends for m in self.meridians)
         edges = np.concatenate([self.ends, *shells, *meridians])
         return edges if len(edges) else np.concatenate([part.slots[:2].T for part in self.sets])
 
     @cached_property
     def edge_lengths(self) -> np.ndarray:
-        """Their lengths at rest (E,) [m]."""
+        """Rest lengths of `edges` (E,) [m]."""
         return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
 
     @cached_property
     def pieces(self) -> list[tuple]:
-        """Pieces of its rods, each with which of the rods it has, and their rows."""
-        found = {}
+        """(piece, rod numbers, rows) of all pieces."""
+        members = {}
         for number, rod in enumerate(self.rods):
-            found.setdefault(id(rod.piece), (rod.piece, []))[1].append((number, rod.row))
-        return [(piece, *np.array(rows).T) for piece, rows in found.values()]
+            members.setdefault(id(rod.piece), (rod.piece, []))[1].append((number, rod.row))
+        return [(piece, *np.array(rows).T) for piece, rows in members.values()]
 
     def rod_stiffnesses(self, s: float) -> np.ndarray:
-        """Stiffnesses of every rod over a step of s [s] (3, rods), by the parameters of the scene; see `precision.stiffnesses`."""
-        found = np.empty((3, len(self.rods)))
+        """Return the stiffnesses of rods over a step of s [s] (3, rods), by the scene; see `precision.stiffnesses`."""
+        result = np.empty((3, len(self.rods)))
         for p, rods, rows in self.pieces:
             parameters = {name: v.T for name, v in p.parameters.items()}
-            found[:, rods] = np.array(stiffnesses(p.kind, inert_mass(p, s), p.length, parameters, s))[:, rows]
-        return found
+            result[:, rods] = np.array(stiffnesses(p.kind, inert_mass(p, s), p.length, parameters, s))[:, rows]
+        return result
 
-    def split_errors(self, found: np.ndarray) -> np.ndarray:
-        """What float32 makes of rods with such stiffnesses (3, W rods) where tensions are unknowns; infinite where they cannot be, of
-        more than one stretch."""
-        _, bending, softest = found
+    def split_errors(self, values: np.ndarray) -> np.ndarray:
+        """Return float32 errors of rods with stiffnesses (3, W rods) in the mixed axial-force formulation.
+
+        Infinite for rods that it does not cover, with more than one stretch term.
+        """
+        _, bending, softest = values
         errors = float32_error(np.maximum(bending, largest_carried(softest.min(initial=np.inf))), softest)
         kinds = (rod.piece.kind for rod in self.rods)
         splits = np.array([kind.edge_strains == kind.tensions == 1 for kind in kinds], bool)
         return np.where(np.resize(splits, errors.shape), errors, np.inf)
 
     def shell_errors(self, s: float) -> np.ndarray:
-        """The same of shells (shells,): their membrane against inertia over a step and the lowest bending mode of a plate."""
+        """Return float32 errors of shells (shells,): membrane against inertia over a step plus the lowest plate mode."""
         errors = []
         for shell in self.shells:
             plate, nodes = shell.plate, len(shell.nodes)
@@ -255,12 +261,12 @@ class Net(Storage):
 
     @property
     def rod_edges(self) -> int:
-        """Angles that belong to rod edges; they come first."""
+        """Number of rod angles, the first of the angles."""
         return len(self.ends)
 
 
 def inert_mass(piece, s: float) -> np.ndarray:
-    """Mean mass of the nodes of every rod of a piece (R,) [kg], with what drag resists over a step of s [s]."""
+    """Return the mean nodal mass of rods of a piece (R,) [kg], plus drag times the step length s [s]."""
     mass = piece.mass.mean(1)
     if piece.kind.drag:
         mass = mass + s * drag.least(piece.drag) * piece.length / piece.mass.shape[1]

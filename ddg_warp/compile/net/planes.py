@@ -1,34 +1,34 @@
-"""Nodes of a net on planes that are not across an axis of space: the frames their dofs are held and solved in.
+"""Skew supports: nodal frames of nodes on planes across no coordinate axis.
 
-A symmetry plane holds the displacement along its normal. Where that is no axis of space, the node gets an orthonormal frame with the
-held directions first; `Net.fixed` then speaks of components in this frame. Positions stay in space everywhere: host and device turn
-forces and tangents into the frames, and directions back.
+A symmetry plane fixes the displacement along its normal. If that is no coordinate axis, the node gets an orthonormal frame with the
+fixed directions first, and `Net.fixed` refers to components in this frame. Positions stay in space: host and device rotate forces and
+tangents into the nodal frames, and search directions back.
 """
 
 import numpy as np
 
 from ddg_warp.errors import SceneError
 
-ALIGNED = 1e-12  # how far a held direction may be off an axis that it is taken for
+ALIGNED = 1e-12  # tolerance of a fixed direction from an axis that it counts as
 
 
 def frames_of_planes(net, normals: dict[int, list]) -> None:
-    """Hold nodes along the normals of their planes, whatever else holds them.
+    """Fix nodes along the normals of symmetry planes, in addition to other constraints.
 
     Raises:
-        SceneError: a node on such a plane is also moved.
+        SceneError: a node on such a plane also has a prescribed motion.
     """
     moves = set(net.moving[:, 0].tolist())
-    for block, given in normals.items():
+    for block, plane_normals in normals.items():
         if block in moves:
             raise SceneError(
                 "the point at ({:g}, {:g}, {:g}) m is on a symmetry plane across {} and moved by a support; give the support other "
-                "vertices".format(*net.rest[block], tuple(np.round(given[0], 6).tolist()))
+                "vertices".format(*net.rest[block], tuple(np.round(plane_normals[0], 6).tolist()))
             )
-        held = np.concatenate([np.eye(3)[net.fixed[block]], given])
-        _, size, directions = np.linalg.svd(held)
+        fixed_directions = np.concatenate([np.eye(3)[net.fixed[block]], plane_normals])
+        _, size, directions = np.linalg.svd(fixed_directions)
         rank = int((size > 1e-9).sum())
-        along = directions[:rank].T @ directions[:rank]  # projector on what is held
+        along = directions[:rank].T @ directions[:rank]  # projector on the fixed directions
         axes = np.diag(along) > 0.5
         if np.abs(along - np.diag(axes)).max() <= ALIGNED:
             net.fixed[block] = axes

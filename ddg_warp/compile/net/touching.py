@@ -1,4 +1,4 @@
-"""What of a net may touch what, and by which numbers."""
+"""Contact of the coupled system: collision bodies and parameters of pairs of groups."""
 
 import numpy as np
 
@@ -8,17 +8,18 @@ from ddg_warp.errors import SceneError
 from ddg_warp.scene.contact import Contact, touching_names
 from ddg_warp.scene.obstacles import MESH
 
-HALF = 0.5  # of the smallest radius, the range of contact by default
-# Of forces that close the gap by some part of the range, by default: weights of a node; the share of EI / r^2, bending to ten radii;
-# the strain of what a node carries of a membrane; and that of a rod, which counts where its bending stiffness is next to none.
+HALF = 0.5  # default activation distance over the smallest radius
+
+# Default contact forces that close a fraction of the activation distance. WEIGHTS: nodal weights. BENDING: fraction of EI / r^2, that
+# is, bending to ten radii. STRAIN: strain of a membrane. LIMP: strain of a rod, decisive where bending stiffness is negligible.
 WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
-BEYOND = 100.0  # range of contact over the size of the scene, at most
-RESOLVED = 1e-13  # range of contact over the coordinates of the scene, at least
-INERTIA = 10.0  # of the mass of a node over the square of the step, the least stiffness of a step that had no room
+BEYOND = 100.0  # largest activation distance over the size of the scene
+RESOLVED = 1e-13  # least activation distance over coordinates
+INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap, over nodal mass / dt^2
 
 
 def touching(scene, net: Net) -> Touching | None:
-    """Contact of a scene's net, None without."""
+    """Return the contact of the coupled system, None without."""
     law = scene.touching
     if law is None:
         return None
@@ -53,24 +54,24 @@ def touching(scene, net: Net) -> Touching | None:
             forces.append((net.mass[shell.nodes, 0].max(), elastic))
     gravity, obstacles = float(np.linalg.norm(scene.gravity)), len(scene.obstacles)
     scale = [max(WEIGHTS * mass * gravity, elastic) for mass, elastic in forces]
-    own = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
-    own = np.column_stack([own, np.full((2, obstacles), np.nan)])
+    scale_mass = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
+    scale_mass = np.column_stack([scale_mass, np.full((2, obstacles), np.nan)])
     for index, (obstacle, nodes, markers) in enumerate(zip(scene.obstacles, net.obstacles, net.markers, strict=True)):
         shape, name = obstacle.shape, obstacle.name
-        given = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
-        bodies.append(Body(*given, still=True, markers=markers))
-    found = _numbers(scene, law, bodies, *own)
-    if law.rolling and not (found.rubs and any(body.angles.size for body in bodies)):
-        lacking = "no rod touches anything" if found.rubs else "there is no friction"
+        geometry = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
+        bodies.append(Body(*geometry, still=True, markers=markers))
+    result = _numbers(scene, law, bodies, *scale_mass)
+    if law.rolling and not (result.rubs and any(body.angles.size for body in bodies)):
+        lacking = "no rod touches anything" if result.rubs else "there is no friction"
         raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
-    return found
+    return result
 
 
 def _radius(batch, row: int, rod: int) -> float:
-    """Largest radius of one rod of a batch [m], by which it touches.
+    """Return the contact radius of one rod of a batch, the largest of its section [m].
 
     Raises:
-        SceneError: its section has none.
+        SceneError: the section has no positive radius.
     """
     radius = batch.section.radius
     if radius is None or not np.all(np.asarray(radius) > 0.0):
@@ -82,27 +83,27 @@ def _radius(batch, row: int, rod: int) -> float:
 
 
 def _of_rod(batch, name: str, row: int) -> np.ndarray:
-    """Values of the section of one rod of a batch."""
+    """Return a section property of one rod of a batch."""
     values = np.asarray(getattr(batch.section, name), float)
     return values[row] if values.ndim == 2 and len(values) > 1 else values
 
 
 def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: np.ndarray) -> Touching:
-    """Numbers by pairs of groups.
+    """Return the contact parameters of pairs of groups.
 
     Args:
-        scale: of every body the force [N] that closes the gap by some part of the range; mass: of its heaviest node [kg].
+        scale: force of every body that closes a fraction of the activation distance [N]; mass: heaviest nodal mass [kg].
     """
     names, group = np.unique([body.name for body in bodies], return_inverse=True)
     count, moving = len(names), np.array([not body.still for body in bodies])
     radius = min(body.radius for body in bodies if not body.still)
     within = np.full((count, count), HALF * radius if law.range is None else law.range)
     rough = np.full((count, count, 3), law.friction)
-    force, inertia = (_of_both(own, group, moving) for own in (scale, INERTIA * mass))
+    force, inertia = (_of_both(values, group, moving) for values in (scale, INERTIA * mass))
     stiffness = np.full((count, count), np.nan if law.stiffness is None else law.stiffness)
-    ignored, place = [], {name: i for i, name in enumerate(names.tolist())}
+    ignored, index = [], {name: i for i, name in enumerate(names.tolist())}
     for between in scene.betweens:
-        g, h = (place[name] for name in between.names)
+        g, h = (index[name] for name in between.names)
         for table, value in ((rough, between.friction), (stiffness, between.stiffness), (within, between.range)):
             if value is not None:
                 table[g, h] = table[h, g] = value
@@ -115,7 +116,7 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
 
 
 def _refuse_ranges(scene, within: np.ndarray, names) -> None:
-    """Refuse a range (groups, groups) far beyond what touches, or one that coordinates do not resolve."""
+    """Refuse activation distances (groups, groups) beyond the scene size or below the resolution of coordinates."""
     points = np.concatenate([o.points.reshape(-1, 3) for o in (*scene.batches, *scene.shells)])
     size, far = np.ptp(points, axis=0).max(), np.abs(points).max()
     for g, h in np.argwhere((within > BEYOND * size) | (within < RESOLVED * far))[:1]:
@@ -131,21 +132,21 @@ def _refuse_ranges(scene, within: np.ndarray, names) -> None:
 
 
 def _of_both(values: np.ndarray, group: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Geometric means (groups, groups) of the largest values of what moves in two groups, of obstacles that of what they touch.
+    """Return geometric means (groups, groups) of the largest values of moving bodies in two groups.
 
-    Two obstacles, which never touch, have zero.
+    An obstacle takes the value of the other group. Two obstacles have zero.
     """
-    own = np.full(int(group.max()) + 1, np.nan)
+    largest = np.full(int(group.max()) + 1, np.nan)
     for g in np.unique(group[moving]):
-        own[g] = values[moving & (group == g)].max()
-    own = np.where(np.isnan(own)[:, None], own[None], own[:, None])
-    return np.nan_to_num(np.sqrt(own * own.T))
+        largest[g] = values[moving & (group == g)].max()
+    largest = np.where(np.isnan(largest)[:, None], largest[None], largest[:, None])
+    return np.nan_to_num(np.sqrt(largest * largest.T))
 
 
 def _by_way(friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of coefficients forwards, backwards and across (..., 3) the smallest but zero, and multiples of it.
+    """Return the smallest nonzero coefficient of forwards, backwards and across (..., 3), and multiples of it.
 
-    So what sticks creeps by less than the velocity of the law, whichever way it is pulled.
+    So sticking contacts creep by less than the velocity of the law in every direction.
     """
     least = np.where(friction > 0.0, friction, np.inf).min(-1)
     none = np.isinf(least)
