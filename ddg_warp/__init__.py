@@ -4,14 +4,14 @@
     model = scene.build(); integrator = Integrator(model); state = model.state()
     for _ in range(100): state = integrator.step(state, dt=0.01)
 
-Names are loaded when first used, so that importing the package loads neither Warp nor anything else that is heavy. Warp then says
-nothing of its modules unless DDG_WARP_VERBOSE=1 is set.
+Names are loaded on first use, so importing the package loads neither Warp nor other heavy modules. Warp is silent about its modules
+unless DDG_WARP_VERBOSE=1 is set.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME`
+if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp import io
     from ddg_warp.ask import inquiry
     from ddg_warp.errors import SceneError, SceneWarning, SolverError

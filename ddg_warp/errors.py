@@ -1,30 +1,30 @@
-"""Errors that a user of ddg_warp can meet; every message names the object, its index and the remedy."""
+"""Errors and warnings of ddg_warp; every message names the object, its index and the remedy."""
 
 
 class SceneError(ValueError):
-    """A scene cannot be built as described."""
+    """Invalid scene or argument."""
 
 
 class SceneWarning(UserWarning):
-    """A scene that can be built, but is likely not what was meant."""
+    """Valid scene that is likely a mistake."""
 
 
 class GradientWarning(UserWarning):
-    """Worlds have no gradient; see `ddg_warp.torch.Simulator`."""
+    """Missing gradient of worlds; see `ddg_warp.torch.Simulator`."""
 
 
 class DataError(ValueError):
-    """Data cannot be written or read as asked; the message names the file or folder, what is wrong and the remedy."""
+    """Failed writing or reading of data; the message names the file or folder, the fault and the remedy."""
 
 
 class SolverError(RuntimeError):
-    """A step or an equilibrium could not be solved.
+    """Failed step or equilibrium solve.
 
     Attributes:
-        state: the last good state.
+        state: last good state.
         outcome: name of the outcome, such as `line_search_failed`.
         rods: indices of the rods concerned.
-        gaining: whether a search for an equilibrium still gained energy when its iterations ended.
+        gaining: True if an equilibrium search still decreased the energy when its iterations ended.
     """
 
     def __init__(self, message: str, *, state=None, outcome: str = "", rods=(), gaining: bool = False):
@@ -36,7 +36,7 @@ class SolverError(RuntimeError):
 
 
 def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
-    """Refuse an option of a frozen dataclass that is no positive number, or no whole number of at least one.
+    """Refuse options of a frozen dataclass that are not positive numbers, or not whole numbers of at least one.
 
     Raises:
         SceneError: names the option.

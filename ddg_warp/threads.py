@@ -1,12 +1,12 @@
-"""Who may launch while others capture.
+"""Thread safety: mutual exclusion of launches, graph captures and kernel loading.
 
-While Warp captures on the CPU device, it records the launches and copies of every thread of the process (Warp 1.19). So a capture,
-and whatever compiles or loads kernels, waits until no other thread is inside of this package, and keeps them out meanwhile; all else
-runs side by side, but for calls of one object that works in memory of its own, such as an `Integrator`. On CUDA all threads share the
-current stream of a device, which Warp replaces while it reads an array: two that read at once can leave it replaced for good
-("unknown stream"), and memory or a graph that a thread frees ends the capture of another. So where there is CUDA every call is alone,
-and so is every collection of garbage; what is launched runs on. Launches that a user makes in threads of his own are his to keep
-apart.
+While Warp captures on the CPU device, it records the launches and copies of every thread of the process (Warp 1.19). So captures,
+compilation and loading of kernels exclude all other threads in this package. Other calls run concurrently, except calls of one object
+with scratch memory, such as an `Integrator`.
+
+On CUDA all threads use the current stream of a device, which Warp replaces while it reads an array. Two concurrent reads can leave the
+stream replaced ("unknown stream"), and memory or graphs freed by one thread end the capture of another. So with CUDA every call and
+every garbage collection excludes all others, while launched work runs on. Launches in a user's threads are not protected.
 """
 
 import gc
@@ -19,17 +19,17 @@ from ddg_warp.errors import SceneError
 
 
 class _Turns:
-    """Many threads that launch, or one that captures; a thread may enter again, and may capture while it launches."""
+    """Reentrant shared/exclusive lock: many threads launch, or one captures; a launching thread may capture."""
 
     def __init__(self):
         self._changed = threading.Condition()
         self._inside, self._capturing = 0, False
         self._own, self._collection = threading.local(), ExitStack()
-        self.shared: bool | None = None  # whether threads share a stream; found out by the first call
+        self.shared: bool | None = None  # True if threads use one stream; set by the first call
 
     @property
     def inside(self) -> bool:
-        """Whether this thread launches, or captures, once it is known whether threads share a stream."""
+        """True if this thread is launching or capturing, once `shared` is known."""
         return self.shared is not None and getattr(self._own, "depth", 0) > 0
 
     @contextmanager
@@ -72,7 +72,7 @@ class _Turns:
                 self._own.depth = depth
 
     def await_lock(self, lock) -> None:
-        """Acquire a lock that another thread holds, which may wait for this one to leave its turn meanwhile."""
+        """Acquire a lock that another thread holds; leave the shared section meanwhile, to avoid deadlock."""
         depth = getattr(self._own, "depth", 0)
         with self._changing():
             self._inside -= depth > 0
@@ -93,7 +93,7 @@ class _Turns:
             self._own.changing = False
 
     def _collecting(self, phase: str, _info: dict) -> None:
-        """Collections take their turn, too; but for one that starts while its thread is about to take or leave a turn."""
+        """Run garbage collections as launches, except in a thread that is entering or leaving a section."""
         if phase == "stop":
             self._collection.close()
         elif not getattr(self._own, "changing", False):
@@ -110,31 +110,31 @@ _turns = _Turns()
 launching, capturing = _turns.launching, _turns.capturing
 
 
-def launches(what):
-    """Decorate what launches: a function, or a class, whose constructor may load kernels and whose other methods launch.
+def launches(target):
+    """Decorate a function that launches, or a class: its constructor loads kernels, its public methods launch.
 
-    Where threads share a stream, what an object of such a class holds is freed in its turn, too.
+    If threads use one stream, the attributes of such an object are freed in a launching section, too.
     """
-    if not isinstance(what, type):
-        return _within(launching, what)
-    for name, member in list(vars(what).items()):
+    if not isinstance(target, type):
+        return _within(launching, target)
+    for name, member in list(vars(target).items()):
         if callable(member) and not isinstance(member, type | staticmethod | classmethod):
             if name == "__init__":
-                setattr(what, name, _within(capturing, member))
+                setattr(target, name, _within(capturing, member))
             elif not name.startswith("_"):
-                setattr(what, name, _within(launching, member))
-    what.__del__ = _release
-    return what
+                setattr(target, name, _within(launching, member))
+    target.__del__ = _release
+    return target
 
 
 def lock_of(owner) -> threading.RLock:
-    """Return the lock of an object whose memory one call at a time may use."""
+    """Return the lock that guards the scratch memory of an object."""
     lock = owner.__dict__.get("_lock")
     return owner.__dict__.setdefault("_lock", threading.RLock()) if lock is None else lock
 
 
 def _acquired(owner) -> threading.RLock:
-    """Return the lock of an object once this thread holds it."""
+    """Acquire and return the lock of an object."""
     lock = lock_of(owner)
     if not lock.acquire(blocking=False):
         _turns.await_lock(lock)
@@ -143,7 +143,7 @@ def _acquired(owner) -> threading.RLock:
 
 @contextmanager
 def alone(owner) -> Iterator[None]:
-    """Keep other threads out of an object's memory."""
+    """Exclude other threads from the scratch memory of an object."""
     lock = _acquired(owner)
     try:
         yield
@@ -152,11 +152,11 @@ def alone(owner) -> Iterator[None]:
 
 
 def one_at_a_time(method):
-    """Decorate a method that works in memory of its object, so that threads which share the object call it one after the other."""
+    """Decorate a method that uses scratch memory of the object: calls of several threads are serialised."""
 
     @wraps(method)
     def entered(self, *args, **kwargs):
-        lock = _acquired(self)  # as `alone`, which takes a hundredth of a small step
+        lock = _acquired(self)  # like `alone`, which costs a hundredth of a small step
         try:
             return method(self, *args, **kwargs)
         finally:
@@ -166,9 +166,7 @@ def one_at_a_time(method):
 
 
 def stays_here(cls):
-    """Decorate a class whose objects hold captured launches and scratch memory of a device: threads that share an object call its
-    public methods one after the other, and no copy can take it over.
-    """
+    """Decorate a class with captured launches and scratch memory: serialise public methods, refuse copies and pickling."""
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and callable(member) and not isinstance(member, type | staticmethod | classmethod):
             setattr(cls, name, one_at_a_time(member))
@@ -189,12 +187,12 @@ def _release(self) -> None:
             vars(self).clear()
 
 
-def _within(turn, function):
+def _within(section, function):
     @wraps(function)
     def entered(*args, **kwargs):
-        if turn is launching and _turns.inside:  # in this very turn, which takes less than to take it anew
+        if section is launching and _turns.inside:  # already in a section; entering again would cost more
             return function(*args, **kwargs)
-        with turn():
+        with section():
             return function(*args, **kwargs)
 
     return entered

@@ -1,4 +1,4 @@
-"""The simulator as a torch module: steps, roll-outs and equilibria as pure functions of tensors, with gradients of all of them."""
+"""Differentiable simulator as a torch module: steps, rollouts and equilibria as pure functions of tensors."""
 
 from ddg_warp.learn.modules import PositiveParameters
 from ddg_warp.learn.rod_parameters import RodParameters

@@ -1,4 +1,4 @@
-"""Time integration: implicit Euler and the implicit midpoint rule, with retry, on the device."""
+"""Time integration on the device: implicit Euler and implicit midpoint rule, with retries."""
 
 import numpy as np
 import warp as wp
@@ -33,57 +33,54 @@ SCHEMES = ("implicit_euler", "implicit_midpoint")
 @stays_here
 @launches
 class Integrator:
-    """Advances states of a model in time.
+    """Implicit time integrator of a model.
 
         integrator = Integrator(model)
         state = model.state()
         for _ in range(100):
             state = integrator.step(state, dt=0.01)
 
-    In mixed precision, groups whose float32 factors would be poor at the step taken (stiff, finely divided rods and long steps) take
-    tensions of edges for unknowns of their own, or, where that does not do or is not to be had (closed rods, and rods joined to what
-    moves), are solved in float64; `statistics()["linear"]` says which. In float32 rounding may leave more than 1e-4 of the loads out of
-    balance at a node; where iterations do not better that, the step counts as `converged_to_rounding`, and a warning says so, once.
+    In mixed precision, stiff rods, fine meshes and long steps may make float32 factors inaccurate. Such groups take the mixed
+    axial-force formulation. Where it fails or is unavailable (closed rods, rods joined to moving nodes), they are solved in float64.
+    `statistics()["linear"]` reports the choice. In float32, rounding may leave residuals above 1e-4 of the load scale at a node. If
+    further iterations do not reduce them, the step counts as `converged_to_rounding`, and one warning is issued.
 
-    A step is one captured graph: nothing in it allocates or waits for the host. On CUDA, outcomes are read every
-    `check_every` steps; a rod that failed rests at its last good state meanwhile, and the others go on.
+    A step is one captured graph without allocation or host synchronisation. On CUDA, outcomes are read every `check_every` steps. Until
+    then a failed rod stays at its last good state while others continue.
 
     Args:
-        model: what to integrate.
-        scheme: "implicit_euler" (first order, damps what the step does not resolve) or "implicit_midpoint" (second order,
-            A-stable, keeps the energy of linear oscillations).
-        solver: "newton", or "projective": the matrix of a step's first iterate serves all of its iterations.
-        linear: of Newton: "auto" (the chain sweep for open rods, on CUDA cyclic reduction where they are few and long; PCG with
-            the chain preconditioner for closed ones), "sweep", "partitioned" (cyclic reduction), or PCG with "jacobi",
-            "block_jacobi" or "chain" as preconditioner. Nets are solved by PCG alone, with "block_jacobi", "chain" (rods between
-            their joints are eliminated), "multilevel" (fewer and longer iterations for large sheets), or "chain_multilevel",
-            both ("auto" by the nodes of rods between joints, and of everything else). By "auto" rods that contact alone couples are
-            solved one by one, as if they were on their own, in steps in which nothing comes within its reach, world by world.
+        model: model to integrate.
+        scheme: "implicit_euler" (first order, damps unresolved motion) or "implicit_midpoint" (second order, A-stable, conserves the
+            energy of linear oscillations).
+        solver: "newton", or "projective": modified Newton, with the Hessian of the first iterate throughout a step.
+        linear: linear solver. Rod groups take `"sweep"` (block LDL^T), `"partitioned"` (block cyclic reduction), or PCG with the
+            preconditioner `"jacobi"`, `"block_jacobi"` or `"chain"` (substructuring). The coupled system takes PCG with
+            `"block_jacobi"`, `"chain"`, `"multilevel"` (fewer, longer iterations for large sheets) or `"chain_multilevel"` (both).
+            For rod groups `"auto"` takes the sweep, cyclic reduction for few long rods on CUDA, and `"chain"` for closed rods. For the
+            coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods coupled by contact
+            alone as uncoupled rods, per world, while no pair is in range.
         rtol, max_iterations, ...: see `NewtonOptions`.
-        retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
-            then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
-        energy_bound: what the midpoint rule may make of the energy, or lose, of every lone rod, and of the net in every world: a
-            fraction of the largest kinetic and elastic energy that it has had, and of what damping and drag took, or None for anything.
-            Loads and supports may do any work. A step that would leave the bound is tried again in halves, and then fails by the
-            outcome `energy_drift`. Counted from a state that the integrator has not made itself (a run that is resumed counts
-            anew); what rounding may make does not count. Where steps resolve the motion the rule keeps the energy to some 1e-3,
-            and where it is unstable the energy grows to a multiple within some steps: a tenth lies between. Implicit Euler takes
-            energy out of what steps do not resolve and is not watched. See `kernels.energy`.
+        retry_limit: consecutive retries of a failed step: first a cold start, then half the step, and so on, down to
+            2^-(retry_limit / 2) of the step.
+        energy_bound: largest energy drift of the midpoint rule, per uncoupled rod and per world of the coupled system. It is a fraction
+            of the largest kinetic and elastic energy so far plus the work of damping and drag; None for no bound. Work of loads and
+            supports and the rounding floor do not count. A step beyond the bound is retried at half length, and then fails with the
+            outcome `energy_drift`. The count starts at a state from outside (a resumed run counts from zero). Resolved motion
+            conserves the energy to about 1e-3, while an unstable run multiplies it within some steps: the default of a tenth lies
+            between. Implicit Euler dissipates and is not watched. See `kernels.energy`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
-        failures: what becomes of a step that is given up: "raise" stops the run, as described; by "flag" nothing is read or raised.
-            The world it is in then rests as it was before that step, all of it, until `reset` starts it anew, or the integrator is
-            given a state that it has not made itself; the others go on, and `outcomes` tells which are which.
-        gyroscopic: whether the spin of a rod about its tangent resists turns of the tangent; by default in steps from states that were
-            given spins (`Model.state`), and in those that follow. Ask for it where motors or moments spin up a rod that then tumbles.
-            Where rods spin no faster than they turn it is as small as their inertia against turns, (radius / length)^2, which rods
-            here do not have. See `kernels.gyroscopic`.
+        failures: "raise" raises an error for a failed step. With "flag" nothing is read or raised, and `outcomes` lists the outcomes.
+            A world with a failed step keeps the state before the step until `reset`, or until the integrator gets a state from
+            outside, while other worlds continue.
+        gyroscopic: True if the spin of a rod about its tangent resists rotation of the tangent. By default True from states with given
+            spins (`Model.state`) on. Set it if motors or moments spin up a rod that then tumbles. If a rod spins no faster than it
+            rotates, the effect is of the order of the neglected rotary inertia, (radius / length)^2. See `kernels.gyroscopic`.
 
     Attributes:
-        whole: whether rods that touch nothing are solved with their net all the same; see `step_whole`.
+        whole: True if rods out of contact are solved in the coupled system regardless; see `step_whole`.
 
     Raises:
-        SceneError: a free node has neither mass nor drag along and across its rod, the scheme does not exist, or implicit Euler is
-            given a bound.
+        SceneError: a free node has neither mass nor drag along and across its rod, or the scheme is unknown, or has no bound.
     """
 
     def __init__(
@@ -119,8 +116,8 @@ class Integrator:
         self.energy_bound = energy.bound(energy_bound, scheme)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         validate.require_mass(model)
-        self.given: Given | None = None  # loads that steps are given, once one is
-        # the uniform magnetic field that they are given, in every world
+        self.given: Given | None = None  # control loads, made with the first one
+        # uniform magnetic field of controls in every world
         self.field, self.whole = None, False
         if model.magnetic:
             self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
@@ -135,31 +132,31 @@ class Integrator:
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
         self._changes: Changes | None = None
-        self._gyroscope: Gyroscope | None = None  # made when a step first takes it
-        self._spinning = False  # whether the step at hand does
-        self._doubted = False  # whether it was told that rounding leaves more than a part of the loads
+        self._gyroscope: Gyroscope | None = None  # made on first use
+        self._spinning = False  # True if the current step has gyroscopic couples
+        self._doubted = False  # True once the rounding warning is issued
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
-        """The state after a step of dt [s]. No state changes that is held: see `State`.
+        """Return the state after a step of dt [s]. States that the caller keeps stay unchanged: see `State`.
 
         Args:
-            state: where the step starts; dt: its length [s].
-            controls: poses of grips, loads, gravity and magnetic field of this step, world by world; see `Controls`.
+            state: start of the step; dt: step length [s].
+            controls: poses of grips, control loads, gravity and magnetic field of this step, per world; see `Controls`.
 
         Raises:
-            SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
-                names rod and outcome. Or supports or obstacles turn farther in contact than substeps resolve, or a grip by more than
-                half a turn (`turned_too_far`).
+            SolverError: a rod failed within the retries, or float32 would lose the motion in rounding; the message names rod and
+                outcome. Also if supports or obstacles rotate farther in contact than substeps resolve, or a grip by more than half
+                a revolution (`turned_too_far`).
             SceneError: controls do not fit the model, or a shell has a curved membrane.
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         validate.check_state("step", self.model, state)
-        found = checked(controls, self.model)
+        inputs = checked(controls, self.model)
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
         self._prepare(dt, state)
-        self._control(found, source)
+        self._control(inputs, source)
         self._spin(self.resists(state))
         self.advance(source, state.time, dt)
         target.time = state.time + dt
@@ -173,32 +170,32 @@ class Integrator:
         return target
 
     def _begin(self, source: int) -> None:
-        """Launches before a step from a state that comes from elsewhere, in a buffer."""
+        """Launch the preparation of a step from an outside state in a buffer."""
         self.forget()
         before, after = self._buffers[source].own, self._buffers[1 - source].own
         self._worlds.bar(self._parts, before, after, self._handed(after))
 
     def _handed(self, after: State) -> list[wp.array]:
-        """Arrays of what a step to a state is given beside the state before it."""
+        """Return the arrays of controls of a step to a state."""
         loads = (
             [getattr(self.given, name).flatten() for name in LOADS] if self.given is not None and self.given.any else []
         )
         return [*loads, *([self.field] if self.field is not None else []), *([after.grips.pose] if after.grips else [])]
 
     def resists(self, state: State) -> bool:
-        """Whether spins resist turns of their axes in a step from a state; see `gyroscopic`."""
+        """Return True if a step from a state has gyroscopic couples; see `gyroscopic`."""
         validate.check_state("resists", self.model, state)
         return state.spun if self.gyroscopic is None else self.gyroscopic
 
     def _spin(self, wanted: bool) -> None:
-        """Take gyroscopic couples into the steps from now on, or leave them out."""
+        """Include or exclude gyroscopic couples from the next step on."""
         self._spinning = wanted
         if wanted and self._gyroscope is None:
             self._gyroscope = Gyroscope(self.model, self._dt)
             self._graphs.clear()
 
     def _prepare(self, dt: float, state: State) -> None:
-        """Solve by what suits steps of dt from now on."""
+        """Set the step length, the solver selection and the limits for steps of dt [s]."""
         changed = dt != self._dt_host or self.model.version != self._version
         if changed:
             validate.refuse_curved_membranes(self.model)
@@ -210,29 +207,29 @@ class Integrator:
                 part.limit(self._solved(dt))
 
     def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
-        """A step from what one buffer holds, at the time `start`, to the other; `anew` where it is from elsewhere: see `forget`."""
+        """Step from one buffer at the time `start` to the other; `anew` for an outside state: see `forget`."""
         for part in self._parts:
             part.prescribe(start, start + dt)
 
-        # where pairs may outgrow their room the step is done again, from what it has begun with once
-        again = anew and self._net is not None and self._net.newton.contact is not None
-        given = self.given is not None and self.given.any
+        # with contact, a capacity overflow repeats the step, so it begins in a graph of its own
+        repeatable = anew and self._net is not None and self._net.newton.contact is not None
+        controlled = self.given is not None and self.given.any
 
         def launch():
-            if anew and not again:
+            if anew and not repeatable:
                 self._begin(source)
             self._launch(source)
 
         def replay():
-            self._graphs.replay((source, anew, given, self._spinning), launch)
+            self._graphs.replay((source, anew, controlled, self._spinning), launch)
 
-        if again:
-            self._graphs.replay(("begin", source, given), lambda: self._begin(source))
+        if repeatable:
+            self._graphs.replay(("begin", source, controlled), lambda: self._begin(source))
 
         net = self._buffers[source].own.net
-        # on its own: steps with and without it would be captured one by one
-        if self._net is not None and (what := self._net.outdated(anew)):
-            self._graphs.replay(("renew", source, what), lambda: self._net.renew(net, what))
+        # a graph of its own: the step needs no capture with and without it
+        if self._net is not None and (trees := self._net.outdated(anew)):
+            self._graphs.replay(("renew", source, trees), lambda: self._net.renew(net, trees))
         replay()
         while self._net is not None and self._net.outgrown(net):
             self._graphs.clear()
@@ -252,14 +249,14 @@ class Integrator:
                 self._doubted = part.warn_of_doubt()
 
     def outcomes(self) -> np.ndarray:
-        """What became of every world (worlds,): "converged", or the name of the outcome for which something in it was given up."""
+        """Return the outcome of every world (worlds,): "converged", or the name of the outcome of its failure."""
         return outcomes(self.model, self._parts, self._worlds.resting)
 
     def failure(self, state: State, world: int) -> str:
-        """What was given up in a world, where it went wrong, and what to do; empty where nothing was.
+        """Return the failed object of a world, the location of the failure and the remedy; empty without failure.
 
         Args:
-            state: the last one, in which the world rests.
+            state: last state of the world.
             world: index.
         """
         validate.check_state("failure", self.model, state)
@@ -268,20 +265,19 @@ class Integrator:
         return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
 
     def reset(self, state: State, mask, to: State | None = None) -> State:
-        """A state whose worlds of a mask are as in another state, while the others are as they were, bit for bit.
+        """Return a state with the masked worlds replaced by another state; other worlds stay bitwise equal.
 
-        What the integrator keeps of these worlds is forgotten: outcomes, retries, the account of their energy. They then step as they
-        would in a new integrator. Time is one for all worlds and goes on: loads, fields and flows that the scene has as functions of
-        time do not start anew (see `Controls` for what each world has of its own).
+        Outcomes, retries and energy accounts of the replaced worlds are cleared, so they step as in a new integrator. Time is common to
+        all worlds and continues: loads, fields and flows as functions of time do not restart (`Controls` holds data per world).
 
         Args:
-            state: of this model; it is not changed.
-            mask: bools (worlds,), True for those that start anew.
-            to: where they start: a state of this model, each from its own world of it, or of the same scene built with worlds=1, all
-                from that one. By default the model's first state.
+            state: state of this model; it stays unchanged.
+            mask: bools (worlds,), True for worlds to reset.
+            to: replacement: a state of this model, world by world, or of the same scene built with worlds=1 for all of them. By default
+                the initial state of the model.
 
         Raises:
-            SceneError: the mask or the state does not fit, or supports that a `Motion` moves are elsewhere at the time of the state.
+            SceneError: the mask or the state does not fit, or a `Motion` has moved supports by the time of the state.
         """
         validate.check_state("reset", self.model, state)
         mask = self._worlds.mask(mask)
@@ -293,28 +289,27 @@ class Integrator:
         self._worlds.load_modules()
         source = self._own(state)
         self._vacate(1 - source)
-        now, then = (self._buffers[i] for i in (source, 1 - source))
+        current, following = (self._buffers[i] for i in (source, 1 - source))
 
         def launch():
-            then.own.assign(now.own)
-            self._worlds.reset(self._parts, mask, to, then.own)
+            following.own.assign(current.own)
+            self._worlds.reset(self._parts, mask, to, following.own)
 
         if anew:
             self._graphs.replay(("reset", source), launch)
-        else:  # whose arrays may be gone by the next time
+        else:  # arrays of a given state may be freed before the next call
             launch()
-        then.state.time, then.state.lead, then.state.stable = state.time, state.lead, None
-        then.state.spun = state.spun or to.spun
+        following.state.time, following.state.lead, following.state.stable = state.time, state.lead, None
+        following.state.spun = state.spun or to.spun
         if self._net is not None:
             self._net.arrive()
-        return then.state
+        return following.state
 
     def statistics(self) -> dict:
-        """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
+        """Return counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
 
-        Under "energy", where it is watched, what the midpoint rule has made and what damping took [J] over all rods and worlds since
-        the state that the integrator was given, and of them the largest fraction made; see `energy_bound`. Under "contact", where
-        there is any, see `NetContact.statistics`.
+        "energy", if watched, has the energy drift and the work of damping [J] over all rods and worlds since the last state from
+        outside, and the largest relative drift; see `energy_bound`. For "contact" see `NetContact.statistics`.
         """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
@@ -336,29 +331,29 @@ class Integrator:
             result["contact"] = self._net.newton.contact.statistics()
         return result
 
-    def _control(self, found: dict[str, np.ndarray], source: int) -> None:
-        """Hand the device what a step from a buffer is given; parts that carry no such loads yet are made anew, to do so."""
-        if self.given is None and any(name in found for name in LOADS):
+    def _control(self, inputs: dict[str, np.ndarray], source: int) -> None:
+        """Upload the controls of a step from a buffer; rebuild the steppers with the first control load."""
+        if self.given is None and any(name in inputs for name in LOADS):
             self.given = Given(self.model)
             self._remake()
         if self.given is not None:
-            self.given.upload(found)
+            self.given.upload(inputs)
         if self.model.magnetic:
-            field = np.broadcast_to(found.get("field", 0.0), (self.model.worlds, 3))
+            field = np.broadcast_to(inputs.get("field", 0.0), (self.model.worlds, 3))
             self.field.assign(np.ascontiguousarray(field.T))
         if self.model.grips:
-            now, then = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
-            if "poses" in found:
-                if counts_turns(found["poses"]):
+            current, following = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
+            if "poses" in inputs:
+                if counts_turns(inputs["poses"]):
                     begin = self._buffers[source].own.poses().reshape(self.model.worlds, -1, 6)
-                    turns_between(begin, np.broadcast_to(found["poses"], begin.shape))
-                poses = np.broadcast_to(found["poses"], (self.model.worlds, *found["poses"].shape[1:]))
-                then.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
+                    turns_between(begin, np.broadcast_to(inputs["poses"], begin.shape))
+                poses = np.broadcast_to(inputs["poses"], (self.model.worlds, *inputs["poses"].shape[1:]))
+                following.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
             else:
-                wp.copy(then, now)
+                wp.copy(following, current)
 
     def _remake(self) -> None:
-        """Make all parts anew, with what they count."""
+        """Rebuild all steppers, keeping counters."""
         self._chains = [ChainStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
         if self._net is not None:
             self._net = NetStep(self, self.model, self._net.means, counts_of=self._net)
@@ -366,31 +361,31 @@ class Integrator:
 
     @property
     def _parts(self) -> list:
-        """Steps of the groups of rods and of the net."""
+        """Steppers of the rod groups and of the coupled system."""
         return self._chains if self._net is None else [*self._chains, self._net]
 
     def _solved(self, dt: float) -> float:
-        """Length [s] of the implicit Euler step that a step of dt solves; see `kernels.step`."""
+        """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.step`."""
         return 0.5 * dt if self.scheme == "implicit_midpoint" else dt
 
     def _weigh(self, dt: float, state: State) -> None:
-        """What suits steps of dt, where they are longer than those before or parameters have changed: solve by it, or refuse them."""
-        anew = self.model.version != self._version
-        if not anew and dt <= self._longest:
+        """Repeat the solver selection for longer steps or new parameters; refuse steps lost in rounding."""
+        changed = self.model.version != self._version
+        if not changed and dt <= self._longest:
             return
         s = self._solved(dt)
         if self.model.precision == "float32":
             lost = lost_in_rounding(self.model, s, state)
             rounded = outcome.LOST_IN_ROUNDING if lost else outcome.CONVERGED_TO_ROUNDING
             for part in self._parts:
-                if part.rounded != rounded and (lost or anew):
+                if part.rounded != rounded and (lost or changed):
                     part.rounded = rounded
                     self._graphs.clear()
-        self._adapt(s, anew)
+        self._adapt(s, changed)
         self._version, self._longest = self.model.version, dt
 
     def _adapt(self, s: float, anew: bool = False) -> None:
-        """From now on solve by what suits a step of s, whatever suited those before where that is `anew`; see `Means`."""
+        """Select the solver for steps of s [s], `anew` or in addition to earlier selections; see `Means`."""
         for i, chain in enumerate(self._chains):
             if (means := chain.suited(s, anew)) != chain.means or (anew and chain.newton.outdated):
                 self._chains[i] = ChainStep(self, self.model, chain.group, means, counts_of=chain)
@@ -416,33 +411,33 @@ class Integrator:
         return 0
 
     def step_whole(self) -> None:
-        """From now on solve rods that touch nothing with their net, too: gradients read what its solves leave."""
+        """Solve rods out of contact in the coupled system, too: gradients read the data of its solves."""
         self.whole = True
         if self._net is not None and self._net.adapt(self._longest):
             self._graphs.clear()
 
     def watch_changes(self) -> Changes:
-        """What steps from now on change of velocities, which each sums up."""
+        """Return the sums of velocity changes of steps, evaluated from the next step on."""
         if self._changes is None:
             self._changes = Changes(self.model)
             self._graphs.clear()
         return self._changes
 
     def forget(self) -> None:
-        """Of a state that comes from elsewhere nothing is known: accounts of energy start anew, and worlds that rest."""
+        """Reset energy accounts and failed worlds, for a state from outside."""
         for part in self._parts:
             if part.energy:
                 part.energy.account.zero_()
-        if self.failures == "flag":  # raised, a failure must stay until it is read
+        if self.failures == "flag":  # with "raise" a failure must stay until it is read
             self._worlds.forget(self._parts)
 
     def _vacate(self, index: int) -> None:
-        """Make sure that nobody holds the state in a buffer."""
+        """Detach a state that the caller keeps from a buffer."""
         if self._buffers[index].vacate():
             self._graphs.clear()
 
     def _launch(self, source: int) -> None:
-        """Launches of a step of all parts from one buffer to the other."""
+        """Launch a step of all steppers from one buffer to the other."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
         for part in self._parts:
             if part.motion:
