@@ -8,19 +8,19 @@ from ddg_warp.solve.direct import SingularError
 
 
 class Bordered:
-    """L U of [[K, -f], [e_k, 0]]: the equations of equilibrium and one unknown k that is prescribed.
+    """LU factors of the bordered system [[K, -f], [e_k, 0]]: equilibrium with one prescribed unknown k.
 
-    All solutions of K dq - f dl = r are a particular one plus a multiple of the tangent of the path, whatever else is asked of
-    them. So one sparse factorisation serves load, displacement and arc-length control alike, as long as the unknown k changes
-    along the path (Rheinboldt and Burkardt, ACM Trans. Math. Softw. 9, 1983).
+    All solutions of K dq - f dl = r are a particular one plus a multiple of the tangent of the path. So one sparse factorisation serves
+    load, displacement and arc-length control alike, if the unknown k changes along the path (Rheinboldt and Burkardt, ACM Trans. Math.
+    Softw. 9, 1983).
 
     Args:
         matrix: K (n, n), symmetric or not.
-        load: f (n,), derivative of the outer forces with respect to the load parameter.
+        load: f (n,), derivative of the external forces by the load parameter.
         unknown: k; n is the load parameter.
 
     Raises:
-        SingularError: the path has no single tangent here (a bifurcation), or the unknown does not change along it.
+        SingularError: no unique tangent of the path (a bifurcation), or the unknown does not change along it.
     """
 
     def __init__(self, matrix: sparse.csc_matrix, load: np.ndarray, unknown: int):
@@ -39,11 +39,11 @@ class Bordered:
             raise SingularError("the path of equilibria has no single tangent here") from error
 
     def particular(self, right: np.ndarray) -> np.ndarray:
-        """(dq, dl) of K dq - f dl = right, with the unknown k kept (n + 1,)."""
+        """Return (dq, dl) (n + 1,) of K dq - f dl = right, with zero change of the unknown k."""
         return self._unscaled(self._lu.solve(np.append(self._scale * right, 0.0)))
 
     def tangent(self) -> np.ndarray:
-        """(dq, dl) of K dq - f dl = 0, with 1 for the unknown k (n + 1,)."""
+        """Return (dq, dl) (n + 1,) of K dq - f dl = 0, with unit change of the unknown k."""
         right = np.zeros(len(self._scale) + 1)
         right[-1] = 1.0 / self._unknown_scale
         return self._unscaled(self._lu.solve(right))

@@ -1,4 +1,4 @@
-"""States that captured steps write into, and what keeps them from changing under whoever holds one."""
+"""State buffers at fixed addresses for graph capture, with copy-on-write for states that the caller still holds."""
 
 import sys
 from dataclasses import fields, replace
@@ -9,14 +9,14 @@ from ddg_warp.model.state import State
 
 
 class Buffer:
-    """Memory of a state at a fixed place, and the `State` that a user gets of it.
+    """State memory at a fixed address, and the `State` that users get of it.
 
-    Before the memory is written again, `vacate` asks whether anybody but the buffer refers to this state: a state that is held takes
-    a copy with it, and the memory stays here. Whoever holds bare arrays of it (or a view of one) keeps the memory itself.
+    Before the memory is overwritten, `vacate` counts references to this state. A state that the caller keeps receives a copy, while the
+    memory stays in the buffer. A caller who keeps bare arrays (or views) keeps the memory itself, and the buffer allocates another.
 
     Attributes:
-        own: what steps are captured with.
-        state: what is handed out: arrays of its own over the same memory, so that references to them tell who looks at it.
+        own: state with which steps are captured.
+        state: state for users: separate arrays over the same memory, to count references.
     """
 
     def __init__(self, model):
@@ -33,12 +33,12 @@ class Buffer:
         self._watch()
 
     def _watch(self) -> None:
-        """Note how often everything is referred to while nobody holds it."""
+        """Record the reference counts without callers."""
         self._handles, self._memory = _objects(self.state)
         self._known = _references(self._handles), _references(self._memory)
 
     def vacate(self) -> bool:
-        """Leave what others hold to them; whether the memory has gone with it, and this is another."""
+        """Detach the state or memory that callers keep; return True if the memory is new."""
         handles, memory = self._known
         if _references(self._memory) != memory:
             self._allocate()
@@ -49,10 +49,10 @@ class Buffer:
         return False
 
 
-def _departed(held: State) -> State:
-    """Gives a state that is held arrays of its own; a state with those that it had."""
-    state = held.copy()
-    for theirs, ours in zip(held.parts().values(), state.parts().values(), strict=True):
+def _departed(kept: State) -> State:
+    """Give a kept state new arrays; return a state with the original ones."""
+    state = kept.copy()
+    for theirs, ours in zip(kept.parts().values(), state.parts().values(), strict=True):
         new = dict(vars(ours))
         vars(ours).update(vars(theirs))
         vars(theirs).update(new)
@@ -60,7 +60,7 @@ def _departed(held: State) -> State:
 
 
 def _objects(state: State) -> tuple[tuple, tuple]:
-    """A state with its parts, which can be given other arrays; and its arrays and lists of them, which can not."""
+    """Return the objects of a state with replaceable arrays, and its arrays and lists of arrays."""
     parts = list(state.parts().values())
     lists = [value for part in parts for value in vars(part).values() if not isinstance(value, wp.array)]
     return (state, state.groups, *parts), (*lists, *(array for part in parts for array in part.arrays().values()))
@@ -71,7 +71,7 @@ def _references(objects: tuple) -> tuple[int, ...]:
 
 
 def _mapped(part, change):
-    """A part of a state with every array changed."""
+    """Return a component of a state with every array changed."""
 
     def changed(value):
         if isinstance(value, list):

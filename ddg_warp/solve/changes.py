@@ -1,4 +1,4 @@
-"""What steps change of velocities, summed up on the device as a part of them; see `kernels.step_error`."""
+"""Velocity changes of steps, summed on the device for the local error estimate; see `kernels.step_error`."""
 
 import numpy as np
 import warp as wp
@@ -10,7 +10,7 @@ from ddg_warp.solve.net.system import Sums
 
 
 class Changes:
-    """Of all that has mass in a model: groups of rods, and the nodes of the net."""
+    """Velocity changes of all masses of a model: rod groups, and nodes of the coupled system."""
 
     def __init__(self, model):
         self._parts = [_Part(model, group) for group in model.groups]
@@ -25,29 +25,29 @@ class Changes:
         return [kernel for part in self._parts for kernel in part.kernels]
 
     def __call__(self, before: State, after: State) -> None:
-        """Sum up what a step from one state to another has changed; launches alone."""
+        """Launch the sums of velocity changes between two states; capturable."""
         for part, states, total in zip(self._parts, _velocities(before, after), self._totals, strict=True):
             part(*states, total)
 
     def squares(self) -> np.ndarray:
-        """Sums of m |v1 - v0|^2 over the last step (worlds,) [J]. Reads from the device."""
+        """Return sums of m |v1 - v0|^2 over the last step (worlds,) [J]. Reads from the device."""
         return self._reading().astype(float).sum(0)
 
     def masses(self) -> np.ndarray:
-        """Of the worlds (worlds,) [kg]. Reads from the device."""
+        """Return the masses of the worlds (worlds,) [kg]. Reads from the device."""
         return sum(part.masses() for part in self._parts)
 
 
 def _velocities(before: State, after: State):
-    """Those at both ends of a step, of every group and of the net."""
-    yield from ((one.v, other.v) for one, other in zip(before.groups, after.groups, strict=True))
+    """Yield velocities at both ends of a step, of every rod group and of the coupled system."""
+    yield from ((one.v, following.v) for one, following in zip(before.groups, after.groups, strict=True))
     if before.net is not None:
         net = before.model.net
         yield net.points(before.net.v), net.points(after.net.v)
 
 
 class _Part:
-    """Sums over a group of rods, or over the nodes of the net if that is None, by world."""
+    """Sums per world over a rod group, or over the nodes of the coupled system if that is None."""
 
     def __init__(self, model, group):
         self._of, net, device, real = group or model.net, model.net, model.wp_device, model.types.real
@@ -61,7 +61,7 @@ class _Part:
         self._device = device
 
     def masses(self) -> np.ndarray:
-        """Of the worlds (worlds,) [kg]."""
+        """Return the masses of the worlds (worlds,) [kg]."""
         mass = arrays.download(self._of.node_mass).astype(float)[: self._rows]
         return mass.sum(0).reshape(-1, self._width).sum(1)
 

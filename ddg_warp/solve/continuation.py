@@ -1,14 +1,14 @@
 """Continuation: paths of equilibria (q, lambda) through limit points, and where they branch.
 
-A path is followed by pseudo-arclength steps (Keller 1977; Riks, Int. J. Solids Struct. 15, 1979): a predictor along the unit tangent,
-then Newton's corrector in the plane across it, on the exact tangent stiffness. Frames are carried on and joint rotations start
-from zero after every iterate; so increments are counted iterate by iterate and nothing refers to angles of an earlier state.
+Pseudo-arclength continuation (Keller 1977; Riks, Int. J. Solids Struct. 15, 1979): a predictor along the unit tangent, then a Newton
+corrector in the plane across it, on the exact tangent stiffness. Frames are updated and joint rotations start from zero after every
+iterate. So increments are summed iterate by iterate, and no angle refers to an earlier state.
 
-Between two points the sign of the load's rate shows a limit point, and the number of negative eigenvalues a bifurcation, as far
-as the limit point does not account for its change (at one, K t = f l' makes the critical eigenvalue change with l' (f . t)).
+Between two points the sign of the load rate shows a limit point, and the inertia count a bifurcation, less the change at the limit
+point (K t = f l' makes the critical eigenvalue change with l' (f . t)).
 
-Where contact sets in or ends a path turns within a small part of the range of contact, all but at once. What is too short for steps is
-passed over as a corner. The load may be stationary there; which eigenvalues change sign at a corner is not looked for.
+Where contact sets in or ends, a path bends within a small fraction of the activation distance. A bend too short for steps is passed as
+a corner. The load may be stationary there; eigenvalues that change sign at a corner are not detected.
 """
 
 import warnings
@@ -27,25 +27,25 @@ from ddg_warp.scene.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Po
 from ddg_warp.solve.corrector import ContinuationOptions, Corrector, Failed
 from ddg_warp.threads import launches, stays_here
 
-FORK = 1e-2  # work of the load along the path, over its largest along any, at which a stationary load is no limit point
-CONTROLLED = 0.2  # of a change under control: how far the shape may be from the mean of its rates at both ends
-LEAP = 4.0  # distance of two points over the length between them at which they are not on one path
-BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
+FORK = 1e-2  # relative work of the load along the path below which a stationary load is no limit point
+CONTROLLED = 0.2  # largest deviation of a controlled change from the mean of the end rates, relative
+LEAP = 4.0  # distance of two points over their arc length beyond which paths differ
+BISECTIONS = 12  # bisections of a bifurcation before linear interpolation of the critical eigenvalue
 
 
 @arguments.sealed
 @stays_here
 @launches
 class Continuation:
-    """Follows the equilibria of one model.
+    """Arc-length continuation of the equilibria of one model.
 
     Args:
-        model: of one world.
+        model: model with one world.
         watch: displacements to record by name.
         options: see `ContinuationOptions`.
 
     Raises:
-        SceneError: nothing holds the structure, the model has several worlds, or a watched point does not exist.
+        SceneError: no supports, several worlds, or a watched point that does not exist.
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement] | None = None, **options):
@@ -71,14 +71,13 @@ class Continuation:
         """Follow the path by arc length.
 
         Args:
-            state: near the equilibrium at load parameter `start`; the rest state by default. It is not changed.
-            start: load parameter to begin at.
-            direction: +1 with the load growing at first, -1 with it falling.
-            stop: where to end.
+            state: state near the equilibrium at load parameter `start`; the rest state by default. It stays unchanged.
+            start: initial load parameter.
+            direction: +1 with initially growing load, -1 with falling load.
+            stop: end of the path.
 
         Raises:
-            SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as its
-                `path`.
+            SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as `path`.
         """
         if not (isinstance(direction, Real) and direction in (1, -1)):
             raise SceneError(
@@ -91,13 +90,13 @@ class Continuation:
         return self._follow(Path([first]), stop)
 
     def _start(self, state: State | None, start: float) -> Point:
-        """The first point of a path, near `state`."""
+        """Return the first point of a path, near `state`."""
         if state is not None:
             validate.check_state("continuation", self.model, state)
         return self.corrector.start(state or self.model.state(), arguments.number("continuation: start", start))
 
     def _stop(self, stop: Stop | None) -> Stop:
-        """Where a path ends, checked."""
+        """Return the checked end of a path."""
         if stop is not None and not isinstance(stop, Stop):
             raise SceneError(f"stop is {arguments.shown(stop)}; give Stop(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
@@ -105,7 +104,7 @@ class Continuation:
         return stop or Stop()
 
     def statistics(self, points: Sequence[Point]) -> dict:
-        """Under "contact", where there is any, what touches at these points and all that were given before.
+        """Return contact statistics of these points and all earlier ones under "contact".
 
         See `NetEquilibrium.contact_statistics`.
         """
@@ -116,16 +115,16 @@ class Continuation:
         return self.corrector.equilibrium.statistics()
 
     def switch(self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: Stop | None = None) -> Path:
-        """Leave a bifurcation along its critical mode, and follow the other path.
+        """Switch branches at a bifurcation along the critical mode, and follow the other path.
 
         Args:
-            bifurcation: of a path.
+            bifurcation: point of a path.
             side: +1 or -1, the sense of the mode.
-            step: arc length of the first step; that of the options by default.
-            stop: where to end.
+            step: arc length of the first step; by default from the options.
+            stop: end of the path.
 
         Raises:
-            SolverError: `no_branch`: no equilibrium beside the path was found; try another step.
+            SolverError: `no_branch`: no equilibrium near the path; try another step.
             ValueError: the point is no bifurcation.
         """
         if not isinstance(bifurcation, Point):
@@ -139,7 +138,7 @@ class Continuation:
             raise ValueError(f"the point is a {bifurcation.kind}; a path branches at a bifurcation")
         across = np.append(bifurcation.mode, 0.0)
         along = self.corrector.dot(across, bifurcation.direction)
-        if abs(along) > (1.0 - 1e-6) * self.corrector.norm(across):  # the path came along the mode
+        if abs(along) > (1.0 - 1e-6) * self.corrector.norm(across):  # the path arrived along the mode
             across = self.corrector.other(bifurcation)
             along = self.corrector.dot(across, bifurcation.direction)
         across -= bifurcation.direction * along
@@ -167,17 +166,17 @@ class Continuation:
         start: float = 0.0,
         max_cuts: int = 10,
     ) -> Path:
-        """Equilibria at given values of a watched displacement, whatever the load.
+        """Return equilibria at given values of a watched displacement, at any load (displacement control).
 
         Args:
-            displacement: name of what is watched.
-            values: [m], one after the other.
+            displacement: name of a watched displacement.
+            values: values in order [m].
             state, start: see `trace`.
-            max_cuts: how often an increment is halved.
+            max_cuts: limit of halvings of an increment.
 
         Raises:
-            SolverError: `no_start`, `singular_start`, or `displacement_turns_back`: the displacement cannot go on along the path
-                without a jump to another part of it; carries the path so far as its `path`.
+            SolverError: `no_start`, `singular_start`, or `displacement_turns_back`: the displacement is stationary along the path, and
+                larger values need a jump; carries the path so far as `path`.
         """
         if not isinstance(displacement, str) or displacement not in self.watched:
             shown = arguments.shown(displacement)
@@ -187,75 +186,75 @@ class Continuation:
         if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise SceneError(f"control: values have shape {values.shape}; give finite numbers (values,), one at least")
         arguments.count("control: max_cuts", max_cuts, 0)
-        here, path = self._start(state, start), Path()
+        current, path = self._start(state, start), Path()
         for value in values:
-            reached, cuts = here.values[displacement], 0
+            reached, cuts = current.values[displacement], 0
             increment = value - reached
             while reached != value:
                 target = value if abs(value - reached) <= abs(increment) * (1.0 + 1e-12) else reached + increment
                 try:
-                    there = self.corrector.to(here, row, target)
-                    self._require_smooth(here, there, row, target - reached)
-                    here, reached = there, target
+                    following = self.corrector.to(current, row, target)
+                    self._require_smooth(current, following, row, target - reached)
+                    current, reached = following, target
                 except Failed:
                     cuts, increment = cuts + 1, 0.5 * increment
                     if cuts > max_cuts:
                         raise self._error(
                             "displacement_turns_back",
-                            Path([*path.points, here]),
+                            Path([*path.points, current]),
                             "follow the path by arc length: trace()",
                         ) from None
-            path.points.append(here)
+            path.points.append(current)
         path.outcome = "values"
         return path
 
-    def _require_smooth(self, here: Point, there: Point, row: np.ndarray, change: float) -> None:
-        """Refuse a change of a controlled functional over which the shape does more than its rates at both ends tell.
+    def _require_smooth(self, first: Point, second: Point, row: np.ndarray, change: float) -> None:
+        """Refuse a controlled change with a shape change that deviates from the rates at both ends.
 
-        A leap to another part of the path has a chord that is not the mean of these rates, or rates of opposite sense.
+        A leap along the path has a chord that differs from the mean of these rates, or rates of opposite sense.
         """
-        rates = [row @ point.direction for point in (here, there)]
-        if abs(change) <= 1e-12 * (np.abs(row[:-1]) @ np.abs(self.tangent.dofs(here.state))):
+        rates = [row @ point.direction for point in (first, second)]
+        if abs(change) <= 1e-12 * (np.abs(row[:-1]) @ np.abs(self.tangent.dofs(first.state))):
             return
         if rates[0] * rates[1] <= 0.0:
             raise Failed("displacement_turns_back")
-        ends = [change / rate * point.direction for rate, point in zip(rates, (here, there), strict=True)]
-        chord = np.append(self.tangent.dofs(there.state) - self.tangent.dofs(here.state), 0.0)
-        gap, *ends = (np.append(way[:-1], 0.0) for way in (chord - 0.5 * (ends[0] + ends[1]), *ends))
+        ends = [change / rate * point.direction for rate, point in zip(rates, (first, second), strict=True)]
+        chord = np.append(self.tangent.dofs(second.state) - self.tangent.dofs(first.state), 0.0)
+        gap, *ends = (np.append(vector[:-1], 0.0) for vector in (chord - 0.5 * (ends[0] + ends[1]), *ends))
         if self.corrector.norm(gap) > CONTROLLED * max(map(self.corrector.norm, ends)):
             raise Failed("leap")
 
     def _follow(self, path: Path, stop: Stop) -> Path:
-        """Add points to a path until it stops."""
+        """Append points to a path until it stops."""
         options, step = self.options, self.options.step
-        here = path.points[-1]
+        current = path.points[-1]
         for _ in range(stop.steps):
-            turn = self.tangent.rotation(self.tangent.dofs(here.state), here.direction[:-1])
+            turn = self.tangent.rotation(self.tangent.dofs(current.state), current.direction[:-1])
             step = min(step, options.max_step, options.rotation_cap / max(1e-300, turn))
-            there, events, outcome, step = self._next(path, step, stop)
+            following, events, outcome, step = self._next(path, step, stop)
             for event in events:
                 path.points.append(event)
                 if event.kind == LIMIT_POINT and len(path.limit_points) == stop.limit_points:
                     path.outcome = "limit_points"
                     return path
-            path.points.append(there)
+            path.points.append(following)
             if outcome:
                 path.outcome = outcome
                 return path
-            step *= np.clip(np.sqrt(options.iterations / max(1, there.iterations)), 0.5, 1.6)
-            here = there
+            step *= np.clip(np.sqrt(options.iterations / max(1, following.iterations)), 0.5, 1.6)
+            current = following
         path.outcome = "steps"
         self._warn_of_rest(path, stop)
         return path
 
     def _warn_of_rest(self, path: Path, stop: Stop) -> None:
-        """Warn of a path that has used up its steps before any bound, and of how far it has come."""
-        ways = [("load", path.load, stop.load)]
+        """Warn of a path that used all steps before any bound, with the fraction reached."""
+        bounded = [("load", path.load, stop.load)]
         if stop.displacement is not None:
-            ways.append((repr(stop.displacement[0]), path.values(stop.displacement[0]), stop.displacement[1:]))
+            bounded.append((repr(stop.displacement[0]), path.values(stop.displacement[0]), stop.displacement[1:]))
         parts = [
             (np.abs(values - values[0]).max() / abs(bound - values[0]), f"{name} = {bound:g}")
-            for name, values, bounds in ways
+            for name, values, bounds in bounded
             for bound in bounds
             if np.isfinite(bound) and bound != values[0]
         ]
@@ -268,109 +267,109 @@ class Continuation:
             )
 
     def _next(self, path: Path, step: float, stop: Stop) -> tuple[Point, list[Point], str, float]:
-        """The point after the last of a path, events on the way, which bound of `stop` it lies on, if any, and the step to it."""
-        here, options = path.points[-1], self.options
+        """Return the next point of a path, the events before it, the bound of `stop` reached or "", and the step length."""
+        current, options = path.points[-1], self.options
         failed: object = f"rotation_cap, a step of {step:.2g} turns edges by all that it allows"
         while step >= options.min_step:
             try:
-                there = self.corrector.at(here, step)
-                outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
-                there = self.corrector.to(here, row, value) if outcome else there
-                self.corrector.follows(here, there)
-                return there, self._events(here, there), outcome, step
+                following = self.corrector.at(current, step)
+                outcome, row, value = self._bound(current, following, stop) or ("", None, 0.0)
+                following = self.corrector.to(current, row, value) if outcome else following
+                self.corrector.follows(current, following)
+                return following, self._events(current, following), outcome, step
             except Failed as failure:
                 failed, step = failure, 0.5 * step
-        there = self.corrector.past_corner(here)
-        if there is None:
+        following = self.corrector.past_corner(current)
+        if following is None:
             remedy = f"{failed}: the path may end or branch here; begin elsewhere, or take min_step below {options.min_step:g}"
             raise self._error("step_too_small", path, remedy)
         events = []
-        if here.direction[-1] * there.direction[-1] < 0.0:
-            highest = here.direction[-1] > 0.0
-            last = max(here, there, key=lambda point: point.load if highest else -point.load)
-            events = [replace(last, kind=LIMIT_POINT, negative=min(here.negative, there.negative))]
-        return there, events, "", there.arclength - here.arclength
+        if current.direction[-1] * following.direction[-1] < 0.0:
+            highest = current.direction[-1] > 0.0
+            last = max(current, following, key=lambda point: point.load if highest else -point.load)
+            events = [replace(last, kind=LIMIT_POINT, negative=min(current.negative, following.negative))]
+        return following, events, "", following.arclength - current.arclength
 
-    def _bound(self, here: Point, there: Point, stop: Stop):
-        """The bound that lies between two points: its name, the functional and its value; None if there is none."""
+    def _bound(self, first: Point, second: Point, stop: Stop):
+        """Return the bound between two points as (name, functional, value); None without."""
         for value in stop.load:
-            if (here.load - value) * (there.load - value) < 0.0 or there.load == value:
+            if (first.load - value) * (second.load - value) < 0.0 or second.load == value:
                 return "load", np.eye(1, self.tangent.size + 1, self.tangent.size)[0], value
         if stop.displacement is not None:
             name, *values = stop.displacement
             if name not in self.watched:
                 raise SceneError(f"stop at displacement {name!r}: it is not watched")
             for value in values:
-                if (here.values[name] - value) * (there.values[name] - value) < 0.0 or there.values[name] == value:
+                if (first.values[name] - value) * (second.values[name] - value) < 0.0 or second.values[name] == value:
                     return "displacement", np.append(self.watched[name], 0.0), value
         return None
 
-    def _events(self, here: Point, there: Point) -> list[Point]:
-        """Limit points and bifurcations between two neighbours on a path, in order."""
-        length, found, jump, fold = there.arclength - here.arclength, [], 0, np.inf
-        if here.direction[-1] * there.direction[-1] < 0.0:
-            limit = self._limit_point(here, length)
+    def _events(self, first: Point, second: Point) -> list[Point]:
+        """Return limit points and bifurcations between two neighbouring points, in order."""
+        length, events, jump, fold = second.arclength - first.arclength, [], 0, np.inf
+        if first.direction[-1] * second.direction[-1] < 0.0:
+            limit = self._limit_point(first, length)
             _, _, rate, *_ = self.corrector.system(limit.state, self.tangent.dofs(limit.state), limit.load)
-            limit.negative = min(here.negative, there.negative)
+            limit.negative = min(first.negative, second.negative)
             free, step = self.corrector.free, limit.direction[:-1]
             work = rate[free] @ step[free]
             size = np.sqrt((rate[free] ** 2 / self.corrector.metric[free]).sum()) * self.corrector.norm(limit.direction)
-            found.append(limit)
-            if here.negative == there.negative and abs(work) <= FORK * size:
-                # f . t vanishes, too: the tangent t is the critical mode, as where asymmetric states cross symmetric ones
+            events.append(limit)
+            if first.negative == second.negative and abs(work) <= FORK * size:
+                # f . t vanishes, too: the tangent t is the critical mode, as for asymmetric states across symmetric ones
                 limit.kind, limit.mode = BIFURCATION, step / self.corrector.norm(limit.direction)
                 limit.mode_displacements = self.tangent.at_points(limit.mode)
             else:
-                fold = limit.arclength - here.arclength
+                fold = limit.arclength - first.arclength
                 sense = np.sign(work)
-                jump = int(sense * there.direction[-1] < 0.0) - int(sense * here.direction[-1] < 0.0)
-        low, count = 0.0, here.negative
-        ends = there.negative - jump if fold < np.inf else there.negative
+                jump = int(sense * second.direction[-1] < 0.0) - int(sense * first.direction[-1] < 0.0)
+        low, count = 0.0, first.negative
+        ends = second.negative - jump if fold < np.inf else second.negative
         while count != ends:
-            point, low, count = self._bifurcation(here, there, low, count, jump, fold)
-            found.append(point)
-        return sorted(found, key=lambda point: point.arclength)
+            point, low, count = self._bifurcation(first, second, low, count, jump, fold)
+            events.append(point)
+        return sorted(events, key=lambda point: point.arclength)
 
-    def _limit_point(self, here: Point, length: float) -> Point:
-        """Where the load's rate vanishes."""
+    def _limit_point(self, first: Point, length: float) -> Point:
+        """Return the point at which the load rate vanishes."""
 
         def rate(step):
-            return self.corrector.at(here, step).direction[-1] if step > 0.0 else here.direction[-1]
+            return self.corrector.at(first, step).direction[-1] if step > 0.0 else first.direction[-1]
 
         root = brentq(rate, 0.0, length, xtol=self.options.tolerance * length)
-        point = self.corrector.at(here, max(root, 1e-12 * length))
+        point = self.corrector.at(first, max(root, 1e-12 * length))
         point.kind = LIMIT_POINT
         return point
 
-    def _bifurcation(self, here: Point, there: Point, low: float, count: int, jump: int, fold: float):
-        """The first change of the number of negative eigenvalues that is not a limit point's; where it is passed, and the count."""
-        length = high = there.arclength - here.arclength
+    def _bifurcation(self, first: Point, second: Point, low: float, count: int, jump: int, fold: float):
+        """Return the first bifurcation after `low`, an arc length beyond it, and the inertia count there."""
+        length = high = second.arclength - first.arclength
 
         def point_at(step):
-            return self.corrector.at(here, step, smooth=False) if step > 0.0 else here
+            return self.corrector.at(first, step, smooth=False) if step > 0.0 else first
 
-        after = there.negative - (jump if length > fold else 0)
+        after = second.negative - (jump if length > fold else 0)
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            found = point_at(middle).negative - (jump if middle > fold else 0)
-            if found == count:
+            negative = point_at(middle).negative - (jump if middle > fold else 0)
+            if negative == count:
                 low = middle
             else:
-                high, after = middle, found
+                high, after = middle, negative
         ends = [point_at(step) for step in (low, high)]
         gap = self.tangent.dofs(ends[1].state) - self.tangent.dofs(ends[0].state)
         if self.corrector.norm(np.append(gap, 0.0)) > LEAP * (high - low) + 1e-6 * length:
-            raise Failed("leap")  # from one path to another, which does not meet it: where an imperfection parts them
+            raise Failed("leap")  # to a separate path: an imperfection has split the bifurcation
         a, b = (self.corrector.critical(end)[0] for end in ends)
         root = low + (high - low) * (a / (a - b) if a * b < 0.0 else 0.5)
         point = point_at(root)
         point.kind = BIFURCATION
-        # where both are all but one, their order may be taken for the other one
+        # nearly coincident events may come in either order
         point.negative = max(0, min(count, after) + (jump if root > fold else 0))
         point.mode = self.corrector.critical(point)[1]
         point.mode_displacements = self.tangent.at_points(point.mode)
-        # the tangent of the path itself, between those beside it
-        along = here.direction + root / length * (there.direction - here.direction)
+        # the tangent of the path itself, interpolated from its neighbours
+        along = first.direction + root / length * (second.direction - first.direction)
         point.direction = along / self.corrector.norm(along)
         return point, high, after
 

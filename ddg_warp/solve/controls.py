@@ -1,4 +1,4 @@
-"""Controls on a device: loads that a step is given world by world, and the load scales that they make."""
+"""Control loads on a device, per step and world, and the resulting load scales."""
 
 import numpy as np
 import warp as wp
@@ -12,11 +12,12 @@ LOADS = ("forces", "moments", "gravity")
 
 
 class Given:
-    """The loads that a step is given, of all worlds in the user's order; zero where it is given none.
+    """Control loads of a step in all worlds, in the order of the user; zero by default.
 
     Attributes:
-        forces, moments: (worlds, points) [N] and (worlds, edges) [N m]; gravity: over the scene's (worlds,) [m/s^2].
-        any: whether the step at hand has any.
+        forces, moments: (worlds, points) [N] and (worlds, edges) [N m].
+        gravity: difference from the gravity of the scene (worlds,) [m/s^2].
+        any: True if the current step has control loads.
     """
 
     def __init__(self, model):
@@ -28,13 +29,13 @@ class Given:
         self.gravity = wp.zeros(worlds, dtype=vector, device=device)
         self._filled: set[str] = set()
 
-    def upload(self, found: dict[str, np.ndarray]) -> None:
-        """Take those among what `Controls.checked` found."""
-        self.any = any(name in found for name in LOADS)
+    def upload(self, inputs: dict[str, np.ndarray]) -> None:
+        """Upload the loads of `Controls.checked`."""
+        self.any = any(name in inputs for name in LOADS)
         for name in LOADS:
             array = getattr(self, name)
-            if name in found:
-                values = found[name] - self._usual if name == "gravity" else found[name]
+            if name in inputs:
+                values = inputs[name] - self._usual if name == "gravity" else inputs[name]
                 array.assign(np.ascontiguousarray(np.broadcast_to(values, (len(array), *values.shape[1:]))))
                 self._filled.add(name)
             elif name in self._filled:
@@ -43,11 +44,11 @@ class Given:
 
 
 class ControlledLoads(Loads):
-    """As `Loads`, on all places and in every world for itself, with those that steps are given.
+    """Loads in time, follower loads and control loads on all dof blocks, per world.
 
     Args:
-        given: these.
-        scale: takes the sizes of the loads on all places (worlds, places) to what residuals are compared with; see `ChainScale`.
+        given: control loads.
+        scale: computes load scales from absolute loads on all dof blocks (worlds, blocks); see `ChainScale`.
     """
 
     def __init__(self, model, part, midpoint: bool, given: Given, scale):
@@ -62,9 +63,9 @@ class ControlledLoads(Loads):
         constant = put(host.constant_loads(), self._vector)
         self._shared = wp.clone(constant) if host.timed else constant
         self._sizes = wp.zeros((model.worlds, len(self.places)), dtype=real, device=device)
-        place, row = loaded_rows(model, part)
-        order = np.argsort(place, kind="stable")
-        starts = np.searchsorted(place[order], np.arange(host.size + 1))
+        block, row = loaded_rows(model, part)
+        order = np.argsort(block, kind="stable")
+        starts = np.searchsorted(block[order], np.arange(host.size + 1))
         self._inputs = [self._shared, constant, put(changing), part.node_mass, part.world_columns, put(arm), nodes]
         self._inputs += [put(starts.astype(np.int32), int), put(row[order].astype(np.int32), int)]
         self._inputs += [given.forces, given.moments, given.gravity]
@@ -88,7 +89,7 @@ class ControlledLoads(Loads):
             self._shared.assign((self._dead @ amplitudes).reshape(-1, 3))
 
     def give(self) -> None:
-        """Add what the step at hand is given, and find what residuals are compared with; launches alone, so that it can be captured."""
+        """Add the control loads of the step and update the load scales; capturable."""
         values = self._values.reshape(self._sizes.shape)
         device = self.model.wp_device
         wp.launch(self._load, self._sizes.shape, self._inputs, [values, self._sizes], device=device)
@@ -96,7 +97,7 @@ class ControlledLoads(Loads):
 
 
 class _Scale:
-    """Load scales of a part, those of the scene's loads or what the sizes of loads at hand make of them."""
+    """Load scales of a stepper, from the loads of the scene or from the current loads."""
 
     def __init__(self, model, worlds: int, owner: np.ndarray, bodies: int):
         self.model, self.bodies, self._worlds = model, bodies, worlds
@@ -111,11 +112,11 @@ class _Scale:
         return wp.array(values.astype(np.int32), dtype=int, device=self.model.wp_device)
 
     def keep(self, *arrays: wp.array) -> None:
-        """Scales to come back to."""
+        """Store the scales of the loads of the scene."""
         self._kept = [(array, wp.clone(array)) for array in arrays]
 
     def update(self, sizes: wp.array | None) -> None:
-        """Take the sizes of the loads on all places, or what was kept."""
+        """Update the scales from absolute loads on all dof blocks, or restore the stored ones."""
         if sizes is None:
             for array, kept in self._kept:
                 wp.copy(array, kept)
@@ -126,14 +127,14 @@ class _Scale:
         self.share()
 
     def share(self) -> None:
-        """Make the scales of the sums over bodies."""
+        """Compute the scales from the sums over bodies."""
 
     def launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
 
 
 class ChainScale(_Scale):
-    """Of rods on their own; `load` is what residuals of each are compared with [N]."""
+    """Load scales of uncoupled rods; `load` is the load scale of each rod [N]."""
 
     def __init__(self, model, part):
         super().__init__(model, part.worlds, np.arange(part.host.size) % part.rods, part.rods)
@@ -142,7 +143,7 @@ class ChainScale(_Scale):
 
     @staticmethod
     def places(host) -> tuple[np.ndarray, np.ndarray]:
-        """What moments are divided by, and sizes of loads that change, of all places."""
+        """Return divisors of moments and absolute loads in time of all dof blocks."""
         turns = host.size > host.nodes
         arm = np.ones(host.size)
         if turns:
@@ -151,7 +152,7 @@ class ChainScale(_Scale):
 
 
 class NetScale(_Scale):
-    """Of a net: what residuals of its blocks and parts may be; see `compile.tolerance`.
+    """Residual limits of dof blocks and clusters of the coupled system; see `compile.tolerance`.
 
     Args:
         solver: the `NetNewton` whose `allowed` and `outer` are written.
@@ -182,18 +183,18 @@ class NetScale(_Scale):
 
     @staticmethod
     def places(host) -> tuple[np.ndarray, np.ndarray]:
-        """As of `ChainScale`."""
+        """Return divisors of moments and absolute loads in time of all dof blocks."""
         return host.bodies.arm, tolerance.changing_forces(host) / host.bodies.arm
 
     def share(self) -> None:
-        """Limits of blocks and parts, from the loads of bodies and the mean of what they are connected with."""
+        """Compute limits of dof blocks and clusters from body loads and means over connected bodies."""
         self.launch(self._share, self._worlds, self._components, [self._scale])
         for starts, body, weight, limit in self._limits:
             self.launch(self._limit, limit.shape, [self.load, self.bodies, starts, body, weight], [limit])
 
 
 def loaded_rows(model, part) -> tuple[np.ndarray, np.ndarray]:
-    """Places of a part, and the rows of the user's points that belong to nodes among them, or of his edges to angles."""
+    """Return loadable dof blocks, and the user's row of each: points for nodes, edges for angles."""
     order, host = model.order, part.host
     if part is model.net:
         rows, blocks = order.net_rows

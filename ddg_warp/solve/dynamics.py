@@ -281,10 +281,10 @@ class Integrator:
         """
         validate.check_state("reset", self.model, state)
         mask = self._worlds.mask(mask)
-        anew = to is None
-        if anew and self._first[0] != self.model.version:
+        to_initial = to is None
+        if to_initial and self._first[0] != self.model.version:
             self._first = self.model.version, self.model.state()
-        to = self._first[1] if anew else to
+        to = self._first[1] if to_initial else to
         self._worlds.check_source(to, state)
         self._worlds.load_modules()
         source = self._own(state)
@@ -295,7 +295,7 @@ class Integrator:
             following.own.assign(current.own)
             self._worlds.reset(self._parts, mask, to, following.own)
 
-        if anew:
+        if to_initial:
             self._graphs.replay(("reset", source), launch)
         else:  # arrays of a given state may be freed before the next call
             launch()
@@ -308,8 +308,8 @@ class Integrator:
     def statistics(self) -> dict:
         """Return counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
 
-        "energy", if watched, has the energy drift and the work of damping [J] over all rods and worlds since the last state from
-        outside, and the largest relative drift; see `energy_bound`. For "contact" see `NetContact.statistics`.
+        "energy", if watched, has the energy drift, the work of damping [J] and the largest relative drift since the last state from
+        outside; see `energy_bound`. For "contact" see `NetContact.statistics`.
         """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
@@ -384,17 +384,17 @@ class Integrator:
         self._adapt(s, changed)
         self._version, self._longest = self.model.version, dt
 
-    def _adapt(self, s: float, anew: bool = False) -> None:
-        """Select the solver for steps of s [s], `anew` or in addition to earlier selections; see `Means`."""
+    def _adapt(self, s: float, changed: bool = False) -> None:
+        """Select the solver for steps of s [s] and, unless parameters have `changed`, for earlier ones; see `Means`."""
         for i, chain in enumerate(self._chains):
-            if (means := chain.suited(s, anew)) != chain.means or (anew and chain.newton.outdated):
+            if (means := chain.suited(s, changed)) != chain.means or (changed and chain.newton.outdated):
                 self._chains[i] = ChainStep(self, self.model, chain.group, means, counts_of=chain)
                 self._graphs.clear()
         net = self._net
-        if net is not None and ((means := net.suited(s, anew)) != net.means or (anew and net.newton.outdated)):
+        if net is not None and ((means := net.suited(s, changed)) != net.means or (changed and net.newton.outdated)):
             self._net = NetStep(self, self.model, means, counts_of=self._net)
             self._graphs.clear()
-        if self._net is not None and self._net.adapt(s, anew):
+        if self._net is not None and self._net.adapt(s, changed):
             self._graphs.clear()
 
     def _own(self, state: State) -> int:

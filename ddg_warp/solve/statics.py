@@ -1,19 +1,17 @@
 """Equilibria: load stepping with Newton's method on the exact tangent.
 
-Every load step places supports where their motion has them at the load parameter t, scales loads by t, and moves rest shapes on. Mode
-"minimise" searches for minima within a trust region of rotations (`ddg_warp.solve.descent`), and mode "follow" takes the tangent as it
-is, with the residual as merit, to follow equilibria that are not stable. A search in mode "minimise" that ends at a saddle goes on from
-beside it, along the direction of lowest stiffness, island by island. Shells try Newton with independent stresses first
-(`ddg_warp.solve.mixed`). Large coupled systems are solved on the device by conjugate gradients (`ddg_warp.solve.net.statics`), and by
-this search where these do not converge.
+A load step moves supports to the load parameter t, scales loads by t, and updates rest shapes. Mode "minimise" searches for minima
+within a trust region of rotations (`ddg_warp.solve.descent`). Mode "follow" uses the unmodified tangent with the residual as merit, for
+unstable equilibria. In mode "minimise" a search leaves a saddle along the direction of lowest stiffness, island by island. Shells try
+mixed Newton first (`ddg_warp.solve.mixed`). Large coupled systems are solved on the device by conjugate gradients
+(`ddg_warp.solve.net.statics`), and by this search if these do not converge.
 
-Contact is solved by conjugate gradients at any size: every iterate is limited before anything passes through anything. Where the
-coupled system is small its equilibria are judged by the factored tangent, saddles are left, and what conjugate gradients do not finish
-is finished by this search, its steps cut alike, as are those of mode "follow". With friction an equilibrium depends on the increments
-of the load parameter; it is found on the device at any size, and nothing tells whether it is stable.
+Contact is solved by conjugate gradients at any size, with CCD on every iterate. For small coupled systems the factored tangent tests
+the stability of equilibria, saddles are left, and this search completes unfinished solves, with CCD on its steps, too. Frictional
+equilibria depend on the increments of the load parameter. They are found on the device at any size, without a stability test.
 
-Every equilibrium says how it was found (`State.outcome`), how far supports and obstacles are from carrying its loads
-(`State.unbalanced`), and whether it is stable (`State.stable`).
+Every equilibrium has its outcome (`State.outcome`), the fraction of the loads not balanced by supports and obstacles
+(`State.unbalanced`), and its stability (`State.stable`).
 """
 
 from collections.abc import Mapping
@@ -41,31 +39,30 @@ from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches, stays_here
 
 SOLVERS = ("auto", "direct", "pcg")
-DESCENTS = 8  # from saddles, in one solve
-# outcomes of conjugate gradients in contact from which factors go on; the second also where the residual is one of rounding, the
-# third where supports press everything together
+DESCENTS = 8  # descents from saddles in one solve
+# Outcomes of conjugate gradients in contact that the direct search continues. The second also occurs at the rounding floor, the third
+# where supports compress everything.
 UNFINISHED = ("max_iterations", "line_search_failed", "no_room")
-LOST = 1e-3  # of the loads, which supports and obstacles may miss for rounding
-FIRST_TURN = 0.1  # rad, by which a search leaves a saddle
+LOST = 1e-3  # fraction of the loads that supports and obstacles may miss by rounding
+FIRST_TURN = 0.1  # rotation by which a search leaves a saddle [rad]
 
 
 @arguments.called
 @dataclass(frozen=True)
 class StaticsOptions:
-    """How an equilibrium is searched.
+    """Options of an equilibrium search.
 
     Attributes:
-        rtol: residual over load scale (sum of the outer forces on a rod or shell, or largest support force) at which a dof is in
-            equilibrium; see `ddg_warp.compile.tolerance`.
-        floor_factor: rounding units of the forces that meet at a dof which count as rounding.
-        max_iterations: Newton iterations of one load step; with friction, how often it takes normal forces anew.
-        rotation_cap: largest turn of an edge or change of an angle in one update [rad].
+        rtol: residual over load scale (sum of external forces of a body, or largest support force) of the convergence test; see
+            `ddg_warp.compile.tolerance`.
+        floor_factor: rounding floor of a dof, in rounding units of its force contributions.
+        max_iterations: limit of Newton iterations of a load step; with friction, of updates of the normal forces.
+        rotation_cap: largest rotation of an edge or change of an angle in one update [rad].
         mode: "minimise" or "follow".
-        max_cuts: how often a load increment is halved before the search is given up; after one that succeeds the next is doubled,
-            up to its first size.
-        solver: "direct": the exact tangent and its factors, on the host. "pcg": conjugate gradients on the device, for nets that are
-            too large for factors, and for contact; in mode "minimise" alone, and of large nets without a count of unstable directions.
-            "auto": by mode and size, in contact by mode alone.
+        max_cuts: limit of halvings of a load increment; after a success the next one doubles, up to the first size.
+        solver: "direct", "pcg" or "auto". Direct: factorised exact tangent on the host. PCG: conjugate gradients on the device, for
+            large coupled systems and contact, in mode "minimise" only. Large systems get no count of unstable directions. Auto: by mode
+            and size, in contact by mode alone.
     """
 
     rtol: float = 1e-10
@@ -99,35 +96,35 @@ def solve(
     rest: Mapping | None = None,
     **options,
 ) -> State:
-    """The equilibrium at load parameter `end`, reached from `start` in `load_steps` increments or more.
+    """Return the equilibrium at load parameter `end`, reached from `start` in at least `load_steps` increments.
 
     Args:
-        model: what to equilibrate.
-        state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is, without `poses`.
-        controls: forces, moments, gravity and magnetic field, world by world, which the load parameter scales as it does those of the
-            scene; and poses of grips at `end`, which move there straight from where the state has them.
-        load_steps: increments; one that fails is halved. In contact supports and obstacles may go any way in one: they stop where
-            something is in their way, and go on once it has yielded; in mode "follow" the increment is halved until nothing is. Where
-            they turn far, there are as many increments as resolve their arcs.
+        model: model to equilibrate.
+        state: start of the search; the rest state by default. It stays unchanged. Grips keep their poses without `poses`.
+        controls: control loads, gravity and magnetic field per world, scaled by the load parameter like the loads of the scene. Poses
+            of grips hold at `end`, reached on a straight path from the poses of the state.
+        load_steps: number of increments; a failed one is halved. In contact supports and obstacles stop before an object and continue
+            once it has yielded; in mode "follow" the increment is halved instead. Large rotations of supports and obstacles get enough
+            increments to resolve their arcs.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
-        way: a list, to which the equilibria of all increments are added, the last one too.
-        rest: rest shapes at `end`, to which those of the model change in proportion to the load parameter from `start` on, so that
-            load steps and halving act on growth: by shell or rod, index or name, such as {0: dict(metric=..., curvature=...)}; see
-            `ddg_warp.solve.rest_path.RestPath`. The model keeps the rest shapes of the last equilibrium.
+        way: list to which the equilibria of all increments are appended.
+        rest: rest shapes at `end`, by shell or rod, index or name, such as {0: dict(metric=..., curvature=...)}. They change in
+            proportion to the load parameter, so that load steps and halving act on growth; see `ddg_warp.solve.rest_path.RestPath`.
+            The model keeps the rest shapes of the last equilibrium.
         options: see `StaticsOptions`.
 
     Returns:
-        The equilibrium. Its `stable` says whether the tangent stiffness is positive but for rigid modes: True, False (in mode
-        "follow" alone, or by conjugate gradients), or None where it was not asked: by conjugate gradients, which only notice what
-        is unstable, and under loads without a potential. Then `ddg_warp.solve.stability.spectrum` tells.
-        In contact where a body ends along what neither supports, loads nor what it touches decide is arbitrary. Friction acts against
-        what slides in a load step, as in that much time: what sticks creeps by less than `velocity` of `scene.contact` times the
-        increment of the load parameter. More load steps follow the order in which things begin to slide.
+        The equilibrium. `stable` is True if the tangent stiffness is positive except for rigid modes, else False (mode "follow" or
+        conjugate gradients only), or None if not tested. Untested are equilibria by conjugate gradients, which only detect
+        instabilities met on the path, and loads without a potential; `ddg_warp.solve.stability.spectrum` tests them.
+        In contact, positions along motions that supports, loads and contacts leave free are arbitrary. Friction acts as in a time step
+        of the length of the load increment: sticking contacts creep by less than `velocity` of `scene.contact` times the increment.
+        More load steps resolve the order in which contacts begin to slide.
 
     Raises:
-        SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
-        SceneError: nothing holds the rods, controls do not fit the model, or in contact surfaces overlap where the search begins, the
-            mode or solver keeps nothing apart, or there is friction and no increment of the load parameter.
+        SolverError: no equilibrium, or in mode "minimise" no stable one, was found; carries the last good state.
+        SceneError: rods without supports, or controls that do not fit the model. In contact: surfaces overlap at the start, the mode or
+            solver does not support contact, or there is friction without a load increment.
     """
     validate.check_model("statics", model)
     if state is not None:
@@ -140,16 +137,17 @@ def solve(
 @stays_here
 @launches
 class Equilibrium:
-    """A static solver of one model; keeps its tangent between solves.
+    """Static solver of one model; keeps the tangent between solves.
 
     Attributes:
-        tangent: energy, gradient and Hessian of the model; residuals: what is small against what, of it.
-        net: what solves by conjugate gradients, if that is the solver, and keeps apart what touches; descent: what solves by factors.
-        factors: whether the tangent at what it finds is factored, to tell whether that is stable.
-        mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
+        tangent: energy, gradient and Hessian of the model.
+        residuals: convergence test.
+        net: solver by conjugate gradients and contact, None without; descent: direct solver.
+        factors: True if the tangent at equilibria is factorised, to test stability.
+        mixed: True to try mixed Newton first; by default if applicable.
         iterations: Newton iterations so far.
-        outcome: of the last solve, `converged` or `converged_to_rounding`.
-        stiffness: the tangent at the last equilibrium (size, size), None without `factors`.
+        outcome: outcome of the last solve, `converged` or `converged_to_rounding`.
+        stiffness: tangent at the last equilibrium (size, size), None without `factors`.
     """
 
     def __init__(self, model, options: StaticsOptions | None = None):
@@ -175,7 +173,7 @@ class Equilibrium:
         return 0 if self._descends else self.net.pcg_iterations()
 
     def _solver(self) -> str:
-        """The solver that the options ask for, if it can serve this model."""
+        """Return the solver of the options; refuse one that does not support the model."""
         solver, obstacle = self.options.solver, why_not_pcg(self.model)
         if self.model.touch:
             self._check_contact(obstacle)
@@ -187,7 +185,7 @@ class Equilibrium:
         return solver
 
     def _check_contact(self, obstacle: str) -> None:
-        """Refuse solvers that do not serve what touches; `obstacle`: to conjugate gradients."""
+        """Refuse solvers without contact; `obstacle`: reason against conjugate gradients."""
         if self.options.mode == "follow":
             validate.refuse_friction(self.model)
         elif self.options.solver == "direct":
@@ -211,7 +209,7 @@ class Equilibrium:
         way: list[State] | None = None,
         rest: Mapping | None = None,
     ) -> State:
-        """Load stepping; see `solve`."""
+        """Run load stepping; see `solve`."""
         for name, value in (("start", start), ("end", end)):
             arguments.number(f"statics: {name}", value)
         load_steps = arguments.count("load_steps", load_steps)
@@ -222,17 +220,17 @@ class Equilibrium:
                 f"contact: friction acts against what slides along an increment of the load parameter, and from {start:g} to {end:g} "
                 "there is none; give start other than end, or friction=0"
             )
-        found = checked(controls, self.model, "statics")
+        inputs = checked(controls, self.model, "statics")
         if self.net and self.net.newton.outdated:
             self.net = NetEquilibrium(self)
         self.check_apart(state)
-        self.tangent.give(found)
-        self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
+        self.tangent.give(inputs)
+        self.tangent.poses = poses_between(state, inputs["poses"], start, end) if "poses" in inputs else None
         state = state.copy()
         state.stop()
         shapes = RestPath(self.model, rest if rest is not None else {})
         if self.net and self.net.arcs:
-            load_steps = self.net.arcs.increments(state, found.get("poses"), start, end, load_steps)
+            load_steps = self.net.arcs.increments(state, inputs.get("poses"), start, end, load_steps)
         if state.net is not None:
             state.net.rate.zero_()  # contact has no inertia in equilibria
         if start == end:
@@ -245,240 +243,247 @@ class Equilibrium:
             if way is not None:
                 way.append(state)
             return state
-        at, whole, cuts = start, (end - start) / load_steps, 0
+        current, whole, cuts = start, (end - start) / load_steps, 0
         if self._rubs:
             self.net.wary = True
         balanced = self._rubs or self._balanced(state, start)
-        while at != end:
+        while current != end:
             increment = whole * 0.5**cuts
-            target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
+            target = end if abs(end - current) <= abs(increment) * (1.0 + 1e-12) else current + increment
             shapes.to((target - start) / (end - start))
             try:
-                state = self.solve(state, at, target)
-                self.count(state, abs(target - at))
+                state = self.solve(state, current, target)
+                self.count(state, abs(target - current))
                 if way is not None:
                     way.append(state)
-                at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
+                current, cuts = target, max(0, cuts - 1)  # a larger increment may succeed again
             except SolverError as error:
-                shapes.to((at - start) / (end - start))
-                if error.outcome == "lost_in_rounding" and (advice := jump_between(self.model, at, target)):
+                shapes.to((current - start) / (end - start))
+                if error.outcome == "lost_in_rounding" and (advice := jump_between(self.model, current, target)):
                     raise self._explained(error, state, target, f"; {advice}") from None
                 if error.outcome in (arguments.PRESCRIBED, "lost_in_rounding"):
                     raise
-                if not balanced:  # as with another rest shape: no part of the increment is small enough
+                if not balanced:  # such as after a change of rest shape: no increment is small enough
                     balanced = True
                     with suppress(SolverError):
                         state = self.solve(state, start, start)
                         continue
                 cuts += 1
                 if cuts > self.options.max_cuts and self._rubs and self.net.wary:
-                    self.net.wary, cuts = False, 0  # it may have to slide
+                    self.net.wary, cuts = False, 0  # the structure may have to slide
                 elif cuts > self.options.max_cuts:
-                    advice = jump_between(self.model, at, target)
-                    told = f" (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)"
-                    if error.outcome != "in_the_way" and (blocked := self._blocked(state, at, target)):
-                        told = f"{error}{told}; {blocked}"
-                        raise SolverError(told, state=state, outcome=error.outcome) from None
-                    raise self._explained(error, state, target, f"{told}{advice and '; ' + advice}") from None
+                    advice = jump_between(self.model, current, target)
+                    details = f" (load parameter {current:g} of {end:g} reached, {cuts - 1} increments halved)"
+                    if error.outcome != "in_the_way" and (blocked := self._blocked(state, current, target)):
+                        details = f"{error}{details}; {blocked}"
+                        raise SolverError(details, state=state, outcome=error.outcome) from None
+                    raise self._explained(error, state, target, f"{details}{advice and '; ' + advice}") from None
         state.time = end
         return state
 
-    def _explained(self, error: SolverError, before: State, at: float, told: str = "") -> SolverError:
-        """The error of a search from the state `before`, which it carries, with what is `told` and what would help."""
-        helps = ("max_iterations", "line_search_failed", "non_finite", UNSETTLED)  # others say it themselves
-        remedy = remedies.of_search(self, error, before, at) if error.outcome in helps else ""
-        return SolverError(f"{error}{told}{remedy and '; ' + remedy}", state=before, outcome=error.outcome)
+    def _explained(self, error: SolverError, before: State, load_factor: float, details: str = "") -> SolverError:
+        """Return the error of a search from the state `before`, with `details` and remedies; it carries that state."""
+        helps = (
+            "max_iterations",
+            "line_search_failed",
+            "non_finite",
+            UNSETTLED,
+        )  # messages of other outcomes have a remedy
+        remedy = remedies.of_search(self, error, before, load_factor) if error.outcome in helps else ""
+        return SolverError(f"{error}{details}{remedy and '; ' + remedy}", state=before, outcome=error.outcome)
 
-    def _balanced(self, state: State, at: float) -> bool:
-        """Whether a state is about in equilibrium at load parameter `at`."""
-        gradient, outer = self.tangent.gradient(state), self.tangent.loads(at, self.tangent.dofs(state))
+    def _balanced(self, state: State, load_factor: float) -> bool:
+        """Return True if a state is approximately in equilibrium at a load parameter."""
+        gradient, outer = self.tangent.gradient(state), self.tangent.loads(load_factor, self.tangent.dofs(state))
         allowed = mixed.UNBALANCED * self.residuals.allowed(self.residuals.load_scale(outer, gradient))
         return bool((np.abs(outer - gradient) <= allowed)[self.tangent.free].all())
 
     def check_apart(self, state: State) -> None:
-        """Refuse to begin where surfaces overlap; by a penalty equilibria may."""
+        """Refuse a start with overlapping surfaces, except for a penalty."""
         if self.model.touch and self.model.touch.keep:
             self.net.newton.contact.check(state.net.q)
 
     def _blocked(self, state: State, start: float, end: float) -> str:
-        """What to do about two held things that motions drive into each other between two load parameters; empty without any."""
+        """Return the remedy for two fixed objects driven into each other by motions; empty without."""
         if not self.model.touch:
             return ""
         return self.net.newton.contact.blocked(self.tangent, state, start, end).rstrip(", ")
 
     def share(self, before: State, after: State) -> float:
-        """The part of the straight way between two states in which nothing passes through anything."""
+        """Return the CCD step fraction of the straight path between two states."""
         return self.net.share(*map(self.tangent.dofs, (before, after))) if self.model.touch else 1.0
 
     def count(self, state: State, increment: float) -> None:
-        """Count an equilibrium that was found, an increment of the load parameter after the one before."""
+        """Add an equilibrium to the contact statistics, one load increment after the last."""
         if self.model.touch:
             self.net.count(state, increment)
 
     def statistics(self) -> dict:
-        """Under "contact", where there is any, what touched in the equilibria that were counted, as those of `load` are.
+        """Return contact statistics of the counted equilibria under "contact"; `load` counts.
 
         See `NetEquilibrium.contact_statistics`.
         """
         return {"contact": self.net.contact_statistics()} if self.model.touch else {}
 
-    def solve(self, state: State, before: float, at: float) -> State:
-        """The equilibrium at load parameter `at`, from a state that belongs to `before`, under the controls of the last `load`.
+    def solve(self, state: State, before: float, load_factor: float) -> State:
+        """Return the equilibrium at `load_factor` from a state at load parameter `before`, with the last controls.
 
-        Mode "minimise" leaves a saddle along its lowest mode for the minimum that lies that way; `saddle` is the outcome where after
-        some such descents there still is none. Conjugate gradients see no more than negative curvature on their way, and leave none.
+        Mode "minimise" leaves a saddle along its lowest mode; the outcome is `saddle` after several such descents without a minimum.
+        Conjugate gradients detect only negative curvature they meet, and leave no saddles.
         """
         tangent, self.stiffness = self.tangent, None
         if not tangent.free.any():
             begun, state = state, state.copy()
-            tangent.move_supports(state, before, at)
+            tangent.move_supports(state, before, load_factor)
             if self.share(begun, state) < 1.0:
-                told = self._blocked(begun, before, at) or (
+                text = self._blocked(begun, before, load_factor) or (
                     "motions drive what they hold through each other: change these motions, or let them pass by "
                     "contact_between(..., ignore=True)"
                 )
                 raise SolverError(
-                    f"no equilibrium at load parameter {at:g}: in_the_way, {told}",
+                    f"no equilibrium at load parameter {load_factor:g}: in_the_way, {text}",
                     state=begun,
                     outcome="in_the_way",
                 )
             none = np.zeros(tangent.size)
             state.stable = True if self.model.worlds == 1 else np.full(self.model.worlds, True, object)
-            return self.found(state, none, none, at, np.ones(tangent.islands, bool))
-        if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
-            state = found
+            return self.found(state, none, none, load_factor, np.ones(tangent.islands, bool))
+        if self.mixed and (result := mixed.newton(self, state, before, load_factor)) is not None:
+            state = result
         else:
-            moved = self._with_supports_moved(state, before, at)
-            state = self._minimum(moved, at, state, abs(at - before))
+            moved = self._with_supports_moved(state, before, load_factor)
+            state = self._minimum(moved, load_factor, state, abs(load_factor - before))
             if not self.factors:
                 return state
         for _ in range(DESCENTS):
-            found = stability.of_islands(tangent, state, self.stiffness)
-            self._tell_stable(state, found)
-            if self.options.mode == "follow" or not found.modes.any():
+            result = stability.of_islands(tangent, state, self.stiffness)
+            self._tell_stable(state, result)
+            if self.options.mode == "follow" or not result.modes.any():
                 return state
-            beside, left = self._beside(state, at, found.modes)
+            candidate, left = self._beside(state, load_factor, result.modes)
             if not left.any():
-                found.stable[found.stable == False] = None  # noqa: E712 (of an array of objects)
-                self._tell_stable(state, found)
+                result.stable[result.stable == False] = None  # noqa: E712 (of an array of objects)
+                self._tell_stable(state, result)
                 return state
-            state = self._minimum(beside, at, state, abs(at - before))
+            state = self._minimum(candidate, load_factor, state, abs(load_factor - before))
         raise SolverError(
-            f"no stable equilibrium at load parameter {at:g}: saddle, {DESCENTS} descents from saddles led to others; begin from a "
-            "state without symmetry, or take mode='follow' to accept what is unstable",
+            f"no stable equilibrium at load parameter {load_factor:g}: saddle, {DESCENTS} descents from saddles led to others; begin "
+            "from a state without symmetry, or take mode='follow' to accept what is unstable",
             state=state,
             outcome="saddle",
         )
 
-    def _minimum(self, state: State, at: float, before: State, increment: float) -> State:
-        """The equilibrium at load parameter `at` from a state with its supports in place; in contact, on a way from `before`."""
+    def _minimum(self, state: State, load_factor: float, before: State, increment: float) -> State:
+        """Return the equilibrium at a load parameter from a state with moved supports; in contact, starting at `before`."""
         if self._descends:
             if self.share(before, state) < 1.0:
                 raise SolverError(
-                    f"no equilibrium at load parameter {at:g}: in_the_way, supports and what follows them would pass through "
+                    f"no equilibrium at load parameter {load_factor:g}: in_the_way, supports and what follows them would pass through "
                     "something; take more load steps, or mode='minimise', whose supports wait until it has yielded",
                     state=before,
                     outcome="in_the_way",
                 )
-            return self.descent.solve(state, at)
+            return self.descent.solve(state, load_factor)
         try:
-            state = self.net.solve(state, at, before, increment)
+            state = self.net.solve(state, load_factor, before, increment)
         except SolverError as error:
             goes_on = not self._rubs and (self.factors or self.model.touch is None)
             if not (goes_on and error.outcome in UNFINISHED and self.net.arrived):
                 raise
-            return self.descent.solve(error.state, at)  # with second derivatives that conjugate gradients leave out
-        self.stiffness = self.tangent.stiffness(state, at) if self.factors else None
+            return self.descent.solve(error.state, load_factor)  # with second derivatives that conjugate gradients omit
+        self.stiffness = self.tangent.stiffness(state, load_factor) if self.factors else None
         return state
 
-    def _tell_stable(self, state: State, found: stability.IslandStability) -> None:
-        stable = found.by_world(self.tangent)
+    def _tell_stable(self, state: State, result: stability.IslandStability) -> None:
+        stable = result.by_world(self.tangent)
         state.stable = np.array(stable, object) if self.model.worlds > 1 else stable[0]
 
-    def _beside(self, state: State, at: float, modes: np.ndarray) -> tuple[State, np.ndarray]:
-        """A state of less energy beside a saddle, along the lowest `modes` (size,) of its unstable islands.
+    def _beside(self, state: State, load_factor: float, modes: np.ndarray) -> tuple[State, np.ndarray]:
+        """Return a state of less energy near a saddle, along the lowest `modes` (size,) of unstable islands.
 
         Returns:
-            The state; and islands (islands,) that have left, as rounding leaves no such difference in others.
+            The state, and the islands (islands,) that left; in others rounding hides the energy difference.
         """
         tangent = self.tangent
         island, q, energies = tangent.island, tangent.dofs(state), tangent.element_energies(state)
-        turns = tangent.rotations(q, modes)
-        length = np.divide(FIRST_TURN, turns, out=np.zeros_like(turns), where=turns > 0.0)
+        rotations = tangent.rotations(q, modes)
+        length = np.divide(FIRST_TURN, rotations, out=np.zeros_like(rotations), where=rotations > 0.0)
         noise = 64 * self.model.types.eps * tangent.island_energies(np.abs(energies))
         wanted = length > 0.0
 
         def moved_by(length):
-            beside = state.copy()
+            candidate = state.copy()
             moved = tangent.retract(q, length[island] * modes)
-            tangent.assign(beside, np.where(length[island] > 0.0, moved, q))
-            return beside
+            tangent.assign(candidate, np.where(length[island] > 0.0, moved, q))
+            return candidate
 
         for _ in range(20):
-            beside = moved_by(length)
-            moved = tangent.dofs(beside)
-            work = 0.5 * (tangent.loads(at, q) + tangent.loads(at, moved)) * (moved - q)
-            change = tangent.island_energies(tangent.element_energies(beside) - energies)
+            candidate = moved_by(length)
+            moved = tangent.dofs(candidate)
+            work = 0.5 * (tangent.loads(load_factor, q) + tangent.loads(load_factor, moved)) * (moved - q)
+            change = tangent.island_energies(tangent.element_energies(candidate) - energies)
             left = wanted & (change - np.bincount(island, work, tangent.islands) < -noise)
             if (left | ~wanted).all():
-                return beside, left
+                return candidate, left
             length = np.where(left, length, 0.5 * length)
         return moved_by(np.where(left, length, 0.0)), left
 
-    def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float, small: np.ndarray) -> State:
-        """The state as the equilibrium at `at`.
+    def found(
+        self, state: State, outer: np.ndarray, residual: np.ndarray, load_factor: float, small: np.ndarray
+    ) -> State:
+        """Return the state as the equilibrium at a load parameter, with outcome and unbalanced loads.
 
         Args:
-            outer, residual: loads and out-of-balance forces (size,) [N, N m].
-            small: islands whose residuals are below the tolerance, not only below rounding (islands,).
+            outer, residual: loads and residuals (size,) [N, N m].
+            small: islands with residuals below the tolerance, not only below the rounding floor (islands,).
 
         Raises:
-            SolverError: `lost_in_rounding`, where rounding hides a part of the full loads, those at load parameter 1 or beyond, from
-                supports and obstacles. Of small load steps on the way to them it may hide more.
+            SolverError: `lost_in_rounding`: supports and obstacles miss a fraction of the full loads (load parameter 1 or beyond) by
+                rounding. Smaller load steps may miss more.
         """
         model, unbalanced = self.model, self.residuals.unbalanced(residual, outer)
         rounded = np.bincount(self.tangent.world, ~small, model.worlds) > 0
         lost = rounded & (unbalanced > LOST)
-        if lost.any() and abs(at) < 1.0:
+        if lost.any() and abs(load_factor) < 1.0:
             full = np.abs(self.tangent.loads(1.0, self.tangent.dofs(state)))
             lost &= self.residuals.unbalanced(residual, np.maximum(np.abs(outer), full)) > LOST
         if lost.any():
             world = int(np.argmax(np.where(lost, unbalanced, 0.0)))
             raise SolverError(
-                f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces so uncertain that "
-                f"supports miss {unbalanced[world]:.1g} of the loads{f' of world {world}' if model.worlds > 1 else ''}; take "
+                f"no equilibrium at load parameter {load_factor:g}: lost_in_rounding, the stiffest elements make forces so uncertain "
+                f"that supports miss {unbalanced[world]:.1g} of the loads{f' of world {world}' if model.worlds > 1 else ''}; take "
                 "better shaped elements, longer ones where the stiffest are shortest, a smaller axial stiffness, or float64",
                 state=state,
                 outcome="lost_in_rounding",
             )
         outcomes = np.where(rounded, "converged_to_rounding", "converged")
         self.outcome = "converged_to_rounding" if rounded.any() else "converged"
-        state.time = at
+        state.time = load_factor
         state.outcome, state.unbalanced = (
             values if model.worlds > 1 else values[0].item() for values in (outcomes, unbalanced)
         )
         return state
 
-    def _with_supports_moved(self, state: State, before: float, at: float) -> State:
-        """A copy with its supports where they are at `at`, and the free dofs following by the tangent if that is the better guess.
+    def _with_supports_moved(self, state: State, before: float, load_factor: float) -> State:
+        """Return a copy with supports at `load_factor`; free dofs follow by the tangent if that predictor is better.
 
-        A support that moves by more than an edge length on its own turns its edge over.
+        A support that moves alone by more than an edge length overturns its edge.
         """
         tangent = self.tangent
         alone = state.copy()
-        step = tangent.support_step(state, before, at)
-        tangent.move_supports(alone, before, at)
+        step = tangent.support_step(state, before, load_factor)
+        tangent.move_supports(alone, before, load_factor)
         if not step.any():
             return alone
-        state = tangent.with_prescribed(state, at)
-        direction = (self.descent if self._descends else self.net).following(state, step, at)
+        state = tangent.with_prescribed(state, load_factor)
+        direction = (self.descent if self._descends else self.net).following(state, step, load_factor)
         if direction is None:
             return alone
         q = tangent.dofs(state)
-        follow = tangent.advance(state, step + direction, at)
+        follow = tangent.advance(state, step + direction, load_factor)
 
         def potential(candidate):
-            return tangent.elastic_energy(candidate) - tangent.loads(at, q) @ (tangent.dofs(candidate) - q)
+            return tangent.elastic_energy(candidate) - tangent.loads(load_factor, q) @ (tangent.dofs(candidate) - q)
 
         overturned = tangent.turned_over(q, tangent.dofs(alone))
         better = overturned or not potential(alone) <= potential(follow)

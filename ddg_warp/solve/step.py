@@ -99,9 +99,9 @@ class PartStep:
         """Number of islands in a world."""
         return len(self.islands) // self.model.worlds
 
-    def suited(self, s: float, anew: bool = False) -> Means:
-        """Return the solver selection for solves over s [s] and, unless `anew`, for earlier solves."""
-        means = USUAL._replace(linear=self.model.types.linear) if anew else self.means
+    def suited(self, s: float, parameters_changed: bool = False) -> Means:
+        """Return the solver selection for solves over s [s] and, unless `parameters_changed`, for earlier ones."""
+        means = USUAL._replace(linear=self.model.types.linear) if parameters_changed else self.means
         return suited(self.model.precision, means, self.float32_errors(s).max(), self.split_errors(s).max())
 
     @property

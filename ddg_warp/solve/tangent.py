@@ -1,6 +1,6 @@
 """Energy, gradient and exact tangent of a model on the host: for statics, stability and tests.
 
-Every group of rods and the net contribute a part: dofs in a row, with offsets. See `ddg_warp.solve.chains.tangent` and
+Every rod group and the coupled system contribute a tangent block with contiguous dofs, see `ddg_warp.solve.chains.tangent` and
 `ddg_warp.solve.net.tangent`.
 """
 
@@ -13,16 +13,16 @@ from ddg_warp.threads import launches
 
 @launches
 class Tangent:
-    """The potential energy of a model and its derivatives at a state, loads and held dofs included.
+    """Potential energy of a model with derivatives at a state, loads and fixed dofs included.
 
     Attributes:
-        parts: what the groups of rods and the net contribute, each with the same methods.
-        size: number of dofs, held and padding ones included.
-        free: which dofs are free (size,) bool.
-        angle: which dofs are angles (size,) bool.
-        islands: number of islands: rods of groups, and worlds of the coupled system, which no stiffness connects; island: of each dof
-            (size,); world: of each island (islands,).
-        poses: of grips by load parameter, load -> (worlds, grips, 6); None where they are as the state has them.
+        parts: tangent blocks of the rod groups and of the coupled system, with equal methods.
+        size: number of dofs, fixed and padding ones included.
+        free: mask of free dofs (size,) bool.
+        angle: mask of angles (size,) bool.
+        islands: number of islands (uncoupled rods, worlds of the coupled system), which no stiffness connects.
+        island: island of each dof (size,); world: world of each island (islands,).
+        poses: poses of grips as a function of the load parameter, (worlds, grips, 6); None for the poses of the state.
     """
 
     def __init__(self, model):
@@ -45,8 +45,8 @@ class Tangent:
         self.islands = int(first[-1])
         self.island = np.concatenate(
             [
-                at + np.repeat(np.arange(p.islands), p.size // p.islands)
-                for at, p in zip(first, self.parts, strict=False)
+                start + np.repeat(np.arange(p.islands), p.size // p.islands)
+                for start, p in zip(first, self.parts, strict=False)
             ]
         )
         self.world = np.concatenate([np.arange(part.islands) // (part.islands // model.worlds) for part in self.parts])
@@ -57,7 +57,7 @@ class Tangent:
         return np.concatenate([part.mass for part in self.parts])
 
     def energy(self, state) -> dict[str, np.ndarray]:
-        """Elastic energy of every term (worlds,) [J]."""
+        """Return the elastic energy of every term (worlds,) [J]."""
         result = {}
         for part in self.parts:
             for name, values in part.energies(state):
@@ -65,64 +65,64 @@ class Tangent:
         return result
 
     def element_energies(self, state) -> np.ndarray:
-        """Elastic energies of all elements [J], for differences free of cancellation."""
+        """Return elastic energies of all elements [J], for differences without cancellation."""
         values, islands, first = [], [], 0
         for part in self.parts:
-            for _, own in part.energies(state):
-                values.append(own.ravel())
-                islands.append(first + np.repeat(np.arange(part.islands), own.size // part.islands))
+            for _, energies in part.energies(state):
+                values.append(energies.ravel())
+                islands.append(first + np.repeat(np.arange(part.islands), energies.size // part.islands))
             first += part.islands
         self._element_island = np.concatenate(islands)
         return np.concatenate(values)
 
     def island_energies(self, element_energies: np.ndarray) -> np.ndarray:
-        """Sums of values of elements, in the order of `element_energies`, over every island (islands,) [J]."""
+        """Return sums of element values, ordered as `element_energies`, over islands (islands,) [J]."""
         return np.bincount(self._element_island, element_energies, self.islands)
 
     def elastic_energy(self, state) -> float:
-        """That of all worlds without what touches [J]."""
+        """Return the elastic energy of all worlds without contact [J]."""
         return float(sum(v.sum() for part in self.parts for name, v in part.energies(state) if name != "contact"))
 
     def gradient(self, state) -> np.ndarray:
-        """Derivative of the elastic energy (size,) [N, N m]; minus the internal force."""
+        """Return the derivative of the elastic energy (size,) [N, N m], minus the internal force."""
         return np.concatenate([part.gradient(state) for part in self.parts])
 
     @property
     def shells_alone(self) -> bool:
-        """Whether the model consists of shells alone."""
+        """True if the model consists of shells alone."""
         return not self.model.groups and not self.model.net.edges
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
-        """Exact second derivative of the elastic energy (size, size); in the coupled system with other stresses where given."""
+        """Return the exact Hessian of the elastic energy (size, size), for the coupled system with `stress` if given."""
         blocks = [part.hessian(state) for part in self.parts[:-1]]
         last = self.parts[-1]
         blocks.append(last.hessian(state) if stress is None else last.hessian(state, stress))
         return blocks[0] if len(blocks) == 1 else sparse.block_diag(blocks, format="csc")
 
     def stiffness(self, state, load: float | None = None, stress: list | None = None) -> sparse.csc_matrix:
-        """The tangent of the whole: `hessian`, less the derivative of the loads that follow at load parameter `load`.
+        """Return the tangent stiffness: `hessian` plus load stiffness at load parameter `load`, by default `state.time`.
 
-        By default that of an equilibrium, which is its time. Where such loads are not conservative it is unsymmetric.
+        It is unsymmetric under nonconservative follower loads.
         """
         following = self.load_stiffness(state.time if load is None else load, self.dofs(state))
         hessian = self.hessian(state, stress)
         return hessian if following is None else hessian + following
 
     def linear_stress(self, state, step: np.ndarray) -> list:
-        """Stresses (strains, elements) of every element set of the coupled system after a step, with strains e + J step."""
+        """Return stresses (strains, elements) of element sets of the coupled system, at strains e + J step."""
         return self.parts[-1].linear_stress(state, self.of(self.parts[-1], step))
 
-    def give(self, found: dict[str, np.ndarray]) -> None:
-        """From now on have the loads among what `Controls.checked` found, times the factor, beside those of the scene."""
+    def give(self, inputs: dict[str, np.ndarray]) -> None:
+        """Set the control loads of `Controls.checked`, to be scaled like the loads of the scene."""
         for part in self.parts:
-            part.give(found)
+            part.give(inputs)
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        """Outer forces (size,) [N, N m] on dofs q: gravity and dead loads times `factor`, timed loads at their amplitude."""
+        """Return external forces (size,) [N, N m] at dofs q: constant loads times `factor`, others by amplitude."""
         return np.concatenate([part.loads(factor, self.of(part, q)) for part in self.parts])
 
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        """Minus the derivative of the loads with respect to q; None where loads do not follow q."""
+        """Return the load stiffness, minus the derivative of loads by q; None without follower loads."""
         blocks = [part.load_stiffness(factor, self.of(part, q)) for part in self.parts]
         if all(block is None for block in blocks):
             return None
@@ -130,30 +130,30 @@ class Tangent:
         return sparse.block_diag([e if b is None else b for b, e in zip(blocks, empty, strict=True)], format="csc")
 
     def dofs(self, state) -> np.ndarray:
-        """Positions and angles of a state (size,)."""
+        """Return positions and angles of a state (size,)."""
         return np.concatenate([part.dofs(state) for part in self.parts])
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`; rods turn their edges instead of shearing them."""
+        """Return q moved along `step`; rod groups use the edge-rotation update."""
         return np.concatenate([part.retract(self.of(part, q), self.of(part, step)) for part in self.parts])
 
     def assign(self, state, q: np.ndarray) -> None:
-        """Put dofs (size,) into a state and carry its frames along."""
+        """Write dofs (size,) to a state and update the reference frames."""
         for part in self.parts:
             part.assign(state, self.of(part, q))
         self.model.carry_frames(state)
         state.forget_equilibrium()
 
-    def move_supports(self, state, before: float, at: float) -> None:
-        """Put held dofs, and the magnetic field, where they are at load parameter `at`; the state belongs to `before`."""
+    def move_supports(self, state, before: float, load_factor: float) -> None:
+        """Move fixed dofs and the magnetic field of a state from load parameter `before` to `load_factor`."""
         if self.model.motions or self.prescribes:
-            self._hold(state, at)
+            self._hold(state, load_factor)
             for part in self.parts:
-                part.move_supports(state, before, at)
+                part.move_supports(state, before, load_factor)
             self.model.carry_frames(state)
 
     def friction(self, state) -> np.ndarray:
-        """Forces of friction by `state.rubbing` (size,) [N], which have no potential and are in no gradient; zero without."""
+        """Return friction forces by `state.rubbing` (size,) [N], which are not in the gradient; zero without friction."""
         result, touch = np.zeros(self.size), self.model.touch
         if touch and touch.terms.frictions:
             net = self.parts[-1]
@@ -162,71 +162,71 @@ class Tangent:
 
     @property
     def prescribes(self) -> bool:
-        """Whether supports turn normals of shells, or a magnetic field acts: what states hold beside their dofs."""
+        """True if states prescribe more than dofs: shell normals of supports, or a magnetic field."""
         return self.model.net is not None and any(
             len(part.turning) or part.term.measure.field for part in self.model.net.sets
         )
 
-    def with_prescribed(self, state, at: float):
-        """The state with grips, the normals that supports turn, and the magnetic field, of `at`; itself where none changes."""
+    def with_prescribed(self, state, load_factor: float):
+        """Return the state with grips, prescribed normals and magnetic field of `load_factor`; itself if unchanged."""
         if not (self.prescribes or self.poses):
             return state
         state = state.copy()
-        self._hold(state, at)
+        self._hold(state, load_factor)
         if self.prescribes:
-            self.parts[-1].prescribe(state, at)
+            self.parts[-1].prescribe(state, load_factor)
         return state
 
-    def _hold(self, state, at: float) -> None:
-        """Put the grips of a state where they are at load parameter `at`."""
+    def _hold(self, state, load_factor: float) -> None:
+        """Set the grip poses of a state at a load parameter."""
         if self.poses:
-            state.grips.pose.assign(np.ascontiguousarray(self.poses(at).reshape(-1, 6).T))
+            state.grips.pose.assign(np.ascontiguousarray(self.poses(load_factor).reshape(-1, 6).T))
 
-    def support_step(self, state, before: float, at: float) -> np.ndarray:
-        """How far the supports of a state that belongs to `before` are from where they are at `at` (size,), zero at free dofs."""
+    def support_step(self, state, before: float, load_factor: float) -> np.ndarray:
+        """Return the displacement of supports from `before` to `load_factor` (size,), zero at free dofs."""
         if not self.model.motions:
             return np.zeros(self.size)
         moved = state.copy()
-        self.move_supports(moved, before, at)
+        self.move_supports(moved, before, load_factor)
         return np.where(self.free, 0.0, self.dofs(moved) - self.dofs(state))
 
-    def advance(self, state, step: np.ndarray, at: float):
-        """Another state, moved along `step` (size,); its supports are then exactly where they are at load parameter `at`."""
+    def advance(self, state, step: np.ndarray, load_factor: float):
+        """Return a state moved along `step` (size,), with supports exactly at `load_factor`."""
         moved = state.copy()
         self.assign(moved, self.retract(self.dofs(state), step))
-        self.move_supports(moved, at, at)
-        moved.time = at
+        self.move_supports(moved, load_factor, load_factor)
+        moved.time = load_factor
         return moved
 
     def rotation(self, q: np.ndarray, direction: np.ndarray) -> float:
-        """Largest rotation of an edge, or change of an angle, that a step along `direction` would make [rad]."""
+        """Return the largest edge rotation or angle change of a step along `direction` [rad]."""
         return float(self.rotations(q, direction).max(initial=0.0))
 
     def rotations(self, q: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Largest rotation of an edge, or change of an angle, of every island (islands,) [rad]; see `rotation`."""
+        """Return the largest edge rotation or angle change of every island (islands,) [rad]; see `rotation`."""
         worst = np.zeros(self.islands)
         np.maximum.at(worst, self.island[self.angle], np.abs(direction[self.angle]))
         first = 0
         for part in self.parts:
             edges, turns = (part.edges(self.of(part, v)) for v in (q, direction))
-            length, own = np.linalg.norm(edges, axis=1), np.linalg.norm(turns, axis=1)
-            turn = np.divide(own, length, out=np.zeros_like(own), where=length > 0.0)
+            length, turned = np.linalg.norm(edges, axis=1), np.linalg.norm(turns, axis=1)
+            turn = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0)
             islands = worst[first : first + part.islands]
             np.maximum(islands, turn.reshape(part.islands, -1).max(1, initial=0.0), out=islands)
             first += part.islands
         return worst
 
     def turned_over(self, before: np.ndarray, after: np.ndarray) -> bool:
-        """Whether an edge points backwards on dofs `after` as against `before`."""
+        """Return True if an edge reverses direction between two dof vectors."""
         pairs = ((part.edges(self.of(part, before)), part.edges(self.of(part, after))) for part in self.parts)
         return any((np.sum(a * b, axis=1) < 0.0).any() for a, b in pairs)
 
     def edge_length(self) -> float:
-        """Mean rest length of edges [m]: what makes angles and positions comparable."""
+        """Return the mean rest length of edges [m], the scale of angles against positions."""
         return float(np.mean([part.edge_length() for part in self.parts]))
 
     def point_dofs(self) -> np.ndarray:
-        """Dofs of the rows of `State.points` (P, 3), of the first world; -1 for what a planar rod has not."""
+        """Return the dofs of the rows of `State.points` (P, 3) in the first world; -1 across the plane of planar rods."""
         result = np.full((self.model.points_count, 3), -1)
         for part in self.parts:
             rows, dofs = part.point_dofs()
@@ -234,29 +234,29 @@ class Tangent:
         return result
 
     def at_points(self, values: np.ndarray) -> np.ndarray:
-        """The entries of dofs (size,) at points, in the shape of `State.points`; zero along what a planar rod has not."""
+        """Return dof values (size,) in the shape of `State.points`; zero across the plane of planar rods."""
         worlds = self.model.worlds
         result = np.zeros((worlds, self.model.points_count, 3), values.dtype)
         for part in self.parts:
             rows, dofs = part.point_dofs()
-            own = self.of(part, values).reshape(worlds, -1)
-            result[:, rows] = np.where(dofs < 0, 0.0, own[:, dofs])
+            of_worlds = self.of(part, values).reshape(worlds, -1)
+            result[:, rows] = np.where(dofs < 0, 0.0, of_worlds[:, dofs])
         return result if worlds > 1 else result[0]
 
     def where(self, dof: int) -> str:
-        """Name of a dof's place, such as "node 3 of rod 1"."""
+        """Return the name of the node or edge of a dof, such as "node 3 of rod 1"."""
         part = next(part for part in self.parts if part.offset <= dof < part.offset + part.size)
         return part.where(dof - part.offset)
 
     def into(self, values: np.ndarray) -> np.ndarray:
-        """Vectors in space (size,) as dofs are: components in the frames of oblique planes; see `ddg_warp.solve.net.planes`."""
+        """Return vectors in space (size,) as dofs: components in nodal frames of skew supports; see `solve.net.planes`."""
         return np.concatenate([part.into(self.of(part, values)) for part in self.parts])
 
     def back(self, values: np.ndarray) -> np.ndarray:
-        """Dofs, forces or steps (size,) as vectors in space."""
+        """Return dofs, forces or steps (size,) as vectors in space."""
         return np.concatenate([part.back(self.of(part, values)) for part in self.parts])
 
     @staticmethod
     def of(part, values: np.ndarray) -> np.ndarray:
-        """The entries of a part."""
+        """Return the entries of a tangent block."""
         return values[part.offset : part.offset + part.size]

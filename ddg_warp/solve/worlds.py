@@ -1,4 +1,4 @@
-"""Worlds apart: what each ends a step with, and worlds that start anew while the others go on."""
+"""Worlds of an integrator: outcomes, failures, reset."""
 
 import numpy as np
 import warp as wp
@@ -12,8 +12,7 @@ from ddg_warp.threads import capturing
 
 
 def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
-    """Return names (worlds,) of what became of each world: of the first reason why something in it was given up, or why it rests, else
-    "converged"."""
+    """Return the outcome of each world (worlds,): of its first failure, or "converged"."""
     codes = resting.numpy()
     for part in parts:
         islands = part.islands
@@ -23,15 +22,15 @@ def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
 
 
 class Worlds:
-    """The worlds of an integrator.
+    """Failure handling of the worlds of an integrator.
 
-    A world in which something was given up rests: all of it is as it was before the step, and stays so until it is reset. Where worlds
-    are `watch`ed, it is not a number instead.
+    A failed world is inactive: it keeps the state before the step until reset. In watched worlds (`watch`) its state becomes NaN
+    instead.
 
     Attributes:
-        resting: of every world the code of the outcome that it rests for, 0 where it goes on; see `kernels.outcome`.
-        invalid: of every world that is watched the code of an outcome that its parameters are refused by, 0 where they are good.
-        start: of worlds that are watched, the state that those are given which are taken out of a step.
+        resting: outcome code of each inactive world, 0 for active ones (worlds,); see `kernels.outcome`.
+        invalid: outcome code of each watched world with refused parameters, else 0 (worlds,).
+        start: state for watched worlds excluded from a step.
     """
 
     def __init__(self, model):
@@ -47,20 +46,18 @@ class Worlds:
         return wp.zeros(count, dtype=int, device=self.model.wp_device)
 
     def watch(self) -> None:
-        """From now on take worlds out of steps whose parameters are `invalid` or whose state is not a number, and leave those that fail
-        not a number."""
+        """Watch worlds: exclude those with `invalid` parameters or a NaN state from steps; failed ones become NaN."""
         self.invalid, self.start = self._zeros(self.model.worlds), self.model.state()
 
     def bar(self, parts: list, before: State, after: State, handed: list[wp.array]) -> None:
-        """Before a step: have watched worlds rest that are taken out of it, as they are at rest; launches alone, so that it can be
-        captured.
+        """Exclude invalid watched worlds from a step and set the start state; capturable.
 
         Args:
-            handed: arrays of all worlds, one after the other, whose entries have to be finite.
+            handed: arrays of all worlds in order that must be finite.
         """
         if self.invalid is None:
             return
-        # of worlds that failed in the last step, entries of no node stay, which a step does not write
+        # in worlds that failed in the last step, padding entries stay NaN, which a step does not write
         wp.capture_if(self._any, lambda: self.take_over(self._failed, self.start, after))
         values, worlds = next(array for array in before.arrays().values() if array.size > 1), self.model.worlds
         cube, (_, bar, _) = cubed(values), blank_kernels(values.dtype)
@@ -76,13 +73,13 @@ class Worlds:
             self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])
 
     def _to_start(self, before: State, after: State) -> None:
-        """Have worlds that rest begin as at rest, and their grips end there, as searches for contact are of all worlds."""
+        """Set inactive worlds to the start state, grips included, since the broad phase covers all worlds."""
         self.take_over(self.resting, self.start, before)
         if after.grips is not None:
             self.take_part(self.resting, self.start.grips, after.grips, self.model.worlds)
 
     def settle(self, parts: list, before: State, after: State) -> None:
-        """After a step: have worlds rest in which something was given up; launches alone, so that it can be captured."""
+        """Deactivate worlds with failures after a step; capturable."""
         self._any.zero_()
         if self.invalid is None:
             self._failed.zero_()
@@ -93,7 +90,7 @@ class Worlds:
             inputs = [part.islands.arrays[0], part.islands_each, self.resting, self._failed]
             self._launch(self._note, len(part.islands), inputs, [self._any])
         wp.capture_if(self._any, lambda: self._rest(parts, before, after))
-        if after.grips is not None and self.invalid is None:  # which go where they are told, but for worlds that rest
+        if after.grips is not None and self.invalid is None:  # controls move grips, except in inactive worlds
             self.take_part(self.resting, before.grips, after.grips, before.model.worlds)
 
     def _rest(self, parts: list, before: State, after: State) -> None:
@@ -107,38 +104,38 @@ class Worlds:
         self._launch(self._enter, self.model.worlds, [self._failed], [self.resting])
 
     def _blank(self, state: State) -> None:
-        """Make a state not a number in worlds that failed."""
+        """Set a state to NaN in failed worlds."""
         for array in state.arrays().values():
             if array.shape[-1] % self.model.worlds == 0:
                 cube, (blank, *_) = cubed(array), blank_kernels(array.dtype)
                 self._launch(blank, cube.shape, [self._failed, cube.shape[-1] // self.model.worlds], [cube])
 
     def take_over(self, mask: wp.array, source: State, target: State) -> None:
-        """Put everything of a state into another one, in worlds of a mask; a state of one world goes into each of them."""
+        """Copy masked worlds of a state into another one; a state of one world goes into each of them."""
         for name, part in target.parts().items():
             self.take_part(mask, source.parts()[name], part, source.model.worlds)
 
     def take_part(self, mask: wp.array, source, target, worlds: int) -> None:
-        """As `take_over`, of a part of a state, from one of so many worlds."""
-        given = source.arrays()
+        """Copy masked worlds of one component of a state with `worlds` worlds; see `take_over`."""
+        sources = source.arrays()
         for name, array in target.arrays().items():
-            if array.shape[-1] % self.model.worlds == 0:  # else it is not there, but for one number
-                self.take_array(mask, given[name], array, worlds)
+            if array.shape[-1] % self.model.worlds == 0:  # else the array is absent, stored as one number
+                self.take_array(mask, sources[name], array, worlds)
 
     def take_array(self, mask: wp.array, source: wp.array, target: wp.array, worlds: int) -> None:
-        """As `take_over`, of an array."""
+        """Copy masked worlds of an array; see `take_over`."""
         several = self.model.worlds
-        share = target.shape[-1] // several
-        stride = share if worlds == several else 0
+        width = target.shape[-1] // several
+        stride = width if worlds == several else 0
         kernel, cubes = select_kernel(target.dtype, self._serial), [cubed(array) for array in (source, target)]
-        dim = (1, 1, several, 1) if self._serial else (*cubes[1].shape[:2], several, share)
-        self._launch(kernel, dim, [mask, share, stride, cubes[0]], [cubes[1]])
+        dim = (1, 1, several, 1) if self._serial else (*cubes[1].shape[:2], several, width)
+        self._launch(kernel, dim, [mask, width, stride, cubes[0]], [cubes[1]])
 
     def mask(self, mask) -> wp.array:
-        """A mask that a user gives, on the device.
+        """Return a user's mask of worlds on the device.
 
         Raises:
-            SceneError: it is no array of bools, one a world.
+            SceneError: no array of bools, one a world.
         """
         try:
             values = np.asarray(mask)
@@ -153,17 +150,17 @@ class Worlds:
         return self._mask
 
     def check_source(self, to, state: State) -> None:
-        """Refuse what worlds of a state cannot start from.
+        """Refuse an invalid source of a reset.
 
         Raises:
-            SceneError: it is no state of the model, nor of the same scene in one world; or belongs to another time, at which supports
-                that are moved by functions of time are elsewhere.
+            SceneError: no state of the model or of the same scene in one world; or a state of another time, with supports moved by
+                functions of time.
         """
         if not isinstance(to, State):
             raise SceneError(f"reset: to is {to!r}; give a state of this model, or of one with one world")
         if to.model is not self.model:
-            found, wanted = (_description(given) for given in (to, state))
-            if to.model.worlds != 1 or found != wanted:
+            description, wanted = (_description(each) for each in (to, state))
+            if to.model.worlds != 1 or description != wanted:
                 raise SceneError(
                     "reset: to is of another model; give a state of this one, such as model.state(), or of the same scene built with "
                     "worlds=1, of the same precision and on the same device"
@@ -175,7 +172,7 @@ class Worlds:
             )
 
     def reset(self, parts: list, mask: wp.array, to: State, target: State) -> None:
-        """Put worlds of the mask into the state `to`, and forget what became of them."""
+        """Set masked worlds to the state `to`, and clear their outcomes."""
         self.take_over(mask, to, target)
         self._launch(forget_kernel(int), (1, self.model.worlds), [mask, 1], [self.resting.reshape((1, -1))])
         for part in parts:
@@ -185,14 +182,14 @@ class Worlds:
                 self._launch(kernel, account.shape, [mask, part.islands_each], [account])
 
     def forget(self, parts: list) -> None:
-        """Have all worlds go on, whatever became of them."""
+        """Activate all worlds and clear all outcomes."""
         self.resting.zero_()
         for part in parts:
             part.islands.status.fill_(outcome.CONVERGED)
             part.islands.reason.zero_()
 
     def load_modules(self) -> None:
-        """Compile and load what it launches, once."""
+        """Compile and load all kernels, once."""
         if self._loaded:
             return
         with capturing():
@@ -208,7 +205,7 @@ class Worlds:
                 *(select_kernel(dtype, self._serial) for dtype in types),
             ]
             if self.invalid is not None:
-                types |= {self.model.types.real, wp.types.vector(3, self.model.types.real)}  # of what is handed in
+                types |= {self.model.types.real, wp.types.vector(3, self.model.types.real)}  # types of inputs
                 kernels += [kernel for dtype in types for kernel in blank_kernels(dtype)]
             kernels += [forget_kernel(dtype) for dtype in (int, self.model.types.real)]
             arrays.load_kernels(kernels, self.model.wp_device)
@@ -219,16 +216,16 @@ class Worlds:
 
 
 def cubed(array: wp.array) -> wp.array:
-    """An array seen with three axes."""
+    """Return a view of an array with three axes."""
     lead = 3 - array.ndim
     shape, strides = (1,) * lead + array.shape, array.strides[:1] * lead + array.strides
     view = wp.array(ptr=array.ptr, dtype=array.dtype, shape=shape, strides=strides, device=array.device)
-    view._ref = array  # what it looks at lives as long
+    view._ref = array  # keeps the memory alive
     return view
 
 
 def _description(state: State) -> list:
-    """Names, types and shapes of everything in one world of a state."""
+    """Return names, types and shapes of all arrays in one world of a state."""
     model = state.model
     return [str(model.wp_device)] + [
         (name, label, array.dtype, array.shape[:-1], max(1, array.shape[-1] // model.worlds))
