@@ -1,4 +1,4 @@
-"""Compile uncoupled rods to rod groups: one kind, similar length, padded arrays (node, rod)."""
+"""Compilation of uncoupled rods to rod groups: one kind, similar length, padded arrays (node, rod)."""
 
 from dataclasses import dataclass
 from functools import cached_property

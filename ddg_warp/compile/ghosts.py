@@ -38,7 +38,7 @@ class Ghosts:
                 before = prescribed[support.rods, end]
                 conflicts = np.flatnonzero(
                     np.abs(before - value).max(1) > 1e-12
-                )  # NaN before the first clamp: compares false
+                )  # False for NaN, before the first clamp
                 if conflicts.size:
                     raise SceneError(
                         f"the {support.end} end of rod {support.rods[conflicts[0]]} is clamped twice, with a {name} "

@@ -8,9 +8,9 @@ import warp as wp
 from ddg_warp.errors import SceneError
 
 BASES, SIZES = (0.0, 1.0), (1e-2, 0.3, 5.0)  # centres and offsets of trial strains
-STEPS = (1e-4, 1e-5)  # of differences, over the size of a strain; one must agree
-TOLERANCE = 1e-3  # of the largest derivative
-TRIED = (1.0, 0.3, 0.0, -0.3)  # values for parameters without value or default
+STEPS = (1e-4, 1e-5)  # Steps of differences, over the size of a strain; one must agree.
+TOLERANCE = 1e-3  # Tolerance over the largest derivative.
+TRIED = (1.0, 0.3, 0.0, -0.3)  # Values for parameters without value or default.
 
 
 def check_law(where: str, law, strains: int) -> None:

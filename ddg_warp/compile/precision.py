@@ -43,9 +43,9 @@ def choose(name: str | None, device) -> Precision:
 
 
 FLOAT32_LIMIT = 0.02  # relative error of a search direction that Newton still corrects quickly; beyond it float32 states are doubtful
-STIFF = 5e4  # stiffness ratio from which rods always use edge-rotation updates and full Hessians
-CARRIED = 1e-3  # error up to which a float32 matrix includes a stiffness; see `kernels.solve.tension`
-FLOAT32_LOST = 0.1  # relative error beyond which rounding decides the motion
+STIFF = 5e4  # Stiffness ratio from which rods always use edge-rotation updates and full Hessians.
+CARRIED = 1e-3  # Error up to which a float32 matrix includes a stiffness; see `kernels.solve.tension`.
+FLOAT32_LOST = 0.1  # Relative error beyond which rounding decides the motion.
 
 
 def stiffnesses(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> tuple[np.ndarray, ...]:

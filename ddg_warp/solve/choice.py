@@ -4,8 +4,8 @@ import numpy as np
 
 # Cyclic reduction pays on a GPU for rods of at least LONG nodes, if there are at most FEW rods.
 #
-# Measured: an iteration by the sweep takes about 2 us a node of the longest rod, for any number of rods; one by cyclic reduction takes
-# about 40 launches, and some ns a node of all rods together.
+# Measured: an iteration by the sweep takes about 2 us a node of the longest rod, for any number of rods. An iteration by cyclic
+# reduction takes about 40 launches, and some ns a node of all rods together.
 LONG = 512
 FEW = 256
 
@@ -22,8 +22,8 @@ LONGEST_REPEATED = 8192
 LARGE = 4096  # nodes of the coupled system outside rods from which fewer, longer iterations of PCG pay
 
 # Substructuring of rods (preconditioner `"chain"`) against block Jacobi, see `net_preconditioner`. BETWEEN: nodes of a rod between
-# joints from which substructuring pays. In units of the time of a block Jacobi iteration on a GPU, a rod path takes 1 / PLACES per path
-# node, a cyclic reduction of few, long paths as much as REDUCED path nodes, and the remaining launches LAUNCHES.
+# joints from which substructuring pays. The time unit is a block Jacobi iteration on a GPU: a path node takes 1 / `PLACES`, the
+# remaining launches `LAUNCHES`. A cyclic reduction of few, long paths takes as much as REDUCED path nodes.
 #
 # Measured: iterations of block Jacobi grow with the square of the edges between joints (gridshell, residual 1e-3: 250 at 8 edges, 2378
 # at 32). Substructuring takes 16 at any number, at about twice the time each on the CPU. On a GPU a rod path is serial: an iteration of
@@ -35,7 +35,7 @@ LAUNCHES = 1
 
 
 def automatic(group) -> str:
-    """Return the linear solver of a rod group: `"chain"` if closed, `"partitioned"` if few and long on CUDA, else `"sweep"`."""
+    """Return the linear solver of a rod group: `"chain"` if closed, `"partitioned"` if few and long on CUDA, or `"sweep"`."""
     if group.kind.closed:
         return "chain"
     return "partitioned" if long_and_few(group.nodes, group.columns, group.device) else "sweep"

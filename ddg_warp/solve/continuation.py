@@ -4,8 +4,8 @@ Pseudo-arclength continuation (Keller 1977; Riks, Int. J. Solids Struct. 15, 197
 corrector in the plane across it, on the exact tangent stiffness. Frames are updated and joint rotations start from zero after every
 iterate. So increments are summed iterate by iterate, and no angle refers to an earlier state.
 
-Between two points the sign of the load rate shows a limit point, and the inertia count a bifurcation, less the change at the limit
-point (K t = f l' makes the critical eigenvalue change with l' (f . t)).
+Between two points the sign of the load rate shows a limit point, and the inertia count a bifurcation. The change of the count at the
+limit point is subtracted: there K t = f l' makes the critical eigenvalue change with l' (f . t).
 
 Where contact sets in or ends, a path bends within a small fraction of the activation distance. A bend too short for steps is passed as
 a corner. The load may be stationary there; eigenvalues that change sign at a corner are not detected.
@@ -27,10 +27,10 @@ from ddg_warp.scene.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Po
 from ddg_warp.solve.corrector import ContinuationOptions, Corrector, Failed
 from ddg_warp.threads import launches, stays_here
 
-FORK = 1e-2  # relative work of the load along the path below which a stationary load is no limit point
-CONTROLLED = 0.2  # largest deviation of a controlled change from the mean of the end rates, relative
-LEAP = 4.0  # distance of two points over their arc length beyond which paths differ
-BISECTIONS = 12  # bisections of a bifurcation before linear interpolation of the critical eigenvalue
+FORK = 1e-2  # Relative work of the load along the path below which a stationary load is no limit point.
+CONTROLLED = 0.2  # Largest deviation of a controlled change from the mean of the end rates, relative.
+LEAP = 4.0  # Distance of two points over their arc length beyond which paths differ.
+BISECTIONS = 12  # Bisections of a bifurcation before linear interpolation of the critical eigenvalue.
 
 
 @arguments.sealed
@@ -104,7 +104,7 @@ class Continuation:
         return stop or Stop()
 
     def statistics(self, points: Sequence[Point]) -> dict:
-        """Return contact statistics of these points and all earlier ones under "contact".
+        """Return contact statistics under "contact", of these points and all earlier points.
 
         See `NetEquilibrium.contact_statistics`.
         """
@@ -225,7 +225,7 @@ class Continuation:
             raise Failed("leap")
 
     def _follow(self, path: Path, stop: Stop) -> Path:
-        """Append points to a path until it stops."""
+        """Append points to a path until a stop."""
         options, step = self.options, self.options.step
         current = path.points[-1]
         for _ in range(stop.steps):
@@ -331,7 +331,7 @@ class Continuation:
         return sorted(events, key=lambda point: point.arclength)
 
     def _limit_point(self, first: Point, length: float) -> Point:
-        """Return the point at which the load rate vanishes."""
+        """Return the limit point, with zero load rate."""
 
         def rate(step):
             return self.corrector.at(first, step).direction[-1] if step > 0.0 else first.direction[-1]

@@ -47,14 +47,14 @@ class ControlledLoads(Loads):
     """Loads in time, follower loads and control loads on all dof blocks, per world.
 
     Args:
-        given: control loads.
+        control_loads: control loads of a step.
         scale: computes load scales from absolute loads on all dof blocks (worlds, blocks); see `ChainScale`.
     """
 
-    def __init__(self, model, part, midpoint: bool, given: Given, scale):
+    def __init__(self, model, part, midpoint: bool, control_loads: Given, scale):
         super().__init__(model, part, midpoint)
         host, real, device = part.host, model.types.real, model.wp_device
-        self.given, self._scale, nodes = given, scale, host.nodes
+        self.given, self._scale, nodes = control_loads, scale, host.nodes
 
         def put(values, dtype=real):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
@@ -68,7 +68,7 @@ class ControlledLoads(Loads):
         starts = np.searchsorted(block[order], np.arange(host.size + 1))
         self._inputs = [self._shared, constant, put(changing), part.node_mass, part.world_columns, put(arm), nodes]
         self._inputs += [put(starts.astype(np.int32), int), put(row[order].astype(np.int32), int)]
-        self._inputs += [given.forces, given.moments, given.gravity]
+        self._inputs += [control_loads.forces, control_loads.moments, control_loads.gravity]
         self._inputs += [put([np.asarray(model.scene.gravity, float)], self._vector)]
         self._load = kernels.load_kernel(real)
 

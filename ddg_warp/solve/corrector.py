@@ -1,9 +1,9 @@
-"""The corrector of a continuation: Newton on the equations of equilibrium and one condition more.
+"""Corrector of a continuation: Newton on the equations of equilibrium and one more condition.
 
-In contact a path goes from state to state on ways on which nothing passes through anything, to which predictors and iterates are cut.
+In contact, CCD limits predictors and iterates, so a path consists of collision-free motions.
 
-The metric of a path is (mean square displacement) / (size of the scene)^2 + (change of load / load_scale)^2, with angles times an
-edge length among the displacements.
+The metric of a path is (mean square displacement) / (size of the scene)^2 + (change of load / load_scale)^2. Angles count as
+displacements after multiplication by an edge length.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,16 +27,16 @@ from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 @arguments.called
 @dataclass(frozen=True)
 class ContinuationOptions:
-    """How a path is followed.
+    """Options of a continuation.
 
     Attributes:
-        step: first arc length; max_step, min_step: largest and smallest. See the metric above.
-        load_scale: change of the load parameter that counts as much as a displacement of the scene's size; by default 1, or if more
-            the lowest critical load parameter or that which moves the scene by its size, both linearised at rest, whichever is less.
-        iterations: of the corrector that the step is adapted to; max_iterations: at which it is given up.
-        rotation_cap: largest turn of an edge in a predictor [rad].
-        tolerance: of limit points, relative to the step in which they are found.
-        rtol, floor_factor: of the residual; see `StaticsOptions`.
+        step: first arc length in the metric above; max_step, min_step: bounds.
+        load_scale: change of the load parameter equivalent to a displacement of the scene size. By default the smaller of two values
+            linearised at rest, at least 1: the lowest critical load parameter, and the one that moves the scene by its size.
+        iterations: corrector iterations to which the step is adapted; max_iterations: limit.
+        rotation_cap: largest edge rotation of a predictor [rad].
+        tolerance: tolerance of limit points, relative to the step.
+        rtol, floor_factor: convergence test; see `StaticsOptions`.
     """
 
     step: float = 0.02
@@ -61,24 +61,24 @@ class ContinuationOptions:
                 )
 
 
-CUTS, SHORTER = 16, 0.9  # of a move in contact: how often it is cut, and to what part of it at most
-CORNERS = (1e-3, 1e-4, 1e-5, 1e-6)  # arc lengths by which a path is followed past one, the first that does
-AROUND = 4.0  # of that length: how far from it an equilibrium beyond the corner may be
-SMALL = 1e-4  # rotation and displacement over the size, in which the tangent at rest is taken to change in proportion
-BEND = 0.2  # of a step: how far its chord may be from the mean of the tangents at its ends
+CUTS, SHORTER = 16, 0.9  # Limit of cuts of a move in contact, and largest fraction left by a cut.
+CORNERS = (1e-3, 1e-4, 1e-5, 1e-6)  # Arc lengths tried beyond a corner, in order.
+AROUND = 4.0  # Largest distance of an equilibrium beyond the corner, over that length.
+SMALL = 1e-4  # Rotation, or displacement over size, within which the tangent at rest changes linearly.
+BEND = 0.2  # Largest deviation of the chord of a step from the mean end tangent, over its length.
 
 
 class Failed(Exception):
-    """A corrector did not arrive; the message is its outcome."""
+    """Failure of a corrector; the message is the outcome."""
 
 
 class Corrector:
-    """Equilibria of one model near others on a path; see `Continuation` for its arguments.
+    """Corrector of one model: equilibria near others on a path; arguments as in `Continuation`.
 
     Attributes:
         tangent: energy, gradient and Hessian of the model.
-        watched: derivative of every watched displacement (size,).
-        metric: weight of every dof and of the load parameter (size + 1,), zero for held dofs.
+        watched: derivatives of watched displacements (size,), by name.
+        metric: weight of every dof and of the load parameter (size + 1,), zero for fixed dofs.
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement], options: ContinuationOptions):
@@ -100,7 +100,7 @@ class Corrector:
         self._unit, self.metric = np.where(tangent.angle, 1.0, size), np.append(weights, self.load_scale**-2)
 
     def _natural_load_scale(self, state: State, weights: np.ndarray) -> float:
-        """See `ContinuationOptions.load_scale`; 1 where the tangent at rest does not tell, as it is singular or not definite."""
+        """Return the default of `ContinuationOptions.load_scale`; 1 if the tangent at rest is not positive definite."""
         self.load_scale = 1.0
         q = self.tangent.dofs(state)
         _, stiffness, rate, support, *_ = self.system(state, q, 0.0)
@@ -114,107 +114,107 @@ class Corrector:
         along = support.copy()
         along[self.free] = factors.solve(rate[self.free])
         size = float(np.sqrt(weights @ along**2))
-        turn = self.tangent.rotation(q, along)
-        if not (np.isfinite(size) and size > 0.0 and turn > 0.0):
+        rotation = self.tangent.rotation(q, along)
+        if not (np.isfinite(size) and size > 0.0 and rotation > 0.0):
             return 1.0
-        part = SMALL / max(turn, size)
-        ahead = self.tangent.stiffness(self.tangent.advance(state, part * along, part), part)
-        softening = (matrix - sparse.csc_matrix(ahead[self.free][:, self.free])) / part
+        fraction = SMALL / max(rotation, size)
+        softened = self.tangent.stiffness(self.tangent.advance(state, fraction * along, fraction), fraction)
+        softening = (matrix - sparse.csc_matrix(softened[self.free][:, self.free])) / fraction
         softening = 0.5 * (softening + softening.T)
         scales = [1.0 / size]
         for sense in (1.0, -1.0):
             scales += list(stability.lowest_factors(matrix, sense * softening, factors, 1))
         return max(1.0, float(min(scale for scale in scales if np.isfinite(scale) and scale > 0.0)))
 
-    def at(self, here: Point, step: float, smooth: bool = True) -> Point:
-        """The equilibrium at an arc length `step` along the tangent; `smooth` refuses a path that turns sharply on the way.
+    def at(self, origin: Point, step: float, smooth: bool = True) -> Point:
+        """Return the equilibrium at an arc length `step` along the tangent; `smooth` refuses sharp bends.
 
-        Next to a bifurcation the tangent is lost in rounding: there it cannot be asked to be smooth.
+        Next to a bifurcation the tangent is lost in rounding, so `smooth` must be False.
         """
-        there = self.correct(here, step * here.direction, self.metric * here.direction)
-        if self.dot(there.direction, here.direction) < 0.0:
-            there.direction = -there.direction
-        if smooth and self.dot(there.direction, here.direction) < 0.7:
+        point = self.correct(origin, step * origin.direction, self.metric * origin.direction)
+        if self.dot(point.direction, origin.direction) < 0.0:
+            point.direction = -point.direction
+        if smooth and self.dot(point.direction, origin.direction) < 0.7:
             raise Failed("sharp_turn")
-        there.arclength = here.arclength + step
-        return there
+        point.arclength = origin.arclength + step
+        return point
 
-    def follows(self, here: Point, there: Point) -> None:
-        """Refuse a step over which the path does more than its ends tell: the chord is the mean of the tangents, times arc length.
+    def follows(self, origin: Point, point: Point) -> None:
+        """Refuse a step with a chord that deviates from the mean end tangent times arc length.
 
-        A step that leaps to another part of the path, or over a rise and fall of the load, has one that is not. The load is looked
-        at by itself, as its scale may hide it. (The trapezoidal rule errs by a third of s^3 where it says half as much again.)
+        The chord deviates if a step leaps along the path, or over a rise and fall of the load. The load is tested separately, since its
+        scale may hide it. (The trapezoidal rule errs by s^3 / 3 where it says half as much again.)
         """
-        length = there.arclength - here.arclength
-        chord = np.append(self.tangent.dofs(there.state) - self.tangent.dofs(here.state), there.load - here.load)
-        ends = length * here.direction, length * there.direction
+        length = point.arclength - origin.arclength
+        chord = np.append(self.tangent.dofs(point.state) - self.tangent.dofs(origin.state), point.load - origin.load)
+        ends = length * origin.direction, length * point.direction
         gap = chord - 0.5 * (ends[0] + ends[1])
         rates = max(abs(end[-1]) for end in ends)
         if self.norm(gap) > BEND * length or abs(gap[-1]) > BEND * rates:
             raise Failed("leap")
 
-    def past_corner(self, here: Point) -> Point | None:
-        """The equilibrium beyond a corner of the path, where something begins or ceases to touch; None where there is none.
+    def past_corner(self, origin: Point) -> Point | None:
+        """Return the equilibrium beyond a corner of the path, where contact begins or ends; None without.
 
-        Beyond the corner the tangent is all but that of states on the line that leads there. Of both ways along it one leads to
-        equilibria whose energy of contact has grown or fallen as on that line, the other one back.
+        Beyond the corner the tangent is nearly that of states on the straight extension of the path. In one sense along it the contact
+        energy changes as on that extension; the other sense leads back.
         """
         if not self.equilibrium.net:
             return None
-        energy = self._contact_energy(here.state)
+        energy = self._contact_energy(origin.state)
         for distance in CORNERS:
             try:
-                state, move = self._moved(here.state, here.load, distance * here.direction)
+                state, move = self._moved(origin.state, origin.load, distance * origin.direction)
                 change = self._contact_energy(state) - energy
-                beside = replace(here, state=state, load=here.load + move[-1])
-                along = self._along(self.system(state, self.tangent.dofs(state), beside.load), here.direction)[0]
+                shifted = replace(origin, state=state, load=origin.load + move[-1])
+                along = self._along(self.system(state, self.tangent.dofs(state), shifted.load), origin.direction)[0]
             except Failed:
                 continue
             along /= self.norm(along)
-            for way in (along, -along):
+            for sense in (along, -along):
                 try:
-                    there = self.correct(beside, distance * way, self.metric * way, reach=AROUND * distance)
+                    point = self.correct(shifted, distance * sense, self.metric * sense, reach=AROUND * distance)
                 except Failed:
                     continue
-                if (self._contact_energy(there.state) - energy) * change > 0.0:
-                    if self.dot(there.direction, way) < 0.0:
-                        there.direction = -there.direction
-                    there.arclength = here.arclength + distance
-                    return there
+                if (self._contact_energy(point.state) - energy) * change > 0.0:
+                    if self.dot(point.direction, sense) < 0.0:
+                        point.direction = -point.direction
+                    point.arclength = origin.arclength + distance
+                    return point
         return None
 
-    def to(self, here: Point, row: np.ndarray, value: float) -> Point:
-        """The equilibrium at which a linear functional of dofs (from rest) and load has a value."""
+    def to(self, origin: Point, row: np.ndarray, value: float) -> Point:
+        """Return the equilibrium with a given value of a linear functional of dofs (from rest) and load."""
 
         def gap(q, load):
             return value - row[:-1] @ (q - self.rest) - row[-1] * load
 
-        rate = row @ here.direction
+        rate = row @ origin.direction
         if rate == 0.0:
             raise Failed("displacement_turns_back")
-        step = gap(self.tangent.dofs(here.state), here.load) / rate * here.direction
-        q = self.tangent.dofs(here.state)
+        step = gap(self.tangent.dofs(origin.state), origin.load) / rate * origin.direction
+        q = self.tangent.dofs(origin.state)
         if self.tangent.rotation(q, step[:-1]) > 2.0 * self.options.rotation_cap:
             raise Failed("sharp_turn")
-        there = self.correct(here, step, row, gap)
-        if self.dot(there.direction, here.direction) < 0.0:
-            there.direction = -there.direction
-        return there
+        point = self.correct(origin, step, row, gap)
+        if self.dot(point.direction, origin.direction) < 0.0:
+            point.direction = -point.direction
+        return point
 
     def correct(
-        self, here: Point, step: np.ndarray, row: np.ndarray, gap: Callable | None = None, reach: float | None = None
+        self, origin: Point, step: np.ndarray, row: np.ndarray, gap: Callable | None = None, reach: float | None = None
     ) -> Point:
-        """Newton from `here` + `step` on equilibrium and the condition row . (increments) = gap(q, load), zero by default.
+        """Run Newton from `origin` + `step` on equilibrium and row . (increments) = gap(q, load), zero by default.
 
-        Without `gap` it is given up farther than `reach` from there, by default as far as it is from `here`.
+        Without `gap` iterates farther than `reach` from the predictor fail; the default is the length of `step`.
         """
         tangent, options, solver = self.tangent, self.options, self.equilibrium
-        state, total = self._moved(here.state, here.load, step)
-        load, polished, reach = here.load + total[-1], False, self.norm(step) if reach is None else reach
+        state, total = self._moved(origin.state, origin.load, step)
+        load, polished, reach = origin.load + total[-1], False, self.norm(step) if reach is None else reach
         first = solver.residuals.first_scale(
-            tangent.loads(here.load, tangent.dofs(here.state)), tangent.gradient(here.state)
+            tangent.loads(origin.load, tangent.dofs(origin.state)), tangent.gradient(origin.state)
         )
-        pivot = here.direction
+        pivot = origin.direction
         for iteration in range(options.max_iterations + 1):
             q = tangent.dofs(state)
             system = self.system(state, q, load)
@@ -247,46 +247,46 @@ class Corrector:
                 raise Failed("diverged")
         direction = along / self.norm(along)
         values = {name: float(row @ (q - self.rest)) for name, row in self.watched.items()}
-        arclength = here.arclength + abs(self.dot(total, here.direction))
+        arclength = origin.arclength + abs(self.dot(total, origin.direction))
         negative = stability.instabilities(tangent, state, stiffness)
         state.stable = negative == 0
         return Point(state, float(load), arclength, values, negative, REGULAR, direction, iterations=iteration)
 
     def _contact_energy(self, state: State) -> float:
-        """Energy of all that touches [J]."""
+        """Return the contact energy [J]."""
         return float(self.tangent.energy(state)["contact"].sum())
 
     def _moved(self, state: State, load: float, move: np.ndarray) -> tuple[State, np.ndarray]:
-        """The state after a move (size + 1,) from it and from `load`, and what of the move was taken before something is in the way.
+        """Return the state after a collision-free fraction of a move (size + 1,) from a state at `load`, and that fraction.
 
-        In contact no more is taken than resolves the arcs of supports and obstacles that turn.
+        In contact the fraction also resolves the arcs of rotating supports and obstacles.
         """
         taken, arcs = 1.0, self.equilibrium.net.arcs if self.equilibrium.net else None
         if arcs:
             taken = 0.5 ** int(arcs.levels(*sorted((load, load + move[-1]))).max())
         for _ in range(CUTS):
-            there = self.tangent.advance(state, taken * move[:-1], load + taken * move[-1])
-            share = self.equilibrium.share(state, there)
-            if share == 1.0:
-                return there, taken * move
-            taken *= min(share, SHORTER)
+            candidate = self.tangent.advance(state, taken * move[:-1], load + taken * move[-1])
+            fraction = self.equilibrium.share(state, candidate)
+            if fraction == 1.0:
+                return candidate, taken * move
+            taken *= min(fraction, SHORTER)
         raise Failed("in_the_way")
 
     def system(self, state: State, q: np.ndarray, load: float):
-        """Residual, tangent stiffness, and the rates of the residual and of supports with the load parameter."""
+        """Return residual, tangent stiffness, load rates of residual and supports, gradient and external forces."""
         tangent = self.tangent
         delta = 1e-4 * self.load_scale
         outer, gradient, stiffness = tangent.loads(load, q), tangent.gradient(state), tangent.stiffness(state, load)
         rate = (tangent.loads(load + delta, q) - tangent.loads(load - delta, q)) / (2.0 * delta)
-        ahead, behind = (tangent.support_step(state, load, load + d) for d in (delta, -delta))
-        support = (ahead - behind) / (2.0 * delta)
+        forward, backward = (tangent.support_step(state, load, load + d) for d in (delta, -delta))
+        support = (forward - backward) / (2.0 * delta)
         if tangent.prescribes:
-            ahead, behind = (tangent.gradient(tangent.with_prescribed(state, load + d)) for d in (delta, -delta))
-            rate = rate - (ahead - behind) / (2.0 * delta)
+            forward, backward = (tangent.gradient(tangent.with_prescribed(state, load + d)) for d in (delta, -delta))
+            rate = rate - (forward - backward) / (2.0 * delta)
         return outer - gradient, stiffness, rate - stiffness @ support, support, gradient, outer
 
     def _along(self, system: tuple, direction: np.ndarray) -> tuple[np.ndarray, Bordered]:
-        """The tangent of a `system`, and its factors with the unknown prescribed that changes most along `direction`."""
+        """Return the tangent of a `system`, and bordered factors with the unknown that changes most along `direction`."""
         _, stiffness, rate, support, *_ = system
         matrix = sparse.csc_matrix(stiffness[self.free][:, self.free])
         change = np.abs(direction) * np.sqrt(self.metric)
@@ -297,19 +297,19 @@ class Corrector:
         return self._full(bordered.tangent(), support), bordered
 
     def _full(self, z: np.ndarray, support: np.ndarray) -> np.ndarray:
-        """All dofs and the load parameter from those of the free dofs; supports go with the load."""
+        """Return all dofs and the load parameter from the free dofs; supports move with the load."""
         full = np.append(support * z[-1], z[-1])
         full[self.free] = z[:-1]
         return full
 
     def start(self, state: State, load: float) -> Point:
-        """The equilibrium at a load parameter, with the direction in which the load grows."""
-        held = np.zeros(self.tangent.size + 1)
-        held[-1] = 1.0
+        """Return the equilibrium at a load parameter, with the direction of growing load."""
+        fixed_load = np.zeros(self.tangent.size + 1)
+        fixed_load[-1] = 1.0
         self.equilibrium.check_apart(state)
-        begin = Point(state, load, 0.0, {}, 0, REGULAR, held)
+        begin = Point(state, load, 0.0, {}, 0, REGULAR, fixed_load)
         try:
-            point = self.correct(begin, np.zeros_like(held), held, lambda _q, at: load - at)
+            point = self.correct(begin, np.zeros_like(fixed_load), fixed_load, lambda _q, trial: load - trial)
         except Failed as failed:
             outcome = "singular_start" if str(failed) == "singular" else "no_start"
             raise SolverError(
@@ -324,7 +324,7 @@ class Corrector:
         return point
 
     def critical(self, point: Point) -> tuple[float, np.ndarray]:
-        """Eigenvalue nearest to zero, and its mode of unit length in the metric (size,)."""
+        """Return the eigenvalue nearest to zero, and its mode of unit length in the metric (size,)."""
         q = self.tangent.dofs(point.state)
         _, stiffness, *_ = self.system(point.state, q, point.load)
         scaling = 1.0 / np.sqrt(self.metric[self.free])
@@ -334,9 +334,9 @@ class Corrector:
         return value, mode
 
     def other(self, point: Point) -> np.ndarray:
-        """Direction (size + 1,) of the path that is crossed at a bifurcation by one along its critical mode.
+        """Return the direction (size + 1,) of the path that crosses the critical mode at a bifurcation.
 
-        K v = f l', solvable as the mode does no work on f, with v across the mode.
+        K v = f l', solvable since the mode does no work on f, with v across the mode.
         """
         q = self.tangent.dofs(point.state)
         _, stiffness, rate, support, *_ = self.system(point.state, q, point.load)
@@ -347,9 +347,9 @@ class Corrector:
         return self._full(np.append(splu(matrix).solve(np.append(rate[free], 0.0))[:-1], 1.0), support)
 
     def dot(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Product of two increments (size + 1,) in the metric."""
+        """Return the product of two increments (size + 1,) in the metric."""
         return float((self.metric * a) @ b)
 
     def norm(self, a: np.ndarray) -> float:
-        """Arc length of an increment (size + 1,)."""
+        """Return the arc length of an increment (size + 1,)."""
         return float(np.sqrt(self.dot(a, a)))

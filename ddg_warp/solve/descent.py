@@ -21,11 +21,11 @@ from ddg_warp.model.state import State
 from ddg_warp.solve.direct import Factorisation, SingularError
 from ddg_warp.solve.trust_region import LEAST_RADIUS, TrustRegion
 
-HALVINGS = 30  # limit of step halvings
-STALLED = 8  # steps without halved residuals that end a search below energy rounding
-CUT = 0.25  # accepted fraction of a step below which rises begin
-RISES = 8  # steps that may raise the energy before the search returns to the best state
-BOLD = 5  # rises after which steps shorten, to recover the stretching energy
+HALVINGS = 30  # Limit of step halvings.
+STALLED = 8  # Steps without halved residuals that end a search below energy rounding.
+CUT = 0.25  # Accepted fraction of a step below which rises begin.
+RISES = 8  # Steps that may raise the energy before the search returns to the best state.
+BOLD = 5  # Rises after which steps shorten, to recover the stretching energy.
 RETURN, RETURNS = (
     0.25,
     3,

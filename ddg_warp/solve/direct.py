@@ -1,4 +1,4 @@
-"""Sparse direct solution of symmetric systems with their inertia (SuperLU), and of equations that leave a choice; of moderate size."""
+"""Sparse direct solvers: symmetric systems with inertia (SuperLU), and least-norm solutions; moderate sizes."""
 
 from functools import cached_property
 
@@ -7,24 +7,24 @@ from scipy.linalg import qr
 from scipy.sparse import bmat, csc_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import norm, splu
 
-SHIFTS = (1e-13, 1e-11, 1e-9)  # of a singular matrix, over its largest eigenvalue as its diagonal shows it
+SHIFTS = (1e-13, 1e-11, 1e-9)  # shifts of a singular matrix over its largest diagonal stiffness
 
-REPEATED = 1e-15  # of equations, over their size: so little keeps regular those that say the same twice
-CORRECTIONS = 20  # at most, of what rounding and that leave
+REPEATED = 1e-15  # relative regularisation of repeated equations
+CORRECTIONS = 20  # limit of refinement steps of rounding and regularisation
 
 
 class SingularError(RuntimeError):
-    """A matrix has no inverse."""
+    """Singular matrix."""
 
 
 class Factorisation:
-    """L U of a symmetric matrix with symmetric permutation, so that the signs of the pivots give its inertia (Sylvester).
+    """LU factors of a symmetric matrix with symmetric permutation: pivot signs give the inertia (Sylvester).
 
     Rows and columns are scaled to a unit diagonal first: stretching and bending stiffness are many orders apart.
 
     Attributes:
-        negative: number of negative pivots, which is that of negative eigenvalues.
-        reliable: whether no row was exchanged, without which `negative` means nothing.
+        negative: number of negative pivots, equal to that of negative eigenvalues.
+        reliable: True if no row was exchanged; else `negative` is meaningless.
 
     Raises:
         SingularError: a pivot is exactly zero.
@@ -47,70 +47,71 @@ class Factorisation:
 
     @cached_property
     def negative(self) -> int:
-        """Number of negative pivots; read when it is asked for, as SuperLU copies all of U for it."""
+        """Number of negative pivots; evaluated on demand, since SuperLU copies all of U."""
         return int(self.negative_rows.sum())
 
     @cached_property
     def negative_rows(self) -> np.ndarray:
-        """Whether the pivot of each row is negative (n,) bool."""
+        """Mask of rows with a negative pivot (n,) bool."""
         return (self._lu.U.diagonal() < 0.0)[self._lu.perm_c]
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        """x with A x = b, for a vector or for columns."""
+        """Return x with A x = b, for a vector or for columns."""
         scale = self._scale if b.ndim == 1 else self._scale[:, None]
         return scale * self._lu.solve(scale * b)
 
 
-def pinned(matrix: csc_matrix, known: np.ndarray) -> csc_matrix:
-    """A symmetric matrix with null vectors (n, m), made regular by a spring at each of m dofs that together move in all of them.
+def pinned(matrix: csc_matrix, null_vectors: np.ndarray) -> csc_matrix:
+    """Return a symmetric matrix with null vectors (n, m) made regular by springs at m dofs that restrain all of them.
 
-    It has as many negative eigenvalues as before, and where the right side does no work along the null vectors its solution is one
-    of the matrix without springs.
+    The number of negative eigenvalues is unchanged. If the right-hand side does no work along the null vectors, the solution also
+    solves the system without springs.
     """
-    if not known.shape[1]:
+    if not null_vectors.shape[1]:
         return matrix
     diagonal = np.abs(matrix.diagonal())
     diagonal = np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0)
-    chosen = qr((np.sqrt(diagonal)[:, None] * known).T, mode="r", pivoting=True)[1][: known.shape[1]]
+    chosen = qr((np.sqrt(diagonal)[:, None] * null_vectors).T, mode="r", pivoting=True)[1][: null_vectors.shape[1]]
     springs = np.zeros(len(diagonal))
     springs[chosen] = diagonal[chosen]
     return csc_matrix(matrix + diags(springs))
 
 
 def regular(matrix: csc_matrix, mass: np.ndarray) -> tuple[Factorisation, float]:
-    """Factors of K - s M and s, which is zero unless K is singular; then it is as little below zero as rounding lets it be.
+    """Return the factors of K - s M and s: zero for a regular K, else the smallest effective negative shift.
 
     Args:
         matrix: K, symmetric.
-        mass: diagonal of M; what has none is given a part of its own stiffness instead.
+        mass: diagonal of M; massless dofs take their own stiffness instead.
     """
     diagonal, massive = np.abs(matrix.diagonal()), mass > 0.0
-    own = np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0)
-    rate = (own[massive] / mass[massive]).max(initial=0.0) or 1.0
-    for part in (0.0, *SHIFTS):
-        added = np.where(massive, part * rate * mass, part * own)
+    stiffness = np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0)
+    rate = (stiffness[massive] / mass[massive]).max(initial=0.0) or 1.0
+    for shift in (0.0, *SHIFTS):
+        added = np.where(massive, shift * rate * mass, shift * stiffness)
         try:
-            return Factorisation(csc_matrix(matrix + diags(added))), -part * rate
+            return Factorisation(csc_matrix(matrix + diags(added))), -shift * rate
         except SingularError:
             continue
     raise SingularError("the tangent is singular whatever is added to it: it is not finite")
 
 
 def shortest(matrix: csr_matrix, right: np.ndarray) -> np.ndarray:
-    """The shortest y with A y = b, by the augmented system [1, A^T; A, 0] (Bjorck, Numerical methods for least squares problems, 1996).
+    """Return the least-norm y with A y = b by the augmented system [1, A^T; A, 0].
 
-    Equations may say the same twice; of those that contradict each other something is left, for the caller to see.
+    See Bjorck, Numerical methods for least squares problems, 1996. Equations may be repeated; contradictory ones leave a residual for
+    the caller to test.
     """
     size = norm(matrix, axis=1)
     scaling = diags(1.0 / np.where(size > 0.0, size, 1.0))
     matrix, right = scaling @ matrix, scaling @ right
     rows, columns = matrix.shape
     factors = splu(bmat([[identity(columns), matrix.T], [matrix, -REPEATED * identity(rows)]], format="csc"))
-    found, left = np.zeros(columns), right
+    solution, remaining = np.zeros(columns), right
     for _ in range(CORRECTIONS):
-        tried = found + factors.solve(np.concatenate([np.zeros(columns), left]))[:columns]
-        now = right - matrix @ tried
-        if not np.linalg.norm(now) < 0.5 * np.linalg.norm(left):
+        tried = solution + factors.solve(np.concatenate([np.zeros(columns), remaining]))[:columns]
+        residual = right - matrix @ tried
+        if not np.linalg.norm(residual) < 0.5 * np.linalg.norm(remaining):
             break
-        found, left = tried, now
-    return found
+        solution, remaining = tried, residual
+    return solution

@@ -1,4 +1,4 @@
-"""Drag on rods on their own and on those of a net, against a fluid that flows; see `kernels.drag`."""
+"""Drag on uncoupled and coupled rods in a flowing fluid; see `kernels.drag`."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from ddg_warp.solve.net.system import lists
 
 
 class Drag:
-    """Drag on a part: `Group` or `DeviceNet`."""
+    """Drag on a `Group` or `DeviceNet`."""
 
     def __init__(self, model, part, kernels: tuple, midpoint: bool):
         self.model, self.part, self.midpoint = model, part, midpoint
@@ -27,7 +27,7 @@ class Drag:
         return [self._resist, *([self._settle] if self.midpoint else [])]
 
     def upload(self, t0: float, t1: float) -> None:
-        """The flow at the time that the scheme balances forces at."""
+        """Upload the flow at the evaluation time of the scheme."""
         if callable(self.model.scene.flow):
             self.flow.assign(self._flow(0.5 * (t0 + t1) if self.midpoint else t1))
 
@@ -35,7 +35,7 @@ class Drag:
         return flow_at(self.model.scene, t)[None, list(self.part.host.axes)]
 
     def _over_a_second(self) -> Islands:
-        """Islands of a solve in which inertia and drag are those of a second."""
+        """Return islands with the inertia and drag coefficients of a step of one second."""
         islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
         islands.coefficient.fill_(1.0)
         islands.rate.fill_(1.0)
@@ -46,13 +46,13 @@ class Drag:
 
 
 class ChainDrag(Drag):
-    """Drag on a group of rods, against a fluid that flows."""
+    """Drag on a rod group in a flowing fluid."""
 
     def __init__(self, model, group, midpoint: bool = False):
         super().__init__(model, group, drag.chain_kernels(group.kind, model.types.real), midpoint)
 
     def resist(self, before, newton, islands) -> None:
-        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
+        """Write inertia and drag of a solve from the state `before`, after the predictor."""
         group = self.part
         self._launch(
             self._resist,
@@ -63,7 +63,7 @@ class ChainDrag(Drag):
         )
 
     def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Inertia and drag (node, column) of a group's state at t, with the resistance over a second, and the flow (dim,)."""
+        """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
         group, real, device = self.part, self.model.types.real, self.model.wp_device
         solve = SimpleNamespace(x=data.x)
         solve.mass = arrays.allocate((group.nodes, group.columns), chain.inertia_type(group.kind, real), device)
@@ -73,7 +73,7 @@ class ChainDrag(Drag):
         return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
 
     def settle(self, before, after, newton, islands) -> None:
-        """Rates of what has no inertia in the state `after`, which may be `before` itself."""
+        """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
         group = self.part
         if self.midpoint:
             self._launch(
@@ -85,7 +85,7 @@ class ChainDrag(Drag):
             )
 
     def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return rates of nodes and edges of a group's state (node, column); of what has no inertia `lead` [s] after its own."""
+        """Return rates of nodes and edges (node, column), of massless dofs extrapolated by `lead` [s]."""
         v, a, omega, alpha, mass, rotary = (
             arrays.download(array).astype(float)
             for array in (data.v, data.a, data.omega, data.alpha, self.part.mass, self.part.rotary)
@@ -98,7 +98,7 @@ class ChainDrag(Drag):
 
 
 class NetDrag(Drag):
-    """Drag on the rods of a net, against a fluid that flows."""
+    """Drag on the coupled rods in a flowing fluid."""
 
     def __init__(self, model, midpoint: bool = False):
         net, host, device = model.net, model.net.host, model.wp_device
@@ -112,7 +112,7 @@ class NetDrag(Drag):
         )
 
     def resist(self, before, solver, islands) -> None:
-        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
+        """Write inertia and drag of a solve from the state `before`, after the predictor."""
         net = self.part
         self._launch(
             self._resist,
@@ -124,7 +124,7 @@ class NetDrag(Drag):
         )
 
     def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Inertia and drag (world, block) of a net's state at t, with the resistance over a second, and the flow (blocks, 3)."""
+        """Return inertia and drag (world, block) of a state at t over a second, and the flow (blocks, 3)."""
         net, device = self.part, self.model.wp_device
         mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
         self.upload(t, t)
@@ -134,13 +134,13 @@ class NetDrag(Drag):
         return mass.numpy(), flow
 
     def rates(self, state, lead: float) -> np.ndarray:
-        """Rates of blocks (world, block) of a net's state, as of `ChainDrag`."""
+        """Return rates of dof blocks (world, block), of massless dofs extrapolated by `lead` [s]."""
         net = self.part
         v, a = (array.numpy().astype(float).reshape(net.worlds, -1, 3) for array in (state.v, state.a))
         return v + lead * np.where((net.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
 
     def settle(self, before, after, solver, islands) -> None:
-        """As of `ChainDrag`."""
+        """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
         net = self.part
         if self.midpoint:
             inputs = [solver.q, solver.mass, *islands.arrays, net.blocks, after.q, before.v]

@@ -1,4 +1,4 @@
-"""The account of what the implicit midpoint rule makes of the energy, of every lone rod and of the net in every world."""
+"""Discrete energy balance of the implicit midpoint rule, per uncoupled rod and per world of the coupled system."""
 
 import math
 
@@ -14,39 +14,41 @@ from ddg_warp.solve.net.system import Sums
 BOUND = 0.1  # see `Integrator`
 
 
-def bound(given: float | None, scheme: str) -> float | None:
-    """The bound of the energy that an integrator is given, None where the energy is not watched.
+def bound(fraction: float | None, scheme: str) -> float | None:
+    """Return the checked energy-drift bound of an integrator, None if the energy is not watched.
 
     Raises:
-        SceneError: it is no fraction, or not of the midpoint rule.
+        SceneError: the bound is no fraction, or the scheme is not the midpoint rule.
     """
-    if given is not None:
-        given = arguments.number("energy_bound", given, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0)
+    if fraction is not None:
+        fraction = arguments.number(
+            "energy_bound", fraction, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0
+        )
     if scheme == "implicit_midpoint":
-        return given
-    if given not in (None, BOUND):
-        raise SceneError(f"energy_bound = {given:g} is of the implicit midpoint rule; {scheme} takes energy out")
+        return fraction
+    if fraction not in (None, BOUND):
+        raise SceneError(f"energy_bound = {fraction:g} is of the implicit midpoint rule; {scheme} takes energy out")
     return None
 
 
 def summary(parts: list["_Energy"]) -> dict[str, float]:
-    """What the rule has made and damping has taken [J] of all rods and worlds, and the largest fraction of one that was made."""
+    """Return energy drift and dissipation of all rods and worlds [J], and the largest relative drift."""
     account = np.concatenate([part.account.numpy() for part in parts], axis=1).astype(float)
-    made, _, held, dissipated = account
-    fraction = np.abs(made) / np.maximum(held + dissipated, np.finfo(float).tiny)
+    made, _, largest, dissipated = account
+    fraction = np.abs(made) / np.maximum(largest + dissipated, np.finfo(float).tiny)
     return {"made": float(made.sum()), "dissipated": float(dissipated.sum()), "fraction": float(fraction.max())}
 
 
 class _Energy:
-    """Watches the energy of the steps of a part; see `kernels.energy`.
+    """Discrete energy balance of the steps of a stepper; see `kernels.energy`.
 
     Args:
-        step: a `ChainStep` or a `NetStep`.
-        count: of its rods in all worlds, or of worlds; rows: how many sums over parts of each are added up.
-        kept: the watch of the step that this one replaces.
+        step: `ChainStep` or `NetStep`.
+        count: number of rods in all worlds, or of worlds; rows: number of partial sums of each.
+        kept: energy balance of the replaced stepper.
 
     Attributes:
-        account: what was made, its rounding, the largest energy held, and what was dissipated (4, count) [J].
+        account: energy drift, its rounding, largest energy, and dissipation (4, count) [J].
     """
 
     def __init__(self, step, count: int, rows: int, kept):
@@ -64,7 +66,7 @@ class _Energy:
         self._judge = energy.judge_kernel(real)
 
     def _enter(self) -> None:
-        """Enter the steps in the account, or have them fail."""
+        """Update the energy balance, or mark steps as failed."""
         step = self.step
         wp.launch(
             self._judge,
@@ -75,16 +77,16 @@ class _Energy:
         )
 
     def failure(self, index: int) -> str:
-        """What to tell of a rod or world that was given up."""
-        made, held = self.failed.numpy()[:, index]
+        """Return the message on a failed rod or world."""
+        made, largest = self.failed.numpy()[:, index]
         return (
-            f"the midpoint rule would have {'made' if made > 0.0 else 'lost'} {abs(made):.3g} J of {held:.3g} J; take a smaller dt, "
+            f"the midpoint rule would have {'made' if made > 0.0 else 'lost'} {abs(made):.3g} J of {largest:.3g} J; take a smaller dt, "
             f"scheme='implicit_euler', or a wider energy_bound than {self.step.integrator.energy_bound:g}"
         )
 
 
 class ChainEnergy(_Energy):
-    """The energy of a group of rods."""
+    """Energy balance of a rod group."""
 
     def __init__(self, step, kept=None):
         group = step.group
@@ -102,7 +104,7 @@ class ChainEnergy(_Energy):
         return [self._measure, self._judge]
 
     def judge(self, before) -> None:
-        """Judge the step that was solved from the state `before`."""
+        """Test the energy drift of the step solved from the state `before`."""
         step, group, newton = self.step, self.step.group, self.step.newton
         if self._follows:
             step.loads.apply(newton.x, *self._loads)
@@ -128,7 +130,7 @@ class ChainEnergy(_Energy):
 
 
 class NetEnergy(_Energy):
-    """The energy of a net."""
+    """Energy balance of the coupled system."""
 
     def __init__(self, step, kept=None):
         net, worlds = step.net, step.model.worlds
@@ -149,16 +151,16 @@ class NetEnergy(_Energy):
         return [*self._elements, self._blocks, self._judge, *sums]
 
     def judge(self, before, middle) -> None:
-        """Judge the step that was solved from the state `before` with the lagged data of `middle`."""
+        """Test the energy drift of the step from `before`, with the lagged data of `middle`."""
         step, net, solver = self.step, self.step.net, self.step.newton
-        for i, (part, own, kernel) in enumerate(zip(net.sets, solver.parts, self._elements, strict=True)):
+        for i, (part, data, kernel) in enumerate(zip(net.sets, solver.parts, self._elements, strict=True)):
             wp.launch(
                 kernel,
                 step.model.worlds * part.elements,
                 [
                     net.elements(middle, i, q=solver.q, rate=step.islands.rate),
                     before.q,
-                    own["stiffness"],
+                    data["stiffness"],
                     self.floor,
                     *step.islands.arrays,
                 ],

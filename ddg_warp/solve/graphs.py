@@ -1,4 +1,4 @@
-"""Launches captured once and replayed."""
+"""Graph capture: record launches once and replay them."""
 
 import gc
 from collections.abc import Callable, Hashable
@@ -10,10 +10,10 @@ from ddg_warp.threads import capturing
 
 
 class Graphs:
-    """Captured launches of a model by name; made anew after memory of the model was.
+    """Captured graphs of a model by name, recaptured after a reallocation of model memory.
 
     Args:
-        load: compiles and loads every kernel, which a capture can not.
+        load: function that compiles and loads every kernel, impossible in a capture.
     """
 
     def __init__(self, model, load: Callable[[], None]):
@@ -21,11 +21,11 @@ class Graphs:
         self._graphs, self._layout = {}, model.layout
 
     def clear(self) -> None:
-        """Forget what was captured."""
+        """Discard all captured graphs."""
         self._graphs.clear()
 
     def replay(self, name: Hashable, launch: Callable[[], None]) -> None:
-        """Launch what is captured under a name; at first, and where memory of the model was made anew since, capture it."""
+        """Replay the graph of a name; capture it first if missing or after a reallocation of model memory."""
         if self._model.layout != self._layout:
             self.clear()
             self._layout = self._model.layout
@@ -39,7 +39,7 @@ class Graphs:
             self._load()
         gc.disable()  # a collection while capturing would free arrays into the graph
         device = self._model.wp_device
-        # a stream of its own, as CUDA captures nothing on the one that torch uses by default
+        # a separate stream, since CUDA cannot capture the default stream of torch
         stream = wp.ScopedStream(wp.Stream(device)) if device.is_cuda else nullcontext()
         try:
             with stream, wp.ScopedCapture(device=device, force_module_load=False) as capture:

@@ -11,17 +11,19 @@ from ddg_warp.model.state import State
 
 
 class Gyroscope:
-    """Half time steps of the couples of all rods with twist and rotary inertia.
+    """Half steps of gyroscopic couples of all rods with twist and rotary inertia.
 
     Args:
-        model: whose rods they are.
-        dt: length of a step of every world [s].
+        model: model of the rods.
+        dt: step length of every world [s].
     """
 
     def __init__(self, model, dt: wp.array):
         self._model = model
         heavy = [group.kind.twist and group.host.rotary.any() for group in model.groups]
-        self._parts = [_Part(model, group, dt) if own else None for group, own in zip(model.groups, heavy, strict=True)]
+        self._parts = [
+            _Part(model, group, dt) if spins else None for group, spins in zip(model.groups, heavy, strict=True)
+        ]
         heavy = model.net is not None and model.net.host.mass[model.net.angle_start :][: model.net.edges].any()
         self._net = _Part(model, model.net, dt) if heavy else None
 
@@ -31,25 +33,25 @@ class Gyroscope:
         return [part.kernel for part in (*self._parts, self._net) if part]
 
     def begin(self, before: State, steps: list, net_step) -> State:
-        """Return the state before a step with the velocities that the couples give it; launches alone."""
+        """Return the state before a step with velocities after half of the couples; capturable."""
         groups = [
-            part.begin(own, step.islands) if part else own
-            for part, own, step in zip(self._parts, before.groups, steps, strict=True)
+            part.begin(state, step.islands) if part else state
+            for part, state, step in zip(self._parts, before.groups, steps, strict=True)
         ]
         net = self._net.begin(before.net, net_step.islands) if self._net else before.net
         return State(self._model, groups, net, before.time, before.grips)
 
     def finish(self, after: State, steps: list, net_step) -> None:
-        """Give the state after a step its half, in place; launches alone."""
-        for part, own, step in zip(self._parts, after.groups, steps, strict=True):
+        """Apply the other half of the couples to the state after a step, in place; capturable."""
+        for part, state, step in zip(self._parts, after.groups, steps, strict=True):
             if part:
-                part.kick(own, own.v, step.islands, True)
+                part.kick(state, state.v, step.islands, True)
         if self._net:
             self._net.kick(after.net, after.net.v, net_step.islands, True)
 
 
 class _Part:
-    """Of a group of rods, or of the net."""
+    """Gyroscopic couples of a rod group, or of the coupled system."""
 
     def __init__(self, model, part, dt: wp.array):
         real, device = model.types.real, model.wp_device
@@ -57,29 +59,31 @@ class _Part:
         host, vector = part.host, wp.types.vector(3, real)
         nodes, angles, colors = _edges(host)
         self._colors = [
-            wp.array(np.column_stack([nodes[own], host.index(angles[own])]).astype(np.int32), dtype=int, device=device)
-            for own in (np.flatnonzero(colors == color) for color in range(colors.max(initial=-1) + 1))
+            wp.array(
+                np.column_stack([nodes[edges], host.index(angles[edges])]).astype(np.int32), dtype=int, device=device
+            )
+            for edges in (np.flatnonzero(colors == color) for color in range(colors.max(initial=-1) + 1))
         ]
         free = np.where(host.holding(np.arange(host.nodes)), 0.0, 1.0)
-        free[list(getattr(host, "frames", ()))] = 0.0  # nodes on oblique planes count as held
+        free[list(getattr(host, "frames", ()))] = 0.0  # nodes on skew supports count as fixed
         self._free = wp.array(free, dtype=vector, device=device)
         self._is_net = part is model.net
         shape = (part.worlds * part.blocks,) if self._is_net else (part.nodes, part.columns)
         self._v = arrays.allocate(shape, vector, device)
 
-    def begin(self, own, islands):
-        """Return the part of a state with other velocities."""
-        arrays.copy(self._v, own.v)
-        self.kick(own, self._v, islands, False)
-        return replace(own, v=self._v)
+    def begin(self, state, islands):
+        """Return a state component with velocities after half of the couples."""
+        arrays.copy(self._v, state.v)
+        self.kick(state, self._v, islands, False)
+        return replace(state, v=self._v)
 
-    def kick(self, own, v: wp.array, islands, after: bool) -> None:
-        """Change velocities v of a part of a state."""
+    def kick(self, state, v: wp.array, islands, after: bool) -> None:
+        """Apply half of the couples to velocities v."""
         part = self._part
         if self._is_net:
-            x, rates, v, rotary = part.points(own.q), part.angles(own.v), part.points(v), part.node_mass
+            x, rates, v, rotary = part.points(state.q), part.angles(state.v), part.points(v), part.node_mass
         else:
-            x, rates, rotary = own.x, own.omega, part.rotary
+            x, rates, rotary = state.x, state.omega, part.rotary
         flags, _ = islands.arrays
         for edges in reversed(self._colors) if after else self._colors:
             inputs = [
@@ -98,7 +102,7 @@ class _Part:
 
 
 def _edges(host) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges with rotary inertia, their nodes (E, 2) and angles (E,) as places, and colors (E,): no two of one color share a node."""
+    """Return nodes (E, 2), angles (E,) and colours (E,) of edges with rotary inertia; a colour has no common nodes."""
     places, nodes, angles = host.places, [], []
     for row in range(len(places.rods)):
         if places.twist[row]:
@@ -110,6 +114,6 @@ def _edges(host) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     taken, colors = {}, np.zeros(len(nodes), int)
     for edge, (a, b) in enumerate(nodes.tolist()):
         used = taken.get(a, 0) | taken.get(b, 0)
-        colors[edge] = color = (~used & (used + 1)).bit_length() - 1  # the lowest that both have left
+        colors[edge] = color = (~used & (used + 1)).bit_length() - 1  # the lowest colour free at both nodes
         taken[a], taken[b] = taken.get(a, 0) | 1 << color, taken.get(b, 0) | 1 << color
     return nodes, np.concatenate([np.zeros(0, int), *angles]), colors

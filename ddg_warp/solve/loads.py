@@ -1,4 +1,4 @@
-"""Loads on a device that change from step to step, or follow what they act on, over the constant ones."""
+"""Loads in time and follower loads on a device, added to constant loads."""
 
 import numpy as np
 import warp as wp
@@ -8,11 +8,11 @@ from ddg_warp.kernels.loads import follower_kernel, spread_kernel
 
 
 class Loads:
-    """Loads of a group of rods or of a net, on the places that such loads touch.
+    """Loads in time and follower loads of a rod group or of the coupled system.
 
     Args:
         part: `Group` or `DeviceNet`.
-        midpoint: whether the scheme balances forces in the middle of a step.
+        midpoint: True if the scheme evaluates forces at the middle of a step.
     """
 
     def __init__(self, model, part, midpoint: bool):
@@ -28,7 +28,7 @@ class Loads:
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        first, self._followers = 0, []  # kernel, load, places, values, place of its first force
+        first, self._followers = 0, []  # kernel, load, dof blocks, values, index of the first force
         for load in host.followers:
             values = wp.array(load.values, dtype=self._vector, device=device)
             kernel = follower_kernel(load.kernel, load.places.shape[1], part.dim, real)
@@ -39,7 +39,7 @@ class Loads:
         starts, items = put(np.searchsorted(target[items], np.arange(len(self.places) + 1))), put(items)
         places, nodes = put(host.index(self.places)), int(np.searchsorted(self.places, host.nodes))
         stride = len(self.places) if self._copies > 1 else 0
-        self._spread = [  # kernel, which array it writes, and lists
+        self._spread = [  # kernel, index of the output array, lists
             (
                 spread_kernel(dim, real),
                 i,
@@ -51,21 +51,21 @@ class Loads:
 
     @property
     def _copies(self) -> int:
-        """How many there are of what follows nothing: one for all worlds."""
+        """Number of copies of dead loads: one for all worlds."""
         return 1
 
     def _touched(self, following: np.ndarray) -> np.ndarray:
-        """Places on which loads act that change or follow."""
+        """Return the dof blocks of loads in time and follower loads."""
         return np.unique(np.concatenate([following, *(load.places for load in self.part.host.timed)]))
 
     def _matrix(self, loads: list) -> sparse.csr_array:
-        """What every load at full amplitude puts on the components of the places (3 P, loads)."""
+        """Return the matrix of loads at full amplitude on the components of the dof blocks (3 P, loads)."""
         rows, columns, values = [], [], []
         for i, load in enumerate(loads):
-            known = np.isin(load.places, self.places)
-            rows.append((3 * np.searchsorted(self.places, load.places[known])[:, None] + np.arange(3)).ravel())
+            present = np.isin(load.places, self.places)
+            rows.append((3 * np.searchsorted(self.places, load.places[present])[:, None] + np.arange(3)).ravel())
             columns.append(np.full(len(rows[-1]), i))
-            values.append(load.force[known].ravel())
+            values.append(load.force[present].ravel())
         data, *where = (np.concatenate(parts) for parts in (values, rows, columns))
         return sparse.csr_array((data, where), shape=(3 * len(self.places), len(loads)))
 
@@ -75,19 +75,19 @@ class Loads:
         return [*{kernel for kernel, *_ in self._followers}, *(kernel for kernel, *_ in self._spread)]
 
     def upload(self, t0: float, t1: float) -> None:
-        """Values at the time that the scheme balances forces at."""
-        at = 0.5 * (t0 + t1) if self.midpoint else t1
-        self._upload_dead([1.0, *(load.at(at, 1.0) for load in self.part.host.timed)])
+        """Upload values at the evaluation time of the scheme."""
+        time = 0.5 * (t0 + t1) if self.midpoint else t1
+        self._upload_dead([1.0, *(load.at(time, 1.0) for load in self.part.host.timed)])
         for _, load, _, values, _ in self._followers:
             if load.amplitude is not None:
-                values.assign(load.at(at, 1.0) * load.values)
+                values.assign(load.at(time, 1.0) * load.values)
 
     def _upload_dead(self, amplitudes: list[float]) -> None:
-        """What follows nothing: constant loads, then each that changes."""
+        """Upload dead loads by amplitudes: constant loads, then each load in time."""
         self._values.assign((self._dead @ amplitudes).reshape(-1, 3))
 
     def apply(self, x: wp.array, force: wp.array, moment: wp.array) -> None:
-        """Write the loads on nodes, which are at x, and on angles."""
+        """Write the loads on nodes at positions x, and on angles."""
         part = self.part
         for kernel, load, places, values, first in self._followers:
             inputs = [x, places, values, part.world_columns, first, self.total]
@@ -98,14 +98,14 @@ class Loads:
 
 
 class StaticLoads(Loads):
-    """As `Loads`, of an equilibrium at a load parameter, in every world for itself."""
+    """Loads of an equilibrium at a load parameter, per world."""
 
     @property
     def _copies(self) -> int:
         return self.part.worlds
 
-    def scale(self, dead: np.ndarray, at: float) -> None:
-        """Values at load parameter `at`, with the loads on all places (worlds, P, 3) that follow nothing."""
+    def scale(self, dead: np.ndarray, load_factor: float) -> None:
+        """Upload values at `load_factor`, with dead loads on all dof blocks (worlds, P, 3)."""
         self._values.assign(dead[:, self.places].reshape(-1, 3))
         for _, load, _, values, _ in self._followers:
-            values.assign(load.at(at, at) * load.values)
+            values.assign(load.at(load_factor, load_factor) * load.values)

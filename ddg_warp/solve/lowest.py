@@ -1,9 +1,9 @@
-"""Lowest eigenpairs of K x = lambda M x with a diagonal mass that may be singular, by shift and invert, with none left out.
+"""Complete set of lowest eigenpairs of K x = lambda M x, by shift-invert Lanczos; the diagonal mass may be singular.
 
-Massless dofs follow the others in equilibrium. Nothing is condensed: the inverse of K - s M, restricted to the dofs with mass, is
-that of the condensed matrix. How many eigenvalues lie below the last one found is counted by the signs of the pivots of K - t M
-(Sylvester), and where iteration left some out, as it may where eigenvalues cluster, it starts again without those it has found
-(Ericsson and Ruhe, Math. Comp. 35, 1980; Grimes, Lewis and Simon, SIAM J. Matrix Anal. Appl. 15, 1994).
+Massless dofs follow the others in equilibrium. Nothing is condensed: the inverse of K - s M, restricted to massive dofs, is that of the
+condensed matrix. The signs of the pivots of K - t M count the eigenvalues below the last one (Sylvester). If iteration has missed some,
+as it may in clusters, it restarts orthogonal to the eigenvectors so far (Ericsson and Ruhe, Math. Comp. 35, 1980; Grimes, Lewis and
+Simon, SIAM J. Matrix Anal. Appl. 15, 1994).
 """
 
 import numpy as np
@@ -12,21 +12,21 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from ddg_warp.solve.direct import Factorisation, SingularError, pinned, regular
 
-STEPS = 40  # of the first estimate of a critical factor
-ROUGH = 0.02  # its relative error
-SOFTENED = 1e-10  # change of a stiffness, over itself, that counts as none
-GUARD = 3  # eigenpairs more than asked for, among which there is a gap to count at
-ROUNDED = 1e-9  # part of the shift that rounding leaves of an eigenvalue that is zero, with either sign
-GAP = 1e-6  # relative distance of two eigenvalues between which can be counted
+STEPS = 40  # Krylov steps of the first estimate of a critical factor.
+ROUGH = 0.02  # Relative error of that estimate.
+SOFTENED = 1e-10  # Relative change of a stiffness that counts as none.
+GUARD = 3  # Extra eigenpairs, to find a gap for the inertia count.
+ROUNDED = 1e-9  # Rounding of a zero eigenvalue, over the shift.
+GAP = 1e-6  # Least relative gap of eigenvalues for an inertia count.
 
 
 class Shifted:
-    """Eigenpairs by iteration with a shifted inverse, with none left out below the last.
+    """Shift-invert iteration for all eigenpairs up to the last one.
 
     Attributes:
-        shift: where the inverse was taken; below: number of eigenvalues under it.
-        near: number of eigenvalues that are zero but for rounding, where the shift is no more than that: they come first and are
-            left out of the search for others, of which the inverse would tell little beside them.
+        shift: shift of the inverse; below: number of eigenvalues below the shift.
+        near: number of eigenvalues that are zero to rounding, if the shift is a rounding-sized one. They come first and are excluded
+            from the search for others, which they would dominate.
         size: number of eigenvalues.
     """
 
@@ -35,68 +35,70 @@ class Shifted:
     near: int
     size: int
 
-    def nearest(self, count: int, which: str, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenpairs nearest to the shift on one side, "SA" below and "LA" above, in the space across orthonormal vectors."""
+    def nearest(self, count: int, side: str, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return eigenpairs nearest to the shift, "SA" below or "LA" above, orthogonal to given orthonormal vectors."""
         raise NotImplementedError
 
-    def inertia(self, at: float) -> int | None:
-        """Number of eigenvalues under a value, None where pivots do not tell."""
+    def inertia(self, value: float) -> int | None:
+        """Return the number of eigenvalues below a value, None if pivots are unreliable."""
         raise NotImplementedError
 
     def pairs(self, count: int, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The `count` lowest eigenvalues, and all under the shift, across orthonormal vectors; with orthonormal eigenvectors."""
+        """Return the `count` lowest eigenpairs, and all below the shift, orthogonal to given orthonormal vectors."""
         count = min(max(count, self.below), self.size - 1)
         wanted, last = self.below + self.near, min(count + GUARD, self.size - 1)
         values, vectors, under = np.zeros(0), without[:, :0], np.inf
         while True:
-            found = int((values < self.shift).sum())
+            number_below = int((values < self.shift).sum())
             wanted = last if len(values) >= wanted else wanted
-            which, number = ("SA", self.below - found) if found < self.below else ("LA", wanted - len(values))
-            more, others = self.nearest(number, which, np.hstack([without, vectors]))
+            side, number = (
+                ("SA", self.below - number_below) if number_below < self.below else ("LA", wanted - len(values))
+            )
+            more, more_vectors = self.nearest(number, side, np.hstack([without, vectors]))
             order = np.argsort(np.append(values, more))
-            values, vectors = np.append(values, more)[order], np.hstack([vectors, others])[:, order]
+            values, vectors = np.append(values, more)[order], np.hstack([vectors, more_vectors])[:, order]
             if len(values) < self.size - 1 and ((values < self.shift).sum() < self.below or len(values) < last):
                 continue
-            missing, at = self._missing(values, count)
-            # where a search without those found turns up none of what pivots counted, rounding made their signs
+            missing, bound = self._missing(values, count)
+            # if a restarted search finds none of the counted eigenvalues, rounding decided pivot signs
             if not missing or len(values) >= self.size - 1 or (under < np.inf and (more > under).all()):
                 return values[:count], vectors[:, :count]
-            last, under = min(len(values) + missing, self.size - 1), at
+            last, under = min(len(values) + missing, self.size - 1), bound
 
     def _missing(self, values: np.ndarray, count: int) -> tuple[int, float]:
-        """How many of the `count` lowest, and of what lies in a cluster with the last of them, have not been found; and under what."""
+        """Return the number of missing eigenvalues up to the end of the cluster of the last one, and the counted bound."""
         gaps = np.diff(values[count - 1 :]) / np.maximum(np.abs(values[count:]), 1e-300)
-        wide = np.flatnonzero(gaps > GAP)
-        if not wide.size:
-            return GUARD, np.inf  # they end in a cluster: go on to its end
-        between = count - 1 + int(wide[0])
-        at = 0.5 * (values[between] + values[between + 1])
-        under = self.inertia(at)
-        return 0 if under is None else max(0, under - (between + 1)), at
+        wide_gaps = np.flatnonzero(gaps > GAP)
+        if not wide_gaps.size:
+            return GUARD, np.inf  # the last one is in a cluster: continue to its end
+        between = count - 1 + int(wide_gaps[0])
+        bound = 0.5 * (values[between] + values[between + 1])
+        under = self.inertia(bound)
+        return 0 if under is None else max(0, under - (between + 1)), bound
 
 
 class Lowest(Shifted):
-    """Eigenpairs of a symmetric stiffness K (n, n) in the metric of masses (n,), of which some may be zero.
+    """Lowest eigenpairs of a symmetric stiffness K (n, n) in the metric of masses (n,), some possibly zero.
 
     Args:
-        known: zero modes (n, m), those without mass included; they are left out.
+        zero_modes: zero modes (n, m) to exclude, massless ones included.
     """
 
-    def __init__(self, matrix: sparse.csc_matrix, mass: np.ndarray, known: np.ndarray):
+    def __init__(self, matrix: sparse.csc_matrix, mass: np.ndarray, zero_modes: np.ndarray):
         self.matrix, self.mass = sparse.csc_matrix(matrix), mass
         self.massive = np.flatnonzero(mass > 0.0)
         self.root = np.sqrt(mass[self.massive])
-        self.known = orthonormal(self.root[:, None] * known[self.massive])
-        self.factor, self.shift = regular(pinned(self.matrix, known), mass)
+        self.known = orthonormal(self.root[:, None] * zero_modes[self.massive])
+        self.factor, self.shift = regular(pinned(self.matrix, zero_modes), mass)
         self.below, self.size = self.factor.negative, len(self.massive) - self.known.shape[1]
         self.near = (self.inertia(-self.shift) or 0) - self.below if self.shift else 0
 
     def __call__(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """The `count` lowest eigenvalues apart from those of known modes, and all negative ones; and their modes (n, number)."""
+        """Return the `count` lowest eigenvalues without known modes, and all negative ones; and modes (n, number)."""
         values, vectors = self.pairs(count, self.known)
         return values, self._modes(vectors)
 
-    def nearest(self, count: int, which: str, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, count: int, side: str, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         n = len(self.massive)
 
         def across(y):
@@ -106,26 +108,26 @@ class Lowest(Shifted):
             return across(self._inverse(across(y))[self.massive] * self.root)
 
         operator = LinearOperator((n, n), matvec=apply, dtype=np.float64)
-        given = {"v0": across(_start(n, without)), "ncv": _vectors(n, count), "tol": 1e-12}
-        inverse, vectors = eigsh(operator, count, which=which, **given)
+        settings = {"v0": across(_start(n, without)), "ncv": _vectors(n, count), "tol": 1e-12}
+        inverse, vectors = eigsh(operator, count, which=side, **settings)
         values = self.shift + 1.0 / inverse
         return np.where(np.abs(values) <= ROUNDED * abs(self.shift), 0.0, values), vectors
 
-    def inertia(self, at: float) -> int | None:
+    def inertia(self, value: float) -> int | None:
         try:
-            factor = Factorisation(self.matrix - at * sparse.diags(self.mass, format="csc"))
-        except SingularError:  # one that is exactly zero tells nothing of its neighbours
+            factor = Factorisation(self.matrix - value * sparse.diags(self.mass, format="csc"))
+        except SingularError:  # an exactly zero pivot makes the inertia unknown
             return None
-        return factor.negative - (self.known.shape[1] if at > 0.0 else 0) if factor.reliable else None
+        return factor.negative - (self.known.shape[1] if value > 0.0 else 0) if factor.reliable else None
 
     def _inverse(self, y: np.ndarray) -> np.ndarray:
-        """x (n,) with (K - s M) x = M^(1/2) y."""
+        """Return x (n,) with (K - s M) x = M^(1/2) y."""
         full = np.zeros(len(self.mass))
         full[self.massive] = self.root * y
         return self.factor.solve(full)
 
     def _modes(self, vectors: np.ndarray) -> np.ndarray:
-        """Eigenvectors with the massless dofs that follow, normalised in the metric."""
+        """Return eigenvectors with massless dofs included, normalised in the metric."""
         modes = np.zeros((len(self.mass), vectors.shape[1]))
         slaves = len(self.massive) < len(self.mass)
         for mode, y in zip(modes.T, vectors.T, strict=True):
@@ -137,15 +139,15 @@ class Lowest(Shifted):
 
 
 class LowestFactors(Shifted):
-    """Lowest positive f with det(K - f S) = 0 for a definite K, whose product makes vectors orthonormal.
+    """Lowest positive f with det(K - f S) = 0 for a positive definite K, the inner product of vectors.
 
-    A rough estimate comes from above, as any of Rayleigh's quotients does. Shifted to a factor s below it, under which the inertia
-    shows that there is none, f / (f - s) spreads out what lies close together, as the many nearly equal critical loads of a closed
-    shell do. Eigenvalues are counted by its inverse 1 - s / f, in which negative f come after all others.
+    A Rayleigh quotient gives a rough estimate from above. The shift s lies below it, where the inertia shows no smaller f. Then
+    f / (f - s) separates clusters, such as the nearly equal critical loads of a closed shell. Eigenvalues are counted by the inverse
+    1 - s / f, in which negative f come last.
 
     Args:
         matrix, softening: K and S.
-        factors: of K.
+        factors: factors of K.
     """
 
     def __init__(self, matrix: sparse.csc_matrix, softening: sparse.csc_matrix, factors: Factorisation):
@@ -161,35 +163,35 @@ class LowestFactors(Shifted):
                     break
 
     def __call__(self, count: int) -> np.ndarray:
-        """The `count` lowest of them, fewer if there are no more."""
+        """Return the `count` lowest factors f, or all if fewer."""
         if not self.least:
             return np.zeros(0)
         values, _ = self.pairs(count, np.zeros((self.size, 0)))
         return self.least / (1.0 - values[values < 1.0])
 
-    def nearest(self, count: int, which: str, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, count: int, side: str, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         kept = self.matrix @ without
 
         def across(x):
             return x - without @ (kept.T @ x)
 
         operator = LinearOperator(self.matrix.shape, matvec=lambda x: across(self.factor.solve(x)), dtype=np.float64)
-        given = {"v0": across(_start(self.size, without)), "ncv": _vectors(self.size, count), "tol": 1e-9}
-        given |= {"mode": "buckling", "sigma": self.least, "OPinv": operator}
-        factors, vectors = eigsh(self.matrix, count, self.softening, which=which, **given)
+        settings = {"v0": across(_start(self.size, without)), "ncv": _vectors(self.size, count), "tol": 1e-9}
+        settings |= {"mode": "buckling", "sigma": self.least, "OPinv": operator}
+        factors, vectors = eigsh(self.matrix, count, self.softening, which=side, **settings)
         return 1.0 - self.least / factors, vectors
 
-    def inertia(self, at: float) -> int | None:
-        if at >= 1.0:
+    def inertia(self, value: float) -> int | None:
+        if value >= 1.0:
             return None
-        factor = self._shifted(self.least / (1.0 - at))
+        factor = self._shifted(self.least / (1.0 - value))
         return factor.negative if factor.reliable else None
 
-    def _shifted(self, at: float) -> Factorisation:
-        return regular(sparse.csc_matrix(self.matrix - at * self.softening), np.zeros(self.size))[0]
+    def _shifted(self, shift: float) -> Factorisation:
+        return regular(sparse.csc_matrix(self.matrix - shift * self.softening), np.zeros(self.size))[0]
 
     def _estimate(self, factors: Factorisation) -> float:
-        """The largest eigenvalue of S x = mu K x on a small Krylov space, from below."""
+        """Return a lower bound of the largest eigenvalue of S x = mu K x, on a small Krylov space."""
         basis = np.zeros((self.size, min(STEPS, self.size)))
         vector = _start(self.size, basis)
         for column in basis.T:
@@ -201,23 +203,23 @@ class LowestFactors(Shifted):
 
 
 def _start(size: int, without: np.ndarray) -> np.ndarray:
-    """A vector without any symmetry, another one for every number of vectors it is to be across."""
+    """Return a start vector without symmetry, different for every number of excluded vectors."""
     return np.random.default_rng(without.shape[1]).standard_normal(size)
 
 
 def _vectors(size: int, count: int) -> int:
-    """Vectors of an iteration for `count` eigenpairs."""
+    """Return the number of Lanczos vectors for `count` eigenpairs."""
     return min(size, max(2 * count + 1, 32))
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that span the same space; dependent ones are dropped."""
+    """Return orthonormal columns of the same span; dependent columns are dropped."""
     vectors, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return vectors[:, sizes > 1e-9 * sizes.max(initial=0.0)]
 
 
-def dense(matrix: sparse.csc_matrix, mass: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All eigenpairs of a small matrix, as `Lowest` finds them."""
+def dense(matrix: sparse.csc_matrix, mass: np.ndarray, zero_modes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all eigenpairs of a small matrix, as by `Lowest`."""
     massive, slaves = np.flatnonzero(mass > 0.0), np.flatnonzero(mass <= 0.0)
     root, matrix = np.sqrt(mass[massive]), sparse.csc_matrix(matrix)
     condensed = matrix[massive][:, massive].toarray()
@@ -226,8 +228,12 @@ def dense(matrix: sparse.csc_matrix, mass: np.ndarray, known: np.ndarray) -> tup
         inner, _ = regular(sparse.csc_matrix(matrix[slaves][:, slaves]), np.zeros(len(slaves)))
         follow = inner.solve(meeting)
         condensed -= meeting.T @ follow
-    known = orthonormal(root[:, None] * known[massive])
-    across = np.linalg.qr(known, mode="complete")[0][:, known.shape[1] :] if known.size else np.eye(len(massive))
+    zero_modes = orthonormal(root[:, None] * zero_modes[massive])
+    across = (
+        np.linalg.qr(zero_modes, mode="complete")[0][:, zero_modes.shape[1] :]
+        if zero_modes.size
+        else np.eye(len(massive))
+    )
     values, vectors = linalg.eigh(across.T @ (condensed / root[:, None] / root) @ across)
     modes = np.zeros((len(mass), len(values)))
     modes[massive] = across @ vectors / root[:, None]

@@ -1,15 +1,15 @@
-"""Newton with stresses of its own: few iterations and long steps for thin shells.
+"""Mixed Newton (MIP) with independent stresses: few iterations and long steps for thin shells.
 
-Where displacements alone are the unknowns, the turn of an element in an iteration stretches it at second order, and the stress of that
-stretch spoils the next tangent. Here stress and displacement are unknowns together (Hellinger and Reissner), as in the mixed
-integration point method of Magisano, Leonetti and Garcea (Int. J. Numer. Meth. Eng. 109, 2017). Stresses are condensed element by
-element, which leaves the residual r of the displacements and one change in the tangent: the second derivatives of the strains are
-weighted with the stress s of the last linear step instead of the stress of the present strains,
+With displacements as the only unknowns, the rotation of an element in an iteration stretches it at second order, and that stress spoils
+the next tangent. Here stress and displacement are both unknowns (Hellinger-Reissner), as in the mixed integration point method of
+Magisano, Leonetti and Garcea (Int. J. Numer. Meth. Eng. 109, 2017). Stresses are condensed element by element. This leaves the residual
+r of the displacements and one change in the tangent. The geometric stiffness takes the stress s of the last linear step instead of the
+stress of the present strains,
 
     (J^T C J + s : d2e) d = r ,   s <- psi'(e + J d) .
 
-What it converges to is the same equilibrium, at the same rate. There is no merit function that falls: steps are taken whole, and
-whoever calls this falls back on the search where it does not converge.
+Equilibrium and convergence rate are unchanged. There is no decreasing merit function: steps are full, and callers fall back on the
+search if the iteration does not converge.
 """
 
 import numpy as np
@@ -17,29 +17,29 @@ import numpy as np
 from ddg_warp.model.state import State
 from ddg_warp.solve.direct import Factorisation, SingularError
 
-MAX_ITERATIONS = 20  # without convergence by then, the load step is too long
-UNBALANCED = 1e-3  # residual over load scale at which a search does not start from an equilibrium
-ROTATION_CAP = 4.0  # rad; no more than a guard against nonsense
+MAX_ITERATIONS = 20  # limit; beyond it the load step is too long
+UNBALANCED = 1e-3  # residual over load scale above which a start is no equilibrium
+ROTATION_CAP = 4.0  # guard against divergence [rad]
 
 
-def newton(solver, state: State, before: float, at: float) -> State | None:
-    """The equilibrium at load parameter `at` from a state that belongs to `before`; None if the iteration does not converge.
+def newton(solver, state: State, before: float, load_factor: float) -> State | None:
+    """Return the equilibrium at `load_factor` from a state at load parameter `before`; None without convergence.
 
     In mode "minimise" only a minimum of the energy is taken. `solver` is an `Equilibrium`; its counters and outcome are updated.
     """
     tangent = solver.tangent
     free = np.flatnonzero(tangent.free)
-    jump = tangent.support_step(state, before, at)
+    jump = tangent.support_step(state, before, load_factor)
     q, gradient, stress = tangent.dofs(state), tangent.gradient(state), None
-    first = solver.residuals.first_scale(tangent.loads(at, q), gradient)
+    first = solver.residuals.first_scale(tangent.loads(load_factor, q), gradient)
     if (np.abs(tangent.loads(before, q) - gradient) > UNBALANCED * solver.residuals.allowed(first))[free].any():
-        # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
+        # a crumpled start, or a new rest shape: stresses out of equilibrium are no estimate
         stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
-    state, factor, polished = tangent.with_prescribed(state, at), None, False
+    state, factor, polished = tangent.with_prescribed(state, load_factor), None, False
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
-        outer, gradient = tangent.loads(at, q), tangent.gradient(state)
-        hessian = tangent.stiffness(state, at, stress)
+        outer, gradient = tangent.loads(load_factor, q), tangent.gradient(state)
+        hessian = tangent.stiffness(state, load_factor, stress)
         residual = outer - gradient
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
@@ -51,7 +51,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
                 if not (factor.reliable and not factor.negative) and solver.options.mode == "minimise":
                     return None
                 solver.stiffness = hessian
-                return solver.found(state, outer, residual, at, small)
+                return solver.found(state, outer, residual, load_factor, small)
             polished = within
         else:
             residual = residual - hessian @ jump

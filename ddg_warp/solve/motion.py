@@ -1,4 +1,4 @@
-"""Motion of supports on a device."""
+"""Prescribed motion of supports on a device."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -16,10 +16,10 @@ from ddg_warp.model.state import State
 
 
 def poses(model, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
-    """Poses of all motions of a model between t0 and t1 (rows, 21), of a whole step or of a `part` of it; see `Motion.pose`.
+    """Return poses of all motions between t0 and t1 (rows, 21), a fraction `part` of a step from `start` on; see `Motion.pose`.
 
     Raises:
-        SolverError: a motion has no finite value, or leaves the plane of a planar scene; names the function and the time.
+        SolverError: a motion is not finite, or leaves the plane of a planar scene; names the function and the time.
     """
     rows = np.concatenate([motion.pose(t0, t1, start, part) for motion in model.motions])
     if model.scene.dimension == 2 and rows[:, 19].any():
@@ -32,27 +32,27 @@ def poses(model, t0: float, t1: float, start: float = 0.0, part: float = 1.0) ->
 
 
 def jump_between(model, t0: float, t1: float) -> str:
-    """What to tell of a step or an increment that failed because a motion jumps in it; empty where none does."""
+    """Return the message on a step or increment with a jump of a motion; empty without."""
     for moved in model.motions:
-        at = moved.jump(t0, t1)
-        if at is not None:
+        time = moved.jump(t0, t1)
+        if time is not None:
             return (
-                f"a motion of its supports jumps at t = {at:g}, which no step can follow: make it continuous, such as a ramp over a "
+                f"a motion of its supports jumps at t = {time:g}, which no step can follow: make it continuous, such as a ramp over a "
                 "few steps"
             )
     return ""
 
 
 def counts_turns(poses: np.ndarray) -> bool:
-    """Whether a rotation vector of poses (..., 6) is longer than orientations take."""
+    """Return True if a rotation vector of poses (..., 6) exceeds the range of orientations."""
     return bool((np.square(poses[..., 3:]).sum(-1) > COUNTED**2).any())
 
 
 def turns_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Rotation vectors (..., 3) by which grips turn from poses (..., 6) to others, the shorter way; see `Grip`.
+    """Return the shorter rotation vectors (..., 3) of grips between poses (..., 6); see `Grip`.
 
     Raises:
-        SolverError: rotation vectors count more than half a turn, of which poses at both ends do not tell the way.
+        SolverError: rotation vectors differ by more than half a revolution, so the sense is ambiguous.
     """
     from scipy.spatial.transform import Rotation
 
@@ -75,7 +75,7 @@ def turns_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> Callable:
-    """Poses of grips (worlds, grips, 6) by load parameter, from those of a state at `start` to `ends` at `end`: see `Grip`.
+    """Return poses of grips (worlds, grips, 6) as a function of the load parameter, from the state at `start` to `ends` at `end`.
 
     Raises:
         SolverError: as `turns_between`.
@@ -86,10 +86,10 @@ def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> C
     ends = np.array(np.broadcast_to(ends, begin.shape))
     first, turn = Rotation.from_rotvec(begin[..., 3:].reshape(-1, 3)), turns_between(begin, ends).reshape(-1, 3)
 
-    def poses(at: float) -> np.ndarray:
-        if at == end:
+    def poses(load_factor: float) -> np.ndarray:
+        if load_factor == end:
             return ends
-        s = (at - start) / (end - start)
+        s = (load_factor - start) / (end - start)
         rotation = (Rotation.from_rotvec(s * turn) * first).as_rotvec().reshape(*begin.shape[:2], 3)
         return np.concatenate([begin[..., :3] + s * (ends - begin)[..., :3], rotation], axis=-1)
 
@@ -97,17 +97,17 @@ def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> C
 
 
 class Motion:
-    """Motion of the held nodes and angles of a group of rods or of a net.
+    """Prescribed motion of nodes and twist angles of a rod group or of the coupled system.
 
-    Poses at both ends of a step come from the host, those of grips from the states there; where supports are in between is found on the
-    device, island by island.
+    Poses at both ends of a step come from the host, poses of grips from the states. The device interpolates per island.
 
     Args:
         part: `Group` or `DeviceNet`.
 
     Attributes:
-        pose: see `kernels.motion`; with grips, of every world, `stride` rows apart; rows: how many there are of an interval.
-        levels: of every world, log2 of the number of intervals (worlds,).
+        pose: see `kernels.motion`; with grips per world, `stride` rows apart.
+        rows: number of poses of an interval.
+        levels: log2 of the number of intervals of every world (worlds,).
     """
 
     def __init__(self, model, part, midpoint: bool = False):
@@ -136,7 +136,7 @@ class Motion:
         self.directors = self._vectors(host.frame[:3].reshape(3, -1)[:, edges].T)
 
     def _make_room(self, level: int) -> None:
-        """Have room for the poses of 2^level intervals, and of all coarser ones."""
+        """Allocate the poses of 2^level intervals, and of all coarser levels."""
         real, device, count = self.model.types.real, self.model.wp_device, (2 ** (level + 1) - 1) * self.rows
         self._shared = wp.zeros((count, motion.POSE), dtype=real, device=device)
         self._host = wp.zeros_like(self._shared, device="cpu")
@@ -158,22 +158,22 @@ class Motion:
         """Kernels to load before a capture."""
         return [self._nodes, *([self._angles] if len(self.angles) else []), *([self._grip] if self._grip else [])]
 
-    def go_by(self, other: "Motion") -> None:
-        """Have the poses that another part of the same model is handed."""
-        self.pose, self.stride, self._timed, self._grip = other.pose, other.stride, False, None
+    def go_by(self, source: "Motion") -> None:
+        """Read the poses of another `Motion` of the same model."""
+        self.pose, self.stride, self._timed, self._grip = source.pose, source.stride, False, None
 
     def resolve_grips(self, of_arcs: list) -> None:
-        """Have the kernel of grips find substeps, by arrays of `Arcs`, for islands whose arrays and tally these end with."""
+        """Compute substeps in the kernel of grips by arrays of `Arcs`, the last of them of the islands and the tally."""
         if self._grip:
             self._grip, self._of_arcs = motion.grip_kernel(self.model.types.real, True), of_arcs
 
     def upload(self, t0: float, t1: float) -> None:
-        """Poses between t0 and t1 of motions that are functions of time."""
+        """Upload poses between t0 and t1 of motions in time."""
         if self._timed:
             self._hand(t0, t1)
 
     def divide(self, levels: np.ndarray, t0: float, t1: float) -> bool:
-        """Poses of each of 2^level intervals of a step, in every world (worlds,), after `upload`; whether arrays have grown."""
+        """Upload poses of 2^level intervals of a step per world (worlds,), after `upload`; return True if arrays grew."""
         self.levels, most = levels, int(levels.max())
         grown = self._shared.shape[0] < (2 ** (most + 1) - 1) * self.rows
         if grown:
@@ -191,11 +191,11 @@ class Motion:
 
     def _hand(self, t0: float, t1: float) -> None:
         self._rows[: self.rows] = poses(self.model, t0, t1)
-        # from memory that is not pinned, so that the next rows may take its place at once
+        # from unpinned memory, so that the next rows may overwrite it at once
         wp.copy(self._shared, self._host)
 
     def follow(self, before: State, after: State) -> None:
-        """Poses of every world over the step from one state to another, where there are grips; launches alone."""
+        """Write poses of every world over a step between two states, with grips; capturable."""
         if self._grip:
             of_arcs = self._of_arcs
             inputs = [
@@ -209,24 +209,24 @@ class Motion:
             self._launch(self._grip, self._shared, inputs, [self.pose, *of_arcs[3:]])
 
     def apply(self, islands, x: wp.array, *directed: wp.array) -> None:
-        """Put what is held where the part of the step that an island tries has it: see `place` and `direct`."""
+        """Move fixed nodes and angles to the end of the substep of each island: see `place` and `direct`."""
         self.place(islands, x)
         self.direct(islands, x, *directed)
 
     def place(self, islands, x: wp.array) -> None:
-        """Put nodes x."""
+        """Move fixed nodes x."""
         inputs = [self.nodes, self.rest, self.pose, self.stride, self.rows, *islands.arrays, self.part.world_columns]
         self._launch(self._nodes, self.nodes, inputs, [x])
 
     def direct(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
-        """Put angles theta, from lagged frames to the tangents that edges have in x."""
+        """Set fixed angles theta, from lagged frames to the tangents of edges in x."""
         if len(self.angles):
             inputs = [self.angles, self.directors, self.pose, self.stride, self.rows]
             inputs += [*islands.arrays, self.part.world_columns, x, frame]
             self._launch(self._angles, self.angles, inputs, [theta])
 
     def put(self, state: State, t0: float, t1: float, *arrays: wp.array) -> None:
-        """Put what `apply` puts, arrays of a state that belong to t0, where it is at t1."""
+        """Apply the motion between t0 and t1 to arrays of a state."""
         self.upload(t0, t1)
         self.follow(state, state)
         islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)

@@ -1,4 +1,4 @@
-"""What the parts of a tangent have in common, groups of rods and the net: outer forces on their dofs, and the derivatives of these."""
+"""Base class of tangent blocks: external forces and load stiffness of rod groups and the coupled system."""
 
 from functools import cached_property
 
@@ -10,14 +10,14 @@ from ddg_warp.solve.controls import loaded_rows
 
 
 class Part:
-    """A part of a model's tangent; dofs are numbered world by world. See `Tangent` for the methods.
+    """Tangent block of a model, with dofs numbered world by world. See `Tangent` for the methods.
 
     Attributes:
-        host: its `Storage`.
-        offset, size: of its dofs among all.
-        islands: number of islands, whose dofs follow one another and are as many in each; body_count: of bodies.
+        host: `Storage` of the block.
+        offset, size: range of dofs among all.
+        islands: number of islands, with contiguous dofs of equal number; body_count: number of bodies.
         block: dofs of a node, positions first.
-        given: outer forces of controls on the dofs of every world, in space, at full load (worlds, n) [N, N m].
+        given: control loads on the dofs of every world, in space, at full load (worlds, n) [N, N m].
 
     Args:
         part: `Group` or `DeviceNet`.
@@ -30,7 +30,7 @@ class Part:
 
     @property
     def mass(self) -> np.ndarray:
-        """Of every dof (size,) [kg, kg m^2]."""
+        """Mass and rotary inertia of every dof (size,) [kg, kg m^2]."""
         return self.part.dof_masses() if self.part.weighed else self._usual_mass
 
     @cached_property
@@ -39,17 +39,17 @@ class Part:
 
     @property
     def parts(self) -> list:
-        """Itself alone, so that a part at offset 0 serves where a `Tangent` does."""
+        """List of this block alone, so that a block at offset 0 acts as a `Tangent`."""
         return [self]
 
     @property
     def axis(self) -> np.ndarray:
-        """Axis of every dof that is a displacement (size,), 0 to 2; any of others."""
+        """Axis of every displacement dof (size,), 0 to 2; arbitrary for others."""
         return np.minimum(np.arange(self.size) % self.block, 2)
 
     @property
     def balances(self) -> np.ndarray:
-        """Which dofs have forces that add up to nothing over a free piece in equilibrium (size,) bool."""
+        """Mask of dofs with forces that sum to zero over a free component in equilibrium (size,) bool."""
         return ~self.angle
 
     @property
@@ -58,44 +58,44 @@ class Part:
         return np.repeat(np.arange(self.islands), self.size // self.islands)
 
     def accelerations(self, gravity: np.ndarray) -> np.ndarray:
-        """Those that gravity (3,) means on the dofs of a node, or of every block (1 or N, dofs of one) [m/s^2]."""
+        """Return accelerations by gravity (3,) on the dofs of a node, or of every dof block (1 or N, dofs of one) [m/s^2]."""
         raise NotImplementedError
 
     def into(self, values: np.ndarray) -> np.ndarray:
-        """Vectors in space (size,) as the dofs are."""
+        """Return vectors in space (size,) as dofs."""
         return values
 
     def back(self, values: np.ndarray) -> np.ndarray:
-        """Dofs, forces or steps (size,) as vectors in space."""
+        """Return dofs, forces or steps (size,) as vectors in space."""
         return values
 
     def matrix(self, values: sparse.csc_matrix) -> sparse.csc_matrix:
-        """A matrix of dofs in space as one of dofs as they are."""
+        """Return a matrix of spatial dofs as a matrix of dofs."""
         return values
 
     def weight(self, gravity: np.ndarray | None = None) -> np.ndarray:
-        """Gravity (3,) or (worlds, 3), by default the scene's, on the dofs of every world, in space (worlds, n) [N]."""
+        """Return weights by gravity (3,) or (worlds, 3), by default of the scene, on spatial dofs (worlds, n) [N]."""
         gravity = np.asarray(self.model.scene.gravity if gravity is None else gravity, float)
-        given = np.broadcast_to(gravity, (self.worlds, 3))
+        gravities = np.broadcast_to(gravity, (self.worlds, 3))
         masses = self.mass.reshape(self.worlds, -1)
-        own = (self.accelerations(g) for g in given)
-        return np.array([(m.reshape(-1, a.shape[1]) * a).ravel() for m, a in zip(masses, own, strict=True)])
+        accelerations = (self.accelerations(g) for g in gravities)
+        return np.array([(m.reshape(-1, a.shape[1]) * a).ravel() for m, a in zip(masses, accelerations, strict=True)])
 
-    def give(self, found: dict[str, np.ndarray]) -> None:
-        """Take the loads among what `Controls.checked` found; none without."""
+    def give(self, inputs: dict[str, np.ndarray]) -> None:
+        """Set the control loads of `Controls.checked`, none by default."""
         self.given[:] = 0.0
-        if "gravity" in found:
-            self.given[:] = self.weight(found["gravity"] - self.model.scene.gravity)
+        if "gravity" in inputs:
+            self.given[:] = self.weight(inputs["gravity"] - self.model.scene.gravity)
         places, rows = loaded_rows(self.model, self.part)
-        for name, own in (("forces", places < self.host.nodes), ("moments", places >= self.host.nodes)):
-            if name in found:
-                dofs, values = self.host.dofs(places[own]), found[name][:, rows[own]]
+        for name, selected in (("forces", places < self.host.nodes), ("moments", places >= self.host.nodes)):
+            if name in inputs:
+                dofs, values = self.host.dofs(places[selected]), inputs[name][:, rows[selected]]
                 values = values if name == "forces" else values[..., None] * [1.0, 0.0, 0.0]
                 for force, each in zip(self.given, np.broadcast_to(values, (self.worlds, *dofs.shape)), strict=True):
                     _add(force, dofs, each)
 
     def dead_loads(self, factor: float) -> np.ndarray:
-        """Outer forces on the dofs of every world, in space, that do not follow it (worlds, n)."""
+        """Return dead loads on the spatial dofs of every world (worlds, n)."""
         result = np.zeros(self.size // self.worlds)
         for load in (self.host.constant, *self.host.timed):
             _add(result, self.host.dofs(load.places), load.at(factor, factor) * load.force)
@@ -116,16 +116,16 @@ class Part:
         for load in self.host.followers:
             dofs, scale = self.host.dofs(load.places), load.at(factor, factor)
             row, column = np.broadcast_arrays(dofs[:, :, :, None, None], dofs[:, None, None])
-            known = (row >= 0) & (column >= 0)
+            present = (row >= 0) & (column >= 0)
             for world, x in enumerate(self.back(q).reshape(self.worlds, -1)):
-                rows.append(row[known] + world * len(x))
-                columns.append(column[known] + world * len(x))
-                values.append(-scale * load.derivative(gathered(x, dofs))[known])
+                rows.append(row[present] + world * len(x))
+                columns.append(column[present] + world * len(x))
+                values.append(-scale * load.derivative(gathered(x, dofs))[present])
         data, *places = (np.concatenate(parts) for parts in (values, rows, columns))
         return self.matrix(sparse.csc_matrix((data, places), shape=(self.size, self.size)))
 
 
 def _add(total: np.ndarray, dofs: np.ndarray, values: np.ndarray) -> None:
-    """Add values to those of dofs; a dof may come several times, -1 is none."""
-    known = dofs >= 0
-    np.add.at(total, dofs[known], values[known])
+    """Add values at dofs; a dof may repeat, -1 is skipped."""
+    present = dofs >= 0
+    np.add.at(total, dofs[present], values[present])

@@ -1,4 +1,4 @@
-"""Block-pentadiagonal systems of chains on a device: few, long chains by many threads each, or many by one each."""
+"""Block-pentadiagonal solvers of rod paths on a device: many threads each for few long rods, else one each."""
 
 import warp as wp
 
@@ -7,27 +7,27 @@ from ddg_warp.kernels.matrix import block_band
 from ddg_warp.kernels.solve import cyclic_reduction, paired, reduction_again
 from ddg_warp.solve.choice import LONGEST_REPEATED
 
-REDUCING = 128  # threads of a block in a level of the reduction
-THREADS = 32  # of a block of threads that walk: few chains reach more multiprocessors
-MOST = 512  # threads of a block that has one chain
-TOGETHER = 4  # neighbouring chains in a block of threads, which read 16 bytes at a time
+REDUCING = 128  # Threads of a block in a reduction level.
+THREADS = 32  # Threads of a block in the sweep: small blocks spread few rods over more multiprocessors.
+MOST = 512  # Largest block for one rod.
+TOGETHER = 4  # Neighbouring rods in a block, for reads of 16 bytes.
 
 
 class CyclicReduction:
-    """Levels of the reduction of open chains of at most `nodes` nodes of `nb` dofs; see `kernels.solve.cyclic_reduction`.
+    """Block cyclic reduction of open rods of at most `nodes` nodes of `nb` dofs; see `kernels.solve.cyclic_reduction`.
 
     Args:
-        tensions: how many dofs of a node are; with any, the system comes in the form of a level. See `kernels.solve.paired`.
-        repeated: whether there are many right-hand sides of the same matrix: chains that are not too long then keep what these
-            need; see `kernels.solve.reduction_again`.
+        tensions: number of tension dofs of a node; if positive, the system comes in the form of a level. See `kernels.solve.paired`.
+        repeated: True for many right-hand sides of one matrix: factors of rods up to a length are kept; see
+            `kernels.solve.reduction_again`.
 
     Attributes:
-        repeats: whether it keeps that.
+        repeats: True if factors are kept.
     """
 
     def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False):
         self.columns, self.device, self.dofs, self._linear = columns, device, 2 * nb, linear
-        self.blocks = [-(-nodes // 2)]  # of every level
+        self.blocks = [-(-nodes // 2)]  # blocks of every level
         while self.blocks[-1] > 1:
             self.blocks.append(-(-self.blocks[-1] // 2))
         matrix_rows, right_rows, kept_rows = cyclic_reduction.level_rows(nb)
@@ -63,30 +63,30 @@ class CyclicReduction:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [(kernel, REDUCING) for kernel in self._reduce[:2]]
+        reducing = [(kernel, REDUCING) for kernel in self._reduce[:2]]
         if self.repeats:
-            return [*own, self._pack, (self._again, self._threads)]
-        return [*own, (self._last, 32), self._expand]
+            return [*reducing, self._pack, (self._again, self._threads)]
+        return [*reducing, (self._last, 32), self._expand]
 
-    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
-        """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`.
+    def solve(self, matrix, right, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
+        """Solve the wanted columns from the blocks of nodes; count lost pivots in `lost`.
 
-        `again` is for a further right-hand side of the same matrix. The solution may take the place of the right-hand side.
+        `again` solves a further right-hand side of the same matrix. The solution may overwrite the right-hand side.
         """
         if self.repeats:
             if not again:
-                self.factorise(matrix, count, wanted, bad)
+                self.factorise(matrix, count, wanted, lost)
             self.again(right, count, wanted, 1, solution)
             return
         for level, kernel in enumerate(self._reduce):
             outputs = [self.matrices[level], self.rights[level], self.kept[level]]
-            self._eliminate(level, kernel, 2 * self.dofs + 1, [matrix, right, count, wanted], 0, outputs, bad)
+            self._eliminate(level, kernel, 2 * self.dofs + 1, [matrix, right, count, wanted], 0, outputs, lost)
             matrix, right = outputs[:2]
         wp.launch(
             self._last,
             self.columns,
             [matrix, right, count, wanted],
-            [solution, bad],
+            [solution, lost],
             device=self.device,
             block_dim=32,
         )
@@ -99,46 +99,50 @@ class CyclicReduction:
                 device=self.device,
             )
 
-    def factorise(self, matrix, count, wanted, bad: wp.array) -> None:
-        """What `again` needs of the wanted columns, where this `repeats`; adds the pivots they lose to `bad`."""
-        at = 0
+    def factorise(self, matrix, count, wanted, lost: wp.array) -> None:
+        """Factorise the wanted columns for `again`; count lost pivots in `lost`."""
+        offset = 0
         for level, kernel in enumerate(self._reduce):
             outputs = [self.matrices[level], self._none, self._packed]
-            self._eliminate(level, kernel, 2 * self.dofs, [matrix, self._none, count, wanted], at, outputs, bad)
-            at += self.blocks[level] // 2
+            self._eliminate(level, kernel, 2 * self.dofs, [matrix, self._none, count, wanted], offset, outputs, lost)
+            offset += self.blocks[level] // 2
             matrix = self.matrices[level]
-        inputs = [matrix, count, wanted, at]
-        wp.launch(self._pack, (self.columns, self.dofs), inputs, [self._packed, bad], device=self.device)
+        inputs = [matrix, count, wanted, offset]
+        wp.launch(self._pack, (self.columns, self.dofs), inputs, [self._packed, lost], device=self.device)
 
-    def _eliminate(self, level: int, kernel, threads: int, inputs: list, at: int, outputs: list, bad: wp.array) -> None:
+    def _eliminate(
+        self, level: int, kernel, threads: int, inputs: list, offset: int, outputs: list, lost: wp.array
+    ) -> None:
         together = min(TOGETHER, self.columns)
         wp.launch(
             kernel,
             (self.blocks[level + 1], -(-self.columns // together), threads, together),
-            [*inputs, self.blocks[level], 2, at, together],
-            [*outputs, bad],
+            [*inputs, self.blocks[level], 2, offset, together],
+            [*outputs, lost],
             device=self.device,
             block_dim=REDUCING,
         )
 
     def again_kernel_at_places(self, twist: bool):
-        """Kernel of `again_at_places`, and how many threads a block of it has."""
+        """Return the kernel of `again_at_places` and the block size."""
         return reduction_again.again_at_places_kernel(twist, self._linear), self._threads
 
-    def again_at_places(self, twist: bool, residual, places, held, count, idle, wanted, blocks: int, z, dots) -> None:
-        """As `again`, of the chains of a net with so many blocks in a world, see `reduction_again.again_at_places_kernel`."""
+    def again_at_places(
+        self, twist: bool, residual, places, fixed, count, inactive, wanted, blocks: int, z, dots
+    ) -> None:
+        """Solve rod paths of the coupled system with kept factors, see `reduction_again.again_at_places_kernel`."""
         kernel, threads = self.again_kernel_at_places(twist)
         wp.launch(
             kernel,
             self.columns * threads,
-            [self._packed, residual, places, held, count, idle, wanted, blocks, self.blocks[0], threads],
+            [self._packed, residual, places, fixed, count, inactive, wanted, blocks, self.blocks[0], threads],
             [self._rest, self._found, z, dots],
             device=self.device,
             block_dim=threads,
         )
 
     def again(self, right, count, wanted: wp.array, width: int, solution: wp.array) -> None:
-        """Solution, once factors are there, of the columns of which `wanted` is 1, of every `width` of them."""
+        """Solve columns with kept factors; `wanted` has one flag for every `width` columns."""
         wp.launch(
             self._again,
             self.columns * self._threads,
@@ -150,16 +154,16 @@ class CyclicReduction:
 
 
 class Elimination:
-    """Node by node, with a thread each, of the same chains by the same calls: for many of them.
+    """Block LDL^T sweep with one thread a rod, for many rods; interface of `CyclicReduction`.
 
     Args:
-        kind: `ChainKind` of the chains; columns: how many there are.
+        kind: `ChainKind` of the rods; columns: number of rods in all worlds.
     """
 
     def __init__(self, kind, nodes: int, columns: int, linear, device):
         self.columns, self.device = columns, device
         self._factors = arrays.allocate((3 * kind.block**2 + kind.block, nodes, columns), linear, device)
-        self._first = wp.zeros(columns, dtype=int, device=device)  # iteration
+        self._first = wp.zeros(columns, dtype=int, device=device)  # first iteration of every column
         self._factor, self._direct = block_band.factor_kernel(kind, linear), block_band.direct_kernel(kind, linear)
 
     @property
@@ -167,10 +171,10 @@ class Elimination:
         """Kernels to load before a capture."""
         return [(self._factor, THREADS), (self._direct, THREADS)]
 
-    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
-        """As `CyclicReduction.solve`."""
+    def solve(self, matrix, right, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
+        """Solve the wanted columns; see `CyclicReduction.solve`."""
         if not again:
-            self._launch(self._factor, [matrix, count, wanted, self._first, 0], [self._factors, bad])
+            self._launch(self._factor, [matrix, count, wanted, self._first, 0], [self._factors, lost])
         self._launch(self._direct, [self._factors, right, count, wanted], [solution])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
@@ -178,7 +182,7 @@ class Elimination:
 
 
 class TensionReduction:
-    """The same of a group of rods with the tensions of their edges as unknowns; see `kernels.solve.paired`."""
+    """Block cyclic reduction of a rod group in the mixed axial-force formulation; see `kernels.solve.paired`."""
 
     def __init__(self, group, real, linear, device):
         kind, columns = group.kind, group.columns
@@ -200,7 +204,7 @@ class TensionReduction:
         return [self._pair, self._unpair, *self.levels.kernels]
 
     def solve(self, blocks, factor, right, x, islands, direction: wp.array) -> None:
-        """Directions of wanted rods and what their edges lengthen by, from the blocks of nodes and the factor of elements."""
+        """Solve for directions and edge elongations of wanted rods, from dof blocks and Gauss-Newton factors."""
         group = self.group
         wp.launch(
             self._pair,

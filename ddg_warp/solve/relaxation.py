@@ -1,10 +1,9 @@
-"""Dynamic relaxation with kinetic damping: a static solver that needs no tangent that is regular, for where Newton finds no way.
+"""Dynamic relaxation with kinetic damping: a static solver without a regular tangent, for cases in which Newton fails.
 
-The structure moves from rest under its residual forces, with fictitious masses; whenever its kinetic energy has passed a maximum it
-is stopped and starts again (Barnes, Int. J. Space Struct. 14, 1999). The masses are sums of the magnitudes of the rows of the
-tangent stiffness, which makes explicit steps of length one stable by Gershgorin's theorem, the largest one for all directions of
-a point, as what is soft sideways is stiff once it has turned. It comes near a minimum cheaply and
-from afar, and closes in on it slowly: let `statics.solve` finish.
+The structure moves from rest under residual forces, with fictitious masses. At every maximum of the kinetic energy it is stopped
+(Barnes, Int. J. Space Struct. 14, 1999). The masses are row sums of the magnitudes of the tangent stiffness, which makes explicit steps
+of length one stable (Gershgorin). A point takes the largest mass over its directions, since a soft direction becomes stiff by rotation.
+Convergence is cheap from afar and slow near a minimum: complete it by `statics.solve`.
 """
 
 import numpy as np
@@ -23,19 +22,19 @@ def relax(
     max_steps: int = 20_000,
     rotation_cap: float = 0.1,
 ) -> State:
-    """A state near an equilibrium at load parameter `at`.
+    """Return a state near an equilibrium at load parameter `at`.
 
     Args:
-        model: what to equilibrate.
-        state: where to begin, with its supports where they are at `at`; the rest state by default. It is not changed.
+        model: model to equilibrate.
+        state: start, with supports at load parameter `at`; the rest state by default. It stays unchanged.
         at: load parameter.
-        residual: largest force of a free dof at which to stop, over the sum of the outer forces; moments over an edge length.
-        max_steps: at most.
-        rotation_cap: largest turn of an edge in a step [rad].
+        residual: tolerance of free dofs over the load scale; moments over an edge length.
+        max_steps: limit of steps.
+        rotation_cap: largest edge rotation in a step [rad].
 
     Raises:
         SceneError: there is contact.
-        SolverError: `max_steps` or `non_finite`; carries the state that was reached.
+        SolverError: `max_steps` or `non_finite`; carries the last state.
     """
     if model.touch:
         raise SceneError("contact: relaxation keeps nothing apart; take statics.solve, which does")
@@ -62,7 +61,7 @@ def relax(
         velocity = velocity + force / mass
         kinetic = float(mass @ velocity**2)
         if kinetic < peak:
-            velocity, peak, mass = np.zeros(tangent.size), 0.0, None  # stiffness has changed on the way: weigh it anew
+            velocity, peak, mass = np.zeros(tangent.size), 0.0, None  # stiffness has changed: update the masses
             continue
         peak = kinetic
         turn = tangent.rotation(q, velocity)
@@ -80,7 +79,7 @@ def relax(
 
 
 def _masses(tangent, state) -> np.ndarray:
-    """Fictitious masses of all dofs (size,)."""
+    """Return fictitious masses of all dofs (size,)."""
     rows = np.asarray(abs(tangent.hessian(state)).sum(axis=1)).ravel()
     dofs = tangent.point_dofs()
     of_points = np.where(dofs >= 0, rows[dofs], 0.0).max(axis=1)

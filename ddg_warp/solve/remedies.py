@@ -1,38 +1,42 @@
-"""Remedies that the message of a failed search for an equilibrium names, of which each one helps where it is named."""
+"""Remedies in messages of failed equilibrium searches, by tests of the failed state."""
 
 import numpy as np
 
 from ddg_warp.solve.choice import large_static
 from ddg_warp.solve.rigid import rigid_modes
 
-PUSHED = 1e-6  # of the norm of the residual along a motion that nothing resists, at which it is pushed
-LIMP = 1e-3  # bending stiffness over load times length squared, below which it decides nothing but the search
+PUSHED = 1e-6  # relative residual along an unresisted motion above which loads drive it
+LIMP = 1e-3  # bending stiffness over load times length squared below which it only hinders the search
 IN_TIME = "step the scene in time (Integrator, with mass_damping) and begin from where it comes to rest"
 
 
-def of_search(equilibrium, error, before, at: float) -> str:
-    """What would help a search at load parameter `at` from a state `before` that has ended with an error.
+def of_search(equilibrium, error, before, load_factor: float) -> str:
+    """Return remedies for a failed search at a load parameter from a state `before`.
 
-    `equilibrium` is the `Equilibrium` that searched.
+    `equilibrium` is the `Equilibrium` of the search.
     """
     if error.outcome == "non_finite":
         return "begin nearer to rest, or take parameters that are less far apart"
     free = ""
     if _factored(equilibrium.model):
-        free = unresisted(equilibrium.tangent, error.state, at) or unresisted(equilibrium.tangent, before, at)
+        free = unresisted(equilibrium.tangent, error.state, load_factor) or unresisted(
+            equilibrium.tangent, before, load_factor
+        )
     longer = "take a larger max_iterations" if error.gaining and not free else ""
-    return ", or ".join(remedy for remedy in (free, limp(equilibrium, error.state, at), longer, IN_TIME) if remedy)
+    return ", or ".join(
+        remedy for remedy in (free, limp(equilibrium, error.state, load_factor), longer, IN_TIME) if remedy
+    )
 
 
 def _factored(model) -> bool:
     return model.touch is None and not (model.net is not None and large_static(model))
 
 
-def unresisted(tangent, state, at: float) -> str:
-    """Advice to hold what loads push along a motion that neither supports nor stiffness resist; empty without one."""
+def unresisted(tangent, state, load_factor: float) -> str:
+    """Return the advice to fix a dof that loads drive along an unresisted motion; empty without."""
     q = tangent.dofs(state)
-    residual = np.where(tangent.free, tangent.loads(at, q) - tangent.gradient(state), 0.0)
-    stiffness = tangent.stiffness(state, at)
+    residual = np.where(tangent.free, tangent.loads(load_factor, q) - tangent.gradient(state), 0.0)
+    stiffness = tangent.stiffness(state, load_factor)
     if not np.isfinite(stiffness.data).all() or not np.isfinite(residual).all():
         return ""
     for mode in rigid_modes(tangent, state, stiffness).T:
@@ -41,10 +45,10 @@ def unresisted(tangent, state, at: float) -> str:
     return ""
 
 
-def limp(equilibrium, state, at: float) -> str:
-    """Advice to leave out the bending of the first rod that is too limp for it to matter; empty without one."""
+def limp(equilibrium, state, load_factor: float) -> str:
+    """Return the advice to omit the bending of the first rod with negligible stiffness; empty without."""
     tangent = equilibrium.tangent
-    loads = np.abs(np.where(tangent.angle, 0.0, tangent.loads(at, tangent.dofs(state)))).sum()
+    loads = np.abs(np.where(tangent.angle, 0.0, tangent.loads(load_factor, tangent.dofs(state)))).sum()
     for batch in equilibrium.model.scene.batches:
         stiffest = max(np.max(batch.section.EI1), np.max(batch.section.EI2)) if batch.bend else np.inf
         length = np.linalg.norm(np.diff(batch.points, axis=1), axis=2).sum(1).max()

@@ -1,9 +1,8 @@
-"""Rigid motions that supports leave: of every free piece, and the spin of rods about their own axes.
+"""Rigid-body modes that supports leave: of every free component, and the spin of rods about their axes.
 
-Rods, shells and shells of revolution are bodies, each with three translations, three rotations and, of a rod with twist, its spin.
-Bodies agree on the dofs that they share (hinges, attachments, rotations of rigid joints) and vanish where supports hold. Of the
-motions that remain, those that the tangent stiffness does not feel are zero modes: all of them without loads, and under loads those
-along which these do no work.
+Rods, shells and shells of revolution are bodies with three translations, three rotations and, for rods with twist, a spin. Motions of
+bodies agree on common dofs (hinges, attachments, rotations of rigid joints) and vanish at fixed dofs. Motions in the null space of the
+tangent stiffness are zero modes: all of them without loads, else the motions along which the loads do no work.
 """
 
 from dataclasses import dataclass
@@ -12,19 +11,19 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-MOST = 64  # bodies of one piece that move by themselves; where there are more, the piece moves as a whole
-DEPENDENT = 1e-9  # singular values of unit vectors that are dependent, or of motions that conditions forbid
-ROUNDING = 1e3  # units of rounding, of a stiffness in proportion to its diagonal, that count as none
+MOST = 64  # Largest number of bodies of a component with separate motions; beyond it the component moves as a whole.
+DEPENDENT = 1e-9  # Singular values of dependent unit vectors, or of constrained motions.
+ROUNDING = 1e3  # Stiffness over its diagonal that counts as zero, in rounding units.
 
 
 @dataclass(frozen=True)
 class Body:
-    """Dofs of what can move as one piece.
+    """Dofs of a body that can move rigidly.
 
     Attributes:
-        nodes: of positions (n, 3), -1 where there is none.
-        angles: of the angles of a rod's edges (m,); ends: places of their nodes (m, 2).
-        spins: of the rotations of rigid joints (s, 3).
+        nodes: dofs of positions (n, 3), -1 where absent.
+        angles: dofs of twist angles (m,); ends: row of `nodes` of both edge nodes (m, 2).
+        spins: dofs of rotations of rigid joints (s, 3).
     """
 
     nodes: np.ndarray
@@ -33,7 +32,7 @@ class Body:
     spins: np.ndarray
 
     def motions(self, q: np.ndarray, centre: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
-        """Its dofs (d,), and what they do (d, 7) in three translations, three rotations about a centre, and the spin of a rod."""
+        """Return dofs (d,) and rates (d, 7) in three translations, three rotations about a centre, and spin."""
         exists = self.nodes >= 0
         x = np.where(exists, q[self.nodes], 0.0)
         axes = np.eye(3)
@@ -51,13 +50,13 @@ class Body:
 
 
 def rigid_modes(tangent, state, stiffness: sparse.csc_matrix) -> np.ndarray:
-    """Independent motions (size, number) that neither supports nor the tangent stiffness (size, size) resist."""
+    """Return independent zero modes (size, number) of the supports and the tangent stiffness (size, size)."""
     q = tangent.dofs(state)
     bodies = [body for part in tangent.parts for body in part.bodies()]
-    places = np.concatenate([body.nodes.max(axis=1) for body in bodies])
-    inside = np.concatenate([np.where(body.nodes >= 0, q[body.nodes], 0.0) for body in bodies])[places >= 0]
+    present_dofs = np.concatenate([body.nodes.max(axis=1) for body in bodies])
+    inside = np.concatenate([np.where(body.nodes >= 0, q[body.nodes], 0.0) for body in bodies])[present_dofs >= 0]
     centre, size = inside.mean(axis=0), max(1e-300, np.linalg.norm(np.ptp(inside, axis=0)))
-    # angles times the size, as displacements are, so that neither outweighs the other whatever the size
+    # angles times the size are comparable with displacements at any size
     lever = np.where(tangent.angle, size, 1.0)
     motions = [
         (dofs, lever[dofs][:, None] * columns) for dofs, columns in (body.motions(q, centre, size) for body in bodies)
@@ -85,7 +84,7 @@ def rigid_modes(tangent, state, stiffness: sparse.csc_matrix) -> np.ndarray:
 
 
 def _of_piece(motions: list, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Dofs of a piece (d,), and its motions (d, m) that vanish at held dofs and on whose shared dofs all bodies agree."""
+    """Return dofs of a component (d,) and motions (d, m), zero at fixed dofs and compatible between bodies."""
     every = np.concatenate([dofs for dofs, _ in motions])
     dofs, first, inverse = np.unique(every, return_index=True, return_inverse=True)
     if len(motions) > MOST:
@@ -103,7 +102,7 @@ def _of_piece(motions: list, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unresisted(dofs: np.ndarray, columns: np.ndarray, stiffness, tolerance: float) -> list:
-    """(dofs, values) of the independent motions among some that the stiffness does not feel."""
+    """Return (dofs, values) of the independent motions in the null space of the stiffness."""
     matrix = stiffness[:, dofs]
     root = np.sqrt(np.abs(stiffness.diagonal()))
     largest = root.max(initial=0.0)
@@ -116,7 +115,7 @@ def _unresisted(dofs: np.ndarray, columns: np.ndarray, stiffness, tolerance: flo
 
 
 def _null_space(rows: np.ndarray, tolerance: float) -> np.ndarray:
-    """Orthonormal vectors (columns, m) that `rows` take to zero, to a tolerance."""
+    """Return the orthonormal null space (columns, m) of `rows`, to a tolerance."""
     size = rows.shape[1]
     if not len(rows):
         return np.eye(size)

@@ -1,4 +1,4 @@
-"""Stability and vibration of equilibria: eigenvalues of the constrained tangent, and the load at which the lowest vanishes."""
+"""Stability and vibration of equilibria: eigenvalues of the constrained tangent, critical and buckling loads."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from ddg_warp.solve.lowest import Lowest, LowestFactors, dense
 from ddg_warp.solve.rigid import rigid_modes
 from ddg_warp.solve.tangent import Tangent
 
-NEGATIVE = 64.0  # units of rounding, of a curvature over the sum of its terms' magnitudes, below which it may be zero
-DENSE = 600  # free dofs up to which a dense eigenvalue solver is the quicker and safer choice
+NEGATIVE = 64.0  # curvature over the sum of magnitudes of its terms that may be zero, in rounding units
+DENSE = 600  # free dofs up to which a dense eigenvalue solver is faster and safer
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,15 @@ class Spectrum:
     """Lowest eigenvalues of a constrained tangent.
 
     Attributes:
-        eigenvalues: in ascending order, exactly zero for rigid modes; with the mass as metric they are squared angular frequencies
-            [1/s^2]. Loads that follow and are not conservative may make them complex: then the equilibrium flutters.
-        modes: (dofs, number), normalised in the metric; zero at held dofs.
-        negative: number of eigenvalues that are negative (inertia), of complex ones in their real part; without rigid modes, with
-            those of dofs without mass, which have no frequency and are not among the eigenvalues.
-        rigid: number of rigid modes that the supports leave: translations, rotations, mechanisms of hinges, spins of rods about
-            their own axes. They come first among eigenvalues that are not negative.
-        displacements: of the modes by node (number, P, 3) in the order of `State.points`, (number, worlds, P, 3) of several worlds.
+        eigenvalues: in ascending order, exactly zero for rigid modes; in the mass metric squared angular frequencies [1/s^2].
+            Nonconservative follower loads may make them complex: then the equilibrium flutters.
+        modes: (dofs, number), normalised in the metric; zero at fixed dofs.
+        negative: inertia count: number of eigenvalues with negative real part, without rigid modes. It includes modes of massless dofs,
+            which have no frequency and are not among the eigenvalues.
+        rigid: number of rigid-body modes that supports leave: translations, rotations, mechanisms of hinges, spins of rods. They come
+            first among nonnegative eigenvalues.
+        displacements: nodal displacements of modes (number, P, 3) in the order of `State.points`, with several worlds
+            (number, worlds, P, 3).
     """
 
     eigenvalues: np.ndarray
@@ -45,19 +46,17 @@ class Spectrum:
 
     @property
     def stable(self) -> bool:
-        """Whether the second variation is positive but for rigid modes; with loads that follow, whether no eigenvalue is negative or
-        complex.
-        """
+        """True if no eigenvalue is negative or complex, except for rigid modes."""
         return self.negative == 0 and not np.iscomplexobj(self.eigenvalues)
 
     @property
     def elastic(self) -> np.ndarray:
-        """The eigenvalues without those of rigid modes."""
+        """Eigenvalues without rigid modes."""
         return np.delete(self.eigenvalues, np.flatnonzero(self.eigenvalues == 0.0)[: self.rigid])
 
     @property
     def frequencies(self) -> np.ndarray:
-        """Angular frequencies [rad/s]; 0 of rigid modes, NaN where an eigenvalue is negative, complex where it flutters."""
+        """Angular frequencies [rad/s]: 0 for rigid modes, NaN for negative eigenvalues, complex for flutter."""
         with np.errstate(invalid="ignore"):
             return np.sqrt(self.eigenvalues)
 
@@ -65,18 +64,18 @@ class Spectrum:
 def spectrum(
     model, state, count: int = 4, metric: str = "mass", tangent: Tangent | None = None, load: float | None = None
 ) -> Spectrum:
-    """The `count` lowest eigenvalues of the constrained tangent at a state.
+    """Return the `count` lowest eigenvalues of the constrained tangent at a state.
 
     Args:
-        model, state: an equilibrium; the tangent is exact, without any projection.
-        count: how many, rigid modes included.
+        model, state: equilibrium; the tangent is exact, without projection.
+        count: number of eigenvalues, rigid modes included.
         metric: "mass" (lumped, rotary inertia included) or "unit" (identity, angles times an edge length squared), for
-            questions of stability alone.
-        tangent: reuse this instead of making one.
-        load: the load parameter, for loads that follow; by default that of an equilibrium, which is its time.
+            stability only.
+        tangent: tangent to reuse.
+        load: load parameter for follower loads; by default the time of the state.
 
     Raises:
-        SceneError: metric "mass" of a model without masses, or a metric or count that does not exist.
+        SceneError: metric "mass" of a model without masses, or an invalid metric or count.
         SolverError: float32 would lose the softest modes in rounding.
     """
     validate.check_model("spectrum", model)
@@ -94,21 +93,19 @@ def spectrum(
     weights = weights[free]
     if not (weights > 0.0).any():
         raise SceneError("nothing that can move has a mass: give the material a density, or ask with metric='unit'")
-    known = rigid_modes(tangent, state, stiffness)[free]
+    zero_modes = rigid_modes(tangent, state, stiffness)[free]
     matrix = sparse.csc_matrix(stiffness[free][:, free])
-    rigid = _normalised(known, weights)
+    rigid = _normalised(zero_modes, weights)
     kept, zero = int((weights > 0.0).sum()), rigid.shape[1]
-    others = min(count, kept - zero)
+    elastic_count = min(count, kept - zero)
     if not is_symmetric(matrix):
-        values, modes = _unsymmetric(matrix, weights, others + zero)
-        kept_values = np.sort(
-            np.argsort(np.abs(values))[zero:]
-        )  # without the rigid ones, which only rounding moves off zero
+        values, modes = _unsymmetric(matrix, weights, elastic_count + zero)
+        kept_values = np.sort(np.argsort(np.abs(values))[zero:])  # without rigid modes, nonzero only by rounding
         values, modes = values[kept_values], modes[:, kept_values]
     elif kept <= DENSE:
-        values, modes = dense(matrix, weights, known)
+        values, modes = dense(matrix, weights, zero_modes)
     else:
-        values, modes = Lowest(matrix, weights, known)(others)
+        values, modes = Lowest(matrix, weights, zero_modes)(elastic_count)
     if (np.abs(values.imag) <= 1e-9 * np.abs(values)).all():
         values, modes = values.real, modes.real
     negative = int((values.real < 0.0).sum())
@@ -122,9 +119,9 @@ def spectrum(
 
 
 def negative_eigenvalues(matrix) -> int:
-    """Number of negative eigenvalues of a stiffness; of an unsymmetric one (loads that follow), of those with negative real part.
+    """Return the number of eigenvalues of a stiffness with negative real part.
 
-    One that is exactly zero counts as none.
+    Exactly zero eigenvalues do not count. Follower loads make the stiffness unsymmetric.
     """
     symmetric = is_symmetric(matrix)
     if symmetric:
@@ -138,13 +135,13 @@ def negative_eigenvalues(matrix) -> int:
 
 
 def instabilities(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> int:
-    """Number of negative eigenvalues of the tangent stiffness (size, size) on free dofs, rigid modes apart."""
+    """Return the inertia count of the tangent stiffness (size, size) on free dofs, without rigid modes."""
     free = np.flatnonzero(tangent.free)
     matrix = sparse.csc_matrix(stiffness[free][:, free])
     negative = negative_eigenvalues(matrix)
     if negative and is_symmetric(matrix):  # rounding gives zeros a sign
-        known = rigid_modes(tangent, state, stiffness)[free]
-        return negative_eigenvalues(pinned(matrix, known)) if known.size else negative
+        zero_modes = rigid_modes(tangent, state, stiffness)[free]
+        return negative_eigenvalues(pinned(matrix, zero_modes)) if zero_modes.size else negative
     return negative
 
 
@@ -153,22 +150,22 @@ class IslandStability:
     """Stability of every island of an equilibrium.
 
     Attributes:
-        stable: whether the stiffness is positive but for rigid modes (islands,), True, False, or None where that is not known: under
-            loads without a potential, and where the lowest eigenvalue is negative by no more than rounding.
-        modes: the lowest modes of unstable islands (size,), each of any length; zero in others.
+        stable: True if the stiffness is positive except for rigid modes, else False (islands,). None if unknown: loads without a
+            potential, or a lowest eigenvalue negative by rounding.
+        modes: lowest modes of unstable islands (size,), of arbitrary length; zero in others.
     """
 
     stable: np.ndarray
     modes: np.ndarray
 
     def by_world(self, tangent: Tangent) -> tuple:
-        """Of all islands of each world: False if one is unstable, None if one is not known, else True."""
+        """Return the stability of each world: False if an island is unstable, None if one is unknown, else True."""
         of_worlds = (self.stable[tangent.world == world] for world in range(tangent.model.worlds))
-        return tuple(False if False in own else None if None in own else True for own in map(list, of_worlds))
+        return tuple(False if False in values else None if None in values else True for values in map(list, of_worlds))
 
 
 def of_islands(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> IslandStability:
-    """Stability of every island by its tangent stiffness (size, size)."""
+    """Return the stability of every island by the tangent stiffness (size, size)."""
     stable, modes = np.full(tangent.islands, None, object), np.zeros(tangent.size)
     free = np.flatnonzero(tangent.free)
     matrix, island = sparse.csc_matrix(stiffness[free][:, free]), tangent.island[free]
@@ -178,43 +175,45 @@ def of_islands(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> IslandS
     if factor.reliable:
         stable[np.bincount(island, factor.negative_rows, tangent.islands) == 0] = True
     unknown = np.flatnonzero(stable != True)  # noqa: E712 (of an array of objects)
-    known = rigid_modes(tangent, state, stiffness)[free] if unknown.size else None
+    zero_modes = rigid_modes(tangent, state, stiffness)[free] if unknown.size else None
     weights = np.where(tangent.angle, tangent.edge_length() ** 2, 1.0)[free]
     for index in unknown:
         rows = np.flatnonzero(island == index)
-        own, rigid = matrix[rows][:, rows], known[rows]
+        block, rigid = matrix[rows][:, rows], zero_modes[rows]
         if not factor.reliable and len(rows) > DENSE:
             continue
         rigid = rigid[:, rigid.any(0)]
-        if negative_eigenvalues(pinned(own, rigid) if rigid.size else own) == 0:
+        if negative_eigenvalues(pinned(block, rigid) if rigid.size else block) == 0:
             stable[index] = True
             continue
-        mode = _lowest_mode(own, weights[rows], rigid)
-        if mode @ (own @ mode) < -NEGATIVE * tangent.model.types.eps * (np.abs(mode) @ (abs(own) @ np.abs(mode))):
+        mode = _lowest_mode(block, weights[rows], rigid)
+        if mode @ (block @ mode) < -NEGATIVE * tangent.model.types.eps * (np.abs(mode) @ (abs(block) @ np.abs(mode))):
             stable[index], modes[free[rows]] = False, mode
     return IslandStability(stable, modes)
 
 
-def _lowest_mode(matrix: sparse.csc_matrix, weights: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Eigenvector of the lowest eigenvalue, rigid modes apart; its largest entry is positive, so that it is the same in every run."""
-    mode = (dense(matrix, weights, known) if len(weights) <= DENSE else Lowest(matrix, weights, known)(1))[1][:, 0]
+def _lowest_mode(matrix: sparse.csc_matrix, weights: np.ndarray, zero_modes: np.ndarray) -> np.ndarray:
+    """Return the lowest eigenvector without rigid modes; the largest entry is positive, for reproducibility."""
+    mode = (dense(matrix, weights, zero_modes) if len(weights) <= DENSE else Lowest(matrix, weights, zero_modes)(1))[1][
+        :, 0
+    ]
     return mode * np.sign(mode[np.argmax(np.abs(mode))])
 
 
 def is_symmetric(matrix) -> bool:
-    """Whether a stiffness is symmetric but for rounding, so that the loads have a potential."""
+    """Return True if a stiffness is symmetric to rounding, so that the loads have a potential."""
     return bool(abs(matrix - matrix.T).max() <= 1e-11 * abs(matrix).max())
 
 
-def _normalised(known: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Vectors that span the same space, orthonormal in the metric, without those that have no mass."""
-    _, sizes, rows = np.linalg.svd(np.sqrt(weights)[:, None] * known, full_matrices=False)
+def _normalised(vectors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return vectors of the same span, orthonormal in the metric; massless vectors are dropped."""
+    _, sizes, rows = np.linalg.svd(np.sqrt(weights)[:, None] * vectors, full_matrices=False)
     kept = sizes > 1e-9 * sizes.max(initial=0.0)
-    return known @ rows[kept].T / sizes[kept]
+    return vectors @ rows[kept].T / sizes[kept]
 
 
 def _unsymmetric(matrix, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """`count` eigenpairs or more by their real parts, all with a negative one among them."""
+    """Return at least `count` eigenpairs by real part, all with negative real part included."""
     massive = np.flatnonzero(weights > 0.0)
     root = np.sqrt(weights[massive])
     try:
@@ -227,10 +226,10 @@ def _unsymmetric(matrix, weights: np.ndarray, count: int) -> tuple[np.ndarray, n
         full[massive] = (root * y.T).T
         return factor.solve(full)
 
-    size, part = len(massive), None
+    size, symmetric_factor = len(massive), None
     if size > DENSE and count < size - 1:
-        part, _ = regular(sparse.csc_matrix(0.5 * (matrix + matrix.T)), weights)
-    if part is not None and part.reliable and not part.negative:
+        symmetric_factor, _ = regular(sparse.csc_matrix(0.5 * (matrix + matrix.T)), weights)
+    if symmetric_factor is not None and symmetric_factor.reliable and not symmetric_factor.negative:
         # where the symmetric part is definite no eigenvalue has a negative real part (Bendixson 1902)
         operator = LinearOperator((size, size), matvec=lambda y: root * inverse(y)[massive], dtype=np.float64)
         values, vectors = eigs(operator, k=count, v0=np.random.default_rng(0).standard_normal(size))
@@ -245,9 +244,9 @@ def _unsymmetric(matrix, weights: np.ndarray, count: int) -> tuple[np.ndarray, n
 
 
 def nearest_to_zero(matrix, scaling: np.ndarray) -> tuple[float, np.ndarray]:
-    """Eigenvalue nearest to zero of S K S, S = diag(scaling), and S times its eigenvector, by inverse iteration.
+    """Return the eigenvalue nearest to zero of S K S, S = diag(scaling), and S times its eigenvector.
 
-    The matrix may be unsymmetric. The vector's largest entry is positive, so that it is the same in every run.
+    Inverse iteration; the matrix may be unsymmetric. The largest entry of the vector is positive, for reproducibility.
     """
     scaled = sparse.csc_matrix(sparse.diags(scaling) @ matrix @ sparse.diags(scaling))
     try:
@@ -267,11 +266,11 @@ def nearest_to_zero(matrix, scaling: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float = 1e-8) -> float:
-    """The parameter between low and high at which the lowest eigenvalue of the tangent vanishes, rigid modes apart.
+    """Return the critical parameter between low and high, a root of the lowest nonrigid eigenvalue.
 
     Args:
         equilibrium_at: parameter -> (model, state) in equilibrium, stable at `low` and not at `high` (or the other way).
-        tolerance: of the parameter, relative to high - low.
+        tolerance: tolerance of the parameter, relative to high - low.
 
     Raises:
         ValueError: the lowest eigenvalue has the same sign at both ends.
@@ -292,18 +291,18 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
     @cache
     def lowest(parameter: float) -> float:
         nonlocal rigid
-        found = equilibrium_at(parameter)
-        if not isinstance(found, tuple | list) or len(found) != 2:
-            shown = arguments.shown(found)
+        result = equilibrium_at(parameter)
+        if not isinstance(result, tuple | list) or len(result) != 2:
+            shown = arguments.shown(result)
             raise SceneError(f"critical: equilibrium_at gives {shown} at {parameter:g}; give (model, state)")
-        model, state = found
-        found = spectrum(model, state, 1, "unit")
-        rigid = min(rigid, found.rigid)
-        if found.rigid > rigid:
-            return 0.0  # the mode that is looked for is a mechanism, which at the root nothing resists
-        if found.rigid:
-            found = spectrum(model, state, 1 + found.rigid, "unit")
-        return float(found.elastic[0].real)
+        model, state = result
+        result = spectrum(model, state, 1, "unit")
+        rigid = min(rigid, result.rigid)
+        if result.rigid > rigid:
+            return 0.0  # the critical mode is a mechanism, unresisted at the root
+        if result.rigid:
+            result = spectrum(model, state, 1 + result.rigid, "unit")
+        return float(result.elastic[0].real)
 
     if lowest(low) * lowest(high) > 0.0:
         raise ValueError(
@@ -314,19 +313,19 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
 
 
 def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
-    """Linearised buckling: the lowest positive factors for which K(free) + factor (K(loaded) - K(free)) is singular.
+    """Return the linearised buckling factors: the lowest positive f with K(free) + f (K(loaded) - K(free)) singular.
 
-    With K the exact tangents of two equilibria, loads that follow included, of which the first is stable. Where the state before
-    buckling is in proportion to its load, as of a flat plate, these are the critical loads over that of `loaded`; elsewhere take
-    `critical`, or two states close to the critical one.
+    K are the exact tangents of two equilibria, follower loads included; the first one is stable. If the state before buckling is
+    proportional to the load, as for a flat plate, the factors are critical loads over the load of `loaded`. Else take `critical`, or
+    two states close to the critical one.
 
     Args:
-        model: what both states belong to.
-        free, loaded: two equilibria, such as the state without load and under a part of it.
-        count: how many factors.
+        model: model of both states.
+        free, loaded: two equilibria, such as the unloaded state and one under a fraction of the load.
+        count: number of factors.
 
     Raises:
-        ValueError: the first equilibrium is not stable, loads that follow are not conservative, or no positive factor is found.
+        ValueError: the first equilibrium is unstable, follower loads are not conservative, or no positive factor exists.
     """
     validate.check_model("buckling", model)
     for state in (free, loaded):
@@ -352,7 +351,7 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
 
 
 def lowest_factors(matrix, softening, factors: Factorisation, count: int) -> np.ndarray:
-    """The `count` lowest positive f with det(K - f S) = 0 for a definite K, whose `factors` these are; fewer if there are no more."""
+    """Return the `count` lowest positive f with det(K - f S) = 0, or all if fewer; `factors` of a positive definite K."""
     if matrix.shape[0] > DENSE:
         return LowestFactors(matrix, softening, factors)(count)
     values = linalg.eigh(softening.toarray(), matrix.toarray(), eigvals_only=True)

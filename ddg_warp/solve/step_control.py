@@ -1,4 +1,4 @@
-"""Steps that are as long as an error allows."""
+"""Time-step controller: step lengths from a local error tolerance."""
 
 import math
 from collections import Counter
@@ -17,39 +17,38 @@ from ddg_warp.solve.motion import poses_between
 from ddg_warp.threads import launches, stays_here
 
 HALVINGS = 4
-MOST_HALVINGS = 40  # beyond which a step is lost in the rounding of the time
-ROOM = 0.8  # of the error, that the estimate of a step twice as long has to leave
+MOST_HALVINGS = 40  # beyond this a step is lost in the rounding of the time
+ROOM = 0.8  # fraction of the tolerance that permits doubling the step
 
 
 @arguments.sealed
 @stays_here
 @launches
 class StepControl:
-    """Advances a state by steps that are halved while motion changes fast, and doubled while it is calm.
+    """Time-step controller for implicit Euler: halve or double steps by a local error estimate.
 
         steps = StepControl(Integrator(model), error=5e-3)
         while state.time < 2.0:
             state = steps.advance(state, 1 / 60)
 
-    Implicit Euler errs by -h^2/2 x'' in a step of length h, to second order (Hairer and Wanner, Solving Ordinary Differential
-    Equations II, 1996, IV.3), so positions go astray at the speed h |x''| / 2, half of what the step changes of the velocity. The
-    estimate is the root of the mean of its square over all mass, of nodes, in the world in which that is the largest. Lengths are
-    those halved again and again that keep it below `error`; all of one world go by one, whatever is in it. A step of a larger
-    estimate is not taken back: those that follow are shorter. So what falls freely errs by no more than `error`; where things hit
-    each other velocities change at once, by as much in short steps as in long ones, and steps are as short as they may be.
+    The local error of implicit Euler in a step of length h is -h^2/2 x'' (Hairer and Wanner, Solving Ordinary Differential Equations
+    II, 1996, IV.3). So the error rate of positions is h |x''| / 2, half the velocity change of the step. The estimate is its
+    mass-weighted root mean square over nodes, in the worst world. Step lengths are repeated halves of dt that keep it below `error`,
+    equal in all worlds. A step with a larger estimate is not repeated; the next ones are shorter. In free fall the error stays below
+    `error`. At impacts velocity jumps do not depend on the step length, so steps take the shortest length.
 
     Args:
-        integrator: what steps; its scheme is implicit Euler.
-        error: speed at which positions may go astray [m/s].
-        halvings: how many times the length that `advance` is given may be halved.
+        integrator: integrator with the scheme implicit Euler.
+        error: tolerated error rate of positions [m/s].
+        halvings: limit of halvings of the step length of `advance`.
 
     Attributes:
-        level: how many times the next step is halved, at first as often as it may be.
-        estimate: of the last step [m/s].
-        lengths: how many steps there were of each length [s].
+        level: number of halvings of the next step, at first the limit.
+        estimate: error estimate of the last step [m/s].
+        lengths: number of steps of each length [s].
 
     Raises:
-        SceneError: an argument is not what it should be, the scheme is another one, or nothing in the model has mass.
+        SceneError: an invalid argument, another scheme, or a model without mass.
     """
 
     def __init__(self, integrator: Integrator, error: float, halvings: int = HALVINGS):
@@ -71,13 +70,13 @@ class StepControl:
         """Return the state dt [s] later, by steps of dt / 2^k.
 
         Args:
-            state, controls: as of `Integrator.step`. Grips move evenly from where they are in the state to the poses of the controls,
-                and turn at a constant rate; loads, gravity and field are constant over dt, as in one step of it.
-            start: loads, gravity and field at the start, from which they go linearly to those of `controls`; what only one of both
-                gives is zero, or the gravity of the scene, in the other.
+            state, controls: as for `Integrator.step`. Grips move and rotate at constant rates from the state to the poses of the
+                controls; loads, gravity and field are constant over dt.
+            start: loads, gravity and field at the start, interpolated linearly to `controls`. Missing entries of either are zero, or
+                the gravity of the scene.
 
         Raises:
-            SolverError, SceneError: as of `Integrator.step`.
+            SolverError, SceneError: as for `Integrator.step`.
         """
         dt = arguments.positive("StepControl: dt", dt, "s")
         between = self._between(state, controls, start)
@@ -93,29 +92,29 @@ class StepControl:
         return state
 
     def _between(self, state: State, controls: Controls | None, start: Controls | None) -> Callable:
-        """Controls of a step by the part of dt at its end."""
+        """Return the controls of a step as a function of the end fraction of dt."""
         model = self.model
         validate.check_state("StepControl.advance", model, state)
-        end, begin = (checked(given, model, "StepControl.advance") for given in (controls, start))
+        end, begin = (checked(values, model, "StepControl.advance") for values in (controls, start))
         if "poses" in begin:
             raise SceneError("StepControl.advance: poses begin where the state has them; leave them out of start")
         usual = {"gravity": np.array(model.scene.gravity, float)[None]}
         ramps = {
-            name: [own.get(name, usual.get(name, 0.0)) for own in (begin, end)]
+            name: [inputs.get(name, usual.get(name, 0.0)) for inputs in (begin, end)]
             for name in ((begin | end).keys() - {"poses"} if begin else ())
         }
         poses = poses_between(state, end["poses"], 0.0, 1.0) if "poses" in end else None
 
         def at(part: float) -> Controls | None:
-            given = {name: (1.0 - part) * first + part * last for name, (first, last) in ramps.items()}
+            values = {name: (1.0 - part) * first + part * last for name, (first, last) in ramps.items()}
             if poses:
-                given["poses"] = poses(part)
-            return replace(controls or Controls(), **given) if given else controls
+                values["poses"] = poses(part)
+            return replace(controls or Controls(), **values) if values else controls
 
         return at
 
     def _judge(self) -> None:
-        """How long the next step is, by what the last one has changed."""
+        """Update the error estimate and the level of the next step."""
         if self.model.version != self._version:
             self._version, self._mass = self.model.version, self._changes.masses()
             if not (self._mass > 0.0).all():

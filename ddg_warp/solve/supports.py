@@ -1,4 +1,4 @@
-"""What static solves ask of the supports of a model."""
+"""Support requirements of static solves."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from ddg_warp.errors import SceneError
 
 
 def require_supports(model) -> None:
-    """Refuse a rod that can be shifted as a whole: no node of it holds some component. It may still turn."""
+    """Refuse structures that can translate rigidly: a component without a fixed dof. Rotations are allowed."""
     for group in model.groups:
         host, axes = group.host, "xz" if group.kind.dim == 2 else "xyz"
-        held = np.bitwise_or.reduce(host.fixed, axis=0)
+        fixed = np.bitwise_or.reduce(host.fixed, axis=0)
         for d, axis in enumerate(axes):
-            loose = np.flatnonzero((held >> d) & 1 == 0)
+            loose = np.flatnonzero((fixed >> d) & 1 == 0)
             if loose.size:
                 raise SceneError(
                     f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "

@@ -24,7 +24,7 @@ def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
 class Worlds:
     """Failure handling of the worlds of an integrator.
 
-    A failed world is inactive: it keeps the state before the step until reset. In watched worlds (`watch`) its state becomes NaN
+    A failed world is inactive: it keeps the state before the step until reset. In watched worlds (`watch`) the state becomes NaN
     instead.
 
     Attributes:

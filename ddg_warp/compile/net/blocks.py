@@ -1,4 +1,4 @@
-"""Compile a scene to the coupled system; nodes of joined rods and attached vertices are merged.
+"""Compilation of a scene to the coupled system, with merged nodes of joined rods and attached vertices.
 
 A scene of dimension 2 gives three-dimensional elements constrained to the plane.
 """
