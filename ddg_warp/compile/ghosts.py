@@ -36,9 +36,8 @@ class Ghosts:
                 if value is None:
                     continue
                 before = prescribed[support.rods, end]
-                conflicts = np.flatnonzero(
-                    np.abs(before - value).max(1) > 1e-12
-                )  # False for NaN, before the first clamp
+                # NaN before the first clamp compares false
+                conflicts = np.flatnonzero(np.abs(before - value).max(1) > 1e-12)
                 if conflicts.size:
                     raise SceneError(
                         f"the {support.end} end of rod {support.rods[conflicts[0]]} is clamped twice, with a {name} "
