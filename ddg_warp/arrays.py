@@ -87,7 +87,7 @@ def takers(count: int, device) -> int:
 
 
 def take_turns(kernel, count: int, inputs: list, outputs: list, device) -> None:
-    """Launch a grid-stride kernel over a device list with capacity for `count` items, of which few may be present.
+    """Launch a grid-stride kernel over a device list with capacity for `count` items.
 
     The first argument of the kernel is the number of threads, which is the stride of each thread.
     """
@@ -126,9 +126,9 @@ def side_by_side(launches: list[Callable[[], None]], device) -> None:
 
 
 class Reading:
-    """Repeated host reads of a small device array through one pinned buffer; allocation would cost more than the copy.
+    """Repeated host reads of a small device array through one pinned buffer.
 
-    For an array on the host the result is a view of the current values.
+    Allocation would cost more than the copy. For an array on the host the result is a view of the current values.
     """
 
     def __init__(self, array: wp.array):

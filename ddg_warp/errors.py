@@ -36,7 +36,7 @@ class SolverError(RuntimeError):
 
 
 def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
-    """Refuse options of a frozen dataclass that are not positive numbers, or not whole numbers of at least one.
+    """Refuse options of a frozen dataclass by rule: positive numbers, or whole numbers of at least one.
 
     Raises:
         SceneError: names the option.

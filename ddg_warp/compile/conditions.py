@@ -19,7 +19,7 @@ def scene_motions(scene) -> list:
 
 
 def pose_starts(motions: list) -> np.ndarray:
-    """Return the index of the first pose of every motion; a motion has one pose, or one for each node."""
+    """Return the index of the first pose of every motion. A motion has one pose, or one for each node."""
     return np.cumsum([0, *(motion.count or 1 for motion in motions)])
 
 

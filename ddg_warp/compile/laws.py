@@ -43,7 +43,7 @@ def _names(law, strains: int) -> list[str]:
 
 
 def _values(law, strains: int) -> np.ndarray:
-    """Return parameters p of a law: given, default or trial values; a lagged law also gets a last step."""
+    """Return parameters p of a law: given, default or trial values. A lagged law also gets a last step."""
     result, used = [], {}
     for parameter in law.density.parameters(strains):
         nth = used[parameter.family] = used.get(parameter.family, -1) + 1

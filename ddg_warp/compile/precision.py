@@ -98,12 +98,12 @@ def straight_turns(errors: np.ndarray) -> np.ndarray:
 
 
 def stiff(errors: np.ndarray) -> np.ndarray:
-    """Return the mask of rods with such errors at least STIFF times as stiff in stretch as in bending."""
+    """Return the mask of stiff rods by their errors: stretch at least STIFF times as stiff as bending."""
     return errors > float32_error(STIFF, 1.0)
 
 
 def rounding(model, s: float = np.inf) -> tuple[float, str]:
-    """Return the largest float32 error of a model over a step of s [s], or at rest, and the name of its rod or shell."""
+    """Return the largest float32 error over a step of s [s], or at rest, and the rod or shell with it."""
     worst = [(0.0, "")]
     for group in model.groups:
         errors = group.float32_errors(s)

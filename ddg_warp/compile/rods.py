@@ -207,7 +207,7 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
 
 
 def _bound(batch: RodBatch, term: Term, inputs: dict, on_edges, cells: HalfCells | None) -> dict[str, np.ndarray]:
-    """Return the parameters of a term by name, from the rod and its law: on edges, or at the vertices of `cells`."""
+    """Return the parameters of a term by name from rod and law, on edges or at the vertices of `cells`."""
 
     def along(family, value):
         return on_edges(value) if cells is None else cells.along(family, on_edges(value))

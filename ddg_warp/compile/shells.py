@@ -253,7 +253,7 @@ def shell_elements(
 
 
 def triangles_beside(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.ndarray]:
-    """Return, by term, the triangles that give bending elements at edges a mean stiffness: two of hinges, one of tilts."""
+    """Return, by term, the triangles that determine the stiffness of bending elements at edges. Hinges have two, tilts one."""
     hinges = surface.edge_triangles[_hinges(surface, kinds)[0]]
     if bending == "isometric":
         return {"shell_isometric": hinges}

@@ -16,7 +16,7 @@ FREE = -1  # pose index of a dof without prescribed motion
 
 @dataclass(frozen=True)
 class Along:
-    """Index map along rods: entry k of row r is `start[r] + step * k`, or the entry of `table` at that position."""
+    """Index map along rods: entry k of row r is `start[r] + step * k`, looked up in `table` if given."""
 
     start: np.ndarray
     step: int = 1
@@ -49,7 +49,7 @@ class RodPlaces:
 
     @cached_property
     def _row(self) -> np.ndarray:
-        """Row of each rod of the scene up to the last one of this storage, and of one more; -1 for rods of other storages."""
+        """Row of each rod of the scene, -1 for rods of other storages; up to one beyond the last row."""
         row = np.full(self.rods.max(initial=-1) + 2, -1)
         row[self.rods] = np.arange(len(self.rods))
         return row

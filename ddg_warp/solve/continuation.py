@@ -267,7 +267,7 @@ class Continuation:
             )
 
     def _next(self, path: Path, step: float, stop: Stop) -> tuple[Point, list[Point], str, float]:
-        """Return the next point of a path, the events before it, the bound of `stop` reached or "", and the step length."""
+        """Return (next point, events before it, bound of `stop` reached or "", step length)."""
         current, options = path.points[-1], self.options
         failed: object = f"rotation_cap, a step of {step:.2g} turns edges by all that it allows"
         while step >= options.min_step:

@@ -1,6 +1,6 @@
-"""Complete set of lowest eigenpairs of K x = lambda M x, by shift-invert Lanczos; the diagonal mass may be singular.
+"""Complete sets of lowest eigenpairs of K x = lambda M x, by shift-invert Lanczos.
 
-Massless dofs follow the others in equilibrium. Nothing is condensed: the inverse of K - s M, restricted to massive dofs, is that of the
+The diagonal mass M may be singular: massless dofs follow the others in equilibrium. Nothing is condensed: the inverse of K - s M, restricted to massive dofs, is that of the
 condensed matrix. The signs of the pivots of K - t M count the eigenvalues below the last one (Sylvester). If iteration has missed some,
 as it may in clusters, it restarts orthogonal to the eigenvectors so far (Ericsson and Ruhe, Math. Comp. 35, 1980; Grimes, Lewis and
 Simon, SIAM J. Matrix Anal. Appl. 15, 1994).
@@ -66,7 +66,7 @@ class Shifted:
             last, under = min(len(values) + missing, self.size - 1), bound
 
     def _missing(self, values: np.ndarray, count: int) -> tuple[int, float]:
-        """Return the number of missing eigenvalues up to the end of the cluster of the last one, and the counted bound."""
+        """Return (number of missing eigenvalues, counted bound), up to the end of the last cluster."""
         gaps = np.diff(values[count - 1 :]) / np.maximum(np.abs(values[count:]), 1e-300)
         wide_gaps = np.flatnonzero(gaps > GAP)
         if not wide_gaps.size:

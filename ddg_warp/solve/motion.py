@@ -16,7 +16,7 @@ from ddg_warp.model.state import State
 
 
 def poses(model, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
-    """Return poses of all motions between t0 and t1 (rows, 21), a fraction `part` of a step from `start` on; see `Motion.pose`.
+    """Return poses of all motions between t0 and t1 (rows, 21), over a fraction `part` of a step; see `Motion.pose`.
 
     Raises:
         SolverError: a motion is not finite, or leaves the plane of a planar scene; names the function and the time.
@@ -75,7 +75,7 @@ def turns_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> Callable:
-    """Return poses of grips (worlds, grips, 6) as a function of the load parameter, from the state at `start` to `ends` at `end`.
+    """Return poses of grips (worlds, grips, 6) as a function of the load parameter, from the state to `ends`.
 
     Raises:
         SolverError: as `turns_between`.
@@ -163,7 +163,7 @@ class Motion:
         self.pose, self.stride, self._timed, self._grip = source.pose, source.stride, False, None
 
     def resolve_grips(self, of_arcs: list) -> None:
-        """Compute substeps in the kernel of grips by arrays of `Arcs`, the last of them of the islands and the tally."""
+        """Compute substeps in the kernel of grips by arrays of `Arcs`; the last ones are islands and tally."""
         if self._grip:
             self._grip, self._of_arcs = motion.grip_kernel(self.model.types.real, True), of_arcs
 

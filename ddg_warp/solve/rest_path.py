@@ -48,7 +48,7 @@ class RestPath:
             )
 
     def _find(self, key, changes: Mapping) -> tuple[int | None, int | None]:
-        """Return the index of the shell or of the rod of a key; the changes decide for an index of both."""
+        """Return the index of the shell or rod of a key; changes decide if both exist."""
         scene = self.model.scene
         shells = [i for i, shell in enumerate(scene.shells) if key in (i, shell.name)]
         rods = [i for i, name in enumerate(self._rod_names()) if key == i or (name and key == name)]

@@ -122,9 +122,10 @@ class PartStep:
             self._set = limits
 
     def limits(self, s: float) -> dict[str, np.ndarray]:
-        """Return the limits of each island by name for a solve of length s [s]: largest edge rotation of a straight update [rad].
+        """Return the limits of islands by name for a solve of length s [s].
 
-        Limits of the last lengths are cached, since steps alternate between few. See `precision.straight_turns`.
+        The limit is the largest edge rotation of a straight update [rad], see `precision.straight_turns`. Limits of the last lengths
+        are cached, since steps alternate between few.
 
         Measured: 24 ms for 10,000 rods.
         """

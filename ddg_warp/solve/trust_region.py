@@ -137,7 +137,7 @@ class TrustRegion:
         return definite, solution
 
     def _factors(self, hessian, shift, islands):
-        """Yield rows and factors of the shifted matrix of all `islands` at once, or one by one if pivots are unreliable.
+        """Yield rows and factors of the shifted matrix, of all `islands` or, if unreliable, one by one.
 
         Islands with unreliable inertia are skipped.
         """

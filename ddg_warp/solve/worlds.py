@@ -111,7 +111,7 @@ class Worlds:
                 self._launch(blank, cube.shape, [self._failed, cube.shape[-1] // self.model.worlds], [cube])
 
     def take_over(self, mask: wp.array, source: State, target: State) -> None:
-        """Copy masked worlds of a state into another one; a state of one world goes into each of them."""
+        """Copy masked worlds of a state into another one. A state of one world goes into each of them."""
         for name, part in target.parts().items():
             self.take_part(mask, source.parts()[name], part, source.model.worlds)
 

@@ -1,4 +1,4 @@
-"""Rod-shell coupling: elements that tie the twist of a rod to the shell, at rod edges that are mesh edges.
+"""Rod-shell coupling: elements that tie the twist of a rod to the shell below, at common edges.
 
 The stiffness per length against rotation over the surface is
 

@@ -38,7 +38,7 @@ class Outwards:
     levels: list[np.ndarray]
 
     def ahead(self, closed: np.ndarray) -> np.ndarray:
-        """Return the next path node (P,): after the last the first of a closed rod, itself of an open one; `closed` (R,)."""
+        """Return the next path node (P,); the last one has the first of a closed rod, itself of an open one. `closed` (R,)."""
         first, end = self.start[:-1], self.start[1:] - 1
         following = np.arange(1, len(self.nodes) + 1)
         following[end] = np.where(closed, first, end)
