@@ -98,7 +98,7 @@ def straight_turns(errors: np.ndarray) -> np.ndarray:
 
 
 def stiff(errors: np.ndarray) -> np.ndarray:
-    """Return the mask of stiff rods by their errors: stretch at least STIFF times as stiff as bending."""
+    """Return the mask of stiff rods by float32 error: stretch at least STIFF times as stiff as bending."""
     return errors > float32_error(STIFF, 1.0)
 
 

@@ -1,9 +1,9 @@
 """Complete sets of lowest eigenpairs of K x = lambda M x, by shift-invert Lanczos.
 
-The diagonal mass M may be singular: massless dofs follow the others in equilibrium. Nothing is condensed: the inverse of K - s M, restricted to massive dofs, is that of the
-condensed matrix. The signs of the pivots of K - t M count the eigenvalues below the last one (Sylvester). If iteration has missed some,
-as it may in clusters, it restarts orthogonal to the eigenvectors so far (Ericsson and Ruhe, Math. Comp. 35, 1980; Grimes, Lewis and
-Simon, SIAM J. Matrix Anal. Appl. 15, 1994).
+The diagonal mass M may be singular: massless dofs follow the others in equilibrium. Nothing is condensed: the inverse of K - s M,
+restricted to massive dofs, is that of the condensed matrix. The signs of the pivots of K - t M count the eigenvalues below the last one
+(Sylvester). If iteration has missed some, as it may in clusters, it restarts orthogonal to the eigenvectors so far (Ericsson and Ruhe,
+Math. Comp. 35, 1980; Grimes, Lewis and Simon, SIAM J. Matrix Anal. Appl. 15, 1994).
 """
 
 import numpy as np
