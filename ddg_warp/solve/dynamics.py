@@ -80,7 +80,8 @@ class Integrator:
         whole: True if rods out of contact are solved in the coupled system regardless; see `step_whole`.
 
     Raises:
-        SceneError: a free node has neither mass nor drag along and across its rod, or the scheme is unknown, or has no bound.
+        SceneError: a free node has neither mass nor drag along and across its rod; the scheme is unknown, or implicit Euler has an
+            energy bound.
     """
 
     def __init__(
