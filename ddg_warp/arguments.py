@@ -375,3 +375,15 @@ def _refusal(error, text: str):
 
 
 PRESCRIBED = "prescribed"  # outcome of a solve with a nonfinite prescribed motion or amplitude
+
+
+def check_options(options, positives: tuple[str, ...], counts: tuple[str, ...]) -> None:
+    """Refuse options of a frozen dataclass by rule: positive numbers, or whole numbers of at least one.
+
+    Raises:
+        SceneError: names the option.
+    """
+    for name in positives:
+        object.__setattr__(options, name, positive(name, getattr(options, name)))
+    for name in counts:
+        count(name, getattr(options, name), 1, 2**31 - 1)

@@ -33,17 +33,3 @@ class SolverError(RuntimeError):
         self.outcome = outcome
         self.rods = tuple(rods)
         self.gaining = gaining
-
-
-def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
-    """Refuse options of a frozen dataclass by rule: positive numbers, or whole numbers of at least one.
-
-    Raises:
-        SceneError: names the option.
-    """
-    from ddg_warp import arguments
-
-    for name in positive:
-        object.__setattr__(options, name, arguments.positive(name, getattr(options, name)))
-    for name in counts:
-        arguments.count(name, getattr(options, name), 1, 2**31 - 1)

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.model import validate
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import check_state
 from ddg_warp.threads import launches
 
 POINT_FIELDS = {
@@ -88,8 +89,8 @@ def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 def _check(call: str, model, state, names, allowed) -> None:
     """Refuse arguments that are no model, no state of the model, or no field name."""
-    validate.check_model(call, model)
-    validate.check_state(call, model, state)
+    check_model(call, model)
+    check_state(call, model, state)
     for name in check_fields(names):
         arguments.choice(call, name, allowed)
 

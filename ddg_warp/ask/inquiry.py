@@ -9,7 +9,8 @@ from ddg_warp import arguments, arrays
 from ddg_warp.ask import end_moments
 from ddg_warp.compile.storage import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
-from ddg_warp.model import validate
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import check_state
 from ddg_warp.solve.drag import ChainDrag, NetDrag
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
@@ -149,8 +150,8 @@ def drag(model, state) -> Drag:
 
 def _check(call: str, model, state) -> None:
     """Refuse arguments that are no model, or no state of the model."""
-    validate.check_model(call, model)
-    validate.check_state(call, model, state)
+    check_model(call, model)
+    check_state(call, model, state)
 
 
 def _each_world(values: np.ndarray) -> np.ndarray:

@@ -21,7 +21,8 @@ from ddg_warp import arguments
 from ddg_warp.ask.inquiry import group_strains
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.densities.quadratic import quadratic
-from ddg_warp.model import validate
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import check_state
 from ddg_warp.solve.direct import Factorisation, shortest
 from ddg_warp.solve.rigid import rigid_modes
 from ddg_warp.solve.stability import lowest_factors
@@ -53,9 +54,9 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
         SceneError: a rod is closed, joined, glued or magnetised, has no twist in space, or a law that is not quadratic. Or there are
             shells, the model is in float32, or the loads of a rod cannot be balanced.
     """
-    validate.check_model("rest_strains", model)
+    check_model("rest_strains", model)
     if state is not None:
-        validate.check_state("rest_strains", model, state)
+        check_state("rest_strains", model, state)
     state, load = state or model.state(), arguments.number("rest_strains: load", load)
     _refuse("rest_strains", model)
     tangent, result = Tangent(model), {}
@@ -88,8 +89,8 @@ def least_stiffness(model, state) -> np.ndarray:
     """
     from scipy import sparse
 
-    validate.check_model("least_stiffness", model)
-    validate.check_state("least_stiffness", model, state)
+    check_model("least_stiffness", model)
+    check_state("least_stiffness", model, state)
     _refuse("least_stiffness", model)
     tangent, result = Tangent(model), np.zeros((model.worlds, model.scene.rod_count))
     forces = [_Elements.of(part, state).forces for part in tangent.parts]

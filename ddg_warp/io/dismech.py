@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ddg_warp.io import CurveError, CurveSet, checked_curves, existing, shown
+from ddg_warp.io.curves import CurveSet, checked_curves
+from ddg_warp.io.paths import CurveError, existing, shown
 
 COLUMNS = {"nodes": (3, float), "edges": (2, int), "triangles": (3, int)}
 ALIASES = {"rodnodes": "nodes", "rodedges": "edges", "shelltriangles": "triangles"}

@@ -36,7 +36,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddg_warp.io import Shapes, existing
 from ddg_warp.io.contacts import Contacts
 from ddg_warp.io.hdf5_read import (
     COUNTS,
@@ -60,6 +59,8 @@ from ddg_warp.io.hdf5_write import (
 )
 from ddg_warp.io.journal import recover, transaction
 from ddg_warp.io.observed import checked_observed
+from ddg_warp.io.paths import existing
+from ddg_warp.io.shapes import Shapes
 from ddg_warp.io.vtkhdf import write_view
 
 __all__ = ["TrajectoryError", "TrajectoryReader", "TrajectoryWriter", "read_rods"]

@@ -13,11 +13,13 @@ import h5py
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.io import CurveError, Curves, CurveSet, Surfaces, checked_curves, existing
 from ddg_warp.io.contacts import FIELDS as PAIR_FIELDS
 from ddg_warp.io.contacts import Contacts, Touching
+from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.journal import TrajectoryError, open_to_read
 from ddg_warp.io.obstacles import Obstacles
+from ddg_warp.io.paths import CurveError, existing
+from ddg_warp.io.shapes import Curves, Surfaces
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness")

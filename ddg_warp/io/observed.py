@@ -7,7 +7,7 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.io import CurveError
+from ddg_warp.io.paths import CurveError
 
 
 def checked_observed(observed, names=None) -> dict[str, float]:

@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.io import CurveError, Curves, Shapes, Surfaces
+from ddg_warp.io.paths import CurveError
+from ddg_warp.io.shapes import Curves, Shapes, Surfaces
 
 
 class Revolution:

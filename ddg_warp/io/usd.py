@@ -20,10 +20,11 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom, Vt
 
 from ddg_warp import arguments
-from ddg_warp.io import CurveError, Curves, Shapes
 from ddg_warp.io.colors import PALETTE
 from ddg_warp.io.contacts import Contacts, Touching
 from ddg_warp.io.obstacles import Obstacles
+from ddg_warp.io.paths import CurveError
+from ddg_warp.io.shapes import Curves, Shapes
 from ddg_warp.io.usd_check import validate
 from ddg_warp.io.usd_contact import ContactsPrim, ObstaclePrim
 from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim

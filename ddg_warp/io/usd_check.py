@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ddg_warp.io import CurveError, MissingFileError, existing
+from ddg_warp.io.paths import CurveError, MissingFileError, existing
 from ddg_warp.io.usd_read import opened
 
 EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32

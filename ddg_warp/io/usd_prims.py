@@ -11,9 +11,9 @@ from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.operators import vertex_normals
-from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.colors import on_scale
 from ddg_warp.io.contacts import Contacts
+from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd_materials import bind_preview_surface
 

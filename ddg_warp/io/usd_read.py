@@ -20,8 +20,10 @@ from pxr import Ar, Sdf, Tf, Usd, UsdGeom
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneWarning
-from ddg_warp.io import CurveError, CurveSet, MeshError, checked_curves, cubic, existing
-from ddg_warp.io.mesh_read import triangulated
+from ddg_warp.io import cubic
+from ddg_warp.io.curves import CurveSet, checked_curves
+from ddg_warp.io.faces import triangulated
+from ddg_warp.io.paths import CurveError, MeshError, existing
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 LISTED = 5  # prims in a message

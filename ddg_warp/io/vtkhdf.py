@@ -14,7 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     import h5py
 
-    from ddg_warp.io import Shapes
+    from ddg_warp.io.shapes import Shapes
 
 VERSION = (2, 0)
 CELL_KINDS = ("Vertices", "Lines", "Polygons", "Strips")

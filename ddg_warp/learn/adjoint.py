@@ -18,10 +18,9 @@ import warp as wp
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.learn.chains import ChainAdjoint, Kept
 from ddg_warp.learn.net import NetAdjoint, NetKept
-from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.net import NetState
-from ddg_warp.model.state import State
+from ddg_warp.model.state import State, check_state
 from ddg_warp.threads import launches, stays_here
 
 
@@ -96,7 +95,7 @@ class Adjoint:
         Raises:
             SolverError: a failed solve split the step, frames were updated during the step, or the solution is no minimum.
         """
-        validate.check_state("pull", self.model, cotangent)
+        check_state("pull", self.model, cotangent)
         self.upload(tape.before.time, tape.dt)
         ends = tape.before, tape.after
         for adjoint, kept, part in zip(self.parts, tape.parts, self.integrator._parts, strict=True):
@@ -199,8 +198,8 @@ class EquilibriumAdjoint:
             SolverError: the tangent of the equilibrium is singular (a limit point, a bifurcation).
             SceneError: there is friction, and the state has no load history (`State.sliding`).
         """
-        validate.check_state("pull", self.model, state)
-        validate.check_state("pull", self.model, cotangent)
+        check_state("pull", self.model, state)
+        check_state("pull", self.model, cotangent)
         control_values, inputs = checked(controls, self.model, "pull"), []
         for own in self.parts:
             own.solve.tangent.give(control_values)

@@ -26,8 +26,8 @@ except ModuleNotFoundError as error:
 
 from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError
-from ddg_warp.io import as_path, is_file
 from ddg_warp.io.hdf5_read import TrajectoryReader
+from ddg_warp.io.paths import as_path, is_file
 from ddg_warp.learn.episodes import INDEX, Episodes, inside
 from ddg_warp.learn.splits import SPLITS
 from ddg_warp.run.run_directory import TRAJECTORY

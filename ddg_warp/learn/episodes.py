@@ -23,7 +23,7 @@ from pathlib import Path
 
 from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError, SolverError
-from ddg_warp.io import as_path, is_file
+from ddg_warp.io.paths import as_path, is_file
 from ddg_warp.learn.ranges import storable
 from ddg_warp.learn.splits import FRACTIONS, SPLITS, checked_fractions, split_of
 from ddg_warp.run.run_directory import LOCK, TRAJECTORY, lock_directory

@@ -28,7 +28,7 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import DataError, SceneError
 from ddg_warp.geometry.polyline import cross, directors, length, unit
-from ddg_warp.io import as_path, is_file
+from ddg_warp.io.paths import as_path, is_file
 from ddg_warp.learn import plain_pickle
 from ddg_warp.learn.episodes import inside
 

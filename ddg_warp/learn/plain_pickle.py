@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ddg_warp.errors import DataError
-from ddg_warp.io import as_path, is_file
+from ddg_warp.io.paths import as_path, is_file
 
 KINDS = "biufc"  # truth values, whole numbers, real and complex ones
 DEEPEST = 64  # lists in lists; arrays have as many axes at most

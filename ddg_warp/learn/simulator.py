@@ -16,8 +16,9 @@ from ddg_warp.learn.layout import copies, tensors
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.learn.world_state import WorldState, outcome_names
-from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, require_acting, shapes
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import check_state
 from ddg_warp.solve import statics
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.dynamics import SCHEMES, Integrator
@@ -59,7 +60,7 @@ class Simulator(torch.nn.Module):
 
     def __init__(self, model, dt: float, *, scheme: str = "implicit_euler", **options):
         super().__init__()
-        validate.check_model("Simulator", model)
+        check_model("Simulator", model)
         arguments.choice("scheme", scheme, SCHEMES)
         self.dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         for name in SETTLED & options.keys():
@@ -133,7 +134,7 @@ class Simulator(torch.nn.Module):
         """
         if isinstance(state, WorldState):
             return self._bound(state)
-        validate.check_state("world_state", self.model, state)
+        check_state("world_state", self.model, state)
         if "gyroscopic" not in self.options:
             refuse_gyroscopic("world_state", state.spun)
         engine = self.engine(self.model.worlds)

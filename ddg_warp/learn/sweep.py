@@ -25,7 +25,7 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.ask.fields import check_fields
 from ddg_warp.errors import DataError, SceneError, SolverError
-from ddg_warp.io import as_path
+from ddg_warp.io.paths import as_path
 from ddg_warp.learn.episodes import DONE, Episodes, EpisodeWriter
 from ddg_warp.learn.ranges import GROWING, KINDS, MOST, Range, check_kind, check_names, draw, seed_of
 from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray

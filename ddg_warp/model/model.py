@@ -11,16 +11,16 @@ from ddg_warp.compile.chains import compile_chains
 from ddg_warp.compile.conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
 from ddg_warp.errors import SceneError
-from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.contacts import Touching
 from ddg_warp.io.obstacles import Obstacles
+from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.kernels import element, step
-from ddg_warp.model import glue, validate
+from ddg_warp.model import glue
 from ddg_warp.model.group import Group
 from ddg_warp.model.order import Order
 from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.model.recipe import Recipe
-from ddg_warp.model.state import GripState, GroupState, State
+from ddg_warp.model.state import GripState, GroupState, State, check_state
 from ddg_warp.scene.grip import Grip
 from ddg_warp.threads import launches, one_at_a_time
 
@@ -159,7 +159,7 @@ class Model:
         """Return energies by term at a state [J]; see `ddg_warp.ask.inquiry`."""
         from ddg_warp.ask.inquiry import energies
 
-        validate.check_state("energies", self, state)
+        check_state("energies", self, state)
         return energies(self, state)
 
     @one_at_a_time
@@ -167,7 +167,7 @@ class Model:
         """Return forces and moments of the supports; see `ddg_warp.ask.inquiry.reactions`."""
         from ddg_warp.ask.inquiry import reactions
 
-        validate.check_state("reactions", self, state)
+        check_state("reactions", self, state)
         return reactions(self, state, **options)
 
     @one_at_a_time
@@ -175,7 +175,7 @@ class Model:
         """Return forces and power of the drag on rods; see `ddg_warp.ask.inquiry.drag`."""
         from ddg_warp.ask.inquiry import drag
 
-        validate.check_state("drag", self, state)
+        check_state("drag", self, state)
         return drag(self, state)
 
     @one_at_a_time
@@ -183,7 +183,7 @@ class Model:
         """Return a state without overlaps and the largest node displacement [m]; see `ask.pushed_apart`."""
         from ddg_warp.ask.pushed_apart import pushed_apart
 
-        validate.check_state("pushed_apart", self, state)
+        check_state("pushed_apart", self, state)
         return pushed_apart(self, state, gap)
 
     @one_at_a_time
@@ -191,7 +191,7 @@ class Model:
         """Return the contact pairs of a state, an `io.contacts.Contacts`; see `ask.contacts`."""
         from ddg_warp.ask.contacts import contacts
 
-        validate.check_state("contacts", self, state)
+        check_state("contacts", self, state)
         return contacts(self, state)
 
     @one_at_a_time
@@ -199,7 +199,7 @@ class Model:
         """Return conjugate stresses of rods and shells by term; see `ddg_warp.ask.inquiry.stresses`."""
         from ddg_warp.ask.inquiry import stresses
 
-        validate.check_state("stresses", self, state)
+        check_state("stresses", self, state)
         return stresses(self, state)
 
     def set_parameter(self, term: str, parameter: str, values) -> None:
@@ -466,3 +466,9 @@ def needs_net(scene) -> bool:
     """Return True if a scene has more than uncoupled rods."""
     parts = scene.shells, scene.joints, scene.attachments, scene.magnets, scene.axisymmetric_shells, scene.touching
     return any(map(bool, parts))
+
+
+def check_model(call: str, model) -> None:
+    """Raise SceneError if an argument is no model."""
+    if not isinstance(model, Model):
+        raise SceneError(f"{call}: the model is {type(model).__name__}; give what scene.build() returns")

@@ -7,8 +7,8 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.compile import axisymmetric
-from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.obstacles import Obstacles
+from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.model.group import Group
 from ddg_warp.scene.material import DRAWN
 

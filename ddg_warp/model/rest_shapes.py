@@ -14,7 +14,7 @@ from ddg_warp import arguments
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.geometry import shell_forms
 from ddg_warp.geometry.surface import DEGENERATE, Surface
-from ddg_warp.model import validate
+from ddg_warp.model.model import check_model
 
 
 def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
@@ -100,7 +100,7 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
 
 def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
     """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
-    validate.check_model("set_rest", model)
+    check_model("set_rest", model)
     if model.net is None or not 0 <= arguments.index("set_rest: shell", shell) < len(model.net.host.shells):
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
@@ -150,7 +150,7 @@ def set_rest_strains(model, strains: dict) -> None:
         ValueError: no uncoupled rod has such a rest strain, or coupled rods have it too; values do not fit or are not finite.
             Nothing is changed then.
     """
-    validate.check_model("set_rest_strains", model)
+    check_model("set_rest_strains", model)
     uncoupled = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
     coupled = {part.term.name for part in model.net.sets} if model.net is not None else set()
     allowed, updates = sorted(name for name in uncoupled if name.partition(".")[0] not in coupled), []

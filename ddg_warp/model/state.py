@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arguments, arrays
+from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.threads import launches
 
@@ -249,3 +250,13 @@ class State:
         spun = {"spun": np.bool_(True)} if self.spun else {}
         values = {name: arrays.download(array) for name, array in self.arrays().items()}
         return {"time": np.float64(self.time)} | spun | values
+
+
+def check_state(call: str, model, state) -> None:
+    """Raise SceneError if an argument is no state of the model."""
+    if not isinstance(state, State):
+        raise SceneError(
+            f"{call}: the state is {arguments.shown(state)}; give one of this model, such as model.state()"
+        )
+    if state.model is not model:
+        raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")

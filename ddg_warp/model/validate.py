@@ -1,32 +1,11 @@
-"""Checks of model and state arguments, and of models for time stepping."""
+"""Checks of models for time stepping."""
 
 import numpy as np
 
-from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import drag
 
 CARRIED = 1e-40  # smallest magnitude that float32, in its subnormal range, keeps to four digits
-
-
-def check_model(call: str, model) -> None:
-    """Raise SceneError if an argument is no model."""
-    from ddg_warp.model.model import Model
-
-    if not isinstance(model, Model):
-        raise SceneError(f"{call}: the model is {type(model).__name__}; give what scene.build() returns")
-
-
-def check_state(call: str, model, state) -> None:
-    """Raise SceneError if an argument is no state of the model."""
-    from ddg_warp.model.state import State
-
-    if not isinstance(state, State):
-        raise SceneError(
-            f"{call}: the state is {arguments.shown(state)}; give one of this model, such as model.state()"
-        )
-    if state.model is not model:
-        raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")
 
 
 def refuse_underflow(model) -> None:

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from ddg_warp.io import Shapes
 from ddg_warp.io.colors import SCALE
+from ddg_warp.io.shapes import Shapes
 
 DPI = 160
 FLAT = 1e-3  # largest thickness over size of flat shapes

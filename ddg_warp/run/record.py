@@ -9,9 +9,9 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
 from ddg_warp.errors import SceneError
-from ddg_warp.io import Shapes
 from ddg_warp.io.contacts import Contacts
 from ddg_warp.io.observed import checked_attributes, checked_notes, checked_observed
+from ddg_warp.io.shapes import Shapes
 from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, VIEW, RecordError, RunDirectory, refuse_to_replace, told
 
 DEFAULT_FPS = 24.0

@@ -21,8 +21,7 @@ from scipy.optimize import brentq
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.model import validate
-from ddg_warp.model.state import State
+from ddg_warp.model.state import State, check_state
 from ddg_warp.scene.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
 from ddg_warp.solve.corrector import ContinuationOptions, Corrector, Failed
 from ddg_warp.threads import launches, stays_here
@@ -92,7 +91,7 @@ class Continuation:
     def _start(self, state: State | None, start: float) -> Point:
         """Return the first point of a path, near `state`."""
         if state is not None:
-            validate.check_state("continuation", self.model, state)
+            check_state("continuation", self.model, state)
         return self.corrector.start(state or self.model.state(), arguments.number("continuation: start", start))
 
     def _stop(self, stop: Stop | None) -> Stop:

@@ -14,8 +14,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ddg_warp import arguments
-from ddg_warp.errors import SceneError, SolverError, check_options
-from ddg_warp.model import validate
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State
 from ddg_warp.scene.path import REGULAR, Displacement, Point
 from ddg_warp.solve import stability
@@ -53,7 +53,7 @@ class ContinuationOptions:
     def __post_init__(self):
         positive = ("step", "max_step", "min_step", "rotation_cap", "tolerance", "rtol", "floor_factor")
         scaled = () if self.load_scale is None else ("load_scale",)
-        check_options(self, positive + scaled, ("iterations", "max_iterations"))
+        arguments.check_options(self, positive + scaled, ("iterations", "max_iterations"))
         for name in ("step", "max_step"):
             if getattr(self, name) < self.min_step:
                 raise SceneError(
@@ -82,7 +82,7 @@ class Corrector:
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement], options: ContinuationOptions):
-        validate.check_model("continuation", model)
+        check_model("continuation", model)
         if model.worlds != 1:
             raise SceneError(f"a path is followed in one world; the model has {model.worlds}")
         self.options = options

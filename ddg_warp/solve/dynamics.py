@@ -10,7 +10,8 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
-from ddg_warp.model.state import State
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import State, check_state
 from ddg_warp.solve import energy
 from ddg_warp.solve.buffers import Buffer
 from ddg_warp.solve.chains.newton import NewtonOptions
@@ -98,7 +99,7 @@ class Integrator:
         gyroscopic: bool | None = None,
         **options,
     ):
-        validate.check_model("Integrator", model)
+        check_model("Integrator", model)
         arguments.choice("scheme", scheme, SCHEMES)
         arguments.choice("solver", solver, SOLVERS)
         if model.net is None and linear in NET_ONLY:
@@ -151,7 +152,7 @@ class Integrator:
             SceneError: controls do not fit the model, or a shell has a curved membrane.
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
-        validate.check_state("step", self.model, state)
+        check_state("step", self.model, state)
         inputs = checked(controls, self.model)
         source = self._own(state)
         self._vacate(1 - source)
@@ -185,7 +186,7 @@ class Integrator:
 
     def resists(self, state: State) -> bool:
         """Return True if a step from a state has gyroscopic couples; see `gyroscopic`."""
-        validate.check_state("resists", self.model, state)
+        check_state("resists", self.model, state)
         return state.spun if self.gyroscopic is None else self.gyroscopic
 
     def _spin(self, wanted: bool) -> None:
@@ -242,7 +243,7 @@ class Integrator:
         Raises:
             SolverError: a rod has been given up, and failures are not flagged.
         """
-        validate.check_state("check", self.model, state)
+        check_state("check", self.model, state)
         self._steps_since_check = 0
         for part in self._parts if self.failures == "raise" else ():
             part.raise_failures(state)
@@ -260,7 +261,7 @@ class Integrator:
             state: last state of the world.
             world: index.
         """
-        validate.check_state("failure", self.model, state)
+        check_state("failure", self.model, state)
         if not 0 <= arguments.index("world", world) < self.model.worlds:
             raise SceneError(f"world {world} does not exist; the model has {self.model.worlds}")
         return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
@@ -280,7 +281,7 @@ class Integrator:
         Raises:
             SceneError: the mask or the state does not fit, or a `Motion` has moved supports by the time of the state.
         """
-        validate.check_state("reset", self.model, state)
+        check_state("reset", self.model, state)
         mask = self._worlds.mask(mask)
         to_initial = to is None
         if to_initial and self._first[0] != self.model.version:

@@ -12,7 +12,8 @@ from scipy.sparse.linalg import LinearOperator, eigs, splu
 from ddg_warp import arguments
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
-from ddg_warp.model import validate
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import check_state
 from ddg_warp.solve.direct import Factorisation, SingularError, pinned, regular
 from ddg_warp.solve.lowest import Lowest, LowestFactors, dense
 from ddg_warp.solve.rigid import rigid_modes
@@ -78,8 +79,8 @@ def spectrum(
         SceneError: metric "mass" of a model without masses, or an invalid metric or count.
         SolverError: float32 would lose the softest modes in rounding.
     """
-    validate.check_model("spectrum", model)
-    validate.check_state("spectrum", model, state)
+    check_model("spectrum", model)
+    check_state("spectrum", model, state)
     arguments.count("spectrum: count", count)
     arguments.choice("spectrum: metric", metric, ("mass", "unit"))
     if tangent is not None and not isinstance(tangent, Tangent):
@@ -327,9 +328,9 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
     Raises:
         ValueError: the first equilibrium is unstable, follower loads are not conservative, or no positive factor exists.
     """
-    validate.check_model("buckling", model)
+    check_model("buckling", model)
     for state in (free, loaded):
-        validate.check_state("buckling", model, state)
+        check_state("buckling", model, state)
     arguments.count("buckling: count", count)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)

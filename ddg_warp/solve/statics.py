@@ -22,10 +22,11 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.compile.precision import lost_in_rounding
-from ddg_warp.errors import SceneError, SolverError, check_options
+from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
-from ddg_warp.model.state import State
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import State, check_state
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve import mixed, remedies, stability
 from ddg_warp.solve.choice import large_static, static_solver, why_not_pcg
@@ -74,7 +75,7 @@ class StaticsOptions:
     solver: str = "auto"
 
     def __post_init__(self):
-        check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
+        arguments.check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
         arguments.choice("statics: mode", self.mode, ("minimise", "follow"))
         arguments.choice("statics: solver", self.solver, SOLVERS)
         if self.solver == "pcg" and self.mode == "follow":
@@ -126,9 +127,9 @@ def solve(
         SceneError: rods without supports, or controls that do not fit the model. In contact: surfaces overlap at the start, the mode or
             solver does not support contact, or there is friction without a load increment.
     """
-    validate.check_model("statics", model)
+    check_model("statics", model)
     if state is not None:
-        validate.check_state("statics", model, state)
+        check_state("statics", model, state)
     options = arguments.options("statics.solve", StaticsOptions, options, arguments.names(solve))
     equilibrium = Equilibrium(model, options)
     return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)

@@ -9,9 +9,8 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
-from ddg_warp.model.state import State
+from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.dynamics import Integrator
 from ddg_warp.solve.motion import poses_between
 from ddg_warp.threads import launches, stays_here
@@ -94,7 +93,7 @@ class StepControl:
     def _between(self, state: State, controls: Controls | None, start: Controls | None) -> Callable:
         """Return the controls of a step as a function of the end fraction of dt."""
         model = self.model
-        validate.check_state("StepControl.advance", model, state)
+        check_state("StepControl.advance", model, state)
         end, begin = (checked(values, model, "StepControl.advance") for values in (controls, start))
         if "poses" in begin:
             raise SceneError("StepControl.advance: poses begin where the state has them; leave them out of start")

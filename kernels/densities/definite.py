@@ -4,11 +4,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.densities import Density
-
 
 @cache
-def root_function(density: Density, real, n: int):
+def root_function(density, real, n: int):
     """root(e, p, shift) of a law; see `Density.functions`. Negative curvature, or eigenvalues of it, are left out."""
     _, _, curvature = density.laws(real, n)
     E, M3 = wp.types.vector(n, real), wp.types.matrix((3, 3), real)

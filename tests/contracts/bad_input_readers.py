@@ -10,9 +10,11 @@ import numpy as np
 from bad_inputs import INF, NAN, each, refuse
 
 from ddg_warp.geometry import meshes
-from ddg_warp.io import Curves, checked_curves, existing, read
+from ddg_warp.io import Curves, read
+from ddg_warp.io.curves import checked_curves
 from ddg_warp.io.dismech import read_rods as read_text
 from ddg_warp.io.mesh_read import read_mesh
+from ddg_warp.io.paths import existing
 from ddg_warp.io.revolve import Revolution
 from ddg_warp.io.usd import read_curves, validate
 from ddg_warp.io.usd_prims import ColorBy

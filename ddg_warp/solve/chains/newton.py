@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from ddg_warp import arguments, arrays
-from ddg_warp.errors import SceneError, check_options
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels import balance, chain, evaluate, foresight, search, step
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix import geometric
@@ -62,7 +62,9 @@ class NewtonOptions:
 
     def __post_init__(self):
         arguments.part("outliers", self.outliers)
-        check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
+        arguments.check_options(
+            self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings")
+        )
         if self.psd not in PSD_MODES:
             raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")
 
