@@ -1,4 +1,4 @@
-"""The commands: what they write, how they end, and what they say to a mistake."""
+"""Commands: written files, exit codes, and messages about mistakes."""
 
 import json
 import os
@@ -60,7 +60,7 @@ SUMMARY = (
 
 @pytest.fixture
 def fall(tmp_path, monkeypatch, device):
-    """Runs a command on the falling rod, in a directory of its own."""
+    """Return a runner of commands on the falling rod, in a temporary directory."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fall.py").write_text(SCENE)
     return lambda command, *flags: main([command, "fall.py", *flags, "--device", device])
@@ -112,7 +112,7 @@ def test_failed_check_fails_the_run(fall):
     assert summary()["checks"][0]["passed"] is False
 
 
-def test_failed_solver_keeps_what_is_complete(fall, monkeypatch, capsys):
+def test_failed_solver_keeps_complete_frames(fall, monkeypatch, capsys):
     from ddg_warp.solve.dynamics import Integrator
 
     step = Integrator.step
@@ -140,8 +140,8 @@ def test_resumed_equals_straight(fall):
     assert summary("parts")["steps"] == 10
 
 
-def test_resumed_runs_end_where_they_were_to_end(fall, monkeypatch):
-    """The duration given to a run that was killed holds when it is resumed, and another one for the next time."""
+def test_resumed_runs_end_at_the_requested_duration(fall, monkeypatch):
+    """The duration of a killed run applies when resumed; a new duration applies to later resumes."""
     from ddg_warp.run.record import Recorder
 
     record = Recorder.record
@@ -162,12 +162,12 @@ def test_resumed_runs_end_where_they_were_to_end(fall, monkeypatch):
     assert len(points("o")) == 5
 
 
-def test_a_run_is_kept_unless_forced(fall, capsys):
-    """A second run of the same name: the message says how to replace the first and how to keep it."""
+def test_existing_run_is_replaced_only_by_force(fall, capsys):
+    """A second run of the same name is refused; the message says how to replace and how to keep the first."""
     assert fall("run", "--duration", "0.02") == 0
     assert fall("run") == 2
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert all(word in told for word in ("out/fall holds 3 frames", "--force", "--out", "--resume"))
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert all(word in message for word in ("out/fall holds 3 frames", "--force", "--out", "--resume"))
     assert len(points("out/fall")) == 3
     assert fall("run", "--force") == 0
     assert len(points("out/fall")) == 6
@@ -178,8 +178,8 @@ def without_clocks(directory) -> dict:
     return {name: value for name, value in summary(directory).items() if name not in clocks}
 
 
-def test_the_summary_of_a_resumed_run_is_of_the_whole(fall):
-    """Every number but those of clocks is that of the run in one piece."""
+def test_resumed_summary_covers_the_whole_run(fall):
+    """All numbers but measured times equal an uninterrupted run."""
     assert fall("run", "--out", "straight") == 0
     assert fall("run", "--out", "parts", "--duration", "0.02") == 0
     assert fall("run", "--resume", "parts", "--duration", "0.05") == 0
@@ -187,7 +187,7 @@ def test_the_summary_of_a_resumed_run_is_of_the_whole(fall):
 
 
 def test_a_finished_run_is_left_as_it_is(fall, tmp_path, capsys):
-    """It says so and how to go on; a duration that would cut the run changes nothing either."""
+    """The message names the state and how to continue; a shorter duration changes nothing."""
     assert fall("run", "--duration", "0.03") == 0
     before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in (tmp_path / "out/fall").iterdir()}
     capsys.readouterr()
@@ -204,7 +204,7 @@ def test_a_finished_run_is_left_as_it_is(fall, tmp_path, capsys):
 
 
 def test_a_run_killed_before_its_summary_gets_one(fall, tmp_path, monkeypatch):
-    """Its frames are complete: resumed, it is judged, summarised and drawn, and no step is taken."""
+    """All frames are complete: the resumed run is checked, summarised and drawn without a step."""
     import ddg_warp.run.cli
 
     def killed(*_):
@@ -220,8 +220,8 @@ def test_a_run_killed_before_its_summary_gets_one(fall, tmp_path, monkeypatch):
     assert (tmp_path / "out/fall/picture.png").exists()
 
 
-def test_a_run_is_alone_until_it_is_drawn(fall, tmp_path, monkeypatch, capsys):
-    """Another one with --force, while the first draws, is refused, and the first ends well."""
+def test_run_is_locked_until_it_is_drawn(fall, tmp_path, monkeypatch, capsys):
+    """A second run with --force during drawing is refused, and the first ends well."""
     import ddg_warp.run.cli
 
     draw, codes = ddg_warp.run.cli.draw, []
@@ -238,8 +238,8 @@ def test_a_run_is_alone_until_it_is_drawn(fall, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "out/fall/run.lock").exists()
 
 
-def test_force_leaves_nothing_of_the_run_before(fall, tmp_path, monkeypatch):
-    """Killed meanwhile, the new run has no summary and no picture of the old one beside it."""
+def test_force_removes_files_of_the_previous_run(fall, tmp_path, monkeypatch):
+    """A killed new run leaves no summary and no picture of the previous one."""
     import ddg_warp.run.simulate
 
     assert fall("run") == 0
@@ -267,7 +267,7 @@ def test_pictures_and_summary_do_not_follow_links(fall, tmp_path):
 
 
 def test_a_cache_that_cannot_be_written_to_is_named(fall, monkeypatch, capsys):
-    """With what helps: another place for the compiled kernels."""
+    """The message proposes another directory for compiled kernels."""
     import ddg_warp.run.cli
 
     def read_only(_):
@@ -282,13 +282,18 @@ def test_a_cache_that_cannot_be_written_to_is_named(fall, monkeypatch, capsys):
     )
 
 
-@pytest.mark.parametrize("place", ["/proc/x.usda", "file/x.usda", "{}/x.usda".format("a" * 300)])
-def test_a_place_that_cannot_be_written_to_is_named(place, fall, tmp_path, capsys):
+@pytest.mark.parametrize("path", ["/proc/x.usda", "file/x.usda", "{}/x.usda".format("a" * 300)])
+def test_unwritable_path_is_named(path, fall, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert fall("run") == 0
-    assert main(["export", "out/fall", "--to", place]) == 2
-    (told,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
-    assert told.startswith(f"ddg-warp: {place}: ") and "give" in told and "room" not in told and "Errno" not in told
+    assert main(["export", "out/fall", "--to", path]) == 2
+    (message,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert (
+        message.startswith(f"ddg-warp: {path}: ")
+        and "give" in message
+        and "room" not in message
+        and "Errno" not in message
+    )
     assert fall("run", "--out", "file") == 2
     assert "file is a file" in capsys.readouterr().err
     assert fall("run", "--force", "--json", "file/x.json") == 2
@@ -296,8 +301,8 @@ def test_a_place_that_cannot_be_written_to_is_named(place, fall, tmp_path, capsy
     assert summary()["steps"] == 5
 
 
-def test_a_run_in_progress_is_left_alone(fall, capsys):
-    """Another process records there: it is named, whatever was asked for."""
+def test_run_in_progress_is_not_touched(fall, capsys):
+    """The message names the other process that records there."""
     import ddg_warp as ddg
     from ddg_warp.run.record import Recorder
 
@@ -310,7 +315,7 @@ def test_a_run_in_progress_is_left_alone(fall, capsys):
 
 
 def test_a_full_disk_ends_a_run_in_one_line(fall, capfd):
-    """Code 1, what is complete is kept, and the run goes on once there is room."""
+    """Exit code 1, complete frames stay, and the run resumes once there is space."""
     import resource
 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -319,16 +324,16 @@ def test_a_full_disk_ends_a_run_in_one_line(fall, capfd):
         assert fall("run", "--n", "40", "--duration", "3", "--dt", "0.005") == 1
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    (told,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
-    assert "out/fall: File too large" in told and "free some space and resume" in told
+    (message,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert "out/fall: File too large" in message and "free some space and resume" in message
     kept = len(points("out/fall"))
     assert kept and kept % 64 == 0
     assert fall("run", "--resume", "out/fall") == 0
     assert len(points("out/fall")) == 601
 
 
-def test_damaged_files_are_told_in_one_line(fall, tmp_path, capfd):
-    """Resumed, exported, or read by a scene: the file, what is wrong, and the remedy."""
+def test_damaged_files_are_reported_in_one_line(fall, tmp_path, capfd):
+    """Resume, export and scenes name the damaged file, the defect and the remedy."""
     assert fall("run") == 0
     path = tmp_path / "out/fall/trajectory.h5"
     path.write_bytes(path.read_bytes()[:1000])
@@ -340,8 +345,8 @@ def test_damaged_files_are_told_in_one_line(fall, tmp_path, capfd):
     ):
         capfd.readouterr()
         assert main(arguments) == 2
-        (told,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
-        assert "cut short or damaged" in told
+        (message,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+        assert "cut short or damaged" in message
 
 
 def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys, device):
@@ -353,7 +358,7 @@ def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys
 
 
 def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
-    """Where stderr is no terminal: whole lines with steps, time and time left, at most one in an interval; none of short runs."""
+    """Piped stderr gets whole lines with steps, time and time left, at most one an interval; short runs print none."""
     import ddg_warp.run.progress
 
     assert fall("run") == 0
@@ -368,13 +373,13 @@ def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
     assert "steps" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("place", ["initial", "first point"])
-def test_a_run_that_fails_before_its_first_state_says_so(place, tmp_path, monkeypatch, capsys, device):
-    """Nothing is recorded or drawn; one line, code 1, and a summary."""
+@pytest.mark.parametrize("failure", ["initial", "first point"])
+def test_a_run_that_fails_before_its_first_state_says_so(failure, tmp_path, monkeypatch, capsys, device):
+    """One line, exit code 1 and a summary; no trajectory or picture."""
     monkeypatch.chdir(tmp_path)
     code = SCENE.replace("    build.shift = shift", "    scene.initial = lost")
     code = code.replace("def build", "def lost(model):\n    raise ddg.SolverError('no equilibrium')\n\n\ndef build", 1)
-    if place == "first point":
+    if failure == "first point":
         from ddg_warp.solve import continuation
 
         def lost(self, state, stop):
@@ -387,8 +392,8 @@ def test_a_run_that_fails_before_its_first_state_says_so(place, tmp_path, monkey
         )
     (tmp_path / "fall.py").write_text(code)
     assert main(["run", "fall.py", "--device", device]) == 1
-    (told,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
-    assert "no equilibrium" in told
+    (message,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert "no equilibrium" in message
     assert "no equilibrium" in summary()["failure"]
 
 
@@ -440,7 +445,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistake_is_told_in_one_line(name, fall, capfd):
+def test_mistake_is_reported_in_one_line(name, fall, capfd):
     arguments, message = MISTAKES[name]
     assert main(arguments) == 2
     errors = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
@@ -494,15 +499,15 @@ def test_info_names_versions(capsys):
 def test_check_prints_the_derivative_table(monkeypatch, capsys, device, passed):
     from ddg_warp.run import derivatives
 
-    asked = []
+    calls = []
 
     def table(*arguments):
-        asked.append(arguments)
+        calls.append(arguments)
         return [{"term": "rod_bend", "check": "gradient", "error": 1e-9, "tolerance": 1e-7, "passed": passed}]
 
     monkeypatch.setattr(derivatives, "table", table)
     assert main(["check", "rod_bend", "--precision", "float32", "--device", device]) == (0 if passed else 1)
-    assert asked == [("rod_bend", "float32", device)]
+    assert calls == [("rod_bend", "float32", device)]
     assert ("passed" if passed else "FAILED") in capsys.readouterr().out.splitlines()[1]
 
 
@@ -525,7 +530,7 @@ def test_bench_gives_error_and_time_together(fall, tmp_path):
         rows = json.load(file)["rows"]
     rows = [
         row for row in rows if row["precision"] == "float64"
-    ]  # on CUDA the defaults are a case of their own, in mixed
+    ]  # on CUDA the defaults are a separate case, in mixed precision
     assert [row["dt"] for row in rows] == [0.01, 0.005]
     # Implicit Euler falls too far by g h T / 2.
     assert [row["error"] for row in rows] == pytest.approx([9.81 * dt * 0.02 / 2 for dt in (0.01, 0.005)], rel=1e-6)
@@ -539,7 +544,7 @@ def test_bench_gives_error_and_time_together(fall, tmp_path):
 
 
 def test_bench_at_another_size(fall, tmp_path, capsys):
-    """Parameters of the scene go to every case, and into the names of the files; what the study varies is its own."""
+    """Scene parameters apply to every case and to file names; parameters varied by the study are refused."""
     assert fall("bench", "--n", "9", "--label", "long") == 0
     with open("out/bench/fall_n_9_label_long.json") as file:
         content = json.load(file)
@@ -566,8 +571,8 @@ def test_module_is_the_command():
     assert run.stderr.startswith("ddg-warp: ")
 
 
-def test_reader_of_the_output_may_leave():
-    """As `ddg-warp list | head` does: no message, and the code of a process that a closed pipe ended."""
+def test_closed_output_pipe_ends_quietly():
+    """`ddg-warp list | head` prints no message and returns the code of a process ended by a closed pipe."""
     ends, into = os.pipe()
     os.close(ends)
     run = subprocess.run([sys.executable, "-m", "ddg_warp", "list"], stdout=into, stderr=subprocess.PIPE, check=False)

@@ -1,4 +1,4 @@
-"""Controls: what worlds are given step by step is what a model of one world does whose scene has it as functions of time."""
+"""Controls: stepwise control inputs of worlds equal functions of time in models of one world."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def one_rod(scene, moved):
 
 
 def some_rods(scene, moved):
-    """Of several groups: by edges, a ring, one without twist."""
+    """Add rods of several rod groups: clamped edges, a ring, a rod without twist."""
     one_rod(scene, moved)
     scene.clamp(scene.add_rod(line((0, 1, 0), (0.5, 1, 0), 7), section=SECTION, material=RUBBER), motion=moved)
     angle = 2.0 * np.pi * np.arange(10) / 10
@@ -89,7 +89,7 @@ def run(model, steps: int = STEPS, scheme: str = "implicit_euler", controls=lamb
 @SCHEMES
 @KINDS
 def test_worlds_are_models_with_functions(device, build, scheme):
-    """Grips, gravity, forces and moments of three worlds against three models with motions, gravity and loads of their own."""
+    """Grips, gravity, forces and moments of three worlds equal motions, gravity and loads of three single models."""
     model = model_of(build, ddg.Grip(PIVOT), device, worlds=3)
     forces, edges = np.zeros((3, model.points_count, 3)), model.order.edges_count
     forces[:, -1, 1], forces[:, 5, 2] = FORCE, FORCE
@@ -97,7 +97,7 @@ def test_worlds_are_models_with_functions(device, build, scheme):
     twisted = bool(model.scene.rod_count)
     if twisted:
         moments[:, 4] = MOMENT
-    found, _ = run(
+    result, _ = run(
         model, STEPS, scheme, lambda k: ddg.Controls(poses(k * DT), forces, moments if twisted else None, GRAVITY)
     )
     for world in range(3):
@@ -114,14 +114,14 @@ def test_worlds_are_models_with_functions(device, build, scheme):
                 scene.add_vertex_force(0, [5], (0.0, 0.0, FORCE[world]))
 
         expected, _ = run(model_of(build, motion(world), device, 1, GRAVITY[world], load), STEPS, scheme)
-        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-11)
-        np.testing.assert_allclose(found.velocities()[world], expected.velocities(), rtol=0.0, atol=1e-8)
+        np.testing.assert_allclose(result.points()[world], expected.points(), rtol=0.0, atol=1e-11)
+        np.testing.assert_allclose(result.velocities()[world], expected.velocities(), rtol=0.0, atol=1e-8)
         if twisted:
-            np.testing.assert_allclose(found.angles()[world], expected.angles(), rtol=0.0, atol=1e-10)
+            np.testing.assert_allclose(result.angles()[world], expected.angles(), rtol=0.0, atol=1e-10)
 
 
 def test_a_planar_rod_and_a_shell_of_revolution(device):
-    """What has two components takes its loads and poses in the plane of x and z."""
+    """Objects with two components receive loads and poses in the xz plane."""
 
     def planar(scene, moved):
         scene.dimension = 2
@@ -134,38 +134,38 @@ def test_a_planar_rod_and_a_shell_of_revolution(device):
 
     for build in (planar, dome):
         model = model_of(build, ddg.Grip(), device, worlds=2)
-        turn = 0.0 if build is dome else 1.0
+        rotates = 0.0 if build is dome else 1.0
         rates, gravity = np.array([2.0, -1.0]), np.array([(0.0, 0.0, -2.0), (0.0, 0.0, 5.0)])
 
-        def controls(k, rates=rates, gravity=gravity, turn=turn):
+        def controls(k, rates=rates, gravity=gravity, rotates=rotates):
             t = k * DT
-            return ddg.Controls([[[0.0, 0.0, r * t * t, 0.0, turn * r * t, 0.0]] for r in rates], gravity=gravity)
+            return ddg.Controls([[[0.0, 0.0, r * t * t, 0.0, rotates * r * t, 0.0]] for r in rates], gravity=gravity)
 
-        found, _ = run(model, STEPS, controls=controls)
+        result, _ = run(model, STEPS, controls=controls)
         for world, rate in enumerate(rates):
             moved = ddg.Motion(
-                lambda t, r=rate: (0.0, 0.0, r * t * t), lambda t, r=rate, a=turn: a * r * t, (0.0, 1.0, 0.0)
+                lambda t, r=rate: (0.0, 0.0, r * t * t), lambda t, r=rate, a=rotates: a * r * t, (0.0, 1.0, 0.0)
             )
             expected, _ = run(model_of(build, moved, device, 1, gravity[world]))
-            np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-11)
+            np.testing.assert_allclose(result.points()[world], expected.points(), rtol=0.0, atol=1e-11)
 
 
 @pytest.mark.parametrize("build", [one_rod, joined, sheet], ids=lambda build: build.__name__)
-def test_gravity_that_is_given_counts_among_the_loads(device, build):
-    """A scene without gravity, given it, converges as one that has it: to the same tolerance, in as many iterations."""
-    given, counts = run(
+def test_control_gravity_counts_in_the_load_scale(device, build):
+    """A scene given gravity by controls converges like one with gravity: equal tolerance and iterations."""
+    controlled, counts = run(
         model_of(build, None, device, gravity=(0, 0, 0)), controls=lambda k: ddg.Controls(gravity=(0, 0, -9.81))
     )
-    own, expected = run(model_of(build, None, device))
+    reference, expected = run(model_of(build, None, device))
     assert counts.statistics()["newton_iterations"] == expected.statistics()["newton_iterations"]
-    np.testing.assert_allclose(given.points(), own.points(), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(controlled.points(), reference.points(), rtol=0.0, atol=1e-12)
     weightless, _ = run(model_of(build, None, device), controls=lambda k: ddg.Controls(gravity=(0, 0, 0)))
     np.testing.assert_allclose(weightless.points(), weightless.model.state().points(), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("build", [one_rod, joined], ids=lambda build: build.__name__)
 def test_the_scene_s_own_loads_stay(device, build):
-    """Timed loads and couples act beside what is given; a step without controls is as if there never had been any."""
+    """Timed loads and couples act in addition to controls; a step without controls is unaffected by earlier ones."""
 
     def load(scene):
         scene.add_force(0, -1, (0.0, 0.0, 0.3), lambda t: 1.0 + t)
@@ -174,38 +174,41 @@ def test_the_scene_s_own_loads_stay(device, build):
     model = model_of(build, None, device, worlds=2, load=load)
     forces = np.zeros((model.points_count, 3))
     forces[6] = (0.0, 0.4, 0.0)
-    found, integrator = run(model, 4, controls=lambda k: ddg.Controls(forces=forces))
+    result, integrator = run(model, 4, controls=lambda k: ddg.Controls(forces=forces))
     both = model_of(build, None, device, load=lambda scene: (load(scene), scene.add_force(0, 6, (0.0, 0.4, 0.0))))
     expected, _ = run(both, 4)
     for world in range(2):
-        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-12)
-    after = integrator.step(found.copy(), DT)
-    fresh = ddg.Integrator(model).step(found, DT)
+        np.testing.assert_allclose(result.points()[world], expected.points(), rtol=0.0, atol=1e-12)
+    after = integrator.step(result.copy(), DT)
+    fresh = ddg.Integrator(model).step(result, DT)
     for name, values in fresh.snapshot().items():
         np.testing.assert_array_equal(after.snapshot()[name], values, err_msg=name)
 
 
 def test_a_step_is_a_function_of_state_and_controls(device):
-    """From a state that is kept, or restored, the same step again, bit for bit; a grip that is told nothing rests."""
+    """A step from a copied or restored state repeats bit for bit; a grip without input stays."""
     model = model_of(everything, ddg.Grip(PIVOT), device, worlds=3)
     state, integrator = run(model, 3, controls=lambda k: ddg.Controls(poses(k * DT)))
     kept = state.copy()
     np.testing.assert_array_equal(kept.poses(), poses(3 * DT))
     later = integrator.step(integrator.step(state, DT, ddg.Controls(poses(4 * DT))), DT).snapshot()
     for start in (kept, model.restore(kept.snapshot())):
-        other = ddg.Integrator(model)
-        again = other.step(other.step(start, DT, ddg.Controls(poses(4 * DT))), DT)
+        fresh = ddg.Integrator(model)
+        again = fresh.step(fresh.step(start, DT, ddg.Controls(poses(4 * DT))), DT)
         for name, values in again.snapshot().items():
             np.testing.assert_array_equal(later[name], values, err_msg=name)
     np.testing.assert_array_equal(again.poses(), poses(4 * DT))
-    held = again.points()[:, :1]
-    np.testing.assert_array_equal(other.step(again, DT).points()[:, :1], held)
+    grip_points = again.points()[:, :1]
+    np.testing.assert_array_equal(fresh.step(again, DT).points()[:, :1], grip_points)
 
 
-def test_three_turns_in_steps(device):
-    """An end is wound up by less than half a turn a step; what is given as 0 to 6 pi or within a turn is the same twist, of 3 turns."""
+def test_three_revolutions_in_steps(device):
+    """An end is wound up by less than half a revolution a step.
+
+    Angles of 0 to 6 pi and angles wrapped to a revolution give the same twist of 3 revolutions.
+    """
     points = line((0, 0, 0), (1, 0, 0), 11)
-    found = []
+    results = []
     for wrap in (False, True):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
         rod = scene.add_rod(points, section=SECTION, material=RUBBER)
@@ -217,24 +220,24 @@ def test_three_turns_in_steps(device):
             angles = 2.0 * np.pi * 0.2 * (k + 1) * np.array([1.0, -0.5])
             if wrap:
                 angles = np.arctan2(np.sin(angles), np.cos(angles))
-            given = np.zeros((2, 1, 6))
-            given[:, 0, 3] = angles
-            state = integrator.step(state, 10.0, ddg.Controls(given))  # so slow that the twist is uniform
+            poses_given = np.zeros((2, 1, 6))
+            poses_given[:, 0, 3] = angles
+            state = integrator.step(state, 10.0, ddg.Controls(poses_given))  # so slow that the twist is uniform
         np.testing.assert_allclose(inquiry.total_twist(model, state), [3.0, -1.5], atol=1e-9)
         np.testing.assert_allclose(state.angles()[:, -1], [6.0 * np.pi, -3.0 * np.pi], atol=1e-9)
-        found.append(state.points())
-    np.testing.assert_allclose(*found, atol=1e-9)
+        results.append(state.points())
+    np.testing.assert_allclose(*results, atol=1e-9)
 
 
 @SCHEMES
-def test_parts_of_a_step_follow_the_same_way(device, scheme):
-    """A step that has to be taken in parts moves a grip along as a motion at constant rates."""
+def test_substeps_move_a_grip_at_constant_rates(device, scheme):
+    """Substeps after a failure move a grip like a motion at constant rates."""
     end = np.array([0.1, 0.05, 0.0, *(2.5 * AXIS)])
     moved = ddg.Motion(lambda t: tuple(end[:3] * t / 0.1), lambda t: 25.0 * t, tuple(AXIS), PIVOT)
     options = {"max_iterations": 6, "energy_bound": None}
     results = []
-    for given, controls in ((moved, None), (ddg.Grip(PIVOT), ddg.Controls([end]))):
-        model = model_of(one_rod, given, device)
+    for support, controls in ((moved, None), (ddg.Grip(PIVOT), ddg.Controls([end]))):
+        model = model_of(one_rod, support, device)
         integrator = ddg.Integrator(model, scheme, **options)
         results.append((integrator.step(model.state(), 0.1, controls), integrator.statistics()))
     assert results[0][1]["retries"] == results[1][1]["retries"] > 1
@@ -243,26 +246,26 @@ def test_parts_of_a_step_follow_the_same_way(device, scheme):
 
 
 @pytest.mark.parametrize("build", [one_rod, joined, sheet], ids=lambda build: build.__name__)
-def test_equilibria_of_what_is_gripped(device, build):
-    """Where grips are in a state, of each world elsewhere, equilibria and reactions find supports."""
+def test_equilibria_use_the_grip_poses_of_the_state(device, build):
+    """Equilibria and reactions take supports at the grip poses of a state, which differ between worlds."""
     small = 0.2 * poses(0.02)
     model = model_of(build, ddg.Grip(PIVOT), device, worlds=3, gravity=(0.0, 0.0, -0.5))
     state = ddg.Integrator(model).step(model.state(), 1.0, ddg.Controls(small))
-    found = statics.solve(model, state)
-    np.testing.assert_array_equal(found.poses(), small)
-    reactions = sum(reaction.force for reaction in model.reactions(found))
+    equilibrium = statics.solve(model, state)
+    np.testing.assert_array_equal(equilibrium.poses(), small)
+    reactions = sum(reaction.force for reaction in model.reactions(equilibrium))
     for world in range(3):
-        turn = np.linalg.norm(small[world, 0, 3:]) * np.sign(RATES[world])
-        to = ddg.Motion(lambda t, w=world: tuple(t * small[w, 0, :3]), lambda t, a=turn: a * t, tuple(AXIS), PIVOT)
-        alone = model_of(build, to, device, gravity=(0.0, 0.0, -0.5))
-        expected = statics.solve(alone)
-        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-6)
-        force = sum(reaction.force for reaction in alone.reactions(expected))
+        angle_end = np.linalg.norm(small[world, 0, 3:]) * np.sign(RATES[world])
+        to = ddg.Motion(lambda t, w=world: tuple(t * small[w, 0, :3]), lambda t, a=angle_end: a * t, tuple(AXIS), PIVOT)
+        single = model_of(build, to, device, gravity=(0.0, 0.0, -0.5))
+        expected = statics.solve(single)
+        np.testing.assert_allclose(equilibrium.points()[world], expected.points(), rtol=0.0, atol=1e-6)
+        force = sum(reaction.force for reaction in single.reactions(expected))
         np.testing.assert_allclose(reactions[world], force, rtol=1e-5, atol=1e-6)
 
 
 def test_a_run_with_grips_is_recorded_and_resumed(device, tmp_path):
-    """Poses are part of checkpoints."""
+    """Poses are stored in checkpoints."""
     from ddg_warp.io.hdf5 import TrajectoryReader
 
     model = model_of(one_rod, ddg.Grip(PIVOT), device, worlds=3)

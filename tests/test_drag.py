@@ -25,9 +25,9 @@ SCHEMES = ("implicit_euler", "implicit_midpoint")
 TANGENTIAL, NORMAL, ROTATIONAL = 0.7, 1.9, 3e-3
 
 
-def fluid(name: str, device, worlds: int = 1, law=None, held: bool = False, **options):
-    """A kind of rods in a fluid, without gravity unless told otherwise."""
-    scene, added = OBJECTS[name].scene(held=held, **({"gravity": (0.0, 0.0, 0.0)} | options))
+def fluid(name: str, device, worlds: int = 1, law=None, supported: bool = False, **options):
+    """Return a model of rods in a fluid, without gravity by default."""
+    scene, added = OBJECTS[name].scene(held=supported, **({"gravity": (0.0, 0.0, 0.0)} | options))
     if law is None:
         scene.drag(tangential=TANGENTIAL, normal=NORMAL, rotational=ROTATIONAL)
     else:
@@ -38,7 +38,7 @@ def fluid(name: str, device, worlds: int = 1, law=None, held: bool = False, **op
 def filament(
     device, n: int = 20, scheme: str = "implicit_euler", clamped: bool = False, law=None, dimension: int = 2, **section
 ):
-    """A straight rod along x without inertia: model and integrator. EI = GJ = 1, length 1."""
+    """Return model and integrator of a straight rod along x without inertia. EI = GJ = 1, length 1."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension)
     section = ddg.Stiffness(**({"EA": 1e4, "EI1": 1.0, "GJ": 1.0, "radius": 0.01} | section))
     rod = scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n + 1), section=section)
@@ -50,17 +50,17 @@ def filament(
 
 
 def polygon_drag(points, closed: bool, v, u=0.0):
-    """Force of the fluid on a polygon that moves without turning, edge by edge."""
+    """Return the fluid force on a translating polygon, summed over edges."""
     edges = np.roll(points, -1, 0) - points if closed else np.diff(points, axis=0)
     length = np.linalg.norm(edges, axis=1, keepdims=True)
-    t, away = edges / length, np.broadcast_to(u - v, edges.shape)
-    along = t * (away * t).sum(1, keepdims=True)
-    return (length * (TANGENTIAL * along + NORMAL * (away - along))).sum(0)
+    t, relative = edges / length, np.broadcast_to(u - v, edges.shape)
+    along = t * (relative * t).sum(1, keepdims=True)
+    return (length * (TANGENTIAL * along + NORMAL * (relative - along))).sum(0)
 
 
 @pytest.mark.parametrize("name", EVERY)
 def test_force_and_power(device, name):
-    """Of rods that move without turning, in every world its own velocity: the sum over edges; power is force times velocity."""
+    """Rods translate at another velocity in every world: force is the sum over edges, power is force times velocity."""
     u = np.array([0.2, 0.0, -0.1])
     model, _ = fluid(name, device, worlds=2, flow=tuple(u))
     velocity = np.array([[0.3, 0.0, 0.4], [-0.5, 0.0, 0.1]])
@@ -80,8 +80,11 @@ def test_force_and_power(device, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("name", MANY)
-def test_the_fluid_takes_what_the_rods_lose(device, name, scheme):
-    """Free rods come to rest; the midpoint rule accounts for it, K + E - E0 = made - dissipated, which is what drag's power says."""
+def test_power_of_drag_is_the_energy_loss(device, name, scheme):
+    """Free rods come to rest.
+
+    The midpoint rule balances K + E - E0 = made - dissipated, and dissipated is the integral of drag's power.
+    """
     model, _ = fluid(name, device)
     points = model.state().points()
     rates = np.cross((0.0, 4.0, 0.0), points - points.mean(0)) + (0.4, 0.0, 0.1)
@@ -101,8 +104,8 @@ def test_the_fluid_takes_what_the_rods_lose(device, name, scheme):
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_flow_carries_what_has_no_inertia(device, name):
-    """Free rods without mass move with the fluid, x = x0 + the integral of u, and feel no force: exact but for that of u in time."""
+def test_massless_rods_move_with_the_flow(device, name):
+    """Free rods without mass move by the integral of u without force, exactly up to quadrature in time."""
     kind = OBJECTS[name]
     scene, _ = kind.scene(held=False, gravity=(0.0, 0.0, 0.0), flow=lambda t: (np.cos(t), 0.0, 2.0 * t))
     for batch in scene.batches:
@@ -120,7 +123,7 @@ def test_a_flow_carries_what_has_no_inertia(device, name):
 
 
 def decay(device, scheme: str, steps: int, n: int) -> float:
-    """Factor by which the first bending mode of a clamped filament decays in the time 0.1 zeta_n L^4 / EI."""
+    """Return the decay factor of the first bending mode of a clamped filament over 0.1 zeta_n L^4 / EI."""
     model, integrator = filament(device, n, scheme, clamped=True)
     points = model.state().points()
     beta, x = 1.875104069, points[:, 0]
@@ -129,14 +132,15 @@ def decay(device, scheme: str, steps: int, n: int) -> float:
     state = model.state(points=points)
     for _ in range(steps):
         state = integrator.step(state, 0.1 / steps)
-    weight = points[:, 2] * np.append(
-        np.ones(n), 0.5
-    )  # projects on the mode: the midpoint rule keeps what else there is
+    weight = points[:, 2] * np.append(np.ones(n), 0.5)  # projects on the mode: the midpoint rule keeps all others
     return (weight @ state.points()[:, 2]) / (weight @ points[:, 2])
 
 
 def test_bending_relaxes_at_its_rate(device):
-    """zeta_n y_t = -EI y_xxxx: the mode decays at beta^4 EI / (zeta_n L^4), beta^4 = 12.3624; orders in time and space."""
+    """zeta_n y_t = -EI y_xxxx: the mode decays at beta^4 EI / (zeta_n L^4), beta^4 = 12.3624.
+
+    Orders of error in time and space.
+    """
     in_space = [abs(decay(device, "implicit_midpoint", 320, n) - np.exp(-1.2362362)) for n in (10, 20, 40)]
     fine = decay(device, "implicit_midpoint", 640, 20)
     in_time = {s: [abs(decay(device, s, steps, 20) - fine) for steps in (20, 40, 80)] for s in SCHEMES}
@@ -168,7 +172,7 @@ def test_twist_relaxes_at_its_rate(device, scheme):
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
 @pytest.mark.parametrize(("scheme", "order"), [("implicit_euler", 1), ("implicit_midpoint", 2)])
 def test_orders_of_the_drag_at_a_state(device, scheme, order, joined):
-    """Of a rod without mass that its clamp turns in a flow that changes: forces, moments and power at the end of a step."""
+    """A clamp rotates a massless rod in a changing flow: forces, moments and power at the end of a step."""
     s = np.linspace(0.0, 1.0, 13)
     points = np.stack([s, 0.0 * s, 0.1 * np.sin(3.0 * s)], -1)
 
@@ -184,21 +188,21 @@ def test_orders_of_the_drag_at_a_state(device, scheme, order, joined):
         integrator, state = ddg.Integrator(model, scheme, rtol=1e-11), model.state()
         for _ in range(steps):
             state = integrator.step(state, 0.2 / steps)
-        found = model.drag(state)
-        return np.concatenate([found.force.ravel(), found.moment, [found.power]])
+        drag = model.drag(state)
+        return np.concatenate([drag.force.ravel(), drag.moment, [drag.power]])
 
-    found = [run(steps) for steps in (10, 20, 40)]
-    first, second = np.abs(np.diff(found, axis=0)).max(1)
+    drag = [run(steps) for steps in (10, 20, 40)]
+    first, second = np.abs(np.diff(drag, axis=0)).max(1)
     assert np.log2(first / second) == pytest.approx(order, abs=0.1)
 
 
 @pytest.mark.slow
 def test_orders_of_the_driven_filament():
-    """The tip of the flagellum against linear hyperdiffusion: second order in space, and in time by the midpoint rule."""
+    """The tip of the flagellum follows linear hyperdiffusion: second order in space, and in time by the midpoint rule."""
 
-    def tip(**given) -> complex:
+    def tip(**options) -> complex:
         result = simulate(
-            flagellum.build(amplitude=1e-3, **given), device="cpu", observe=flagellum.observe, progress=False
+            flagellum.build(amplitude=1e-3, **options), device="cpu", observe=flagellum.observe, progress=False
         )
         amplitude, phase, _ = flagellum.check(result)
         return amplitude.measured * np.exp(1j * phase.measured)
@@ -218,7 +222,7 @@ def test_orders_of_the_driven_filament():
 @pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize(("scheme", "order"), [("implicit_euler", 1), ("implicit_midpoint", 2)])
 def test_orders_in_space(device, scheme, order, joined):
-    """A curved rod without mass, alone or in two halves, that its clamp turns in a flow that changes, with rotational drag."""
+    """A clamp rotates a curved massless rod, whole or in two halves, in a changing flow, with rotational drag."""
 
     def run(steps: int) -> np.ndarray:
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=lambda t: (0.0, np.sin(3.0 * t), 0.5))
@@ -236,20 +240,20 @@ def test_orders_in_space(device, scheme, order, joined):
             state = integrator.step(state, 0.4 / steps)
         return state.points()
 
-    found = [run(steps) for steps in (20, 40, 80)]
-    first, second = np.abs(np.diff(found, axis=0)).max((1, 2))
+    results = [run(steps) for steps in (20, 40, 80)]
+    first, second = np.abs(np.diff(results, axis=0)).max((1, 2))
     assert np.log2(first / second) == pytest.approx(order, abs=0.1)
 
 
 def test_coefficients_of_helices():
-    """A, B and D of a helix of four turns, in closed form against quadrature of its pieces (4 turns, a = 0.02 m, mu = 1 Pa s)."""
-    known = {"gray_hancock": (18.4317, -1.51113, 1.11712), "lighthill": (25.2005, -1.63259, 1.53737)}
-    for theory, (A, B, D) in known.items():
-        found = helical_flagellum.grand_resistance(theory, 4)
+    """A, B and D of a helix of four revolutions, in closed form and by quadrature (a = 0.02 m, mu = 1 Pa s)."""
+    closed_forms = {"gray_hancock": (18.4317, -1.51113, 1.11712), "lighthill": (25.2005, -1.63259, 1.53737)}
+    for theory, (A, B, D) in closed_forms.items():
+        coefficients = helical_flagellum.grand_resistance(theory, 4)
         spin = (
             4.0 * np.pi * 0.02**2 * np.cos(helical_flagellum.THETA) ** 2 * 8.68783
-        )  # of zeta_r, which those leave out
-        np.testing.assert_allclose(found, (A, B, D + spin), rtol=1e-5)
+        )  # of zeta_r, which the closed forms leave out
+        np.testing.assert_allclose(coefficients, (A, B, D + spin), rtol=1e-5)
 
 
 def test_slender_bodies():
@@ -261,8 +265,10 @@ def test_slender_bodies():
 SAND = ddg.Granular(lateral=5.0, friction=2.0, leading=1.0, angle=0.3, speed=1e-4)
 
 
-def test_sand_minds_directions_alone(device):
-    """Forces along and across a rod of unit length, by angle, at two speeds; far below v0 they go to zero with the velocity."""
+def test_granular_drag_depends_on_direction_alone(device):
+    """Forces along and across a rod of unit length by angle, at two speeds; far below v0 they vanish with the
+    velocity.
+    """
     model, _ = filament(device, n=4, law=SAND)
     for psi in (0.1, 0.7, 1.3):
         sine = np.sin(psi) / np.hypot(np.tan(0.3), np.sin(psi))  # sin(beta)
@@ -279,7 +285,9 @@ def test_sand_minds_directions_alone(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_sand_stops_a_rod(device, scheme):
-    """Along itself it slows down evenly, v = v0 - (C_F + C_L) t / m, and stands still from m v0 / (C_F + C_L) on, here 0.2 s."""
+    """Moving axially, the rod slows down evenly, v = v0 - (C_F + C_L) t / m, and stops after m v0 / (C_F + C_L), here
+    0.2 s.
+    """
     model, integrator = filament(device, n=4, scheme=scheme, law=SAND, mass_per_length=1.0)
     state, speeds, dt = model.state(velocities=np.tile((0.6, 0.0, 0.0), (5, 1))), [], 1e-3
     for _ in range(300):
@@ -292,7 +300,7 @@ def test_sand_stops_a_rod(device, scheme):
 
 @pytest.mark.parametrize("dt", [1e-2, 1.0, 1e3])
 def test_long_steps(device, dt):
-    """A strongly bent filament without inertia straightens, however long the steps: its energy only falls."""
+    """A strongly bent filament without inertia straightens with steps of any length: energy only falls."""
     model, integrator = filament(device)
     points = model.state().points()
     angle = 4.0 * points[:, 0]
@@ -306,8 +314,8 @@ def test_long_steps(device, dt):
 
 
 @pytest.mark.slow
-def test_drag_is_the_scale_where_it_is_all_there_is(device):
-    """Driven at its base with nothing else, a filament is solved as exactly as one with a tighter tolerance."""
+def test_drag_sets_the_load_scale_of_massless_rods(device):
+    """A filament driven at the base alone is solved as exactly as with a tighter tolerance."""
     tips = []
     for rtol in (1e-6, 1e-10):
         scene = flagellum.build(n=20, steps=50, amplitude=0.05)
@@ -321,18 +329,18 @@ def test_drag_is_the_scale_where_it_is_all_there_is(device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MANY)
-def test_nothing_in_statics_and_spectra(device, name):
-    """Velocity is zero: equilibria and frequencies with drag are those without, bit by bit; at rest it does no work."""
-    found = []
+def test_drag_is_absent_from_statics_and_spectra(device, name):
+    """Equilibria and frequencies equal results without drag, bit by bit; at rest drag does no work."""
+    results = []
     for dragged in (False, True):
         scene, _ = OBJECTS[name].scene(gravity=(0.0, 0.0, -0.5))
         if dragged:
             scene.drag(tangential=TANGENTIAL, normal=NORMAL, rotational=ROTATIONAL)
         model = scene.build(device, "float64")
         state = statics.solve(model)
-        found.append((state.points(), spectrum(model, state, 3).frequencies))
-    np.testing.assert_array_equal(found[0][0], found[1][0])
-    np.testing.assert_array_equal(found[0][1], found[1][1])
+        results.append((state.points(), spectrum(model, state, 3).frequencies))
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    np.testing.assert_array_equal(results[0][1], results[1][1])
     drag = model.drag(state)
     assert drag.power == 0.0
     assert not drag.force.any()
@@ -342,22 +350,22 @@ def test_nothing_in_statics_and_spectra(device, name):
 @pytest.mark.parametrize("linear", ["partitioned", "block_jacobi", "chain", "sweep"])
 def test_solvers_agree(device, linear):
     """Every linear solver takes the same steps of a rod that sinks and bends."""
-    found = []
-    for way in ("sweep", linear):
-        model, _ = fluid("rod", device, held=True, gravity=(0.0, 0.0, -9.81))
-        integrator, state = ddg.Integrator(model, linear=way, rtol=1e-10), model.state()
+    results = []
+    for name in ("sweep", linear):
+        model, _ = fluid("rod", device, supported=True, gravity=(0.0, 0.0, -9.81))
+        integrator, state = ddg.Integrator(model, linear=name, rtol=1e-10), model.state()
         for _ in range(10):
             state = integrator.step(state, 0.02)
-        found.append(state.points())
-    np.testing.assert_allclose(found[0], found[1], atol=1e-9)
+        results.append(state.points())
+    np.testing.assert_allclose(results[0], results[1], atol=1e-9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_joined_halves_are_one_rod(device, scheme):
-    """Two halves joined rigidly move as the rod that they make, in a cross flow that bends it; also without mass."""
+    """Two rigidly joined halves move as one rod in a cross flow, also without mass."""
     for mass in (0.0, 0.3):
-        found = []
+        results = []
         for halves in (1, 2):
             scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=lambda t: (0.0, np.sin(3.0 * t), 1.0))
             section = ddg.Stiffness(EA=1e4, EI1=1.0, GJ=1.0, mass_per_length=mass, rotary_inertia=1e-3 * mass)
@@ -373,16 +381,16 @@ def test_joined_halves_are_one_rod(device, scheme):
             integrator, state = ddg.Integrator(model, scheme, rtol=1e-9), model.state()
             for _ in range(20):
                 state = integrator.step(state, 0.02)
-            found.append(state.points()[-1])
-        assert np.abs(found[0] - (1.0, 0.0, 0.0)).max() > 0.05
-        np.testing.assert_allclose(found[0], found[1], atol=2e-3)  # a rigid joint's half cells are of second order
+            results.append(state.points()[-1])
+        assert np.abs(results[0] - (1.0, 0.0, 0.0)).max() > 0.05
+        np.testing.assert_allclose(results[0], results[1], atol=2e-3)  # a rigid joint's half cells are of second order
 
 
 # coefficients along rods, and bodies at nodes ---------------------------------------------------------------------------------------
 
 
 def varied(device, joined: bool, worlds: int = 1, **drag):
-    """Model of two rods of 7 nodes at random in a fluid, on their own or joined, and their points (2, 7, 3)."""
+    """Return a model of two random rods of 7 nodes in a fluid, uncoupled or joined, and points (2, 7, 3)."""
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.3), 7) + np.array([[[0.0]], [[2.0]]]) * (0.0, 1.0, 0.0)
     points = points + 0.03 * np.random.default_rng(1).normal(size=points.shape)
     if joined:
@@ -397,7 +405,7 @@ def varied(device, joined: bool, worlds: int = 1, **drag):
 
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
 def test_coefficients_of_every_edge(device, joined):
-    """Both rods move at one velocity, each edge is resisted by its own coefficients, and each node by that of the body there."""
+    """Rods of one velocity: each edge has its own coefficients, and each node the coefficient of the body there."""
     random, u = np.random.default_rng(2), np.array([0.3, -0.2, 0.5])
     tangential, normal, bodies = (random.uniform(0.5, 2.0, (2, n)) for n in (6, 6, 7))
     model, points = varied(device, joined, 2, tangential=tangential, normal=normal, nodes=bodies)
@@ -409,15 +417,15 @@ def test_coefficients_of_every_edge(device, joined):
     expected = -bodies[..., None] * u
     expected[:, :-1] += halves
     expected[:, 1:] += halves
-    if joined:  # rows that share a node have equal parts
+    if joined:  # rows of a joint have half the force each
         expected[0, -1] = expected[1, 0] = 0.5 * (expected[0, -1] + expected[1, 0])
     state = model.state(velocities=np.tile(u, (2, 14, 1)))
-    for found in model.drag(state).force:
-        np.testing.assert_allclose(found.reshape(2, 7, 3), expected, rtol=1e-12)
+    for force in model.drag(state).force:
+        np.testing.assert_allclose(force.reshape(2, 7, 3), expected, rtol=1e-12)
 
 
 def test_coefficients_at_nodes_are_linear_between(device):
-    """Those of open rods; of all that is given for a rod, one row serves both."""
+    """Open rods interpolate nodal coefficients linearly to edges; one row serves both rods."""
     values = np.array([1.0, 3.0, 2.0, 2.0, 5.0, 4.0, 0.0])
     by_node, _ = varied(device, False, tangential=values, normal=2.0 * values, rotational=values)
     middles = 0.5 * (values[1:] + values[:-1])
@@ -426,17 +434,17 @@ def test_coefficients_at_nodes_are_linear_between(device):
 
 
 def test_a_radius_of_every_edge(device):
-    """Viscous(radius=...) is the drag of a section with such radii, without a thicker rod."""
+    """Viscous(radius=...) gives the drag of a section with such radii, without a thicker rod."""
     radius = np.array([0.01, 0.02, 0.01, 0.005, 0.03, 0.01])
-    found, _ = varied(device, False, law=ddg.Viscous(2.0, scale=1.0, radius=radius))
+    model, _ = varied(device, False, law=ddg.Viscous(2.0, scale=1.0, radius=radius))
     cox = np.log(2.0) - 0.5  # 4 pi mu / (ln(S / a) + ln 2 - 1/2)
     expected = np.tile(4.0 * np.pi * 2.0 / (np.log(1.0 / radius) + cox), (2, 1))
-    np.testing.assert_allclose(found.groups[0].host.drag[1, :6].T, expected, rtol=1e-12)
+    np.testing.assert_allclose(model.groups[0].host.drag[1, :6].T, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
 def test_balls_on_a_thread_sink_at_stokes_speed(device, joined):
-    """A hanging thread of no weight and no drag, some nodes of which carry balls: W / (sum of 6 pi mu R), all as fast."""
+    """Balls on a hanging thread without weight or drag sink at W / (sum of 6 pi mu R)."""
     resistance = 6.0 * np.pi * 10.0 * np.array([5e-3, 0.0, 25e-3, 0.0, 5e-3])
     scene, points = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 5)
     thread = ddg.Stiffness(EA=10.0, EI1=1e-4, GJ=1e-4, mass_per_length=1e-6)
@@ -457,8 +465,8 @@ def test_balls_on_a_thread_sink_at_stokes_speed(device, joined):
     assert model.drag(state).force[:, 2].sum() == pytest.approx(7e-3, rel=1e-6)
 
 
-def test_balls_hold_massless_nodes_and_nothing_else(device):
-    """A rod without mass needs drag at every free node: balls on all of them do, balls on some do not."""
+def test_massless_nodes_need_drag_at_every_free_node(device):
+    """Drag of balls at all free nodes suffices for a massless rod, at some nodes it does not."""
     for bodies in (np.ones(5), np.array([1.0, 1.0, 0.0, 1.0, 1.0])):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
         rod = scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), section=ddg.Stiffness(1e2, 1.0, GJ=1.0))

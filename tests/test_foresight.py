@@ -1,9 +1,19 @@
-"""Where solves start: from predictors, and what the last solve added to its own; that leads no solution astray."""
+"""Warm start: solves start from predictors plus the last correction, which changes no solution."""
 
 import numpy as np
 import pytest
 import warp as wp
-from test_predictors import SOLVERS, angle_between, forgetful, hair, lengths, linear_of, predicted, spinning, turned
+from test_predictors import (
+    SOLVERS,
+    angle_between,
+    hair,
+    lengths,
+    linear_of,
+    predicted,
+    rotated_about,
+    spinning,
+    without_warm_start,
+)
 
 import ddg_warp as ddg
 from ddg_warp import arrays
@@ -16,13 +26,13 @@ STEPS = np.array([T240, T240, T240, 0.5 * T240, 0.01, 0.01])
 
 
 def accelerations(state) -> list[wp.array]:
-    """Arrays of a state, of groups and the net."""
+    """Return correction arrays of a state, of rod groups and of the coupled system."""
     return [part.a for part in (*state.groups, *([state.net] if state.net else []))]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_an_edge_turns_further_as_it_has_turned(device, dim):
-    """From e0 to e1 the last solve has turned an edge and lengthened it: so is the next one, where that is no more than 60 degrees."""
+def test_warm_start_extrapolates_the_rotation_of_an_edge(device, dim):
+    """The rotation and elongation from e0 to e1 in the last solve repeat, if the rotation is at most 60 degrees."""
     V, (_, _, further) = wp.types.vector(dim, wp.float64), edge_functions(dim, wp.float64)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -34,18 +44,19 @@ def test_an_edge_turns_further_as_it_has_turned(device, dim):
     e, e1, de = random.normal(size=(3, 200, dim))
     de *= 10.0 ** random.uniform(-4.0, 0.3, size=(200, 1))
     de[0] = 0.0
-    e[1] = e1[1] - de[1]  # which is where e0 went
-    out, given = wp.zeros(200, dtype=V, device=device), [wp.array(a, dtype=V, device=device) for a in (e, e1, de)]
-    wp.launch(call, 200, given, [out], device=device)
+    e[1] = e1[1] - de[1]  # which is the start e0 of the last rotation
+    out, inputs = wp.zeros(200, dtype=V, device=device), [wp.array(a, dtype=V, device=device) for a in (e, e1, de)]
+    wp.launch(call, 200, inputs, [out], device=device)
     end, e0 = out.numpy(), e1 - de
-    near = np.cos(angle_between(e0, e1)) > LEAP
-    assert near[:2].all() and 50 < near.sum() < 198
-    np.testing.assert_allclose(end[~near], e[~near], rtol=0.0, atol=1e-15 * 10.0)
+    small = np.cos(angle_between(e0, e1)) > LEAP
+    assert small[:2].all() and 50 < small.sum() < 198
+    np.testing.assert_allclose(end[~small], e[~small], rtol=0.0, atol=1e-15 * 10.0)
     np.testing.assert_allclose(end[0], e[0], rtol=1e-14)
     np.testing.assert_allclose(end[1], e1[1], rtol=1e-13)
     grown = lengths(e) + lengths(e1) - lengths(e0)
-    np.testing.assert_allclose(lengths(end)[near], np.maximum(grown, 0.1 * lengths(e))[near], rtol=1e-12)
-    # the rotation from e0 to e1, in their plane: what is across stays, what is within turns by their angle
+    np.testing.assert_allclose(lengths(end)[small], np.maximum(grown, 0.1 * lengths(e))[small], rtol=1e-12)
+    # rotation from e0 to e1, in their plane: the component across stays, components within rotate by the angle between
+    # them
     first = e0 / lengths(e0)[:, None]
     second = e1 - first * np.sum(e1 * first, 1)[:, None]
     second /= lengths(second)[:, None]
@@ -53,32 +64,34 @@ def test_an_edge_turns_further_as_it_has_turned(device, dim):
     x, y = np.sum(e * first, 1), np.sum(e * second, 1)
     across = e - x[:, None] * first - y[:, None] * second
     expected = across + (c * x - s * y)[:, None] * first + (s * x + c * y)[:, None] * second
-    unit = [values[near][2:] / lengths(values[near][2:])[:, None] for values in (end, expected)]
+    unit = [values[small][2:] / lengths(values[small][2:])[:, None] for values in (end, expected)]
     np.testing.assert_allclose(*unit, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("supported", [False, True])
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_a_rod_that_spins_up_is_foreseen_to_spin_up(device, solver, supported):
-    """Turned by 0.3 in the last step, of which its predictor knew 0.22: it is foreseen to turn by 0.38."""
-    angle, known, dt = 0.3, 0.22, 0.01
+def test_warm_start_extrapolates_angular_acceleration(device, solver, supported):
+    """The last step rotated by 0.3, its predictor by 0.22: the warm start rotates by 0.38."""
+    angle, predicted_angle, dt = 0.3, 0.22, 0.01
     scene, points, pivot = spinning(solver, supported, angle, dt)
-    scene.gravity = (0.0, 0.0, -9.81)  # of which the start of a solve knows nothing
-    if supported:  # which is held by what it leaves out of the step before, and where it goes by its motion
-        known = angle
+    scene.gravity = (0.0, 0.0, -9.81)  # the start of a solve does not depend on gravity
+    if supported:  # a supported rod follows its prescribed motion instead of the last correction
+        predicted_angle = angle
     integrator = ddg.Integrator(model := scene.build(device, "float64"), linear=linear_of(solver))
-    state = model.state(velocities=(points - turned(points, -angle, pivot)) / dt)
-    added = (points - turned(points, known - angle, pivot)) / dt**2
+    state = model.state(velocities=(points - rotated_about(points, -angle, pivot)) / dt)
+    added = (points - rotated_about(points, predicted_angle - angle, pivot)) / dt**2
     (a,) = accelerations(state)
     a.assign(model.order.put_blocks(added, a.numpy(), "added") if state.net else added[:, None])
-    found = predicted(integrator, state, dt, foresees=True).points()
-    np.testing.assert_allclose(found, turned(points, 2.0 * angle - known, pivot), rtol=0.0, atol=1e-12)
+    result = predicted(integrator, state, dt, warm=True).points()
+    np.testing.assert_allclose(
+        result, rotated_about(points, 2.0 * angle - predicted_angle, pivot), rtol=0.0, atol=1e-12
+    )
 
 
 def thrown(
     dim: int = 3, joined: bool = False, shell: bool = False, contact: bool = False
 ) -> tuple[ddg.Scene, np.ndarray]:
-    """What flies freely, and how fast."""
+    """Return a scene in free flight and the velocity of flight."""
     scene = ddg.Scene(dimension=dim)
     line = np.linspace(0.0, 0.2, 6)
     points = np.stack([line, 0.0 * line, 0.0 * line], 1)
@@ -98,13 +111,13 @@ def thrown(
 
 
 @pytest.mark.parametrize(
-    "given",
+    "options",
     [{}, {"dim": 2}, {"joined": True}, {"shell": True}, {"contact": True}, {"joined": True, "contact": True}],
     ids=["rods", "planar", "joined", "shell", "touching", "joined and touching"],
 )
-def test_free_flight_is_foreseen(device, given):
-    """x'' = g: after the first solve none has anything to do, also where steps have another length."""
-    scene, velocity = thrown(**given)
+def test_warm_start_is_exact_in_free_flight(device, options):
+    """x'' = g: solves after the first take no iteration, also with other step lengths."""
+    scene, velocity = thrown(**options)
     model = scene.build(device, "float64")
     start = model.state(velocities=np.tile(velocity, (model.points_count, 1)))
     state = ddg.Integrator(model, rtol=1e-10).step(start, T240)
@@ -113,16 +126,16 @@ def test_free_flight_is_foreseen(device, given):
         state = integrator.step(state, dt)
     assert integrator.statistics()["newton_iterations"]["max"] == 0
     added = [arrays.download(group.a) for group in state.groups]
-    found = model.order.nodes(added, state.net and state.net.a)
-    np.testing.assert_allclose(found, np.tile([0.0, 0.0, -9.81], (model.points_count, 1)), rtol=0.0, atol=1e-4)
-    fall = 9.81 * np.sum(STEPS * np.cumsum(STEPS))  # of implicit Euler
+    result = model.order.nodes(added, state.net and state.net.a)
+    np.testing.assert_allclose(result, np.tile([0.0, 0.0, -9.81], (model.points_count, 1)), rtol=0.0, atol=1e-4)
+    fall = 9.81 * np.sum(STEPS * np.cumsum(STEPS))  # by implicit Euler
     expected = start.points() + velocity * state.time - [0.0, 0.0, fall]
     np.testing.assert_allclose(state.points(), expected, rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_no_solution_depends_on_where_its_solve_starts(device, solver):
-    """With couples that follow their edges and drag, which go by the predictor. What is foreseen takes fewer iterations."""
+def test_warm_start_does_not_change_solutions(device, solver):
+    """Loads include follower couples and drag, which depend on the predictor. The warm start takes fewer iterations."""
     motion = ddg.Motion(translation=lambda t: (0.02 * np.sin(40.0 * t), 0.0, 0.0))
     scene = hair("root", motion, 0 if solver == "net" else None)
     scene.add_couple(range(4), -3, (1e-8, 2e-8, 1e-8))
@@ -131,15 +144,17 @@ def test_no_solution_depends_on_where_its_solve_starts(device, solver):
     integrators = [ddg.Integrator(model, linear=linear_of(solver), rtol=1e-10) for _ in range(2)]
     state = model.state()
     while state.time < 0.05:
-        found = [one.step(start, dt) for one, start in zip(integrators, (state, forgetful(state)), strict=True)]
-        np.testing.assert_allclose(found[0].points(), found[1].points(), rtol=0.0, atol=1e-9 * 0.2)
-        np.testing.assert_allclose(found[0].angles(), found[1].angles(), rtol=0.0, atol=1e-7)
-        state = found[0]
+        results = [
+            one.step(start, dt) for one, start in zip(integrators, (state, without_warm_start(state)), strict=True)
+        ]
+        np.testing.assert_allclose(results[0].points(), results[1].points(), rtol=0.0, atol=1e-9 * 0.2)
+        np.testing.assert_allclose(results[0].angles(), results[1].angles(), rtol=0.0, atol=1e-7)
+        state = results[0]
     counts = [one.statistics()["newton_iterations"]["mean"] for one in integrators]
     assert counts[0] < 0.9 * counts[1]
 
 
-def test_by_the_midpoint_rule_nothing_is_foreseen(device):
+def test_midpoint_rule_has_no_warm_start(device):
     model = hair("root").build(device, "float64")
     integrator = ddg.Integrator(model, "implicit_midpoint", energy_bound=None)
     state = ddg.Integrator(model).step(model.state(), T240)
@@ -149,31 +164,33 @@ def test_by_the_midpoint_rule_nothing_is_foreseen(device):
         np.testing.assert_array_equal(a.numpy(), 0.0)
 
 
-def test_what_solves_add_is_trusted_as_it_lasts(device):
-    """By its cosine with what was trusted, up to four times as much; shocks by a twentieth, what is less than the tolerance never."""
+def test_warm_start_weight_follows_the_persistence_of_corrections(device):
+    """The weight is the cosine with the last correction, limited to a fourfold growth; shocks get 1/20, corrections
+    below tolerance 0.
+    """
     real, (*_, trust) = wp.float64, foresight.foresight_kernels(wp.float64, wp.float64, arrays.serial(device))
     rtol = 0.1
-    # m a.b, m a.a, m b.b, m |a|, and what is trusted
+    # m a.b, m a.a, m b.b, m |a|, and the weight
     cases = [
-        (4.0, 4.0, 4.0, 2.0, 1.0),  # the same once more
-        (2.0, 4.0, 4.0, 2.0, 0.5),  # by 60 degrees
-        (-4.0, 4.0, 4.0, 2.0, 0.05),  # the other way
-        (12.5, 100.0, 100.0 / 64.0, 2.0, 0.5),  # eight times as much
-        (0.0, 4.0, 0.0, 2.0, 1.0),  # the first
+        (4.0, 4.0, 4.0, 2.0, 1.0),  # the same correction again
+        (2.0, 4.0, 4.0, 2.0, 0.5),  # at 60 degrees
+        (-4.0, 4.0, 4.0, 2.0, 0.05),  # reversed
+        (12.5, 100.0, 100.0 / 64.0, 2.0, 0.5),  # eight times as large
+        (0.0, 4.0, 0.0, 2.0, 1.0),  # the first correction
         (4.0, 4.0, 4.0, 0.9, 0.0),
     ]
     sums, expected = np.array(cases)[:, :4].T, np.array(cases)[:, 4]
     scalars = np.zeros((len(SCALARS), len(cases)))
     scalars[LOAD_SCALE] = 0.5
-    given = [wp.array(np.ascontiguousarray(values), dtype=real, device=device) for values in (sums, scalars)]
-    total = wp.full(len(cases), 20.0, dtype=real, device=device)  # twice what these leave of the load
-    found = wp.zeros(len(cases), dtype=real, device=device)
-    wp.launch(trust, len(cases), [given[0], rtol, total, given[1]], [found], device=device)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-14)
+    inputs = [wp.array(np.ascontiguousarray(values), dtype=real, device=device) for values in (sums, scalars)]
+    total = wp.full(len(cases), 20.0, dtype=real, device=device)  # twice the residual of these corrections
+    weights = wp.zeros(len(cases), dtype=real, device=device)
+    wp.launch(trust, len(cases), [inputs[0], rtol, total, inputs[1]], [weights], device=device)
+    np.testing.assert_allclose(weights.numpy(), expected, rtol=1e-14)
 
 
-def test_a_shock_is_not_foreseen_again(device):
-    """A rod that lands on a floor: in the step that stops it a twentieth is kept of what it takes, then what bears its weight."""
+def test_shock_is_not_extrapolated(device):
+    """A rod lands on a floor: the stopping step keeps 1/20 of its correction, later steps the support of its weight."""
     scene, _ = thrown(contact=True)
     scene.obstacles.clear()
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -0.02), (0.0, 0.0, 1.0)), name="floor")
@@ -189,8 +206,8 @@ def test_a_shock_is_not_foreseen_again(device):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_what_bears_no_load_starts_from_its_predictor(device, solver):
-    """Its tolerance is of the residual that a solve starts with, which means the same at any step then."""
+def test_unloaded_rods_start_from_their_predictor(device, solver):
+    """The tolerance refers to the residual at the start of the solve, so that it means the same in every step."""
     scene = hair(
         "root",
         ddg.Motion(translation=lambda t: (0.02 * np.sin(40.0 * t), 0.0, 0.0)),
@@ -201,7 +218,9 @@ def test_what_bears_no_load_starts_from_its_predictor(device, solver):
     integrators = [ddg.Integrator(model, linear=linear_of(solver)) for _ in range(2)]
     state = model.state()
     for _ in range(10):
-        found = [one.step(start, dt) for one, start in zip(integrators, (state, forgetful(state)), strict=True)]
-        np.testing.assert_array_equal(found[0].points(), found[1].points())
-        state = found[0]
+        results = [
+            one.step(start, dt) for one, start in zip(integrators, (state, without_warm_start(state)), strict=True)
+        ]
+        np.testing.assert_array_equal(results[0].points(), results[1].points())
+        state = results[0]
     assert np.abs(accelerations(state)[0].numpy()).max() > 1.0

@@ -1,4 +1,4 @@
-"""Family "freshness": whatever is changed, by whatever route, the next step is that of a new model with these values, bit for bit."""
+"""Parameter changes by any route: the next step equals a new model with these values, bit for bit."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ EVERY_KIND = pytest.mark.parametrize(
     [
         pytest.param(name, marks=() if name in FAST else pytest.mark.slow)
         for name in OBJECTS
-        if "curved membrane" not in name  # which is for equilibria alone
+        if "curved membrane" not in name  # for equilibria alone
     ],
 )
 
@@ -43,7 +43,7 @@ def built(name: str, device, worlds: int = WORLDS):
 
 
 def moving(model):
-    """A state of which every term has a strain and a rate."""
+    """Return a state with a strain and a rate in every term."""
     points = model.state().points()
     random = np.random.default_rng(3)
     axes = [1.0, 0.0, 1.0] if model.scene.dimension == 2 or model.scene.axisymmetric_shells else [1.0, 1.0, 1.0]
@@ -51,37 +51,37 @@ def moving(model):
 
 
 def changed(model) -> dict[str, np.ndarray]:
-    """Other values of every parameter of a model's terms, one a world (worlds,), by "term.parameter"."""
-    found = {}
-    for term, known in model._terms().items():
-        for name, parameter in known.items():
+    """Return other values of every parameter (worlds,), by "term.parameter"."""
+    result = {}
+    for term, parameters in model._terms().items():
+        for name, parameter in parameters.items():
             values = [v for key, v in model.parameters().items() if key.split("/")[-2:] == [term, name]]
             usual = float(np.ravel(values[0])[0]) if values else 0.0
             factors = 1.0 + 0.02 * np.arange(1, model.worlds + 1)
-            found[f"{term}.{name}"] = usual * factors if usual else 1e-3 * (factors - 1.0)
-            assert parameter.valid[1](found[f"{term}.{name}"]).all()
-    return found
+            result[f"{term}.{name}"] = usual * factors if usual else 1e-3 * (factors - 1.0)
+            assert parameter.valid[1](result[f"{term}.{name}"]).all()
+    return result
 
 
 def set_to(model, name: str, values) -> None:
     model.set_parameter(*name.rsplit(".", 1), values)
 
 
-def same(one, other) -> None:
-    """Two states are alike bit for bit in all arrays."""
-    one, other = one.snapshot(), other.snapshot()
-    for name, values in one.items():
-        np.testing.assert_array_equal(values, other[name], err_msg=name)
+def same(state, expected) -> None:
+    """Check that all arrays of two states are bitwise equal."""
+    state, expected = state.snapshot(), expected.snapshot()
+    for name, values in state.items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
 def set_back(model, name: str) -> None:
-    """Put back all parameters of the scene."""
+    """Restore all parameters of the scene."""
     Recipe(built(name, model.device), WORLDS).put(model)
 
 
 @EVERY_KIND
-def test_a_parameter_that_is_set_is_that_of_a_new_model(device, name):
-    """Set between two steps, in new memory and in place, and put back: in an integrator that has stepped as in a new one."""
+def test_set_parameter_equals_a_new_model(device, name):
+    """Parameters are set between steps, in new memory and in place, and restored: a used integrator equals a new one."""
     model = built(name, device)
     integrator, start = ddg.Integrator(model), moving(model)
     usual, moved = integrator.step(start.copy(), DT).copy(), 0
@@ -89,36 +89,36 @@ def test_a_parameter_that_is_set_is_that_of_a_new_model(device, name):
         fresh = built(name, device)
         set_to(fresh, parameter, values)
         wanted = ddg.Integrator(fresh).step(fresh.restore(start.snapshot()), DT)
-        for given in (1.01 * values, values):  # the first makes memory anew, the other writes in place
-            set_to(model, parameter, given)
-            found = integrator.step(start.copy(), DT)
-        same(found, wanted)
-        moved += bool((found.points() != usual.points()).any())
+        for new_values in (1.01 * values, values):  # the first allocates, the second writes in place
+            set_to(model, parameter, new_values)
+            state = integrator.step(start.copy(), DT)
+        same(state, wanted)
+        moved += bool((state.points() != usual.points()).any())
         set_back(model, name)
         same(integrator.step(start.copy(), DT), usual)
     assert moved, "no parameter had any effect"
 
 
 @EVERY_KIND
-def test_a_tensor_is_what_set_parameter_sets(device, name):
-    """Every parameter, handed to a step as a tensor or set in the model, by the simulator of that; without it the model's is back."""
+def test_tensor_input_equals_set_parameter(device, name):
+    """Parameters passed to a step as tensors equal values set in the model; without tensors the model's values return."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
 
     model = built(name, device)
-    own, other = (Simulator(each, DT) for each in (model, built(name, device)))
+    by_model, by_tensor = (Simulator(each, DT) for each in (model, built(name, device)))
     with torch.no_grad():
-        start, begin = (each.world_state(moving(each.model)) for each in (own, other))
-        usual = own.step(start)
+        start, begin = (each.world_state(moving(each.model)) for each in (by_model, by_tensor))
+        usual = by_model.step(start)
         for parameter, values in changed(model).items():
-            given = torch.tensor(values, dtype=usual.values[0].dtype, device=usual.values[0].device)[:, None]
-            found = other.step(begin, {parameter: given})
+            tensor = torch.tensor(values, dtype=usual.values[0].dtype, device=usual.values[0].device)[:, None]
+            result = by_tensor.step(begin, {parameter: tensor})
             set_to(model, parameter, values)
-            wanted = own.step(start)
+            wanted = by_model.step(start)
             set_back(model, name)
-            back = other.step(begin)
+            back = by_tensor.step(begin)
             for field, a, b, c, d in zip(
-                own.engine(WORLDS).fields, found.values, wanted.values, back.values, usual.values, strict=True
+                by_model.engine(WORLDS).fields, result.values, wanted.values, back.values, usual.values, strict=True
             ):
                 assert torch.equal(a, b), f"{parameter}: {field.name}"
                 assert torch.equal(c, d), f"{parameter}: {field.name} is not back"
@@ -126,7 +126,7 @@ def test_a_tensor_is_what_set_parameter_sets(device, name):
 
 @pytest.mark.parametrize("name", EQUILIBRIA)
 def test_equilibria_follow_the_model(device, name):
-    """By a solver that is kept, as by a new one."""
+    """A reused solver equals a new one."""
     model = built(name, device)
     kept = statics.Equilibrium(model)
     usual = kept.load(model.state(), 2).snapshot()
@@ -134,15 +134,15 @@ def test_equilibria_follow_the_model(device, name):
         set_to(model, parameter, values)
         same(kept.load(model.state(), 2), statics.Equilibrium(model).load(model.state(), 2))
     set_back(model, name)
-    found = kept.load(model.state(), 2).snapshot()
-    for key, value in found.items():
+    restored = kept.load(model.state(), 2).snapshot()
+    for key, value in restored.items():
         np.testing.assert_array_equal(value, usual[key], err_msg=key)
 
 
 @pytest.mark.parametrize("precision", ["mixed", "float64"])
 @pytest.mark.parametrize("name", ["rod", "rods joined rigidly"])
-def test_solvers_suit_what_parameters_have_become(device, name, precision):
-    """Stiffer by 1e6 along, and back: what solves is chosen anew, as for a new model, and forgets what it was."""
+def test_solver_selection_follows_parameter_changes(device, name, precision):
+    """Axial stiffness changes by 1e6 and back: the linear solver is selected as for a new model."""
     model = scene_of(name).build(device, precision)
     stiffness = float(
         np.ravel(next(v for k, v in model.parameters().items() if k.endswith("rod_stretch/stiffness")))[0]
@@ -153,9 +153,9 @@ def test_solvers_suit_what_parameters_have_become(device, name, precision):
     before = integrator.statistics()["linear"]
     for factor in (1e6, 1.0):
         model.set_parameter("rod_stretch", "stiffness", factor * stiffness)
-        found = integrator.step(start.copy(), DT)
+        state = integrator.step(start.copy(), DT)
         fresh = ddg.Integrator(model)
-        same(found, fresh.step(start.copy(), DT))
+        same(state, fresh.step(start.copy(), DT))
         assert integrator.statistics()["linear"] == fresh.statistics()["linear"]
         assert (integrator.statistics()["linear"] == before) == (factor == 1.0 or precision == "float64")
     same(integrator.step(start.copy(), DT), usual)
@@ -163,21 +163,21 @@ def test_solvers_suit_what_parameters_have_become(device, name, precision):
 
 @pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "rods in contact"])
 def test_captured_launches_stay(device, name):
-    """Values that fit their memory are written in place: the graphs of steps are the same objects, of an integrator and a simulator."""
+    """Values that fit are written in place: captured graphs of integrator and simulator stay the same objects."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
 
     model = built(name, device)
     integrator, start = ddg.Integrator(model), moving(model)
-    own = Simulator(model, DT)
-    begin = own.world_state(moving(model))
-    held = []
+    simulator = Simulator(model, DT)
+    begin = simulator.world_state(moving(model))
+    graph_ids = []
     for factor in (1.0, 1.01, 1.02):
         for parameter, values in changed(model).items():
             set_to(model, parameter, factor * values)
         integrator.step(start.copy(), DT)
         with torch.no_grad():
-            own.step(begin)
-        graphs = integrator._graphs._graphs | own.engine(WORLDS).integrator._graphs._graphs
-        held.append({key: id(graph) for key, graph in graphs.items()})
-    assert held[1] == held[2]
+            simulator.step(begin)
+        graphs = integrator._graphs._graphs | simulator.engine(WORLDS).integrator._graphs._graphs
+        graph_ids.append({key: id(graph) for key, graph in graphs.items()})
+    assert graph_ids[1] == graph_ids[2]

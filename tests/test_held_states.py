@@ -1,4 +1,4 @@
-"""States that are held never change; where none is held, two of them take turns in the same memory."""
+"""Referenced states never change; without references, two states alternate in the same memory."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def rods(scene):
     scene.clamp(scene.add_rods(points, section=ddg.Circle(0.01), material=RUBBER), edges=[0])
 
 
-def net(scene):
+def coupled(scene):
     points = np.linspace([0.0, 1.0, 0.0], [0.5, 1.0, 0.0], 6)
     first = scene.add_rod(points, section=ddg.Circle(0.01), material=RUBBER)
     second = scene.add_rod(points[-1] + points - points[0], section=ddg.Circle(0.01), material=RUBBER)
@@ -32,7 +32,7 @@ def shell(scene):
     scene.hold(scene.add_shell(points, triangles, thickness=0.01, material=RUBBER, bending="hinge"), [0, 3])
 
 
-SCENES = {"rods": [rods], "net": [net], "shell": [shell], "all": [rods, net, shell]}
+SCENES = {"rods": [rods], "net": [coupled], "shell": [shell], "all": [rods, coupled, shell]}
 
 
 def model_of(name: str, device, worlds: int = 1, **options):
@@ -46,28 +46,28 @@ def memory(state) -> list[int]:
     return [array.ptr for part in state.parts().values() for array in part.arrays().values()]
 
 
-def alone(model, steps: int) -> list[np.ndarray]:
-    """Everything of every state, copied while it is the last one."""
-    integrator, state, found = ddg.Integrator(model), model.state(), []
+def snapshots_of_a_run(model, steps: int) -> list[np.ndarray]:
+    """Return snapshots of every state, taken while it is the last."""
+    integrator, state, snapshots = ddg.Integrator(model), model.state(), []
     for _ in range(steps):
         state = integrator.step(state, DT)
-        found.append(state.snapshot())
-    return found
+        snapshots.append(state.snapshot())
+    return snapshots
 
 
 def same(states, expected) -> None:
     for state, wanted in zip(states, expected, strict=True):
-        found = state.snapshot()
-        assert found.keys() == wanted.keys()
+        snapshot = state.snapshot()
+        assert snapshot.keys() == wanted.keys()
         for name, values in wanted.items():
-            np.testing.assert_array_equal(found[name], values, err_msg=name)
+            np.testing.assert_array_equal(snapshot[name], values, err_msg=name)
 
 
 @pytest.mark.parametrize(("name", "worlds"), [("rods", 1), ("rods", 3), ("net", 1), ("shell", 3), ("all", 1)])
-def test_states_in_a_list_stay_as_they_were(device, name, worlds):
-    """Held states are those of a run that holds none, bit by bit; memory and captured steps stay two."""
+def test_referenced_states_do_not_change(device, name, worlds):
+    """Referenced states equal a run without references, bit for bit; state buffers and captured steps stay two."""
     model = model_of(name, device, worlds)
-    expected = alone(model, 6)
+    expected = snapshots_of_a_run(model, 6)
     integrator, states = ddg.Integrator(model), [model.state()]
     for _ in range(6):
         states.append(integrator.step(states[-1], DT))
@@ -75,28 +75,28 @@ def test_states_in_a_list_stay_as_they_were(device, name, worlds):
     same(states[1:], expected)
     assert len({id(state) for state in states}) == 7
     assert len(integrator._graphs._graphs) == 2
-    # and they can be gone on from: the last of them, and one that was left behind
+    # steps may continue from the last state and from an earlier one
     again = integrator.step(states[3], DT)
     same([again], expected[3:4])
     same(states[1:], expected)
 
 
 @pytest.mark.parametrize("name", ["rods", "all"])
-def test_nobody_holds_nothing_is_allocated(device, monkeypatch, name):
-    """Twenty steps of a loop that keeps the last state alone use the memory of two."""
+def test_unreferenced_states_use_two_buffers(device, monkeypatch, name):
+    """Twenty steps that keep only the last state use the memory of two."""
     model = model_of(name, device)
-    integrator, state, seen = ddg.Integrator(model), model.state(), set()
+    integrator, state, buffers = ddg.Integrator(model), model.state(), set()
     state = integrator.step(state, DT)
     monkeypatch.setattr(model, "empty_state", lambda: pytest.fail("a state was allocated"))
     for _ in range(20):
         state = integrator.step(state, DT)
-        seen.add(tuple(memory(state)))
-    assert len(seen) == 2
+        buffers.add(tuple(memory(state)))
+    assert len(buffers) == 2
 
 
 @pytest.mark.parametrize("name", ["rods", "net", "shell"])
-def test_parts_arrays_and_views_are_held_too(device, name):
-    """What is taken from a state that is let go stays: a part, an array, a slice, what NumPy sees of it on the CPU."""
+def test_referenced_arrays_and_views_do_not_change(device, name):
+    """Objects taken from a released state stay: a member, an array, a slice, a NumPy view on the CPU."""
     model = model_of(name, device)
     takes = {
         "part": lambda state: state.groups[0] if state.groups else state.net,
@@ -117,7 +117,7 @@ def test_parts_arrays_and_views_are_held_too(device, name):
             return values(taken.arrays())
         return np.array(taken if isinstance(taken, np.ndarray) else taken.numpy())
 
-    for what, take in takes.items():
+    for kind, take in takes.items():
         integrator, state = ddg.Integrator(model), model.state()
         state = integrator.step(state, DT)
         taken = take(state)
@@ -126,8 +126,8 @@ def test_parts_arrays_and_views_are_held_too(device, name):
         moved = state.points()
         for _ in range(4):
             state = integrator.step(state, DT)
-        for one, other in zip(_flat(values(taken)), _flat(before), strict=True):
-            np.testing.assert_array_equal(one, other, err_msg=what)
+        for after, original in zip(_flat(values(taken)), _flat(before), strict=True):
+            np.testing.assert_array_equal(after, original, err_msg=kind)
         assert not np.array_equal(state.points(), moved)
 
 
@@ -135,8 +135,8 @@ def _flat(nested):
     return [array for item in nested for array in _flat(item)] if isinstance(nested, list) else [nested]
 
 
-def test_callbacks_and_a_run_hold_states(device):
-    """A callback that keeps its states, and the last state of `simulate`."""
+def test_states_kept_by_callbacks_do_not_change(device):
+    """States kept by a callback stay; the last is the state that `simulate` returns."""
     kept: list[State] = []
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), callbacks=[kept.append])
     rods(scene)
@@ -146,12 +146,12 @@ def test_callbacks_and_a_run_hold_states(device):
     assert kept[-1] is result.state
     points = [state.points() for state in kept]
     np.testing.assert_allclose([state.time for state in kept], (1 + np.arange(6)) * DT, atol=1e-15)
-    falls = [at[1:6, 2].mean() for at in points]
+    falls = [position[1:6, 2].mean() for position in points]
     assert (np.diff(falls) < 0.0).all()
 
 
 def test_the_last_good_state_of_an_error_stays(device):
-    """`SolverError.state` is not what later steps write."""
+    """Later steps do not overwrite `SolverError.state`."""
     model = model_of("rods", device)
     integrator, strict = ddg.Integrator(model), ddg.Integrator(model, max_iterations=1, retry_limit=0, check_every=1)
     state = model.state()
@@ -160,18 +160,18 @@ def test_the_last_good_state_of_an_error_stays(device):
             state = strict.step(state, DT)
     good = caught.value.state.snapshot()
     assert caught.value.state.model is model
-    other = model.state()
+    next_state = model.state()
     for _ in range(4):
-        other = integrator.step(other, DT)
+        next_state = integrator.step(next_state, DT)
         try:
-            strict.step(other, DT)
+            strict.step(next_state, DT)
         except SolverError:
             pass
     same([caught.value.state], [good])
 
 
-def test_a_resumed_run_has_the_parameters_that_callbacks_set(device, tmp_path):
-    """By the time: muscles, say."""
+def test_resumed_run_has_parameters_set_by_callbacks(device, tmp_path):
+    """Callbacks set parameters by time, such as muscle activation."""
 
     def build(duration):
         scene = ddg.Scene(
@@ -188,10 +188,10 @@ def test_a_resumed_run_has_the_parameters_that_callbacks_set(device, tmp_path):
         return scene
 
     def run(end, **where):
-        found = simulate(
+        result = simulate(
             build(end), device=device, duration=end, options={"rtol": 1e-10}, progress=False, usd=False, **where
         )
-        return found.state.points().copy()
+        return result.state.points().copy()
 
     straight = run(0.06)
     before = run(0.03, out=tmp_path)

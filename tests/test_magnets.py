@@ -1,4 +1,4 @@
-"""Hard-magnetic rods: deflection, buckling and vibration in a field, gradients, fields that change with time, pairs of dipoles."""
+"""Hard-magnetic rods: deflection, buckling and vibration in fields, gradients, fields in time, dipole pairs."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ SECTION = ddg.Stiffness(EA=1e7, EI1=1.0, GJ=1.0, area=1e-4, mass_per_length=1.0,
 def cantilever(
     n: int, field, magnetisation=MA / 1e-4, dimension: int = 3, analysis=None, gradient=None, **rod
 ) -> ddg.Scene:
-    """A beam of length 1 along x, clamped at its first end."""
+    """Return a beam of length 1 along x, clamped at the first end."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension, analysis=analysis or ddg.Statics())
     beam = scene.add_rod(np.linspace(0.0 * X, X, n + 1), section=SECTION, **rod)
     scene.clamp_end(beam)
@@ -30,7 +30,8 @@ def order(sizes, errors) -> float:
     return float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
 
 
-# Tip of a beam magnetised along x in a field along z, by elliptic integrals and a boundary value problem that agree to 2e-12:
+# Tip of a beam magnetised along x in a field along z, by elliptic integrals and a boundary value problem that agree to
+# 2e-12:
 # EI th'' = -M A B cos(th). Load M A B L^2 / EI -> angle of the tip [rad], x, z.
 ACROSS = {
     0.1: (0.04995425575, 0.9993346, 0.03329531927),
@@ -47,29 +48,33 @@ ACROSS = {
     "load", [pytest.param(load, marks=() if load in (0.5, 5.0) else pytest.mark.slow) for load in ACROSS]
 )
 def test_cantilever_across_the_field(device, load):
-    """Second order in the edges; the tip's angle is that of the last edge's middle, where th' = 0 to first order."""
+    """Errors are of second order in the edges; the tip angle is that of the last edge's midpoint, where th' = 0 to
+    first order.
+    """
     errors, sizes = [], (50, 100, 200)
     for n in sizes:
         points = statics.solve(cantilever(n, load / MA * Z, dimension=2).build(device), load_steps=4).points()
         edge = points[-1] - points[-2]
-        found = np.array([np.arctan2(edge[2], edge[0]), points[-1, 0], points[-1, 2]])
-        errors.append(np.abs(found - ACROSS[load]).max())
+        tip = np.array([np.arctan2(edge[2], edge[0]), points[-1, 0], points[-1, 2]])
+        errors.append(np.abs(tip - ACROSS[load]).max())
     assert errors[-1] < 1e-4 * min(1.0, load)
     assert order(sizes, errors) == pytest.approx(-2.0, abs=0.1)
 
 
 @pytest.mark.parametrize("kind", ["twist", pytest.param("no twist", marks=pytest.mark.slow)])
 def test_rods_in_space_bend_as_planar_ones(device, kind):
-    """In space, with frames or without, the same equilibrium."""
+    """Rods in space, with and without frames, have the planar equilibrium."""
     flat, space = (
-        statics.solve(cantilever(16, 2.0 / MA * Z, **given).build(device)).points()
-        for given in ({"dimension": 2}, {"twist": kind == "twist"})
+        statics.solve(cantilever(16, 2.0 / MA * Z, **options).build(device)).points()
+        for options in ({"dimension": 2}, {"twist": kind == "twist"})
     )
     np.testing.assert_allclose(space, flat, atol=1e-9)
 
 
 def test_rod_magnetised_across_twists(device):
-    """M along the first director z, B along y: GJ phi'' = -M A B cos(phi), the same equation with the twist as the angle."""
+    """M along the first director z, B along y: GJ phi'' = -M A B cos(phi), the equation of bending with twist as
+    angle.
+    """
     scene = cantilever(40, 2.0 / MA * Y, magnetisation=(MA / 1e-4, 0.0, 0.0), director=Z)
     model = scene.build(device)
     state = statics.solve(model)
@@ -80,7 +85,10 @@ def test_rod_magnetised_across_twists(device):
 
 
 def test_gradient_pulls(device):
-    """dB_z/dx = dB_x/dz = g: of -M A int (B_x + w' B_z) ds = -M A g L w(L) the force at the tip M A g L, w(L) = M A g L^4 / 3 EI."""
+    """dB_z/dx = dB_x/dz = g: the energy -M A int (B_x + w' B_z) ds = -M A g L w(L) is a tip force M A g L.
+
+    w(L) = M A g L^4 / 3 EI.
+    """
     g = 1e-3
     gradient = g * (np.outer(X, Z) + np.outer(Z, X))
     model = cantilever(40, np.zeros(3), gradient=gradient).build(device)
@@ -92,7 +100,7 @@ def test_gradient_pulls(device):
 
 
 def test_field_has_an_origin(device):
-    """A gradient about another point is one about the origin with another field."""
+    """A gradient about another origin equals one about zero with another field."""
     G = np.diag([0.1, 0.1, -0.2])
     origin = np.array([0.3, 0.0, -0.7])
     shifted, plain = (
@@ -101,25 +109,31 @@ def test_field_has_an_origin(device):
     shifted.applied_field = None
     shifted.magnetic_field(0.2 * Z, G, origin)
     energies = [scene.build(device) for scene in (shifted, plain)]
-    one, other = (model.energies(model.state())["magnetic_tangent"] for model in energies)
-    # -M A int t . B ds along x: only B_x counts, G_xx (x - 0.3)
-    assert one == pytest.approx(-MA * 0.1 * (0.5 - 0.3), rel=1e-12)
-    assert other == pytest.approx(one, rel=1e-12)
+    shifted_energy, plain_energy = (model.energies(model.state())["magnetic_tangent"] for model in energies)
+    # energy -M A int t . B ds along x: only B_x contributes, G_xx (x - 0.3)
+    assert shifted_energy == pytest.approx(-MA * 0.1 * (0.5 - 0.3), rel=1e-12)
+    assert plain_energy == pytest.approx(shifted_energy, rel=1e-12)
 
 
 @pytest.mark.parametrize("n", [20, pytest.param(40, marks=pytest.mark.slow)])
 def test_antiparallel_field_buckles(device, n):
-    """M A B L^2 / EI = (pi / 2)^2; the critical load of n edges is low by 0.2 (pi / 2)^2 / n^2, of second order."""
+    """M A B L^2 / EI = (pi / 2)^2; n edges underestimate the critical load by 0.2 (pi / 2)^2 / n^2, second order."""
     model = cantilever(n, -X / MA, dimension=2).build(device, "float64")
-    critical = stability.critical(lambda at: (model, statics.solve(model, end=at, mode="follow")), 2.2, 2.6)
+    critical = stability.critical(
+        lambda load_factor: (model, statics.solve(model, end=load_factor, mode="follow")), 2.2, 2.6
+    )
     assert critical == pytest.approx(0.25 * np.pi**2, rel=0.3 / n**2)
-    low, high = (statics.solve(model, end=at) for at in (1e-3, 1.0))
-    factor = stability.buckling(model, low, high)[0]  # linear: the straight beam is the same in every field
+    low, high = (statics.solve(model, end=load_factor) for load_factor in (1e-3, 1.0))
+    factor = stability.buckling(model, low, high)[
+        0
+    ]  # linear buckling: the straight beam is an equilibrium in every field
     assert 1e-3 + factor * (1.0 - 1e-3) == pytest.approx(critical, rel=1e-6)
 
 
 def test_path_branches_at_the_critical_field(device):
-    """The load parameter scales the field: continuation finds the bifurcation and the tip beside the axis on its branch."""
+    """The load parameter scales the field: continuation finds the bifurcation and the lateral tip position of its
+    branch.
+    """
     model = cantilever(20, -3.0 / MA * X, dimension=2).build(device, "float64")
     follow = Continuation(model, {"tip": ddg.Displacement.of(-1, "z")}, max_step=0.3)
     path = follow.trace(stop=ddg.Stop(load=(-1.0, 1.0)))
@@ -128,7 +142,7 @@ def test_path_branches_at_the_critical_field(device):
     branch = follow.switch(fork, stop=ddg.Stop(load=(-1.0, 1.0)))
     straight, bent = path.points[-1], branch.points[-1]
     assert not straight.stable and bent.stable
-    # elastica: M A B L^2 / EI = K(k)^2, tip beside the axis 2 k L / K(k)
+    # elastica: M A B L^2 / EI = K(k)^2, lateral tip position 2 k L / K(k)
     from scipy.special import ellipk
 
     square = brentq(lambda m: ellipk(m) ** 2 - 3.0, 0.0, 0.99)
@@ -149,15 +163,17 @@ def test_field_along_the_rod_raises_its_frequency(device):
 
     omega = brentq(determinant, 3.6, 8.0)
     model = cantilever(60, T / MA * X, dimension=2).build(device, "float64")
-    found = stability.spectrum(model, statics.solve(model), 1)
-    assert found.frequencies[0] == pytest.approx(omega, rel=1e-3)
+    modes = stability.spectrum(model, statics.solve(model), 1)
+    assert modes.frequencies[0] == pytest.approx(omega, rel=1e-3)
 
 
 # Dynamics.
 
 
 def compass(field, angle: float = 0.0, EA: float = 1e7) -> tuple[ddg.Scene, float]:
-    """A stiff needle of two edges along x, held at its middle and turned by a small angle; V M over its inertia [1/(T s^2)]."""
+    """Return a stiff needle of two edges pivoted at the middle, rotated by a small angle, and V M over inertia [1/(T
+    s^2)].
+    """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     points = np.outer([-0.5, 0.0, 0.5], [np.cos(angle), 0.0, np.sin(angle)])
     section = ddg.Stiffness(EA=EA, EI1=1e4, area=1e-4, mass_per_length=1.0)
@@ -173,7 +189,7 @@ def compass(field, angle: float = 0.0, EA: float = 1e7) -> tuple[ddg.Scene, floa
     [("implicit_euler", 1.0), pytest.param("implicit_midpoint", 2.0, marks=pytest.mark.slow)],
 )
 def test_order_in_a_field_that_changes(device, scheme, expected):
-    """I th'' = V M b sin(W t): th = V M b / (I W^2) (W t - sin(W t)); of first and second order in the step."""
+    """I th'' = V M b sin(W t) has th = V M b / (I W^2) (W t - sin(W t)); orders one and two in the step."""
     b, W, end = 1e-4, 3.0, 1.0
     scene, rate = compass(lambda t: (0.0, 0.0, b * np.sin(W * t)))
     model, errors, steps = scene.build(device, "float64"), [], (20, 40, 80)
@@ -184,26 +200,28 @@ def test_order_in_a_field_that_changes(device, scheme, expected):
             state = integrator.step(state, end / count)
         points = state.points()
         errors.append(abs(np.arctan2(points[2, 2], points[2, 0]) - exact))
-        # the state stands in the field at its own time: -V M n . B
+        # energy of the state in the field at its time: -V M n . B
         energy = -MA * b * np.sin(W * end) * np.sin(np.arctan2(points[2, 2], points[2, 0]))
         assert model.energies(state)["magnetic_tangent"] == pytest.approx(energy, rel=1e-6)
     assert order(steps, errors) == pytest.approx(-expected, abs=0.1)
 
 
 @pytest.mark.slow
-def test_needle_turns_over(device):
-    """From 1 degree off a strong field that points back to where it points, and beyond: every step converges, and keeps energy."""
+def test_needle_reverses(device):
+    """A needle 1 degree off an antiparallel strong field reverses and swings on: every step converges and keeps the
+    energy.
+    """
     B = 0.5
     scene, rate = compass(tuple(-B * X), angle=np.radians(1.0), EA=1e3)
     model = scene.build(device, "float64")
     integrator, state = ddg.Integrator(model, "implicit_midpoint"), model.state()
-    start, turned = sum(model.energies(state).values()), 0.0
+    start, largest_angle = sum(model.energies(state).values()), 0.0
     dt = 2.0 * np.pi / np.sqrt(rate * B) / 120.0
     for _ in range(360):
         state = integrator.step(state, dt)
         angle = np.arctan2(*state.points()[2, [2, 0]])
-        turned = max(turned, abs(angle))
-    assert turned > 3.0
+        largest_angle = max(largest_angle, abs(angle))
+    assert largest_angle > 3.0
     assert set(integrator.statistics()["outcomes"]) <= {"converged", "converged_to_rounding"}
     assert sum(model.energies(state).values()) == pytest.approx(start, abs=1e-2 * MA * B)
 
@@ -211,9 +229,11 @@ def test_needle_turns_over(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 def test_twist_swings_in_a_field(device, scheme):
-    """Magnetised across, along z, in a field along z: GJ phi'' - M A B phi = J phi_tt, J the rotary inertia, of which the first mode
-    has the frequency sqrt((M A B + GJ (pi / 2L)^2) / J); let go with a rate, it is farthest after a quarter of its period and back
-    after half."""
+    """A rod magnetised across, along z, in a field along z: GJ phi'' - M A B phi = J phi_tt, J the rotary inertia.
+
+    The first mode has the frequency sqrt((M A B + GJ (pi / 2L)^2) / J). Released with a rate, it is farthest after a
+    quarter period and back after half.
+    """
     B, J, n = 5.0 / MA, SECTION.rotary_inertia, 20
     scene = cantilever(n, B * Z, magnetisation=(MA / 1e-4, 0.0, 0.0), director=Z, analysis=ddg.Dynamics())
     model = scene.build(device, "float64")
@@ -224,15 +244,15 @@ def test_twist_swings_in_a_field(device, scheme):
     integrator, steps = ddg.Integrator(model, scheme, rtol=1e-9), 400
     for _ in range(steps):
         state = integrator.step(state, 0.5 * np.pi / omega / steps)
-    turned = state.directors()[:, 1]  # of z towards -y
-    np.testing.assert_allclose(np.abs(turned), 1e-2 * mode, atol=1e-4)
+    tilt = state.directors()[:, 1]  # of z towards -y
+    np.testing.assert_allclose(np.abs(tilt), 1e-2 * mode, atol=1e-4)
     for _ in range(steps):
         state = integrator.step(state, 0.5 * np.pi / omega / steps)
     assert np.abs(state.directors()[:, 1]).max() < 2e-4
 
 
-def test_worlds_have_magnetisations_of_their_own(device):
-    """Small deflections are in proportion to M, one a world, in statics and in steps."""
+def test_magnetisations_differ_between_worlds(device):
+    """Small deflections are proportional to the magnetisation of each world, in statics and in steps."""
     scene = cantilever(10, 1e-3 / MA * Z, analysis=ddg.Dynamics())
     model = scene.build(device, "float64", worlds=3)
     factors = np.array([1.0, 2.0, -3.0])
@@ -246,16 +266,16 @@ def test_worlds_have_magnetisations_of_their_own(device):
     np.testing.assert_allclose(tips / tips[0], factors, rtol=1e-4)
 
 
-@pytest.mark.parametrize("way", ["step", "statics"])
-def test_field_that_is_not_finite_is_named(device, way):
-    """The function and the time, in steps and in load steps."""
+@pytest.mark.parametrize("solve_kind", ["step", "statics"])
+def test_field_that_is_not_finite_is_named(device, solve_kind):
+    """The error names the function and the time, in steps and in load steps."""
 
     def broken(t):
         return (0.0, 0.0, 1e-3 if t < 0.5 else np.nan)
 
     model = cantilever(4, broken).build(device)
     with pytest.raises(ddg.SolverError, match=r"magnetic field .*broken.* t = ") as caught:
-        if way == "step":
+        if solve_kind == "step":
             ddg.Integrator(model).step(model.state(), 1.0)
         else:
             statics.solve(model, load_steps=2)
@@ -267,24 +287,27 @@ def test_field_that_is_not_finite_is_named(device, way):
 MU0 = 4e-7 * np.pi
 
 
-def kittel(m: np.ndarray, other: np.ndarray, r: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Energy of two dipoles, r from the first to the other, force and torque on the first.
+def kittel(m: np.ndarray, m2: np.ndarray, r: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return energy of two dipoles, force and torque on the first; r points from the first to the other.
 
-    mu0 / (4 pi r^3) [m . m' - 3 (m . u) (m' . u)];
-    F = -3 mu0 / (4 pi r^4) [(m . u) m' + (m' . u) m + (m . m') u - 5 (m . u) (m' . u) u];  m x B.
+    Energy: mu0 / (4 pi r^3) [m . m' - 3 (m . u) (m' . u)].
+
+    Force: -3 mu0 / (4 pi r^4) [(m . u) m' + (m' . u) m + (m . m') u - 5 (m . u) (m' . u) u].
+
+    Torque: m x B.
     """
     d = np.linalg.norm(r)
     u = r / d
     k = MU0 / (4.0 * np.pi * d**3)
-    mu, nu = m @ u, other @ u
-    field = k * (3.0 * nu * u - other)
-    force = -3.0 * k / d * (mu * other + nu * m + (m @ other) * u - 5.0 * mu * nu * u)
-    return k * (m @ other - 3.0 * mu * nu), force, np.cross(m, field)
+    mu, nu = m @ u, m2 @ u
+    field = k * (3.0 * nu * u - m2)
+    force = -3.0 * k / d * (mu * m2 + nu * m + (m @ m2) * u - 5.0 * mu * nu * u)
+    return k * (m @ m2 - 3.0 * mu * nu), force, np.cross(m, field)
 
 
 @pytest.mark.parametrize("across", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_pair_of_dipoles(device, across):
-    """Two edges askew: energy, force and torque on the first against Kittel's closed form; the forces of both cancel."""
+    """Two skew edges: energy, force and torque on the first equal Kittel's closed form; the forces cancel."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     M = np.array([3e5, -2e5, 5e5]) if across else np.array([0.0, 0.0, 5e5])
     lines = [((0.0, 0.0, 0.0), (0.02, 0.01, 0.0)), ((0.05, 0.03, 0.01), (0.05, 0.04, 0.03))]
@@ -312,14 +335,16 @@ def test_pair_of_dipoles(device, across):
     np.testing.assert_allclose(forces[:nodes].sum(0), force, atol=1e-8 * size)
     np.testing.assert_allclose(forces[nodes : 2 * nodes].sum(0), -force, atol=1e-8 * size)
     lever = first - first.mean(0)
-    about = sum(np.cross(arm, f) for arm, f in zip(lever, forces[:2], strict=True))
+    moment = sum(np.cross(arm, f) for arm, f in zip(lever, forces[:2], strict=True))
     if across:
-        about = about + forces[2 * nodes, 0] * tangents[0]
-    np.testing.assert_allclose(about, torque, atol=1e-8 * np.linalg.norm(torque))
+        moment = moment + forces[2 * nodes, 0] * tangents[0]
+    np.testing.assert_allclose(moment, torque, atol=1e-8 * np.linalg.norm(torque))
 
 
 def test_parallel_rods_repel(device):
-    """Side by side, magnetised across: a force 3 mu0 m^2 / (4 pi d^4) for each pair of short edges far apart; a clamp carries it."""
+    """Parallel rods magnetised across: each pair of short distant edges has the force 3 mu0 m^2 / (4 pi d^4), carried
+    by supports.
+    """
     d, length = 0.2, 0.002
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     for y in (0.0, d):
@@ -337,7 +362,7 @@ def test_parallel_rods_repel(device):
 
 @pytest.mark.slow
 def test_free_dipoles_keep_their_momentum(device):
-    """Two short rods that attract, let go: what they gain in speed their dipoles lose in energy, and the sum of momenta stays zero."""
+    """Two short attracting rods gain kinetic energy from the dipole energy; the sum of momenta stays zero."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     for x in (0.0, 0.08):
         points = np.linspace(x * X, (x + 0.02) * X, 3) + 0.01 * x * Z
@@ -357,7 +382,7 @@ def test_free_dipoles_keep_their_momentum(device):
 
 
 def snake(n: int = 24) -> ddg.Scene:
-    """A soft rod magnetised in turn along and against its tangent, whose edges act on each other up to some edges away."""
+    """Return a soft rod magnetised alternately along and against the tangent, with dipole forces between near edges."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     section, material = ddg.Circle(1e-3), ddg.Material(young=1e6, density=2000.0)
     rod = scene.add_rod(np.linspace(0.0 * X, 0.1 * X, n + 1), section=section, material=material)
@@ -369,8 +394,8 @@ def snake(n: int = 24) -> ddg.Scene:
 
 
 @pytest.mark.slow
-def test_chains_keep_their_preconditioner_under_dipoles(device):
-    """What acts from afar is left to conjugate gradients: some iterations a direction, not hundreds."""
+def test_substructuring_preconditions_rods_with_dipoles(device):
+    """Distant interactions are left to conjugate gradients: some iterations a direction, not hundreds."""
     integrator = ddg.Integrator(snake().build(device, "float64"))
     state = integrator.model.state()
     for _ in range(4):
@@ -389,12 +414,14 @@ def test_conjugate_gradients_find_the_same_equilibrium(device):
 
 
 def test_pairs_are_listed_once(device):
-    """Edges that share a node are left out, those beyond the cutoff, too; rods named twice count once."""
+    """Pairs of edges with a common node or beyond the cutoff are omitted; rods named twice count once."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rods = [scene.add_rod(np.linspace(y * Y, X + y * Y, 5), section=SECTION) for y in (0.0, 10.0)]
     scene.magnetize(rods, 1e5)
     scene.add_dipoles(rods, cutoff=0.6)
     scene.add_dipoles(rods[0], cutoff=0.6)
-    (pairs,) = [part for part in scene.build(device).net.sets if part.term.name.startswith("dipoles")]
+    (pairs,) = [
+        element_set for element_set in scene.build(device).net.sets if element_set.term.name.startswith("dipoles")
+    ]
     # middles at 1/8, 3/8, 5/8, 7/8: of each rod the pairs (0, 2) and (1, 3), half a metre apart
     assert pairs.elements == 4

@@ -1,4 +1,4 @@
-"""Steps of nets do what those of lone rods do: they turn edges, renew frames, and can keep the matrix of the first iterate."""
+"""Steps of coupled systems: edge rotations, frame updates and frozen Hessians as for uncoupled rods."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def line(start, end, nodes: int) -> np.ndarray:
 
 
 def cantilever(joined: bool, radius: float, material, natural="straight", points=None) -> ddg.Scene:
-    """A rod held at its first edge; part of a net where a held stub is joined to its first node."""
+    """Return a rod with a clamped first edge; `joined` hinges its first node to a clamped stub."""
     scene = ddg.Scene(gravity=(0.0, -2.9, -9.81))
     points = line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 32) if points is None else points
     options = {"section": ddg.Circle(radius), "material": material}
@@ -39,7 +39,7 @@ def curl() -> np.ndarray:
 
 
 def advance(scene, device, dt, count, velocities=None, **options):
-    """Points after so many steps, and the integrator's statistics."""
+    """Return points after a number of steps, and the integrator's statistics."""
     model = scene.build(device, "float64")
     integrator, state = ddg.Integrator(model, **options), model.state(velocities=velocities)
     for _ in range(count):
@@ -50,56 +50,57 @@ def advance(scene, device, dt, count, velocities=None, **options):
 @pytest.mark.parametrize(
     ("radius", "material", "points", "dt", "count"),
     [
-        (2e-3, RUBBER, None, 0.3, 6),  # straight steps take 15.8 iterations for 7.7
-        (5e-4, WIRE, None, 0.1, 10),  # 27 for 11
+        (2e-3, RUBBER, None, 0.3, 6),  # straight updates take 15.8 iterations instead of 7.7
+        (5e-4, WIRE, None, 0.1, 10),  # 27 instead of 11
         (1e-4, WIRE, curl(), 1.0 / 60.0, 20),
     ],
     ids=["rubber", "wire", "curl"],
 )
-def test_joined_rods_turn_their_edges_as_alone(device, radius, material, points, dt, count):
-    """Long steps of stiff, thin rods: the same motion in about as many iterations, without retries."""
+def test_joined_rods_rotate_edges_as_uncoupled_rods(device, radius, material, points, dt, count):
+    """Long steps of stiff, thin rods: equal motion in about as many iterations, without retries."""
     natural = "straight" if points is None else "shape"
-    (alone, one), (joined, other) = (
-        advance(cantilever(own, radius, material, natural, points), device, dt, count) for own in (False, True)
+    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+        advance(cantilever(is_coupled, radius, material, natural, points), device, dt, count)
+        for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(joined[:32], alone, atol=1e-7)
-    assert np.abs(alone - cantilever(False, radius, material, natural, points).batches[0].points[0]).max() > 0.1
-    assert one["retries"] == other["retries"] == 0
-    assert other["newton_iterations"]["mean"] < 1.25 * one["newton_iterations"]["mean"]
+    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-7)
+    assert np.abs(uncoupled - cantilever(False, radius, material, natural, points).batches[0].points[0]).max() > 0.1
+    assert uncoupled_counts["retries"] == coupled_counts["retries"] == 0
+    assert coupled_counts["newton_iterations"]["mean"] < 1.25 * uncoupled_counts["newton_iterations"]["mean"]
 
 
-def test_joined_rods_stop_where_they_do_alone(device):
-    """Where elimination is exact a tolerance means the same: the same iterates, up to rounding, whoever shares the island."""
-    (alone, one), (joined, other) = (
-        advance(cantilever(own, 2e-3, RUBBER), device, 1.0 / 60.0, 20, rtol=1e-8) for own in (False, True)
+def test_joined_rods_converge_as_uncoupled_rods(device):
+    """Exact elimination gives the same iterates up to rounding, whatever else the island contains."""
+    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+        advance(cantilever(is_coupled, 2e-3, RUBBER), device, 1.0 / 60.0, 20, rtol=1e-8) for is_coupled in (False, True)
     )
-    # the stub has a little weight, which the scale of the island's loads has, too: one step in twenty may end one iteration sooner
+    # the stub adds a little weight to the load scale of the island: one step in twenty may end one iteration sooner
     assert (
-        one["newton_iterations"]["mean"] - 0.051
-        < other["newton_iterations"]["mean"]
-        <= one["newton_iterations"]["mean"]
+        uncoupled_counts["newton_iterations"]["mean"] - 0.051
+        < coupled_counts["newton_iterations"]["mean"]
+        <= uncoupled_counts["newton_iterations"]["mean"]
     )
-    assert 0 <= one["newton_iterations"]["max"] - other["newton_iterations"]["max"] <= 1
-    np.testing.assert_allclose(joined[:32], alone, atol=1e-11)
+    assert 0 <= uncoupled_counts["newton_iterations"]["max"] - coupled_counts["newton_iterations"]["max"] <= 1
+    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-11)
 
 
 def whip(joined: bool) -> ddg.Scene:
     return cantilever(joined, 2e-3, RUBBER)
 
 
-def test_predictors_turn_edges(device):
-    """A rod that swings by 0.4 rad a step is predicted unstretched: first iterates cost little more than when it rests."""
+def test_predictors_rotate_edges(device):
+    """A rod that swings by 0.4 rad a step is predicted unstretched: the coupled system takes hardly more iterations."""
     rates = np.zeros((35, 3))
     rates[:32, 2] = 40.0 * np.linspace(0.0, 1.0, 32)
-    (alone, one), (joined, other) = (
-        advance(whip(own), device, 0.01, 3, rates[: 35 if own else 32]) for own in (False, True)
+    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+        advance(whip(is_coupled), device, 0.01, 3, rates[: 35 if is_coupled else 32]) for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(joined[:32], alone, atol=1e-6)
-    assert other["newton_iterations"]["mean"] <= 1.25 * one["newton_iterations"]["mean"]
+    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-6)
+    assert coupled_counts["newton_iterations"]["mean"] <= 1.25 * uncoupled_counts["newton_iterations"]["mean"]
 
 
 def tree() -> ddg.Scene:
-    """Rods of both ways joined rigidly and by hinges at angles, twisted and curved at rest."""
+    """Return rods of both orientations joined rigidly and by hinges at angles, twisted and curved at rest."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     options = {"section": ddg.Rectangle(6e-3, 4e-3), "material": RUBBER, "natural": (1.0, 0.5, 2.0)}
     trunk = scene.add_rod(line((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), 7), **options)
@@ -112,11 +113,11 @@ def tree() -> ddg.Scene:
     return scene
 
 
-@pytest.mark.parametrize("turn", [0.3, 2.0])
-def test_renewed_frames_change_no_energy(device, turn):
-    """In the middle of a solve, edges and joints turned far: strains stay what they are; other worlds keep their frames.
+@pytest.mark.parametrize("rotation", [0.3, 2.0])
+def test_frame_update_keeps_strains(device, rotation):
+    """Edges and joints rotate far within a solve: strains stay, and other worlds keep their frames.
 
-    The lagged tangents are those of the iterate then, up to rounding.
+    Lagged tangents then equal tangents of the iterate, up to rounding.
     """
     model = tree().build(device, "float64", worlds=2)
     net, state = model.net, model.net.rest()
@@ -124,28 +125,30 @@ def test_renewed_frames_change_no_energy(device, turn):
     random = np.random.default_rng(3)
     q = np.array(state.q.numpy().reshape(2, -1, 3), float)
     nodes, spins = net.host.nodes, net.host.spins
-    # turned about an axis by an angle that grows along x, with angles and rotations of joints at random
-    angle = turn * q[:, :nodes, :1]
+    # rotated about an axis by an angle that grows along x, with random twist angles and joint rotations
+    angle = rotation * q[:, :nodes, :1]
     y, z = q[:, :nodes, 1:2] + 0.2, q[:, :nodes, 2:3]
     q[:, :nodes, 1:] = np.concatenate(
         [np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z], -1
     )
     q[:, nodes : -spins or None, 0] += random.normal(size=q[:, nodes : -spins or None, 0].shape)
-    q[:, -spins:] = 0.3 * turn * random.normal(size=(2, spins, 3))
+    q[:, -spins:] = 0.3 * rotation * random.normal(size=(2, spins, 3))
     newton.q.assign(q.reshape(-1, 3))
 
     def energies():
-        found = []
-        for i, part in enumerate(net.sets):
-            strain = wp.zeros((len(part.term.measure.strains), 2 * part.elements), dtype=net.real, device=net.device)
+        strains = []
+        for i, element_set in enumerate(net.sets):
+            strain = wp.zeros(
+                (len(element_set.term.measure.strains), 2 * element_set.elements), dtype=net.real, device=net.device
+            )
             state.q.assign(newton.q)
             net.strains(state, i, strain)
-            found.append(strain.numpy())
-        return np.concatenate([values.ravel() for values in found])
+            strains.append(strain.numpy())
+        return np.concatenate([values.ravel() for values in strains])
 
     before, frames = energies(), state.frame.numpy().copy()
-    todo = wp.array([RELAG, 0], dtype=int, device=net.device)
-    net.renew(state, newton.q, todo)
+    actions = wp.array([RELAG, 0], dtype=int, device=net.device)
+    net.renew(state, newton.q, actions)
     after = energies()
     assert np.abs(before).max() > 1.0
     np.testing.assert_allclose(after, before, atol=1e-10 * np.abs(before).max())
@@ -158,41 +161,46 @@ def test_renewed_frames_change_no_energy(device, turn):
     assert np.abs(frames[3:, :edges].T - tangent).max() > 0.1
 
 
-def spun(joined: bool, turns: float) -> ddg.Scene:
-    """A rod in the shape of an L whose root is turned about by so many turns a second."""
+def spun(joined: bool, rate: float) -> ddg.Scene:
+    """Return an L-shaped rod with a root that rotates by some revolutions a second."""
     corner = np.array(
         [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2], [0.1, 0.0, 0.25], [0.2, 0.0, 0.25], [0.3, 0.0, 0.25]]
     )
     scene = cantilever(joined, 2e-2, RUBBER, "shape", corner)
     scene.supports.clear()
-    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t, axis=(0.6, 0.0, 0.8))
+    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * rate * t, axis=(0.6, 0.0, 0.8))
     scene.clamp(0, edges=[0], motion=motion)
     if joined:
         scene.clamp(1, edges=[0, 1], motion=motion)
     return scene
 
 
-def test_whipped_rods_move_as_alone(device):
-    """Thrown about so that edges turn over within steps, which are halved; without new frames the joined rod is off by 0.09 m."""
+def test_whipped_rods_move_as_uncoupled_rods(device):
+    """Edges reverse within steps, which are halved.
+
+    Measured: without frame updates the joined rod is off by 0.09 m.
+    """
     s = np.linspace(0.0, 1.0, 32)
     rates = np.zeros((35, 3))
     rates[:32, 1:] = np.stack([50.0 * s, 60.0 * s**3 * np.sin(20.0 * s)], -1)
-    (alone, one), (joined, other) = (
-        advance(whip(own), device, 0.02, 5, rates[: 35 if own else 32]) for own in (False, True)
+    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+        advance(whip(is_coupled), device, 0.02, 5, rates[: 35 if is_coupled else 32]) for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(joined[:32], alone, atol=1e-6)
-    assert other["retries"] <= one["retries"]
+    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-6)
+    assert coupled_counts["retries"] <= uncoupled_counts["retries"]
 
 
-def test_joined_rods_turn_by_more_than_a_right_angle_in_a_step(device):
-    """120 degrees a step, from which frames are renewed within the solve: edges follow as alone, and twist is not lost."""
-    (alone, one), (joined, other) = (advance(spun(own, 1.0 / 3.0), device, 1.0, 3) for own in (False, True))
-    np.testing.assert_allclose(joined[:6], alone, atol=1e-6)
-    assert one["retries"] == other["retries"]
+def test_joined_rods_rotate_by_more_than_a_right_angle_a_step(device):
+    """Frames are updated within solves of 120 degrees a step: edges follow, and twist is kept."""
+    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+        advance(spun(is_coupled, 1.0 / 3.0), device, 1.0, 3) for is_coupled in (False, True)
+    )
+    np.testing.assert_allclose(coupled[:6], uncoupled, atol=1e-6)
+    assert uncoupled_counts["retries"] == coupled_counts["retries"]
 
 
 def frame() -> ddg.Scene:
-    """A portal frame of rigid joints that is pushed sideways."""
+    """Return a portal frame of rigid joints under a lateral force."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     options = {"section": ddg.Circle(5e-3), "material": RUBBER}
     left = scene.add_rod(line((0.0, 0.0, 0.0), (0.0, 0.0, 0.3), 8), **options)
@@ -215,34 +223,34 @@ def sheet() -> ddg.Scene:
 
 @pytest.mark.parametrize("linear", ["auto", "block_jacobi"])
 @pytest.mark.parametrize("scene", [whip, frame, tree, sheet], ids=["stub", "frame", "tree", "sheet"])
-def test_projective_finds_what_newton_does(device, scene, linear):
-    """By one matrix a step: the same states, in more iterations, since it converges linearly."""
+def test_projective_converges_to_newtons_solution(device, scene, linear):
+    """The frozen Hessian gives the same states in more iterations, since it converges linearly."""
     made = scene(True) if scene is whip else scene()
     options = {"rtol": 1e-9, "linear": linear}
     expected, newton = advance(made, device, 1.0 / 120.0, 10, **options)
-    found, projective = advance(made, device, 1.0 / 120.0, 10, solver="projective", **options)
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    points, projective = advance(made, device, 1.0 / 120.0, 10, solver="projective", **options)
+    np.testing.assert_allclose(points, expected, atol=1e-8)
     assert projective["retries"] == 0
     assert projective["newton_iterations"]["mean"] > newton["newton_iterations"]["mean"]
 
 
 @pytest.mark.parametrize("scene", [frame, tree])
-def test_exact_hessian_of_nets(device, scene):
-    """psd 'none': the same states; where nothing buckles it converges as fast as 'progressive', at least."""
+def test_exact_hessian_of_coupled_systems(device, scene):
+    """psd 'none' gives the same states; without buckling it converges at least as fast as 'progressive'."""
     expected, progressive = advance(scene(), device, 1.0 / 120.0, 10, rtol=1e-9, psd="progressive")
-    found, exact = advance(scene(), device, 1.0 / 120.0, 10, rtol=1e-9, psd="none")
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    points, exact = advance(scene(), device, 1.0 / 120.0, 10, rtol=1e-9, psd="none")
+    np.testing.assert_allclose(points, expected, atol=1e-8)
     assert exact["newton_iterations"]["mean"] <= progressive["newton_iterations"]["mean"]
 
 
-def test_outwards_meets_every_rod_once_from_what_is_held():
-    """A held grid, a chain that hangs from it, and two loose rods: who is placed when, and where it is anchored."""
+def test_rod_order_visits_every_rod_once_from_the_supports():
+    """A supported grid, a path hanging from it, and two free rods: levels, and anchored nodes of each rod."""
     grid = [np.array([0, 1, 2, 3]), np.array([4, 5, 6, 7]), np.array([8, 1, 5, 9]), np.array([10, 2, 6, 11])]
-    chain = [np.array([3, 12, 13]), np.array([14, 13])]
-    loose = [np.array([20, 21]), np.array([21, 22])]
-    held = np.zeros(23, bool)
-    held[[0, 4, 7, 8]] = True
-    plan = outwards([*grid, *chain, *loose], held)
+    hanging = [np.array([3, 12, 13]), np.array([14, 13])]
+    free = [np.array([20, 21]), np.array([21, 22])]
+    fixed = np.zeros(23, bool)
+    fixed[[0, 4, 7, 8]] = True
+    plan = outwards([*grid, *hanging, *free], fixed)
     assert sorted(np.concatenate(plan.levels)) == list(range(8))
     level = {rod: i for i, rods in enumerate(plan.levels) for rod in rods}
     assert level[0] == level[1] == 0
@@ -254,8 +262,8 @@ def test_outwards_meets_every_rod_once_from_what_is_held():
 
 
 @pytest.mark.parametrize("scene", [whip, frame, sheet], ids=["stub", "frame", "sheet"])
-def test_report_says_how_a_net_is_solved(device, scene):
-    """By elimination alone where it is exact; the memory of H is that of what lies in bands and of what does not."""
+def test_report_states_the_linear_solver_of_a_coupled_system(device, scene):
+    """The report states exact elimination; the memory of H is that of bands and of the remaining blocks."""
     model = (scene(True) if scene is whip else scene()).build(device, "float64")
     newton = ddg.Integrator(model)._net.newton
     lines = model.report()

@@ -1,4 +1,4 @@
-"""Recorder and resumed runs: what is recorded is what was given, and a run in parts is the run in one piece."""
+"""Recorder and resumed runs: recorded data are exact, and a resumed run equals an uninterrupted one."""
 
 import json
 from pathlib import Path
@@ -25,17 +25,17 @@ TERMS = {"curvature_1", "twist", "axial_force"}
 
 
 def rods(scene, height: float = 0.0) -> None:
-    """Two open rods and a ring."""
+    """Add two open rods and a ring."""
     line = np.linspace((0.0, 0.0, height), (1.0, 0.0, height + 0.1), 5)
     for y in (0.0, 0.3):
         scene.add_rod(line + [0.0, y, 0.0], section=ddg.Circle(0.02), material=RUBBER, name="strand")
-    turn = np.linspace(0.0, 2.0 * np.pi, 6, endpoint=False)
-    ring = np.stack([0.3 * np.cos(turn), 1.0 + 0.3 * np.sin(turn), np.full(6, height)], axis=1)
+    angle = np.linspace(0.0, 2.0 * np.pi, 6, endpoint=False)
+    ring = np.stack([0.3 * np.cos(angle), 1.0 + 0.3 * np.sin(angle), np.full(6, height)], axis=1)
     scene.add_rod(ring, section=ddg.Circle(0.02), material=RUBBER, closed=True, name="ring")
 
 
 def scene_of(kind: str, dt: float = 0.004, duration: float = 0.08, **analysis) -> ddg.Scene:
-    """A small scene of "rods", a "net" of them, a "shell", or rods on a floor with friction in "contact"."""
+    """Return a small scene of "rods", coupled rods ("net"), a "shell", or rods on a floor with friction ("contact")."""
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration, **analysis))
     if kind == "shell":
         scene.add_shell(*meshes.rectangle(3, 2), thickness=0.01, material=RUBBER, name="sheet")
@@ -54,19 +54,19 @@ def scene_of(kind: str, dt: float = 0.004, duration: float = 0.08, **analysis) -
 
 
 def stepped(model, count: int):
-    """Some states of a model, copied."""
+    """Return copies of the first states of a model."""
     integrator, state = ddg.Integrator(model), model.state()
-    found = [state.copy()]
+    states = [state.copy()]
     for _ in range(count - 1):
         state = integrator.step(state, 0.004)
-        found.append(state.copy())
-    return found
+        states.append(state.copy())
+    return states
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("kind", ["rods", "net", "shell", "contact"])
-def test_what_is_recorded_is_what_was_given(kind, worlds, device, tmp_path):
-    """Bit for bit, with every option, over several blocks, the last of them not full."""
+def test_recorded_data_equal_the_states(kind, worlds, device, tmp_path):
+    """Recorded data are bitwise equal with every option, over several blocks, the last of them partial."""
     model = scene_of(kind).build(device, worlds=worlds)
     states = stepped(model, 7)
     names = ["shell_strain", "shell_energy"] if kind == "shell" else sorted(TERMS)
@@ -84,8 +84,8 @@ def test_what_is_recorded_is_what_was_given(kind, worlds, device, tmp_path):
     options = {"velocities": True, "directors": kind != "shell", "fields": names, "contacts": kind == "contact"}
     notes = {"provenance": {"by": "test", "n": 3, "list": [1, {"x": None}]}, "control": {"field": np.eye(3), "dt": 0.1}}
     with Recorder(model, tmp_path, block=3, attributes=attributes, **options, **notes) as recorder:
-        for state, found in zip(states, observed, strict=True):
-            recorder.record(state, found)
+        for state, values_observed in zip(states, observed, strict=True):
+            recorder.record(state, values_observed)
     with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
         assert len(reader) == 7
         assert reader.time.tolist() == [state.time for state in states]
@@ -103,7 +103,7 @@ def test_what_is_recorded_is_what_was_given(kind, worlds, device, tmp_path):
                 for name, wanted in vars(model.contacts(state)).items():
                     np.testing.assert_array_equal(getattr(reader.contacts[frame], name), wanted)
         for name in observed[0]:
-            assert reader.series[name].tolist() == [found[name] for found in observed]
+            assert reader.series[name].tolist() == [values_observed[name] for values_observed in observed]
         for name, values in attributes.items():
             np.testing.assert_array_equal(reader.attributes[name], values)
         for name, value in notes["provenance"].items():
@@ -116,8 +116,8 @@ def test_what_is_recorded_is_what_was_given(kind, worlds, device, tmp_path):
         assert file["control"].attrs["dt"] == 0.1
 
 
-def told(result) -> dict:
-    """The summary of a run as it is written, without what clocks say."""
+def summary_without_clocks(result) -> dict:
+    """Return the summary of a run as written, without measured times."""
     content = json.loads(json.dumps(summary("scene", {}, result, []), default=lambda value: np.asarray(value).tolist()))
     return {name: value for name, value in content.items() if name not in CLOCKS}
 
@@ -129,40 +129,43 @@ def observe(model, state) -> dict:
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("kind", ["rods", "net", "shell", "contact"])
 def test_resumed_equals_straight_in_every_number(kind, worlds, device, tmp_path):
-    """Of summary and trajectory: in two parts and in three, one of them a single step."""
-    scene, given = (
+    """Summary and trajectory agree for runs in two segments and in three, one of them a single step."""
+    scene, options = (
         scene_of(kind),
         {"device": device, "worlds": worlds, "observe": observe, "progress": False, "usd": False},
     )
-    given["fields"] = ["contacts"] if kind == "contact" else ["velocities"]
-    straight = simulate(scene, out=tmp_path / "straight", **given)
+    options["fields"] = ["contacts"] if kind == "contact" else ["velocities"]
+    straight = simulate(scene, out=tmp_path / "straight", **options)
     for name, ends in {"two": (0.04, 0.08), "three": (0.02, 0.024, 0.08)}.items():
-        simulate(scene, out=tmp_path / name, duration=ends[0], **given)
+        simulate(scene, out=tmp_path / name, duration=ends[0], **options)
         for end in ends[1:]:
-            resumed = simulate(scene, resume=tmp_path / name, duration=end, **given)
-        assert told(resumed) == told(straight)
+            resumed = simulate(scene, resume=tmp_path / name, duration=end, **options)
+        assert summary_without_clocks(resumed) == summary_without_clocks(straight)
         assert resumed.series == straight.series and resumed.times == straight.times
         assert resumed.wall_time > resumed.compile_time > 0.0
-        with TrajectoryReader(tmp_path / name / "trajectory.h5") as one:
-            with TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as other:
-                assert one.recorded == other.recorded
-                for field in one.recorded:
-                    assert one._file["trajectory"][field][:].tobytes() == other._file["trajectory"][field][:].tobytes()
-                counts = one.run_counts(), other.run_counts()
+        with TrajectoryReader(tmp_path / name / "trajectory.h5") as resumed_file:
+            with TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as straight_file:
+                assert resumed_file.recorded == straight_file.recorded
+                for field in resumed_file.recorded:
+                    assert (
+                        resumed_file._file["trajectory"][field][:].tobytes()
+                        == straight_file._file["trajectory"][field][:].tobytes()
+                    )
+                counts = resumed_file.run_counts(), straight_file.run_counts()
         for key in counts[0]:
             if not key.startswith(("clock/", "search/")):
                 np.testing.assert_array_equal(*(each[key] for each in counts), err_msg=key)
 
 
 class Killed(BaseException):
-    """As if the process had ended."""
+    """Stand in for the end of the process."""
 
 
 @pytest.mark.parametrize("kind", ["rods", "contact"])
-def test_a_killed_run_counts_what_was_complete(kind, device, tmp_path, monkeypatch):
-    """Steps after the last block are done again, and counted once."""
-    scene, given = scene_of(kind, duration=0.32), {"device": device, "progress": False, "usd": False}
-    straight = simulate(scene, out=tmp_path / "straight", **given)
+def test_resume_after_kill_counts_steps_once(kind, device, tmp_path, monkeypatch):
+    """Repeated steps after the last block are counted once."""
+    scene, options = scene_of(kind, duration=0.32), {"device": device, "progress": False, "usd": False}
+    straight = simulate(scene, out=tmp_path / "straight", **options)
 
     def record(self, state, observed=None, record=Recorder.record):
         if state.time > 0.29:
@@ -172,16 +175,18 @@ def test_a_killed_run_counts_what_was_complete(kind, device, tmp_path, monkeypat
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(Recorder, "record", record)
-        simulate(scene, out=tmp_path / "killed", **given)
+        simulate(scene, out=tmp_path / "killed", **options)
     with TrajectoryReader(tmp_path / "killed" / "trajectory.h5") as reader:
         assert len(reader) == 64
-    assert told(simulate(scene, resume=tmp_path / "killed", **given)) == told(straight)
+    assert summary_without_clocks(simulate(scene, resume=tmp_path / "killed", **options)) == summary_without_clocks(
+        straight
+    )
 
 
 def test_a_failed_step_is_counted_once(device, tmp_path, monkeypatch):
-    """A run that failed, and goes on once the reason is gone, counts as if it had not."""
-    scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
-    straight = simulate(scene, out=tmp_path / "straight", **given)
+    """A failed run that is resumed without the cause counts like an uninterrupted one."""
+    scene, options = scene_of("rods"), {"device": device, "progress": False, "usd": False}
+    straight = simulate(scene, out=tmp_path / "straight", **options)
 
     def step(self, state, dt, step=ddg.Integrator.step):
         if state.time > 0.03:
@@ -191,43 +196,45 @@ def test_a_failed_step_is_counted_once(device, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(ddg.Integrator, "step", step)
-        assert simulate(scene, out=tmp_path / "failed", **given).failure
-    assert told(simulate(scene, resume=tmp_path / "failed", **given)) == told(straight)
+        assert simulate(scene, out=tmp_path / "failed", **options).failure
+    assert summary_without_clocks(simulate(scene, resume=tmp_path / "failed", **options)) == summary_without_clocks(
+        straight
+    )
 
 
-def test_a_file_without_counts_is_told(device, tmp_path):
-    """Of an older version: nothing is invented of what came before."""
-    scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
-    simulate(scene, out=tmp_path, duration=0.04, **given)
+def test_resume_of_a_file_without_counts_starts_counting(device, tmp_path):
+    """Files of an older version have no counts: earlier counts stay unknown."""
+    scene, options = scene_of("rods"), {"device": device, "progress": False, "usd": False}
+    simulate(scene, out=tmp_path, duration=0.04, **options)
     with transaction(tmp_path / "trajectory.h5") as file:
         for slot in ("a", "b"):
             if slot in file["checkpoint"]:
                 del file[f"checkpoint/{slot}/run"]
                 file[f"checkpoint/{slot}"].attrs.pop("crc32")
     for end in (0.06, 0.08):
-        result = simulate(scene, resume=tmp_path, duration=end, **given)
-        content = told(result)
+        result = simulate(scene, resume=tmp_path, duration=end, **options)
+        content = summary_without_clocks(result)
     assert content["counted_from"] == pytest.approx(0.06)
     assert content["energy"]["start"] is None and content["energy"]["end"]
     assert content["steps"] == 20 and content["outcomes"] == {"converged": 5 * 3}
 
 
 def test_a_finished_run_stays_as_it_is(device, tmp_path):
-    """Its result is had again; no file of it changes."""
-    scene, given = scene_of("contact"), {"device": device, "progress": False}
-    first = simulate(scene, out=tmp_path, **given)
+    """The result is returned again, and no file changes."""
+    scene, options = scene_of("contact"), {"device": device, "progress": False}
+    first = simulate(scene, out=tmp_path, **options)
     before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in tmp_path.iterdir()}
-    again = simulate(scene, resume=tmp_path, **given)
-    assert told(again) == told(first) and again.times == first.times
+    again = simulate(scene, resume=tmp_path, **options)
+    assert summary_without_clocks(again) == summary_without_clocks(first) and again.times == first.times
     with pytest.raises(
         InputError, match=r"recorded up to 0.08 s; a duration of 0.04 s would cut it: give a longer one"
     ):
-        simulate(scene, resume=tmp_path, duration=0.04, **given)
+        simulate(scene, resume=tmp_path, duration=0.04, **options)
     assert before == {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("changed", "message"),
     [
         ({"dt": 0.002}, "has dt = 0.004"),
         ({"worlds": 2}, "has worlds = 1"),
@@ -238,18 +245,18 @@ def test_a_finished_run_stays_as_it_is(device, tmp_path):
         ({"out": "elsewhere"}, "goes on in its directory"),
     ],
 )
-def test_a_run_resumes_with_its_own_settings(options, message, tmp_path):
-    scene, given = scene_of("rods"), {"device": "cpu", "progress": False, "usd": False}
-    simulate(scene, out=tmp_path, duration=0.004, **given)
+def test_a_run_resumes_with_its_own_settings(changed, message, tmp_path):
+    scene, options = scene_of("rods"), {"device": "cpu", "progress": False, "usd": False}
+    simulate(scene, out=tmp_path, duration=0.004, **options)
     before = (tmp_path / "trajectory.h5").read_bytes()
     with pytest.raises(InputError, match=message):
-        simulate(scene, resume=tmp_path, **given, **options)
+        simulate(scene, resume=tmp_path, **options, **changed)
     assert (tmp_path / "trajectory.h5").read_bytes() == before
 
 
-def test_parameters_that_callbacks_set_are_no_other_model(device, tmp_path):
-    """A resumed run begins with the parameters of its scene and its first state, and callbacks set them by the time."""
-    scene, given = scene_of("rods"), {"device": device, "progress": False, "usd": False}
+def test_parameters_set_by_callbacks_do_not_block_a_resume(device, tmp_path):
+    """Resumed runs start with parameters of the scene and of the first state; callbacks set them by time."""
+    scene, options = scene_of("rods"), {"device": device, "progress": False, "usd": False}
 
     def soften(model, time: float) -> None:
         model.set_parameter("rod_stretch", "stiffness", 1000.0 * (1.0 - time))
@@ -257,9 +264,11 @@ def test_parameters_that_callbacks_set_are_no_other_model(device, tmp_path):
     scene.initial = lambda model: soften(model, 0.0) or model.state()
     scene.callbacks.append(lambda state: soften(state.model, state.time))
 
-    straight = simulate(scene, out=tmp_path / "straight", **given)
-    simulate(scene, out=tmp_path / "parts", duration=0.04, **given)
-    assert told(simulate(scene, resume=tmp_path / "parts", duration=0.08, **given)) == told(straight)
+    straight = simulate(scene, out=tmp_path / "straight", **options)
+    simulate(scene, out=tmp_path / "parts", duration=0.04, **options)
+    assert summary_without_clocks(
+        simulate(scene, resume=tmp_path / "parts", duration=0.08, **options)
+    ) == summary_without_clocks(straight)
 
 
 def build(kind: str = "rods", change=None, worlds: int = 1):
@@ -289,21 +298,21 @@ def _add_sheet(scene) -> None:
     scene.add_shell(*meshes.rectangle(1, 1), thickness=0.01, material=RUBBER)
 
 
-@pytest.mark.parametrize("other", OTHERS)
-def test_another_model_cannot_go_on(other, tmp_path):
-    """It is refused when the recorder is opened, and the file stays."""
+@pytest.mark.parametrize("change", OTHERS)
+def test_resume_with_another_model_is_refused(change, tmp_path):
+    """The refusal comes when the recorder is opened, and the file stays."""
     model = build()
     with Recorder(model, tmp_path, usd=False) as recorder:
         recorder.record(model.state())
     before = (tmp_path / "trajectory.h5").read_bytes()
-    make, what = OTHERS[other]
-    with pytest.raises(TrajectoryError, match=what):
+    make, message = OTHERS[change]
+    with pytest.raises(TrajectoryError, match=message):
         Recorder(make(), tmp_path, usd=False, resume=True)
     assert (tmp_path / "trajectory.h5").read_bytes() == before
 
 
 def test_states_are_recorded_in_order(device, tmp_path):
-    """A state not later than the last is refused; of a resumed run only the checkpoint is passed over, if it is that."""
+    """States that are not later than the last are refused; a resumed run skips only its own checkpoint."""
     model = build()
     states = stepped(model, 4)
     with Recorder(model, tmp_path, usd=False) as recorder:
@@ -334,7 +343,7 @@ def _moved(model, state):
 
 
 def test_frames_may_be_numbered(tmp_path):
-    """Designs and equilibria one after the other, whose states have any time; resumed, they count on."""
+    """Designs or equilibria in sequence may have any time; resumed recordings continue the numbering."""
     from pxr import Usd
 
     model = build()
@@ -354,14 +363,14 @@ def test_frames_may_be_numbered(tmp_path):
         Recorder(model, tmp_path, resume=True, time="state")
 
 
-def test_what_is_refused_leaves_the_recording_whole(tmp_path):
-    """After each refusal of `record` the frames before and after it are there, all of them."""
+def test_refused_frames_leave_the_recording_whole(tmp_path):
+    """Frames before and after each refusal of `record` are all present."""
     model = build()
     states = stepped(model, 8)
-    bad = [{"a/b": 1.0}, {"": 1.0}, {3: 1.0}, {"a": "1"}, {"a": np.nan}, {"b": 1.0}, {}]
+    refused = [{"a/b": 1.0}, {"": 1.0}, {3: 1.0}, {"a": "1"}, {"a": np.nan}, {"b": 1.0}, {}]
     with Recorder(model, tmp_path, block=2) as recorder:
         recorder.record(states[0], {"a": 0.0})
-        for k, observed in enumerate(bad):
+        for k, observed in enumerate(refused):
             with pytest.raises(SceneError, match="observed"):
                 recorder.record(states[k + 1], observed)
             recorder.record(states[k + 1], {"a": k + 1})
@@ -376,11 +385,11 @@ def _later(model, state):
     return ddg.Integrator(model).step(state, 0.004)
 
 
-def test_a_directory_that_is_held_stays_so(tmp_path):
-    """From before the recorder until after it."""
+def test_locked_directory_stays_locked(tmp_path):
+    """The lock outlasts the recorder."""
     model = build()
-    with RunDirectory(tmp_path / "a") as held:
-        with Recorder(model, held, usd=False) as recorder:
+    with RunDirectory(tmp_path / "a") as directory:
+        with Recorder(model, directory, usd=False) as recorder:
             recorder.record(model.state())
         with pytest.raises(FileExistsError, match="is recording a run there"):
             Recorder(model, tmp_path / "a", usd=False, force=True)
@@ -391,7 +400,7 @@ def test_a_directory_that_is_held_stays_so(tmp_path):
 
 
 def test_force_replaces_all_of_a_run(tmp_path):
-    """Also what the new one does not write, such as the scene of a run that is recorded without."""
+    """Files that the new run does not write are removed too, such as the scene."""
     model = build()
     for name in ("summary.json", "picture.png", "notes.txt"):
         (tmp_path / name).write_text("{}")
@@ -404,11 +413,11 @@ def test_force_replaces_all_of_a_run(tmp_path):
 @pytest.mark.parametrize("name", ["run.lock", "trajectory.h5", "scene.usdc", "trajectory.h5.partial", "scene.partial.usdc",
                                   "scene.room.usdc", "trajectory.h5.journal", "scene.copy.usdc"])  # fmt: skip
 def test_links_are_not_written_through(name, tmp_path):
-    """A link in the directory to a file elsewhere: that file stays, whether the run is recorded or refused."""
-    model, other, folder = build(), tmp_path / "other", tmp_path / "run"
-    other.write_bytes(b"precious" * 100)
+    """The target of a link in the directory stays, whether the run is recorded or refused."""
+    model, target, folder = build(), tmp_path / "other", tmp_path / "run"
+    target.write_bytes(b"precious" * 100)
     folder.mkdir()
-    (folder / name).symlink_to(other)
+    (folder / name).symlink_to(target)
     for options in ({"force": True}, {"resume": True}):
         try:
             with Recorder(model, folder, block=1, **options) as recorder:
@@ -416,7 +425,7 @@ def test_links_are_not_written_through(name, tmp_path):
                     recorder.record(state)
         except (FileExistsError, ValueError) as error:
             assert "link" in str(error) or "cut short" in str(error) or "later" in str(error) or "follows" in str(error)
-    assert other.read_bytes() == b"precious" * 100
+    assert target.read_bytes() == b"precious" * 100
 
 
 def test_a_trajectory_that_is_a_link_is_read_but_not_resumed(tmp_path):
@@ -433,7 +442,7 @@ def test_a_trajectory_that_is_a_link_is_read_but_not_resumed(tmp_path):
 
 @pytest.mark.parametrize("dt", [1e8, 1e-9])
 def test_time_codes_of_any_step(dt, tmp_path):
-    """One a frame."""
+    """One time code a frame."""
     from pxr import Usd
 
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=3 * dt))
@@ -448,13 +457,13 @@ def test_time_codes_of_any_step(dt, tmp_path):
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 3.0)
 
 
-def test_places_that_cannot_be_written_to_are_named(tmp_path, monkeypatch):
-    """As they were given, with a remedy that helps: no free space is asked for where there is enough."""
+def test_unwritable_paths_are_named(tmp_path, monkeypatch):
+    """The path is stated as given, with a remedy that fits the cause."""
     model = build()
     (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(FileExistsError, match=rf"{place}: .*file is a file.*give another one"):
-            Recorder(model, place)
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(FileExistsError, match=rf"{path}: .*file is a file.*give another one"):
+            Recorder(model, path)
     with pytest.raises(OSError, match=r"/proc/x: .*give another place") as caught:
         Recorder(model, "/proc/x")
     assert "free some space" not in str(caught.value)

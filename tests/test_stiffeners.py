@@ -1,4 +1,4 @@
-"""Rods glued along shells: their sections turn with the surface. Closed forms, meshes, turns, and what is left free."""
+"""Rods glued along shells: sections rotate with the surface. Closed forms, meshes, rotations, and omitted elements."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from ddg_warp.solve.tangent import Tangent
 
 YOUNG, LENGTH, WIDTH, THICKNESS = 1e7, 1.0, 0.4, 0.01
 TALL = ddg.Stiffness(EA=1e3, EI1=0.08, EI2=0.01, GJ=0.02, mass_per_length=0.1, rotary_inertia=1e-5)
-LIGHT = ddg.Stiffness(EA=1e3, EI1=0.016, EI2=0.002, GJ=0.004, mass_per_length=0.1)  # against the plate's b D = 0.4
+LIGHT = ddg.Stiffness(EA=1e3, EI1=0.016, EI2=0.002, GJ=0.004, mass_per_length=0.1)  # against b D = 0.4 of the plate
 X, Y, Z = np.eye(3)
 
 
@@ -26,7 +26,7 @@ def strip(
     jitter=0.0,
     **options,
 ):
-    """A strip along x with a rod along its middle, or another row of its mesh; its scene and the vertices along the rod."""
+    """Return a strip along x with a rod along the middle or another mesh row, and the vertices along the rod."""
     rows = max(2, 2 * round(0.5 * cells * WIDTH / LENGTH))
     points, triangles = meshes.rectangle(cells, rows, (LENGTH, WIDTH), pattern)
     points[:, 1] -= 0.5 * WIDTH
@@ -53,11 +53,16 @@ def elastic(model, state) -> dict[str, float]:
 
 
 def torsional_stiffness(device, cells: int, factor=1.0, **options) -> float:
-    """Torque over rate of twist [N m^2] of a strip whose ends are turned about its axis and may warp, from its energy."""
+    """Return torque over rate of twist [N m^2] of a strip, from its energy.
+
+    The ends are rotated about the axis and may warp.
+    """
     scene, line = strip(cells, section=LIGHT, **options)
     points, twist = scene.shells[0].points, 0.02
-    for x, turn in ((0.0, -0.5 * twist), (LENGTH, 0.5 * twist)):
-        motion = ddg.Motion(angle=lambda t, turn=turn: turn * t, axis=tuple(X), pivot=tuple(points[line[0]]))
+    for x, rotation in ((0.0, -0.5 * twist), (LENGTH, 0.5 * twist)):
+        motion = ddg.Motion(
+            angle=lambda t, rotation=rotation: rotation * t, axis=tuple(X), pivot=tuple(points[line[0]])
+        )
         scene.hold(0, on(points, 0, x), "yz", motion=motion)
     scene.hold(0, line[[len(line) // 2]], "x")
     if not scene.attachments[0].glued:
@@ -75,10 +80,10 @@ PLATE = YOUNG / 2.6 * WIDTH * THICKNESS**3 / 3.0  # G b t^3 / 3
     ("pattern", "jitter", "row"), [("alternating", 0.0, None), ("alternating", 0.0, 0), ("right", 0.25, None)]
 )
 def test_glued_rod_stiffens_twist(device, pattern, jitter, row):
-    """A twisted strip of plate has the torque G b t^3 / 3 a rate of twist, and G b t^3 / 3 + GJ with the rod, at its middle or edge.
+    """Twisted strips have the torque G b t^3 / 3 a rate of twist, plus GJ with a rod at the middle or edge.
 
-    Torque enters the rod through the glue, over the first edge at either end: with a torsional stiffness that is small against
-    the plate's its energy is that of the inner vertices, GJ (L - l), and what the glue gives is small against that.
+    Torque enters the rod through the glue, over the first edge at either end. GJ is small against the plate, so the
+    energy of the rod is GJ (L - l) of the inner vertices. The energy of the glue is small against it.
     """
     options = {"pattern": pattern, "jitter": jitter, "row": row}
     added = {}
@@ -87,12 +92,12 @@ def test_glued_rod_stiffens_twist(device, pattern, jitter, row):
         assert free == pytest.approx(PLATE, rel=2e-3)
         added[cells] = (torsional_stiffness(device, cells, **options) - free) / LIGHT.GJ
         assert added[cells] == pytest.approx(1.0 - 1.0 / cells, abs=0.6 / cells)
-    assert 2.0 * added[20] - added[10] == pytest.approx(1.0, abs=0.02)  # of first order
+    assert 2.0 * added[20] - added[10] == pytest.approx(1.0, abs=0.02)  # first order
 
 
 @pytest.mark.parametrize("bending", ["midedge_boundary", "midedge", "hinge", "isometric"])
-def test_every_bending_turns_the_rod(device, bending):
-    """The same of the models that are no plates, on a mesh that is alike along the rod."""
+def test_every_bending_model_rotates_the_rod(device, bending):
+    """Bending models that are no plates give the same stiffness on a mesh that is uniform along the rod."""
     added = []
     for cells in (10, 20):
         free, glued = (
@@ -105,7 +110,9 @@ def test_every_bending_turns_the_rod(device, bending):
 
 @pytest.mark.slow
 def test_stiffness_of_the_glue_does_not_matter(device):
-    """Ten times as much changes the torque by some thousandths, the less the finer the mesh; a tenth by less than a tenth."""
+    """A tenfold glue stiffness changes the torque by some thousandths, less on finer meshes; a tenth by less than a
+    tenth.
+    """
     changes = []
     for cells in (10, 20, 40):
         base = torsional_stiffness(device, cells)
@@ -116,10 +123,15 @@ def test_stiffness_of_the_glue_does_not_matter(device):
 
 
 def arched(device, cells: int, spin: str):
-    """A strip of Poisson's ratio 0 bent to an arc of curvature 1; model, equilibrium, and energy over (E b t^3 / 12 + EI1) / 2."""
+    """Return model, equilibrium and relative energy of a strip bent to an arc of curvature 1.
+
+    Poisson's ratio is 0; the energy is divided by (E b t^3 / 12 + EI1) / 2.
+    """
     scene, _ = strip(cells, poisson=0.0, spin=spin, section=LIGHT)
-    for x, turn in ((0.0, 0.5), (LENGTH, -0.5)):
-        motion = ddg.Motion(angle=lambda t, turn=turn: turn * LENGTH * t, axis=tuple(Y), pivot=(x, 0.0, 0.0))
+    for x, rotation in ((0.0, 0.5), (LENGTH, -0.5)):
+        motion = ddg.Motion(
+            angle=lambda t, rotation=rotation: rotation * LENGTH * t, axis=tuple(Y), pivot=(x, 0.0, 0.0)
+        )
         scene.clamp_boundary(0, on(scene.shells[0].points, 0, x), "yz" if x else "xyz", motion=motion)
         if spin == "glued":
             scene.clamp_end(0, "last" if x else "first", motion=motion, components="yz" if x else "xyz")
@@ -131,7 +143,7 @@ def arched(device, cells: int, spin: str):
 
 @pytest.mark.slow
 def test_tall_section_stands(device):
-    """Glued, the rod bends about its strong axis with the strip, which is stable so; one that may spin is not, and lies down."""
+    """A glued rod bends stably about the strong axis with the strip; a rod that may spin is unstable."""
     for cells, error in ((10, 2e-4), (20, 5e-5)):
         model, state, energy = arched(device, cells, "glued")
         assert energy == pytest.approx(1.0, abs=error)
@@ -139,7 +151,7 @@ def test_tall_section_stands(device):
         assert spectrum(model, state, metric="unit").negative == 0
     model, state, _ = arched(device, 10, "free")
     assert not state.stable
-    # -(EI1 - EI2) kappa^2 a length is the stiffness against a turn that is alike all along, which costs no torsion
+    # -(EI1 - EI2) kappa^2 a length is the stiffness against a uniform rotation, which costs no torsion
     assert spectrum(model, state, metric="unit").negative == 1
 
 
@@ -147,62 +159,62 @@ def test_tall_section_stands(device):
     ("precision", "cells"),
     [pytest.param(*case, marks=pytest.mark.slow) for case in (("float64", 3), ("float64", 6), ("mixed", 6))],
 )
-def test_rigid_turns_cost_nothing(device, precision, cells):
-    """Held along one side, which turns it by one and a half turns about the rod: no energy, and the rod has turned as often."""
+def test_rigid_rotations_have_no_energy(device, precision, cells):
+    """A clamped side rotates the strip by one and a half revolutions about the rod: no energy, and the rod follows."""
     scene, _ = strip(cells)
-    turns = 1.5
-    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t, axis=tuple(X))
+    revolutions = 1.5
+    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * revolutions * t, axis=tuple(X))
     scene.clamp_boundary(0, on(scene.shells[0].points, 0, 0.0), motion=motion)
     model = scene.build(device, precision)
     state = solve(model, load_steps=18)
     assert sum(elastic(model, state).values()) < 1e-9
     np.testing.assert_allclose(state.points(), motion.place(1.0, model.state().points()), atol=1e-5)
     np.testing.assert_allclose(state.directors(), np.tile([0.0, 0.0, -1.0], (cells, 1)), atol=1e-5)
-    np.testing.assert_array_equal(np.round(state.angles() / np.pi), 2.0 * turns)
+    np.testing.assert_array_equal(np.round(state.angles() / np.pi), 2.0 * revolutions)
 
 
-def test_given_states_turn_the_rod(device):
-    """Positions and velocities of a strip that turns as a rigid body, about its rod and aside: no energy, and a spin to match."""
+def test_initial_states_rotate_the_rod(device):
+    """Rigid rotations of a strip about the rod and other axes: no energy, and matching spin rates."""
     scene, line = strip(6)
     model = scene.build(device, "float64", worlds=2)
     rest = model.state().points()[0]
-    turn = ddg.Motion(angle=lambda t: 1.2, axis=(2.0, 1.0, -0.5))
+    rotation = ddg.Motion(angle=lambda t: 1.2, axis=(2.0, 1.0, -0.5))
     spin = np.array([0.7, -0.4, 0.3])
-    points = turn.place(1.0, rest)
+    points = rotation.place(1.0, rest)
     state = model.state(points=points, velocities=np.cross(spin, points))
     assert np.abs(list(elastic(model, state).values())).max() < 1e-18
     rates = state.net.v.numpy().reshape(2, -1, 3)[:, model.net.host.rods[0].edges, 0]
-    np.testing.assert_allclose(rates, spin @ turn.turn(1.0, X[None])[0], rtol=1e-9)
-    held = model.state(points=points, velocities=np.cross(spin, points), spins=np.zeros(len(line) - 1))
-    assert not held.net.v.numpy().reshape(2, -1, 3)[:, model.net.host.rods[0].edges, 0].any()
+    np.testing.assert_allclose(rates, spin @ rotation.turn(1.0, X[None])[0], rtol=1e-9)
+    without_spin = model.state(points=points, velocities=np.cross(spin, points), spins=np.zeros(len(line) - 1))
+    assert not without_spin.net.v.numpy().reshape(2, -1, 3)[:, model.net.host.rods[0].edges, 0].any()
 
 
 @pytest.mark.parametrize("scheme", [pytest.param("implicit_euler", marks=pytest.mark.slow), "implicit_midpoint"])
-def test_spinning_strip_keeps_turning(device, scheme):
-    """A free strip that spins about its rod, two turns: the rod spins with it, and is not sheared off its surface."""
+def test_spinning_strip_rotates_its_rod(device, scheme):
+    """A free strip spins about the rod by two revolutions: the rod spins with it, without shear against the surface."""
     scene, line = strip(4)
     model = scene.build(device, "float64")
     rate, dt = 2.0 * np.pi, 0.01
     state = model.state(velocities=np.cross([rate, 0.0, 0.0], model.state().points()))
     integrator = ddg.Integrator(model, scheme=scheme)
     energy = model.energies(state)["kinetic"]
-    turned = 0.0
+    rotation = 0.0
     for _ in range(200):
         before = state.angles()
         state = integrator.step(state, dt)
-        turned += np.mean(state.angles() - before)
+        rotation += np.mean(state.angles() - before)
     assert model.energies(state)["glued_edge"] < 1e-6 * energy
     across = state.points()[len(line) :][-1] - state.points()[len(line) :][line[-1]]
     angle = np.arctan2(across[2], across[1])
-    assert np.mod(turned - angle + np.pi, 2.0 * np.pi) - np.pi == pytest.approx(0.0, abs=1e-3)
+    assert np.mod(rotation - angle + np.pi, 2.0 * np.pi) - np.pi == pytest.approx(0.0, abs=1e-3)
     if scheme == "implicit_midpoint":
-        assert turned == pytest.approx(4.0 * np.pi, rel=5e-3)
+        assert rotation == pytest.approx(4.0 * np.pi, rel=5e-3)
     else:
-        assert turned > 2.2 * np.pi
+        assert rotation > 2.2 * np.pi
 
 
 def pendulum(device, cells: int, spin="glued", stiff=1e3):
-    """A light wire, clamped at its end, that carries a stiff plate on its other half; its lowest frequencies and its free length."""
+    """Return the lowest modes of a light clamped wire with a stiff plate on the other half."""
     half = 0.5
     points, triangles = meshes.rectangle(cells, 2 * cells, (half, 0.2), "crossed")
     points[:, 1] -= 0.1
@@ -221,14 +233,16 @@ def pendulum(device, cells: int, spin="glued", stiff=1e3):
 
 
 def test_torsional_pendulum(device):
-    """A plate of the inertia I = rho t l b^3 / 12 on a wire: w^2 = GJ / (L I), of first order; without glue the plate turns freely."""
+    """Plates of inertia I = rho t l b^3 / 12 on a wire have w^2 = GJ / (L I), first order; without glue the plate
+    spins freely.
+    """
     inertia = 1000.0 * 0.02 * 0.5 * 0.2**3 / 12.0
     exact = np.sqrt(0.02 / (0.5 * inertia))
     errors = []
     for cells in (4, 8, 16):
-        found = pendulum(device, cells)
-        assert (found.rigid, found.stable) == (0, True)
-        errors.append(found.frequencies[0] / exact - 1.0)
+        modes = pendulum(device, cells)
+        assert (modes.rigid, modes.stable) == (0, True)
+        errors.append(modes.frequencies[0] / exact - 1.0)
     assert abs(errors[-1]) < 0.03
     ratios = np.array(errors[:-1]) / errors[1:]
     assert (ratios > 1.8).all()
@@ -237,7 +251,7 @@ def test_torsional_pendulum(device):
 
 
 def test_folds_across_the_rod_are_free(device):
-    """A sheet folded along the rod by the same angle on both sides leaves it as it is; by another it turns it by the mean."""
+    """Equal folds on both sides leave the rod at rest; different folds rotate it by the mean."""
     scene, _ = strip(4, bending="hinge")
     model = scene.build(device, "float64")
     points = model.state().points()
@@ -253,7 +267,7 @@ def test_folds_across_the_rod_are_free(device):
 
 
 def test_half_a_plate_on_a_symmetry_plane(device):
-    """A stiffened plate under pressure, and half of it with half of its stiffener: that one can not turn, and both sag alike."""
+    """Half a stiffened plate with half a stiffener does not rotate, and sags like the whole plate."""
     sags = []
     for half in (False, True):
         cells, material = 8, ddg.Material(YOUNG, 0.3, 1000.0)
@@ -264,8 +278,8 @@ def test_half_a_plate_on_a_symmetry_plane(device):
         line = line[np.argsort(points[line, 0])]
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
         scene.add_shell(points, triangles, thickness=THICKNESS, material=material)
-        part = 0.5 if half else 1.0
-        section = ddg.Stiffness(EA=part * 1e3, EI1=part * 0.4, EI2=part * 0.1, GJ=part * 0.1)
+        fraction = 0.5 if half else 1.0
+        section = ddg.Stiffness(EA=fraction * 1e3, EI1=fraction * 0.4, EI2=fraction * 0.1, GJ=fraction * 0.1)
         scene.add_rod(points[line], section=section, director=Z)
         scene.attach(0, range(len(line)), 0, line)
         if half:
@@ -284,8 +298,8 @@ def test_half_a_plate_on_a_symmetry_plane(device):
     assert sags[1] == pytest.approx(sags[0], rel=1e-6)
 
 
-def test_what_is_not_glued(device):
-    """A post, nodes that no mesh edge joins, rods without twist and `spin="free"`: no elements, and the report says so."""
+def test_cases_without_glue_elements(device):
+    """A post, nodes off mesh edges, rods without twist and `spin="free"`: no elements, and the report states so."""
     points, triangles = meshes.rectangle(4, 4)
     corner = points[-1]
     cases = {
@@ -295,19 +309,19 @@ def test_what_is_not_glued(device):
         "no bending": (points[:5], range(5), range(5), {"bend": False}),
         "free": (points[:5], range(5), range(5), {}),
     }
-    for name, (nodes, own, vertices, options) in cases.items():
+    for name, (nodes, rod_nodes, vertices, options) in cases.items():
         scene = ddg.Scene()
         scene.add_shell(points, triangles, thickness=0.01, material=ddg.Material(YOUNG, 0.3, 1000.0))
         section = ddg.Stiffness(EA=1e3, mass_per_length=0.1) if "bend" in options else ddg.Stiffness(1e3, 1.0, GJ=0.5)
         scene.add_rod(np.array(nodes), section=section, natural="straight", **options)
-        scene.attach(0, own, 0, vertices, spin="free" if name == "free" else "glued")
+        scene.attach(0, rod_nodes, 0, vertices, spin="free" if name == "free" else "glued")
         model = scene.build(device, "float64")
         present, absent = model.report().split("not in this scene: ")
         assert "glued_edge" in absent and "glued_edge" not in present, name
 
 
 def test_a_ring_and_two_calls(device):
-    """A ring around a cylinder is glued at all edges, the last one too; a rod attached in two calls is, where each has both nodes."""
+    """A ring on a cylinder is glued at all edges; a rod attached in two calls is glued where an edge has both nodes."""
     points, triangles = meshes.cylinder(12, 2, 1.0, 0.6)
     ring = on(points, 2, np.median(np.unique(points[:, 2])))
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))

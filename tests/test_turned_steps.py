@@ -1,4 +1,4 @@
-"""Steps of stiff rods: the same motion by every solver, second derivatives where they are of use, and patience that ends."""
+"""Steps of stiff rods: equal motion by every solver, second derivatives where needed, limited projected iterations."""
 
 from functools import cache
 
@@ -21,7 +21,7 @@ from ddg_warp.kernels.turns import TURNED
 
 
 def advance(scene, device, dt: float, steps: int, precision: str = "float64", **options):
-    """Points after so many steps, and the integrator."""
+    """Return points after a number of steps, and the integrator."""
     model = scene.build(device, precision)
     integrator, state = ddg.Integrator(model, **options), model.state()
     for _ in range(steps):
@@ -30,34 +30,36 @@ def advance(scene, device, dt: float, steps: int, precision: str = "float64", **
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("held", ["root", "tip"])
-def test_supports_that_move_are_the_same_to_every_solver(device, held, scheme):
-    """Shaken and turned: on their own by all solvers, and in a net beside stubs that a hinge joins, which move along."""
+@pytest.mark.parametrize("support", ["root", "tip"])
+def test_solvers_agree_for_moving_supports(device, support, scheme):
+    """Supports shake and rotate: uncoupled rods with all solvers, and rods hinged to stubs that move with them."""
     motion = ddg.Motion(
         translation=lambda t: (0.03 * (1.0 - np.cos(12.0 * t)), 0.0, 0.01 * (1.0 - np.cos(20.0 * t))),
         angle=lambda t: 0.3 * (1.0 - np.cos(9.0 * t)),
         axis=(0.0, 1.0, 1.0),
     )
     options = {"rtol": 1e-10, "scheme": scheme, "energy_bound": None if scheme == "implicit_midpoint" else 0.1}
-    expected, alone = advance(hair(held, motion), device, T60, 20, **options)
-    iterations = alone.statistics()["newton_iterations"]["mean"]
-    assert alone.statistics()["retries"] == 0
+    expected, uncoupled = advance(hair(support, motion), device, T60, 20, **options)
+    iterations = uncoupled.statistics()["newton_iterations"]["mean"]
+    assert uncoupled.statistics()["retries"] == 0
     assert iterations < 6.0
     for solver in SOLVERS[1:]:
-        joined = None if solver != "net" else 0 if held == "root" else -1
-        found, other = advance(hair(held, motion, joined), device, T60, 20, linear=linear_of(solver), **options)
-        np.testing.assert_allclose(found[: len(expected)], expected, rtol=0.0, atol=1e-9)
-        assert other.statistics()["retries"] == 0
-        assert other.statistics()["newton_iterations"]["mean"] == pytest.approx(iterations, rel=0.1)
+        joined = None if solver != "net" else 0 if support == "root" else -1
+        points, integrator = advance(
+            hair(support, motion, joined), device, T60, 20, linear=linear_of(solver), **options
+        )
+        np.testing.assert_allclose(points[: len(expected)], expected, rtol=0.0, atol=1e-9)
+        assert integrator.statistics()["retries"] == 0
+        assert integrator.statistics()["newton_iterations"]["mean"] == pytest.approx(iterations, rel=0.1)
 
 
 def straight(nodes: int) -> np.ndarray:
-    """A rod of 1 m along x."""
+    """Return points of a rod of 1 m along x."""
     return np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), nodes)
 
 
 def cantilever(nodes: int, section, material=None, joined: bool = False) -> ddg.Scene:
-    """Of 1 m; joined, beside a stub that is held and joined to it by a hinge."""
+    """Return a cantilever of 1 m; `joined` hinges it to a clamped stub."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     rod = scene.add_rod(straight(nodes), section=section, material=material)
     scene.clamp_end(rod)
@@ -70,9 +72,9 @@ def cantilever(nodes: int, section, material=None, joined: bool = False) -> ddg.
 
 @pytest.mark.parametrize("joined", [False, True])
 def test_iterations_do_not_grow_with_the_stiffness_of_stretching(device, joined):
-    """EA L^2 / EI from 1e4 to 1e12, to a hundredth of the usual tolerance: the tip is where bending takes it.
+    """EA L^2 / EI ranges from 1e4 to 1e12, at a hundredth of the usual tolerance: the tip is where bending moves it.
 
-    But for strains of about a weight over EA, and for what rounding leaves of forces: some eps EA, times L^3 / 3 EI.
+    Deviations: strains of about a weight over EA, and rounding of forces, some eps EA times L^3 / 3 EI.
     """
     stiffest, tips = 1e12, {}
     for axial in (1e4, 1e6, 1e8, 1e10, stiffest):
@@ -90,13 +92,13 @@ def test_iterations_do_not_grow_with_the_stiffness_of_stretching(device, joined)
 # The matrix.
 
 
-def parts(integrator) -> list:
+def matrix_and_stiffness(integrator) -> list:
     return [(part.newton.psd, part.means.stiff) for part in integrator._parts]
 
 
 @pytest.mark.parametrize("joined", [False, True])
-def test_second_derivatives_come_with_long_steps(device, joined):
-    """A soft straight rod is Gauss-Newton's at 1/240 s; from a step of 1/15 s on it is stiff; what was counted stays.
+def test_long_steps_use_second_derivatives(device, joined):
+    """A soft straight rod uses Gauss-Newton at 1/240 s and is stiff from a step of 1/15 s on; statistics accumulate.
 
     EA / l over m / h^2 (with l = 1/63, m = rho A / 64) is E h^2 63 64 / rho: 700 at 1/240 s, 180,000 at 1/15 s.
     """
@@ -104,27 +106,27 @@ def test_second_derivatives_come_with_long_steps(device, joined):
     integrator, state = ddg.Integrator(model), model.state()
     for _ in range(10):
         state = integrator.step(state, 1.0 / 240.0)
-    assert parts(integrator) == [("gauss_newton", False)]
+    assert matrix_and_stiffness(integrator) == [("gauss_newton", False)]
     np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), TURNED)
-    early = integrator.statistics()
-    assert early["outcomes"] == {"converged": 10}
+    start = integrator.statistics()
+    assert start["outcomes"] == {"converged": 10}
     for _ in range(5):
         state = integrator.step(state, 1.0 / 15.0)
-    assert parts(integrator) == [("progressive", True)]
+    assert matrix_and_stiffness(integrator) == [("progressive", True)]
     np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), 0.0)
-    late = integrator.statistics()
-    assert late["outcomes"] == {"converged": 15}
-    own = (15.0 * late["newton_iterations"]["mean"] - 10.0 * early["newton_iterations"]["mean"]) / 5.0
-    assert 1.0 <= own <= late["newton_iterations"]["max"] < 15
-    # a shorter step takes its edges straight again; its matrix stays
+    end = integrator.statistics()
+    assert end["outcomes"] == {"converged": 15}
+    iterations = (15.0 * end["newton_iterations"]["mean"] - 10.0 * start["newton_iterations"]["mean"]) / 5.0
+    assert 1.0 <= iterations <= end["newton_iterations"]["max"] < 15
+    # a shorter step updates edges straight again; its matrix stays
     integrator.step(state, 1.0 / 240.0)
-    assert parts(integrator) == [("progressive", True)]
+    assert matrix_and_stiffness(integrator) == [("progressive", True)]
     np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), TURNED)
     assert integrator.statistics()["outcomes"] == {"converged": 16}
 
 
-def test_the_midpoint_rule_is_about_half_the_step(device):
-    """At 1/20 s, whose ratio is 101,000, and 25,000 over half of it."""
+def test_midpoint_rule_is_stiff_by_half_the_step(device):
+    """The stiffness ratio at 1/20 s is 101,000, and 25,000 over half the step."""
     for scheme, expected in zip(SCHEMES, (True, False), strict=True):
         _, integrator = advance(cantilever(64, ddg.Circle(2e-3), RUBBER), device, 1.0 / 20.0, 1, scheme=scheme)
         assert integrator._parts[0].means.stiff == expected
@@ -141,32 +143,35 @@ def test_the_midpoint_rule_is_about_half_the_step(device):
         ({"psd": "none"}, "none"),
     ],
 )
-def test_what_stiff_rods_take(device, options, psd):
-    """What cannot tell an indefinite matrix, freezes it, or was told otherwise does without; all go to the same place."""
+def test_matrix_of_stiff_rods_by_options(device, options, psd):
+    """Options that cannot detect indefinite matrices, freeze them or exclude them use none; all results agree."""
     scene = cantilever(32, ddg.Circle(2e-3), ddg.Material(young=5e8, poisson=0.5, density=1000.0))
     expected, usual = advance(scene, device, T60, 5, rtol=1e-9)
-    assert parts(usual) == [("progressive", True)]
+    assert matrix_and_stiffness(usual) == [("progressive", True)]
     points, integrator = advance(scene, device, T60, 5, rtol=1e-9, **options)
-    assert parts(integrator) == [(psd, True)]
+    assert matrix_and_stiffness(integrator) == [(psd, True)]
     assert integrator.statistics()["retries"] == 0
     np.testing.assert_allclose(points, expected, rtol=0.0, atol=1e-7)
 
 
-def test_a_step_of_another_matrix_goes_on_from_the_last(device):
-    """Whoever adapts after some steps goes where one does that is progressive from the start."""
+def test_change_of_matrix_between_steps_keeps_the_solution(device):
+    """Switching to the progressive matrix after some steps agrees with using it from the start."""
     model = cantilever(24, ddg.Circle(2e-3), RUBBER).build(device, "float64")
     ends = []
     for psd in ("auto", "progressive"):
         integrator, state = ddg.Integrator(model, rtol=1e-11, psd=psd), model.state()
         for dt in [1.0 / 240.0] * 5 + [1.0 / 8.0] * 5:
             state = integrator.step(state, dt)
-        assert parts(integrator)[0][0] == "progressive"
+        assert matrix_and_stiffness(integrator)[0][0] == "progressive"
         ends.append(state.points())
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-9)
 
 
-def test_wound_up_by_20_turns(device):
-    """In a second, in steps of 10 ms: 84 iterations and 1,970 retries without second derivatives."""
+def test_winding_by_20_revolutions(device):
+    """Winding takes one second in steps of 10 ms.
+
+    Measured: 84 iterations a step and 1,970 retries without second derivatives.
+    """
     scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3), mass_damping=1.0)
     section = ddg.Stiffness(EA=1e3, EI1=1e-2, GJ=0.8e-2, mass_per_length=0.01, rotary_inertia=1e-7)
     rod = scene.add_rod(straight(101), section=section)
@@ -180,8 +185,10 @@ def test_wound_up_by_20_turns(device):
     assert np.abs(np.linalg.norm(np.diff(points, axis=0), axis=1) * 100.0 - 1.0).max() < 0.2
 
 
-def test_worlds_are_stiff_each_by_itself(device):
-    """One with a thousand times the stretching stiffness turns its edges always, the other takes small turns straight: as alone."""
+def test_stiffness_is_decided_per_world(device):
+    """The world with a thousandfold stretching stiffness always rotates edges, the other updates small rotations
+    straight.
+    """
     scene, names = cantilever(20, ddg.Circle(0.02), RUBBER), ("rod_stretch", "stiffness")
     scene.clamp(0, edges=[0])
 
@@ -197,27 +204,27 @@ def test_worlds_are_stiff_each_by_itself(device):
     together, integrator = run(1.0, 1e3)
     assert (integrator._parts[0].islands.turn.numpy() > 0.0).tolist() == [True, False]
     for points, factor in zip(together, (1.0, 1e3), strict=True):
-        alone, own = run(factor)
-        assert own._parts[0].means.stiff == (factor > 1.0)
-        np.testing.assert_allclose(points, alone, rtol=0.0, atol=1e-12)
+        single, single_integrator = run(factor)
+        assert single_integrator._parts[0].means.stiff == (factor > 1.0)
+        np.testing.assert_allclose(points, single, rtol=0.0, atol=1e-12)
     assert np.abs(together[0] - together[1]).max() > 1e-6
 
 
-def test_parameters_that_make_a_rod_stiff_are_noticed(device):
-    """Between steps of one length, and when they make it soft again: its edges are turned, or may go straight, as of a new model."""
+def test_stiffness_follows_parameter_changes(device):
+    """Parameters change between steps of one length, and back: edge rotations follow as in a new model."""
     model = cantilever(20, ddg.Circle(0.02), RUBBER).build(device, "float64")
     integrator, state = ddg.Integrator(model), model.state()
     axial = float(model.parameters()["0/rod_stretch/stiffness"].flat[0])
-    for factor, stiff, straight_turns in ((1.0, False, True), (1e3, True, False), (1.0, False, True)):
+    for factor, stiff, straight_update in ((1.0, False, True), (1e3, True, False), (1.0, False, True)):
         model.set_parameter("rod_stretch", "stiffness", factor * axial)
         state = integrator.step(state, 0.01)
         assert integrator._parts[0].means.stiff == stiff
-        assert (integrator._parts[0].islands.turn.numpy()[0] > 0.0) == straight_turns
+        assert (integrator._parts[0].islands.turn.numpy()[0] > 0.0) == straight_update
     assert integrator.statistics()["outcomes"] == {"converged": 3}
 
 
 def taut_laws(real, n):
-    """psi = k (e - 1)^2 / 2 of the ratio of lengths e."""
+    """Return the law psi = k (e - 1)^2 / 2 of the length ratio e."""
     E, P = wp.types.vector(n, real), wp.types.vector(1, real)
 
     @wp.func
@@ -240,11 +247,11 @@ UNNAMED = {"bending": LAW, "stretching": {"rod_stretch": ddg.Law(TAUT, modulus=1
 
 
 @pytest.mark.parametrize("name", ["bending", pytest.param("stretching", marks=slow)])
-def test_laws_that_name_no_stiffness_move_in_mixed_precision(device, name):
-    """They are taken for the worst: of bending for none, of stretching for unlimited, which makes a rod stiff over any step."""
+def test_laws_without_named_stiffness_run_in_mixed_precision(device, name):
+    """Unnamed stiffnesses count as zero in bending and unlimited in stretching, which makes a rod stiff at any step."""
     scene = lawful(UNNAMED[name])
     (mixed, integrator), (exact, _) = (advance(scene, device, 0.02, 20, p, rtol=1e-10) for p in ("mixed", "float64"))
-    assert parts(integrator) == [("gauss_newton", False) if name == "bending" else ("progressive", True)]
+    assert matrix_and_stiffness(integrator) == [("gauss_newton", False) if name == "bending" else ("progressive", True)]
     assert integrator.statistics()["linear"] == ["float32" if name == "bending" else "float32 with tensions"]
     assert np.abs(exact - scene.batches[0].points[0]).max() > 0.1
     np.testing.assert_allclose(mixed, exact, rtol=0.0, atol=1e-6)
@@ -253,11 +260,11 @@ def test_laws_that_name_no_stiffness_move_in_mixed_precision(device, name):
         np.testing.assert_allclose(exact, usual, rtol=0.0, atol=1e-8)
 
 
-# Patience.
+# Limit of projected iterations.
 
 
 def squeezed(joined: bool) -> tuple[ddg.Scene, np.ndarray]:
-    """A rod at 0.8 of its length between nodes that are held, bent a little: compression far beyond what buckles it."""
+    """Return a rod between fixed nodes at 0.8 of the rest length, slightly bent, far beyond buckling."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     section = ddg.Stiffness(EA=100.0, EI1=1e-3, GJ=1e-3, mass_per_length=0.1)
     scene.fix(scene.add_rod(straight(24), section=section, natural="straight"), [0, 23])
@@ -272,10 +279,10 @@ def squeezed(joined: bool) -> tuple[ddg.Scene, np.ndarray]:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_a_solve_out_of_patience_is_tried_again_in_halves(device, solver):
-    """It ends by its name, after so many iterations with an indefinite Hessian, and the run goes on.
+def test_solve_beyond_the_projected_limit_is_halved(device, solver):
+    """The solve ends by name after the allowed iterations with an indefinite Hessian, and the run continues.
 
-    Where there are not the eight retries that bring a step below an eighth, the same solve takes its time.
+    Fewer than the eight retries that reach an eighth of a step remove the limit.
     """
     scene, start = squeezed(solver == "net")
     model = scene.build(device, "float64")
@@ -302,27 +309,27 @@ def test_a_solve_out_of_patience_is_tried_again_in_halves(device, solver):
 
 
 @pytest.mark.parametrize(
-    ("result", "detours", "again"),
+    ("result", "projected", "again"),
     [("LINE_SEARCH_FAILED", 3, True), ("INDEFINITE", 0, True), ("INDEFINITE", 31, False)],
 )
-def test_who_is_out_of_patience_is_not_tried_again_from_another_start(device, result, detours, again):
-    """Which would lead to the same valley: the step is halved at once, as others are after a second try from the last state."""
+def test_projected_limit_skips_the_cold_start(device, result, projected, again):
+    """A cold start would lead to the same valley: the step is halved at once. Other failures get a second try first."""
     real = wp.float64
     islands = Islands(1, real, device)
     islands.status.fill_(getattr(outcome, result))
-    islands.detours.fill_(detours)
+    islands.detours.fill_(projected)
     islands.patience.fill_(DETOURS_ALLOWED)
     islands.portion.fill_(1.0)
     counts = [wp.zeros(16, dtype=wp.int64, device=device) for _ in range(2)]
     remaining = wp.zeros(1, dtype=int, device=device)
-    given = [*islands.arrays, 20, 2.0**-10, outcome.CONVERGED_TO_ROUNDING, *counts, remaining]
-    wp.launch(advance_kernel(real), 1, given, device=device)
+    inputs = [*islands.arrays, 20, 2.0**-10, outcome.CONVERGED_TO_ROUNDING, *counts, remaining]
+    wp.launch(advance_kernel(real), 1, inputs, device=device)
     assert (islands.cautious.numpy()[0], islands.portion.numpy()[0]) == ((1, 1.0) if again else (0, 0.5))
     assert remaining.numpy()[0] == 1
 
 
-def test_gauss_newton_has_all_the_patience(device):
-    """It never takes the exact Hessian, and does not end for want of it."""
+def test_gauss_newton_has_no_projected_limit(device):
+    """Gauss-Newton never uses the exact Hessian, so that no solve ends as indefinite."""
     scene, start = squeezed(False)
     model = scene.build(device, "float64")
     integrator, state = ddg.Integrator(model, psd="gauss_newton", max_iterations=3000), model.state(points=start)
@@ -330,14 +337,14 @@ def test_gauss_newton_has_all_the_patience(device):
     assert "indefinite" not in integrator.statistics()["outcomes"]
 
 
-# Where a net stalls.
+# Stalled solves of coupled systems.
 
 
 @pytest.mark.parametrize(
     ("length", "decrease", "stalls"), [(1.0, 1e-4, True), (1e-6, 1.0, False), (1.0, 1.0, False), (1e-6, 1e-4, True)]
 )
-def test_a_net_stalls_by_what_a_whole_step_would_gain(device, length, decrease, stalls):
-    """A residual that does not fall is rounding where the decrease of a whole step drowns, however short the last one was."""
+def test_stall_test_uses_the_decrease_of_a_full_step(device, length, decrease, stalls):
+    """A stagnant residual is rounding if the decrease of a full step is below rounding, whatever the last step length."""
     real, n = wp.float64, 4 * STALLED
     judge = search_kernels(real, real, True, False, False)[0]
     islands = Islands(1, real, device)
@@ -349,8 +356,8 @@ def test_a_net_stalls_by_what_a_whole_step_would_gain(device, length, decrease, 
         islands.unbalanced.fill_(1)
         islands.step_length.fill_(length)
         islands.decrement.fill_(decrease)
-        given = [change, noise, square, worst, 1e-6, 1e-4, 10 * n, 20, 0.1, 1e-8, 0.5]
-        wp.launch(judge, 1, [*given, *islands.arrays, best, stalled, forcing, goal, limit], device=device)
+        inputs = [change, noise, square, worst, 1e-6, 1e-4, 10 * n, 20, 0.1, 1e-8, 0.5]
+        wp.launch(judge, 1, [*inputs, *islands.arrays, best, stalled, forcing, goal, limit], device=device)
         status = int(islands.status.numpy()[0])
         assert status == (outcome.CONVERGED_TO_ROUNDING if stalls and k > STALLED else outcome.ACTIVE)
 
@@ -366,17 +373,17 @@ def test_a_net_stalls_by_what_a_whole_step_would_gain(device, length, decrease, 
         (3, np.nan, 0.0, 2, outcome.NON_FINITE),
     ],
 )
-def test_directions_that_are_not_solved_do_not_stall_a_net(device, wanted, decrease, before, iteration, status):
-    """What they would gain is not known; a world that has none twice in a row ends by name."""
+def test_unsolved_directions_do_not_count_as_stalls(device, wanted, decrease, before, iteration, status):
+    """The predicted decrease is unknown; a world without direction twice in a row ends by name."""
     real = wp.float64
     take = search_kernels(real, real, True, False, False)[3]
     islands, stalled = Islands(1, real, device), wp.full(1, STALLED, dtype=int, device=device)
     islands.wanted.fill_(wanted)
     islands.decrement.fill_(before)
     islands.iteration.fill_(iteration)
-    given = [wp.full(1, v, dtype=real, device=device) for v in (decrease, 0.0)]
+    inputs = [wp.full(1, v, dtype=real, device=device) for v in (decrease, 0.0)]
     iterations, work = wp.zeros(1, dtype=int, device=device), wp.zeros(1, dtype=wp.int64, device=device)
-    wp.launch(take, 1, [*given, 1.0, iterations, *islands.arrays, stalled, work], device=device)
+    wp.launch(take, 1, [*inputs, 1.0, iterations, *islands.arrays, stalled, work], device=device)
     assert islands.status.numpy()[0] == status
     if status != outcome.NON_FINITE:
         assert stalled.numpy()[0] == (STALLED if wanted == 2 else 0)

@@ -1,4 +1,4 @@
-"""Rods of nets as they are alone: ends that turn past full turns, couples, and the reactions of their supports."""
+"""Coupled rods against uncoupled rods: ends that rotate past full revolutions, couples, and support reactions."""
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ def bow(count=9) -> np.ndarray:
     return np.stack([s, 0.15 * (np.cos(3.0 * s) - 1.0), 0.2 * np.sin(2.0 * s)], -1)
 
 
-def one_rod(in_net: bool, twist=True, dimension=3, **options) -> ddg.Scene:
-    """A curved rod held at its first edge; part of a net where another one hangs from its held first node."""
+def one_rod(is_coupled: bool, twist=True, dimension=3, **options) -> ddg.Scene:
+    """Return a curved rod with a clamped first edge; `in_net` hinges a second rod to its first node."""
     scene = ddg.Scene(gravity=(0.2, 0.0 if dimension == 2 else 0.7, -3.0), dimension=dimension, **options)
     points = bow() * [1.0, float(dimension == 3), 1.0]
     section = ROD if twist else ddg.Stiffness(EA=1e3, EI1=0.5, mass_per_length=0.6)
@@ -35,125 +35,127 @@ def one_rod(in_net: bool, twist=True, dimension=3, **options) -> ddg.Scene:
     director = (0.0, 0.3, 1.0) if twist and dimension == 3 else None
     rod = scene.add_rod(points, section=section, director=director, twist=twist, natural=natural)
     scene.clamp(rod, edges=[0])
-    if in_net:
-        other = scene.add_rod(np.outer(np.linspace(0.0, 1.0, 3), [-1.0, 0.0, 0.0]) + points[0], section=ROD)
-        scene.join([(rod, 0), (other, 0)], rigid=False)
+    if is_coupled:
+        second = scene.add_rod(np.outer(np.linspace(0.0, 1.0, 3), [-1.0, 0.0, 0.0]) + points[0], section=ROD)
+        scene.join([(rod, 0), (second, 0)], rigid=False)
     return scene
 
 
-def turned_end(scene, dimension=3):
-    """The last edge is led along and turned: by 7 rad in half a second, or by two turns in statics."""
+def rotate_end(scene, dimension=3):
+    """Move and rotate the last edge: by 7 rad in half a second, or by two revolutions in statics."""
     axis = (0.0, 1.0, 0.0) if dimension == 2 else (1.0, 0.3, 0.2)
     pivot = tuple(scene.batches[0].points[0, -1])
-    turns = 1.0 if dimension == 2 else 14.0
-    motion = ddg.Motion(lambda t: (-0.1 * t, 0.0, 0.1 * t), lambda t: turns * t, axis, pivot)
+    rate = 1.0 if dimension == 2 else 14.0
+    motion = ddg.Motion(lambda t: (-0.1 * t, 0.0, 0.1 * t), lambda t: rate * t, axis, pivot)
     scene.clamp(0, edges=[-1], motion=motion)
 
 
-def twisted_edge(scene, dimension=3):
-    """The angle alone is prescribed of an edge whose nodes are free."""
+def twist_edge(scene, dimension=3):
+    """Prescribe the twist angle of an edge with free nodes."""
     scene.fix_twist(0, [-1], motion=ddg.Motion(angle=lambda t: 5.0 * t, axis=(1.0, 0.0, 0.0)))
 
 
-def coupled(scene, dimension=3):
-    """A couple at the end, and one that changes inside."""
+def add_couples(scene, dimension=3):
+    """Add a couple at the end, and a varying one inside."""
     out = 1.0 if dimension == 3 else 0.0
     scene.add_couple(0, -1, (0.2 * out, 0.3, -0.1 * out))
     scene.add_couple(0, 4, (0.0, 0.2, 0.3 * out), amplitude=lambda t: 1.0 + t)
 
 
-ACTIONS = pytest.mark.parametrize("action", [turned_end, twisted_edge, coupled])
+ACTIONS = pytest.mark.parametrize("action", [rotate_end, twist_edge, add_couples])
 
 
 @ACTIONS
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_rod_in_a_net_moves_as_alone(device, scheme, action):
-    """By conjugate gradients in a net, or by the sweep of chains: ends that turn, past 2 pi, and couples."""
-    found = []
-    for in_net in (False, True):
-        scene = one_rod(in_net)
+def test_coupled_rod_moves_as_uncoupled(device, scheme, action):
+    """Conjugate gradients of a coupled system and the sweep of a rod agree for ends that rotate past 2 pi, and for
+    couples.
+    """
+    results = []
+    for is_coupled in (False, True):
+        scene = one_rod(is_coupled)
         action(scene)
         model = scene.build(device, "float64")
         state = steps(model, 50, 0.01, scheme, rtol=1e-11)
-        found.append((state.points()[:9], state.directors()[:8], np.diff(state.angles()[:8])))
-    assert np.abs(found[0][0] - bow()).max() > 0.02
-    for alone, joined in zip(*found, strict=True):
-        np.testing.assert_allclose(joined, alone, atol=1e-9)
+        results.append((state.points()[:9], state.directors()[:8], np.diff(state.angles()[:8])))
+    assert np.abs(results[0][0] - bow()).max() > 0.02
+    for uncoupled, coupled in zip(*results, strict=True):
+        np.testing.assert_allclose(coupled, uncoupled, atol=1e-9)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_rod_in_a_net_spins_as_alone(device, scheme):
-    """Twisted by the rates that its edges begin with."""
-    found, rates = [], 20.0 * np.linspace(0.0, 1.0, 8)
-    for in_net in (False, True):
-        model = one_rod(in_net).build(device, "float64")
-        state = model.state(spins=np.concatenate([rates, np.zeros(2)]) if in_net else rates)
-        found.append(steps(model, 10, 0.01, scheme, state, rtol=1e-11).angles()[:8])
-    assert np.ptp(found[0]) > 0.3
-    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+def test_coupled_rod_spins_as_uncoupled(device, scheme):
+    """Initial rates of the edges twist the rod."""
+    results, rates = [], 20.0 * np.linspace(0.0, 1.0, 8)
+    for is_coupled in (False, True):
+        model = one_rod(is_coupled).build(device, "float64")
+        state = model.state(spins=np.concatenate([rates, np.zeros(2)]) if is_coupled else rates)
+        results.append(steps(model, 10, 0.01, scheme, state, rtol=1e-11).angles()[:8])
+    assert np.ptp(results[0]) > 0.3
+    np.testing.assert_allclose(results[1], results[0], atol=1e-9)
 
 
 def test_couple_on_the_edge_that_closes_a_ring(device):
-    """Between its last node and its first; the ring is held at an edge, alone or where another rod is joined to it."""
-    found, turn = [], 2.0 * np.pi * np.arange(8) / 8.0
-    for in_net in (False, True):
+    """The couple acts between the last node and the first of a ring clamped at an edge, uncoupled or joined to a rod."""
+    results, angle = [], 2.0 * np.pi * np.arange(8) / 8.0
+    for is_coupled in (False, True):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
-        ring = scene.add_rod(np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], -1), section=ROD, closed=True)
+        ring = scene.add_rod(np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1), section=ROD, closed=True)
         scene.clamp(ring, edges=[3])
         scene.add_couple(ring, -1, (0.1, 0.2, 0.3))
-        if in_net:
-            other = scene.add_rod(np.outer([1.0, 1.5, 2.0], [np.cos(turn[3]), np.sin(turn[3]), 0.0]), section=ROD)
-            scene.join([(ring, 3), (other, 0)], rigid=False)
-        found.append(steps(scene.build(device, "float64"), 20, 0.01, rtol=1e-11).points()[:8])
-    assert np.abs(found[0][0] - [1.0, 0.0, 0.0]).max() > 1e-3
-    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+        if is_coupled:
+            spoke = scene.add_rod(np.outer([1.0, 1.5, 2.0], [np.cos(angle[3]), np.sin(angle[3]), 0.0]), section=ROD)
+            scene.join([(ring, 3), (spoke, 0)], rigid=False)
+        results.append(steps(scene.build(device, "float64"), 20, 0.01, rtol=1e-11).points()[:8])
+    assert np.abs(results[0][0] - [1.0, 0.0, 0.0]).max() > 1e-3
+    np.testing.assert_allclose(results[1], results[0], atol=1e-9)
 
 
 @pytest.mark.parametrize("case", ["no twist", "planar"])
-@pytest.mark.parametrize("action", [turned_end, coupled])
+@pytest.mark.parametrize("action", [rotate_end, add_couples])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_rod_without_twist_moves_as_alone(device, scheme, action, case):
-    """In the plane of x and z, and in space; nodes alone are led, and a couple is a pair of forces alone."""
-    dimension, found = 2 if case == "planar" else 3, []
-    for in_net in (False, True):
-        scene = one_rod(in_net, False, dimension)
+def test_coupled_rod_without_twist_moves_as_uncoupled(device, scheme, action, case):
+    """Cases in the xz plane and in space: only nodes are prescribed, and a couple is a pair of forces."""
+    dimension, results = 2 if case == "planar" else 3, []
+    for is_coupled in (False, True):
+        scene = one_rod(is_coupled, False, dimension)
         action(scene, dimension)
         model = scene.build(device, "float64")
-        found.append(steps(model, 40, 0.01, scheme, rtol=1e-11).points()[:9])
-    if action is turned_end:
-        at = scene.supports[-1].motion.place(0.4, np.array(scene.batches[0].points[0, -2:]))
-        np.testing.assert_allclose(found[0][-2:], at, atol=1e-13)
-    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+        results.append(steps(model, 40, 0.01, scheme, rtol=1e-11).points()[:9])
+    if action is rotate_end:
+        expected = scene.supports[-1].motion.place(0.4, np.array(scene.batches[0].points[0, -2:]))
+        np.testing.assert_allclose(results[0][-2:], expected, atol=1e-13)
+    np.testing.assert_allclose(results[1], results[0], atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("action", "case"),
     [
-        (coupled, "planar"),
-        pytest.param(turned_end, "spatial", marks=pytest.mark.slow),
-        pytest.param(coupled, "no twist", marks=pytest.mark.slow),
-        pytest.param(turned_end, "planar", marks=pytest.mark.slow),
-        pytest.param(turned_end, "no twist", marks=pytest.mark.slow),
-        pytest.param(coupled, "spatial", marks=pytest.mark.slow),
+        (add_couples, "planar"),
+        pytest.param(rotate_end, "spatial", marks=pytest.mark.slow),
+        pytest.param(add_couples, "no twist", marks=pytest.mark.slow),
+        pytest.param(rotate_end, "planar", marks=pytest.mark.slow),
+        pytest.param(rotate_end, "no twist", marks=pytest.mark.slow),
+        pytest.param(add_couples, "spatial", marks=pytest.mark.slow),
     ],
 )
-def test_rod_in_a_net_rests_as_alone(device, action, case):
-    """Statics with exact derivatives of the couples, in the plane and without twist, too."""
-    dimension, found = 2 if case == "planar" else 3, []
-    for in_net in (False, True):
-        scene = one_rod(in_net, case == "spatial", dimension)
+def test_equilibrium_of_coupled_rod_as_uncoupled(device, action, case):
+    """Statics with exact derivatives of the couples, also in the plane and without twist."""
+    dimension, results = 2 if case == "planar" else 3, []
+    for is_coupled in (False, True):
+        scene = one_rod(is_coupled, case == "spatial", dimension)
         action(scene, dimension)
-        if in_net:
+        if is_coupled:
             scene.clamp(1, edges=[0])
         model = scene.build(device, "float64")
-        found.append(solve(model, load_steps=20, floor_factor=1.0).points()[:9])
-    np.testing.assert_allclose(found[1], found[0], atol=1e-8)
+        results.append(solve(model, load_steps=20, floor_factor=1.0).points()[:9])
+    np.testing.assert_allclose(results[1], results[0], atol=1e-8)
 
 
-def test_derivatives_of_following_loads(device):
-    """load_stiffness is minus the central difference of the loads, of couples with and without twist and of pressure."""
+def test_load_stiffness_of_follower_loads(device):
+    """load_stiffness is minus the central difference of loads: couples with and without twist, and pressure."""
     scene = one_rod(True)
-    coupled(scene)
+    add_couples(scene)
     bare = scene.add_rod(bow() + [0.0, 2.0, 0.0], section=ddg.Stiffness(1e3, 0.5), twist=False, natural="straight")
     scene.add_couple(bare, 3, (0.1, -0.4, 0.2))
     scene.join([(1, -1), (scene.add_rod(bow()[::-1] + [-1.0, 0.0, 0.0] - bow()[-1], section=ROD), 0)], rigid=False)
@@ -172,8 +174,8 @@ def test_derivatives_of_following_loads(device):
     np.testing.assert_allclose(-tangent.load_stiffness(1.0, q) @ step, difference, atol=1e-7)
 
 
-def test_moments_of_a_turned_end(device):
-    """A frame whose end is turned in dynamics, at rest: forces and moments of its supports balance the weight, bitwise again."""
+def test_reactions_of_a_rotated_end(device):
+    """A frame with a rotated end comes to rest: reactions balance the weight, and a repetition is bitwise equal."""
 
     def build():
         scene = one_rod(True, mass_damping=8.0)
@@ -189,25 +191,25 @@ def test_moments_of_a_turned_end(device):
     host = model.net.host
     x = state.net.q.numpy()[: host.nodes]
     weight = host.mass[: host.nodes] * model.scene.gravity
-    found = model.reactions(state, point=(0.0, 0.0, 0.0))
-    np.testing.assert_allclose(sum(r.force for r in found), -weight.sum(0), atol=1e-6)
-    np.testing.assert_allclose(sum(r.moment for r in found), -np.cross(x, weight).sum(0), atol=1e-6)
+    reactions = model.reactions(state, point=(0.0, 0.0, 0.0))
+    np.testing.assert_allclose(sum(r.force for r in reactions), -weight.sum(0), atol=1e-6)
+    np.testing.assert_allclose(sum(r.moment for r in reactions), -np.cross(x, weight).sum(0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("action", "words"),
+    ("action", "message"),
     [
         (lambda scene: scene.add_couple(0, 8, (0.0, 1.0, 0.0)), "edge 8 does not exist: rod 0 has 8 edges"),
         (lambda scene: scene.add_force(0, 9, (0.0, 1.0, 0.0)), "node 9 does not exist: rod 0 has 9 nodes"),
         (lambda scene: scene.add_mass(0, -10, 1.0), "node -10 does not exist: rod 0 has 9 nodes"),
     ],
 )
-def test_places_that_are_not_there(action, words):
-    with pytest.raises(ddg.SceneError, match=words):
+def test_nodes_and_edges_that_do_not_exist_are_refused(action, message):
+    with pytest.raises(ddg.SceneError, match=message):
         action(one_rod(True))
 
 
-def test_an_edge_turned_twice_is_refused():
+def test_two_motions_of_an_edge_are_refused():
     scene = one_rod(True)
     for _ in range(2):
         scene.fix_twist(0, [3], motion=ddg.Motion(angle=lambda t: t))
@@ -215,15 +217,17 @@ def test_an_edge_turned_twice_is_refused():
         scene.build("cpu")
 
 
-def test_a_turn_out_of_the_plane_is_refused():
+def test_rotation_out_of_the_plane_is_refused():
     with pytest.raises(ddg.SceneError, match=r"turns about \(0.0, 0.0, 1.0\), out of the plane .* axis=\(0, 1, 0\)"):
         one_rod(False, False, 2).clamp(0, motion=ddg.Motion(angle=lambda t: t))
 
 
-@pytest.mark.parametrize("in_net", [False, True], ids=["alone", "in a net"])
-def test_motions_move_what_their_supports_hold(device, in_net):
-    """One motion each for x and z of a node, y held by a third support; a second motion of one is refused by name."""
-    scene = one_rod(in_net)
+@pytest.mark.parametrize("is_coupled", [False, True], ids=["uncoupled", "coupled"])
+def test_motions_apply_to_the_components_of_their_supports(device, is_coupled):
+    """x and z of a node have one motion each, y is fixed by a third support; a second motion of one is refused by
+    name.
+    """
+    scene = one_rod(is_coupled)
     scene.fix(0, [-1], "y")
     scene.fix(0, [-1], "x", motion=ddg.Motion(translation=lambda t: (-t, 9.0, 9.0)))
     scene.fix(0, [-1], "z", motion=ddg.Motion(translation=lambda t: (9.0, 9.0, 2.0 * t)))
@@ -235,7 +239,7 @@ def test_motions_move_what_their_supports_hold(device, in_net):
 
 
 def test_a_joint_may_be_displaced_by_both_its_rods(device):
-    """A displacement for each node that is named: rods that share one name it twice, one rod may not."""
+    """Each named node has a displacement: two rods may name their common node twice, one rod may not."""
     scene = one_rod(True)
     scene.fix(
         [0, 1],

@@ -1,4 +1,4 @@
-"""Clamps of shells that turn, in statics and dynamics, past full turns, and the reactions of supports."""
+"""Rotating clamps of shells in statics and dynamics, past full revolutions, and support reactions."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ AXIS, PIVOT = (1.0, 2.0, 0.5), (0.1, 0.2, 0.3)
 
 
 def strip(cells, size, bending="midedge_dof", thickness=0.01, material=RUBBER, **options) -> ddg.Scene:
-    """A flat sheet in the plane of x and y; `bending` "curved" is the curved membrane."""
+    """Return a flat sheet in the xy plane; `bending` "curved" is the curved membrane."""
     points, triangles = meshes.rectangle(*cells, size, "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), **options)
     curved = {"membrane": "curved"} if bending == "curved" else {"bending": bending}
@@ -25,9 +25,9 @@ def strip(cells, size, bending="midedge_dof", thickness=0.01, material=RUBBER, *
     return scene
 
 
-def end(scene, which="min", axis=0) -> np.ndarray:
+def end(scene, extreme="min", axis=0) -> np.ndarray:
     along = scene.shells[0].points[:, axis]
-    return np.flatnonzero(along == getattr(along, which)())
+    return np.flatnonzero(along == getattr(along, extreme)())
 
 
 def steps(model, count, dt, scheme="implicit_euler", state=None, **options):
@@ -43,20 +43,20 @@ def elastic(model, state) -> float:
 
 
 def normals(state) -> np.ndarray:
-    """The normals that turning clamps prescribe (n, 3), as the elements read them."""
-    found = []
+    """Return the prescribed normals of rotating clamps (n, 3), as elements read them."""
+    parts_of_data = []
     for index, data in state.net.data.items():
         element, row, _ = state.model.net.sets[index].turning.T
-        found.append(data.numpy()[row[:, None] + np.arange(3), element[:, None]])
-    return np.concatenate(found)
+        parts_of_data.append(data.numpy()[row[:, None] + np.arange(3), element[:, None]])
+    return np.concatenate(parts_of_data)
 
 
 @pytest.mark.parametrize(
     "model",
     ["hinge", *(pytest.param(model, marks=pytest.mark.slow) for model in ("midedge_dof", "midedge", "curved"))],
 )
-def test_a_sheet_is_carried_through_three_turns(device, model):
-    """In statics: it is where the motion of its clamp has it, without energy, and so are the normals."""
+def test_clamp_rotates_a_sheet_by_three_revolutions(device, model):
+    """Statics move vertices and normals rigidly with the clamp, without energy."""
     scene = strip((3, 2), (1.0, 0.6), model)
     motion = ddg.Motion(lambda t: (t, 0.0, -t), lambda t: 6.0 * np.pi * t + 0.4 * t, AXIS, PIVOT)
     scene.clamp_boundary(0, end(scene), motion=motion)
@@ -64,12 +64,11 @@ def test_a_sheet_is_carried_through_three_turns(device, model):
     state = solve(built, load_steps=40)
     np.testing.assert_allclose(state.points(), motion.place(1.0, scene.shells[0].points), atol=1e-8)
     assert elastic(built, state) < 1e-15
-    turned = motion.rotation(0.4) @ [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(normals(state), np.tile(turned, (len(normals(state)), 1)), atol=1e-12)
+    normal = motion.rotation(0.4) @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(normals(state), np.tile(normal, (len(normals(state)), 1)), atol=1e-12)
 
 
-def test_a_sheet_held_as_a_whole(device):
-    """Nothing is free: it goes where its motion has it."""
+def test_sheet_without_free_vertices_follows_its_motion(device):
     scene = strip((2, 2), (1.0, 1.0))
     motion = ddg.Motion(angle=lambda t: 7.0 * t, axis=AXIS, pivot=PIVOT)
     scene.clamp_boundary(0, range(9), motion=motion)
@@ -81,12 +80,12 @@ def test_a_sheet_held_as_a_whole(device):
 
 @pytest.mark.parametrize("model", ["midedge_dof", "hinge"])
 def test_a_spinning_sheet_stretches(device, model):
-    """Three turns and more at a constant rate: clamped on the axis, N' = -rho h w^2 r, so that it grows by rho w^2 L^3 / (3 E).
+    """A sheet clamped on the axis spins at a constant rate: N' = -rho h w^2 r, so it grows by rho w^2 L^3 / (3 E).
 
-    nu = 0; n cells with half of their mass at either end grow by 1 + 1 / (2 n^2) times that. Implicit Euler lags by the angle a of
-    a step: its acceleration is (2 sin(a / 2) / h)^2 r, turned by a.
+    nu = 0; n cells with half the mass at either end grow by 1 + 1 / (2 n^2) times that. Implicit Euler lags by the
+    angle a of a step: its acceleration is (2 sin(a / 2) / h)^2 r, rotated by a.
     """
-    rate, length, cells, turn = 1.5, 1.0, 4, 0.05
+    rate, length, cells, step_angle = 1.5, 1.0, 4, 0.05
     material = ddg.Material(1e6, 0.0, 1000.0, viscosity=0.02)
     scene = strip((cells, 1), (length, 0.4), model, thickness=0.1, material=material)
     points = scene.shells[0].points
@@ -95,18 +94,18 @@ def test_a_spinning_sheet_stretches(device, model):
     scene.clamp_boundary(0, end(scene), motion=motion)
     built = scene.build(device, "float64")
     start = built.state(velocities=np.cross([0.0, 0.0, rate], points - pivot))
-    state = steps(built, int(6.5 * np.pi / turn), turn / rate, state=start, rtol=1e-7)
-    reached = rate * state.time
-    assert reached > 6.0 * np.pi
-    there = (state.points() - motion.place(state.time, points)) @ motion.rotation(reached)
-    euler = (2.0 * np.sin(0.5 * turn) / turn) ** 2 * np.cos(turn)
+    state = steps(built, int(6.5 * np.pi / step_angle), step_angle / rate, state=start, rtol=1e-7)
+    rotation = rate * state.time
+    assert rotation > 6.0 * np.pi
+    corotated = (state.points() - motion.place(state.time, points)) @ motion.rotation(rotation)
+    euler = (2.0 * np.sin(0.5 * step_angle) / step_angle) ** 2 * np.cos(step_angle)
     expected = 1000.0 * rate**2 * length**3 / (3.0 * 1e6) * (1.0 + 0.5 / cells**2) * euler
-    assert there[end(scene, "max"), 0].mean() == pytest.approx(expected, rel=2e-3)
-    assert np.abs(there[:, 2]).max() < 1e-9
+    assert corotated[end(scene, "max"), 0].mean() == pytest.approx(expected, rel=2e-3)
+    assert np.abs(corotated[:, 2]).max() < 1e-9
 
 
 def twisted(device, angle, length=1.0, cells=20, across=4, ramp=None, **options):
-    """A strip 0.1 m wide and 0.01 m thick with both ends clamped, one of them turned about its middle line."""
+    """Return a strip 0.1 m wide and 0.01 m thick with clamped ends, one rotated about the middle line."""
     scene = strip((cells, across), (length, 0.1), **options)
     scene.clamp_boundary(0, end(scene))
     middle = tuple(scene.shells[0].points.mean(0))
@@ -116,17 +115,19 @@ def twisted(device, angle, length=1.0, cells=20, across=4, ramp=None, **options)
 
 
 def test_torsion_of_a_strip(device):
-    """Saint-Venant: T = G b h^3 / 3 times the rate of twist, of a thin plate. Clamps that hold the ends flat shorten the strip by the
-    same length whatever its own (Reissner and Stein 1951), so that two lengths give G b h^3 / 3 = (L2 - L1) / (phi / T2 - phi / T1).
+    """Saint-Venant: T = G b h^3 / 3 times the rate of twist of a thin plate.
+
+    Clamps that keep the ends flat shorten strips of any length equally (Reissner and Stein 1951). Two lengths therefore
+    give G b h^3 / 3 = (L2 - L1) / (phi / T2 - phi / T1).
     """
     angle, compliance = 0.01, []
     for length, cells in ((0.5, 20), (1.0, 40)):
         model, middle = twisted(device, angle, length, cells)
         state = solve(model)
-        fixed, turned = model.reactions(state, point=middle)
-        np.testing.assert_allclose(fixed.moment, -turned.moment, atol=1e-9 * abs(turned.moment[0]))
-        assert turned.moment[0] * angle == pytest.approx(2.0 * elastic(model, state), rel=1e-3)
-        compliance.append(angle / turned.moment[0])
+        fixed, rotated = model.reactions(state, point=middle)
+        np.testing.assert_allclose(fixed.moment, -rotated.moment, atol=1e-9 * abs(rotated.moment[0]))
+        assert rotated.moment[0] * angle == pytest.approx(2.0 * elastic(model, state), rel=1e-3)
+        compliance.append(angle / rotated.moment[0])
     stiffness = RUBBER.young / 2.6 * 0.1 * 0.01**3 / 3.0
     assert 0.5 / (compliance[1] - compliance[0]) == pytest.approx(stiffness, rel=0.02)
 
@@ -141,7 +142,9 @@ def test_torsion_of_a_strip(device):
     ids=["twisted", "hinge", "wound"],
 )
 def test_a_slow_motion_ends_in_the_static_solution(device, bending, angle, load_steps):
-    """A strip twisted in 2 s and left to rest, against statics; wound by 420 degrees it is a helicoid, b12 = -phi / L."""
+    """A strip twisted in 2 s comes to rest in the static solution; wound by 420 degrees it is a helicoid, b12 = -phi /
+    L.
+    """
     model, middle = twisted(device, angle, cells=16, bending=bending)
     static = solve(model, load_steps=load_steps)
     ramp = lambda t: angle * min(1.0, 0.5 * t)  # noqa: E731
@@ -161,18 +164,20 @@ def test_a_slow_motion_ends_in_the_static_solution(device, bending, angle, load_
 
 
 @pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "midedge_boundary"])
-def test_a_clamp_that_slides_bends_a_strip_into_an_arc(device, bending):
-    """Its normal turned by 4 rad, its vertices free in the plane of bending: M = E h^3 b / 12 * 4 / L without a force, nu = 0."""
+def test_sliding_clamp_bends_a_strip_into_an_arc(device, bending):
+    """The clamp normal rotates by 4 rad, vertices slide in the bending plane: M = E h^3 b / 12 * 4 / L, no force, nu =
+    0.
+    """
     scene = strip((24, 2), (1.0, 0.1), bending, material=ddg.Material(1e6, 0.0, 1000.0))
     scene.clamp_boundary(0, end(scene))
     motion = ddg.Motion(angle=lambda t: 4.0 * t, axis=(0.0, 1.0, 0.0))
     scene.clamp_boundary(0, end(scene, "max"), "y", motion=motion)
     model = scene.build(device, "float64")
     state = solve(model, load_steps=10)
-    fixed, turned = model.reactions(state)
+    fixed, rotated = model.reactions(state)
     moment = 1e6 * 0.01**3 * 0.1 / 12.0 * 4.0
-    np.testing.assert_allclose(turned.moment, [0.0, moment, 0.0], atol=5e-3 * moment)
-    np.testing.assert_allclose(fixed.moment, -turned.moment, atol=1e-7 * moment)
+    np.testing.assert_allclose(rotated.moment, [0.0, moment, 0.0], atol=5e-3 * moment)
+    np.testing.assert_allclose(fixed.moment, -rotated.moment, atol=1e-7 * moment)
     np.testing.assert_allclose(fixed.force, 0.0, atol=1e-7 * moment)
     tip = state.points()[end(scene, "max")] - state.points()[end(scene)]
     np.testing.assert_allclose(tip[:, [0, 2]], np.tile([np.sin(4.0), np.cos(4.0) - 1.0], (3, 1)) / 4.0, atol=2e-3)
@@ -180,7 +185,7 @@ def test_a_clamp_that_slides_bends_a_strip_into_an_arc(device, bending):
 
 @TURNED
 def test_reactions_balance(device, model):
-    """Supports that turn, that meet in one element, a plane of symmetry, weight and pressure: forces and moments add up to zero."""
+    """Rotating supports, supports of one element, symmetry, weight and pressure: forces and moments sum to zero."""
     scene = strip((4, 4), (1.0, 1.0), model, thickness=0.05)
     scene.gravity = (0.3, 0.0, -1.0)
     points = scene.shells[0].points
@@ -198,17 +203,17 @@ def test_reactions_balance(device, model):
     q = tangent.dofs(state)
     host, x = built.net.host, q.reshape(-1, 3)[: built.net.host.nodes]
     load = tangent.loads(1.0, q).reshape(-1, 3)[: host.nodes]
-    about = np.array([0.2, -0.1, 0.4])
-    found = built.reactions(state, point=about)
+    pole = np.array([0.2, -0.1, 0.4])
+    reactions = built.reactions(state, point=pole)
     scale = np.abs(load).sum()
-    np.testing.assert_allclose(sum(r.force for r in found), -load.sum(0), atol=1e-8 * scale)
-    np.testing.assert_allclose(sum(r.moment for r in found), -np.cross(x - about, load).sum(0), atol=1e-8 * scale)
-    assert min(np.linalg.norm(r.moment) for r in found) > 1e-3 * scale
+    np.testing.assert_allclose(sum(r.force for r in reactions), -load.sum(0), atol=1e-8 * scale)
+    np.testing.assert_allclose(sum(r.moment for r in reactions), -np.cross(x - pole, load).sum(0), atol=1e-8 * scale)
+    assert min(np.linalg.norm(r.moment) for r in reactions) > 1e-3 * scale
 
 
 @TURNED
-def test_reactions_are_the_work_of_a_turn(device, model):
-    """The moment of a clamp about its axis is the derivative of the energy by its angle, central differences."""
+def test_reaction_moment_is_the_energy_derivative(device, model):
+    """Reaction moments about the axis equal derivatives of the energy by the angle, by central differences."""
     angles, energies = 0.5 + 1e-3 * np.array([-1.0, 0.0, 1.0]), []
     scene = strip((4, 2), (1.0, 0.5), model, thickness=0.05)
     scene.clamp_boundary(0, end(scene))
@@ -223,8 +228,8 @@ def test_reactions_are_the_work_of_a_turn(device, model):
     assert moment == pytest.approx((energies[2] - energies[0]) / (angles[2] - angles[0]), rel=1e-5)
 
 
-def test_a_path_with_a_clamp_that_turns(device):
-    """Arc length or load steps lead to the same equilibrium; the rate of the normals is in the tangent of the path."""
+def test_continuation_with_a_rotating_clamp(device):
+    """Arc length and load steps reach one equilibrium; the rate of the normals enters the tangent of the path."""
     model, _ = twisted(device, 0.4, cells=8, across=2)
     path = Continuation(model, step=0.05, max_step=0.4).trace(stop=Stop(load=(-1.0, 1.0)))
     np.testing.assert_allclose(path.points[-1].state.points(), solve(model).points(), atol=1e-9)
@@ -233,7 +238,7 @@ def test_a_path_with_a_clamp_that_turns(device):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_normals_belong_to_the_state(device, scheme):
-    """A run goes on bit by bit from a snapshot, and a world that was given up keeps its normals while the other turns."""
+    """A run continues bitwise from a snapshot; a failed world keeps its normals while the other rotates."""
     scene = strip((4, 2), (1.0, 0.5), material=ddg.Material(1e6, 0.3, 1000.0, viscosity=0.01))
     scene.clamp_boundary(0, end(scene), motion=ddg.Motion(angle=lambda t: 2.0 * t, axis=AXIS, pivot=PIVOT))
     model = scene.build(device, "float64", worlds=2)
@@ -242,25 +247,25 @@ def test_normals_belong_to_the_state(device, scheme):
     integrator = ddg.Integrator(model, scheme, check_every=10**9)
     state = integrator.step(model.state(points=points), 0.02)
     saved = state.snapshot()
-    other = ddg.Integrator(model, scheme, check_every=10**9)
-    other.step(model.state(points=points), 0.02)
+    second_integrator = ddg.Integrator(model, scheme, check_every=10**9)
+    second_integrator.step(model.state(points=points), 0.02)
     again = model.restore(saved)
     for _ in range(4):
-        state, again = integrator.step(state, 0.02), other.step(again, 0.02)
+        state, again = integrator.step(state, 0.02), second_integrator.step(again, 0.02)
     for name, values in state.snapshot().items():
         np.testing.assert_array_equal(values, again.snapshot()[name], err_msg=name)
     single = scene.build(device, "float64")
-    alone = steps(single, 5, 0.02, scheme)
+    single_state = steps(single, 5, 0.02, scheme)
     same = np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose
-    same(state.points()[1], alone.points())
-    (given_up,), (data,) = (list(s.net.data.values()) for s in (state, alone))
+    same(state.points()[1], single_state.points())
+    (given_up,), (data,) = (list(s.net.data.values()) for s in (state, single_state))
     half = data.shape[1]
     np.testing.assert_array_equal(given_up.numpy()[:, half:], data.numpy())
     np.testing.assert_array_equal(given_up.numpy()[:, :half], next(iter(single.state().net.data.values())).numpy())
 
 
-def test_retried_steps_turn_along_the_arc(device):
-    """A step that is taken in parts has its supports on their circle in every part, not on the chord."""
+def test_retried_steps_rotate_along_the_arc(device):
+    """Supports lie on the circle in every substep, not on the chord."""
     scene = strip((3, 2), (1.0, 0.6))
     motion = ddg.Motion(angle=lambda t: 2.0 * t, axis=AXIS, pivot=PIVOT)
     scene.clamp_boundary(0, end(scene), motion=motion)
@@ -277,7 +282,7 @@ def test_retried_steps_turn_along_the_arc(device):
 
 
 def test_two_motions_of_one_vertex(device):
-    """Of different components they go together; of the same one the point and the axis are named."""
+    """Motions of different components combine; two motions of one component are refused with point and axis."""
     scene = strip((2, 2), (1.0, 1.0))
     corner = [int(np.argmin(scene.shells[0].points.sum(1)))]
     scene.hold(0, corner, "x", ddg.Motion(translation=lambda t: (t, 9.0, 9.0)))
