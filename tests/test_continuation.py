@@ -1,4 +1,4 @@
-"""Paths of equilibria: closed forms of trusses, the elastica, limit points, bifurcations, branches, and failures by name."""
+"""Equilibrium paths: trusses in closed form, the elastica, limit points, bifurcations, branches, failures by name."""
 
 import sys
 from itertools import groupby
@@ -21,7 +21,11 @@ from convergence import order
 
 
 def truss(device, length: float, **options):
-    """Two bars of this length from (-1, 0) and (1, 0) to an apex, EA = 1, pressed down by the load parameter (von Mises 1923)."""
+    """Return the continuation and height of a von Mises truss (1923): two bars of a length, EA = 1, under a load at
+    the apex.
+
+    Supports are at (-1, 0) and (1, 0); the load parameter acts downwards.
+    """
     height = np.sqrt(length**2 - 1.0)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     points = [[-1.0, 0.0, 0.0], [0.0, 0.0, height], [1.0, 0.0, 0.0]]
@@ -40,7 +44,10 @@ def exact_load(z, length):
 
 
 def test_shallow_truss_snaps_through(device):
-    """dP/dz = 0 at l^3 = l0; in between the equilibria are unstable; the path goes on below zero load and comes back."""
+    """dP/dz = 0 at l^3 = l0; equilibria in between are unstable.
+
+    The load falls below zero and comes back.
+    """
     length = 1.1
     continuation, height = truss(device, length)
     path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 2.3 * height)))
@@ -62,7 +69,7 @@ def test_shallow_truss_snaps_through(device):
     assert {point.state.time == point.load for point in path.points} == {True}
 
 
-# The sideways stiffness 2 EA (1 / (l0 l^2) + (l - l0) z^2 / (l0 l^3)) vanishes where l^3 - l0 l^2 + l0 = 0.
+# The lateral stiffness 2 EA (1 / (l0 l^2) + (l - l0) z^2 / (l0 l^3)) vanishes where l^3 - l0 l^2 + l0 = 0.
 def test_steep_truss_bifurcates_before_it_snaps(device):
     length = 3.0
     continuation, height = truss(device, length)
@@ -70,18 +77,21 @@ def test_steep_truss_bifurcates_before_it_snaps(device):
     roots = np.sort(np.roots([1.0, -length, 0.0, length]).real)[:0:-1]
     assert roots == pytest.approx([2.532, 1.347], abs=1e-3)
     expected = [("bifurcation", roots[0]), ("limit point", length ** (1.0 / 3.0)), ("bifurcation", roots[1])]
-    found = [point for point in path.points if point.kind != "regular"]
-    assert [point.kind for point in found] == [kind for kind, _ in expected]
-    for point, (_, bar) in zip(found, expected, strict=True):
+    events = [point for point in path.points if point.kind != "regular"]
+    assert [point.kind for point in events] == [kind for kind, _ in expected]
+    for point, (_, bar) in zip(events, expected, strict=True):
         assert np.hypot(1.0, height - point.values["drop"]) == pytest.approx(bar, abs=1e-6)
-    mode = found[0].mode.reshape(-1, 2)
+    mode = events[0].mode.reshape(-1, 2)
     assert np.abs(mode[1, 1]) < 1e-9 * np.abs(mode[1, 0])  # sideways
     counts = [point.negative for point in path.points if point.kind == "regular"]
     assert [count for count, _ in groupby(counts)] == [0, 1, 2, 1]
 
 
 def test_branch_of_the_truss(device):
-    """Bars of different length in equilibrium; the other side is its mirror image; it leaves the first path sideways."""
+    """Bars of different lengths are in equilibrium; the other side is the mirror image.
+
+    The branch starts laterally.
+    """
     length = 3.0
     continuation, height = truss(device, length)
     (point,) = continuation.trace(stop=Stop(load=(-1.0, 0.5))).bifurcations
@@ -92,8 +102,8 @@ def test_branch_of_the_truss(device):
         forces = np.zeros((len(branch), 2))
         for foot in (-1.0, 1.0):
             bar = np.stack([x - foot, z], axis=1)
-            now = np.linalg.norm(bar, axis=1, keepdims=True)
-            forces += (now / length - 1.0) * bar / now
+            bar_length = np.linalg.norm(bar, axis=1, keepdims=True)
+            forces += (bar_length / length - 1.0) * bar / bar_length
         np.testing.assert_allclose(forces[:, 0], 0.0, atol=1e-9)
         np.testing.assert_allclose(forces[:, 1], -branch.load, atol=1e-9)
         assert (np.diff(np.abs(x[:6])) > 0.0).all()
@@ -115,7 +125,7 @@ def test_displacement_control_passes_a_limit_point(device):
 
 
 def strip(device, n: int, axial: float):
-    """A column of EI = L = 1 along x between hinges, one of which slides, pressed by the load parameter."""
+    """Return a simply supported column of EI = L = 1 along x, under an axial load by the load parameter."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n + 1)
     rod = scene.add_rod(points, section=ddg.Stiffness(EA=axial, EI1=1.0, radius=0.01))
@@ -164,7 +174,7 @@ def test_branch_follows_the_elastica(device):
 
 
 def arch(device, load_scale: float, imperfection: float = 0.0):
-    """A shallow elastic arch of 20 edges between hinges, pressed down at its crown."""
+    """Return a shallow elastic arch of 20 edges between hinges, loaded at the crown."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     x = np.linspace(-1.0, 1.0, 21)
     points = np.stack([x, 0.0 * x, 0.3 * (1.0 - x**2) + imperfection * np.sin(np.pi * x)], axis=1)
@@ -177,29 +187,30 @@ def arch(device, load_scale: float, imperfection: float = 0.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("load_scale", [30.0, 300.0])
-def test_branch_comes_back_through_the_pitchforks(device, load_scale):
-    """The asymmetric states of an arch close in a loop through both pitchforks of the symmetric ones: each is one event, in turn.
+def test_closed_branch_passes_both_pitchforks(device, load_scale):
+    """The asymmetric states of an arch form a loop through both pitchforks, each one event.
 
-    There the load is stationary, yet it is no limit point: the load does no work on the mode, along which the branch runs.
+    The load is stationary there, yet this is no limit point: the load does no work on the mode, along which the branch
+    runs.
     """
     continuation = arch(device, load_scale)
     first = continuation.trace(stop=Stop(displacement=("drop", -1.0, 0.1))).bifurcations[0]
     branch = continuation.switch(first, stop=Stop(steps=45))
-    found = [point for point in branch.points[1:] if point.kind != "regular"]
-    assert {point.kind for point in found} == {"bifurcation"}
-    assert len(found) >= 2
-    for point, back in zip(found, (False, True), strict=False):
+    events = [point for point in branch.points[1:] if point.kind != "regular"]
+    assert {point.kind for point in events} == {"bifurcation"}
+    assert len(events) >= 2
+    for point, back in zip(events, (False, True), strict=False):
         assert point.values["sway"] == pytest.approx(0.0, abs=1e-3)
         assert (point.load == pytest.approx(first.load, rel=1e-4)) == back
     assert np.abs(branch.values("sway")).max() > 0.02
-    # leaving the other pitchfork across the loop leads to symmetric states
-    through = continuation.switch(found[0], stop=Stop(steps=3))
-    assert np.abs(through.values("sway")[1:]).max() < 1e-3 < np.ptp(through.values("drop"))
+    # switching at the other pitchfork, across the loop, leads to symmetric states
+    symmetric = continuation.switch(events[0], stop=Stop(steps=3))
+    assert np.abs(symmetric.values("sway")[1:]).max() < 1e-3 < np.ptp(symmetric.values("drop"))
 
 
 @pytest.mark.slow
-def test_imperfect_arch_turns_off_where_the_perfect_one_forks(device):
-    """It follows its own path around the pitchfork, with limit points instead, and leaps to no other."""
+def test_imperfect_arch_has_a_limit_point_near_the_pitchfork(device):
+    """The path passes the pitchfork by limit points instead, without a jump to another path."""
     path = arch(device, 30.0, 1e-4).trace(stop=Stop(displacement=("drop", -1.0, 0.55)))
     assert [point.kind for point in path.points if point.kind != "regular"] == ["limit point"]
     (limit,) = path.limit_points
@@ -212,22 +223,22 @@ def test_imperfect_arch_turns_off_where_the_perfect_one_forks(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("load_scale", [0.3, 3.0, 30.0])
 def test_every_event_is_listed_once(device, load_scale):
-    """Six crossings of the steep truss on its way down and through, by closed form (see above), whatever the metric."""
+    """The steep truss passes six events, by closed form (see above), in any metric."""
     continuation, height = truss(device, 3.0, load_scale=load_scale)
     path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 2.2 * height)))
     roots = np.sort(np.roots([1.0, -3.0, 0.0, 3.0]).real)[:0:-1]
     bars = [roots[0], 3.0 ** (1.0 / 3.0), roots[1]]
     kinds = ["bifurcation", "limit point", "bifurcation"]
-    found = [point for point in path.points if point.kind != "regular"]
-    assert [point.kind for point in found] == kinds + kinds[::-1]
-    lengths = [np.hypot(1.0, height - point.values["drop"]) for point in found]
+    events = [point for point in path.points if point.kind != "regular"]
+    assert [point.kind for point in events] == kinds + kinds[::-1]
+    lengths = [np.hypot(1.0, height - point.values["drop"]) for point in events]
     assert lengths == pytest.approx(bars + bars[::-1], abs=1e-5)
     assert path.stable.tolist() == (path.negative == 0).tolist()
     assert path.kinds == [point.kind for point in path.points]
 
 
 def cap(device):
-    """A shallow cap of triangles, twice as high as it is thick, between hinges under a pressure that keeps its direction."""
+    """Return a shallow triangulated cap, twice as high as thick, between hinges under a dead pressure."""
     points, triangles = meshes.disc(3)
     radius = np.linalg.norm(points, axis=1)
     points = points + (0.02 * (1.0 - radius**2))[:, None] * [0.0, 0.0, 1.0]
@@ -241,8 +252,8 @@ def cap(device):
 
 
 @pytest.mark.slow
-def test_defaults_do_not_leap_over_a_snap(device):
-    """Its whole snap is shorter than the first step of the defaults: the path is found, by the loads that control finds on it."""
+def test_default_steps_resolve_a_snap(device):
+    """The snap is shorter than the first default step: limit loads agree with displacement control."""
     continuation = cap(device)
     path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 0.042)))
     assert np.diff(path.values("drop")).max() < 0.01  # a thickness
@@ -263,7 +274,7 @@ def test_defaults_do_not_leap_over_a_snap(device):
 
 
 def test_path_under_moving_supports(device):
-    """The load parameter moves a hinge: the path goes through the equilibria that load stepping finds, and through its end."""
+    """The load parameter moves a hinge: the path agrees with load stepping, and passes the final load."""
     scene = post_buckling.build(0.1, 1e6, 20)
     scene.supports.clear()
     scene.fix(0, [0])
@@ -280,8 +291,8 @@ def test_path_under_moving_supports(device):
         np.testing.assert_allclose(point.state.points(), stepped.points(), atol=1e-8)
 
 
-def test_path_under_a_following_couple(device):
-    """A couple in space has no potential; the rod rolls up into the circle that load stepping in the plane finds."""
+def test_path_under_a_follower_couple(device):
+    """A couple in space has no potential; the rod rolls into the circle that planar load stepping gives."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 13)
     rod = scene.add_rod(points, section=ddg.Stiffness(EA=1e5, EI1=1.0, GJ=1.0))
@@ -306,9 +317,9 @@ def test_path_goes_backwards_and_repeats_bitwise(device):
     assert len(first) == 13
     assert (first.load[1:] < 0.0).all()
     np.testing.assert_array_equal(first.load, again.load)
-    for one, other in zip(first.points, again.points, strict=True):
-        np.testing.assert_array_equal(one.state.points(), other.state.points())
-        np.testing.assert_array_equal(one.direction, other.direction)
+    for point, repeated in zip(first.points, again.points, strict=True):
+        np.testing.assert_array_equal(point.state.points(), repeated.state.points())
+        np.testing.assert_array_equal(point.direction, repeated.direction)
 
 
 def test_stop_by_limit_points_and_the_start_is_kept(device):
@@ -324,8 +335,8 @@ def test_stop_by_limit_points_and_the_start_is_kept(device):
 
 
 @pytest.mark.slow
-def test_displacement_that_turns_back(device):
-    """v of the Lee frame does not reach 65 cm on this path (its largest is 61.3 at 20 edges)."""
+def test_displacement_that_reverses_is_refused(device):
+    """v of the Lee frame stays below 65 cm on this path (the maximum is 61.3 at 20 edges)."""
     scene = lee_frame.build(10)
     continuation = Continuation(scene.build(device, "float64"), scene.analysis.watch)
     with pytest.raises(ddg.SolverError, match=r"displacement_turns_back.*arc length") as caught:
@@ -353,7 +364,7 @@ def test_failures_are_named(device):
 
 
 def test_structure_without_stiffness_has_no_path(device):
-    """A straight string at rest: nothing resists to what is sideways."""
+    """A straight string at rest has no lateral stiffness."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 4)
     rod = scene.add_rod(points, section=ddg.Stiffness(EA=1.0, mass_per_length=1.0), bend=False)
@@ -385,7 +396,8 @@ def test_mistakes(device):
         Continuation(continuation.model.scene.build(device, "float64", worlds=2))
 
 
-# All equilibria on the way satisfy the equations of the model, whatever the metric; a watched sum is the sum of its parts.
+# All equilibria of the path satisfy the equations of the model in any metric; a watched sum equals the sum of its
+# terms.
 @pytest.mark.slow
 def test_metric_does_not_move_the_path(device):
     for load_scale in (0.03, 3.0):

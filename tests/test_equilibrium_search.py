@@ -1,4 +1,4 @@
-"""The search for equilibria: columns past buckling, slack cables, mechanisms and many islands, at any scale; and its outcomes."""
+"""Convergence of static solves: buckled columns, slack cables, mechanisms, many islands, any scale; outcomes."""
 
 from itertools import pairwise
 
@@ -11,23 +11,24 @@ from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
 
 
 def searched(scene, device, steps: int = 1, **options):
-    """Equilibrium of a scene, and its solver."""
+    """Return the equilibrium of a scene, and the solver."""
     model = scene.build(device, "float64")
     solver = Equilibrium(model, StaticsOptions(**options))
     return solver.load(model.state(), steps), solver
 
 
-def add_column(scene, stretching: float, ratio: float, load: float, length: float = 1.0, at: float = 0.0):
-    """A straight column along x, clamped at its first end, with EI = 1 N m^2 and EA L^2 / EI = `stretching`."""
+def add_column(scene, stretching: float, ratio: float, load: float, length: float = 1.0, y: float = 0.0):
+    """Add a straight column along x, clamped at the first end, with EI = 1 N m^2 and EA L^2 / EI = `stretching`."""
     section = ddg.Stiffness(EA=stretching / length**2, EI1=1.0, EI2=ratio, GJ=0.7, radius=0.01 * length)
-    rod = scene.add_rod(np.linspace((0, at, 0), (length, at, 0), 26), section=section)
+    rod = scene.add_rod(np.linspace((0, y, 0), (length, y, 0), 26), section=section)
     scene.clamp_end(rod)
     scene.add_force(rod, -1, (-load / length**2, 0, 0))
     return rod
 
 
-# Elastica: P L^2 / EI = 2.6 > pi^2 / 4 and no stretch leave the tip 2 k L / K(k) = 0.39228 L off the axis, K(k)^2 = 2.6; 0.3836 L
-# with EA L^2 / EI = 1e3; 26 nodes err by 1e-4.
+# Elastica: P L^2 / EI = 2.6 > pi^2 / 4 without stretch puts the tip 2 k L / K(k) = 0.39228 L off the axis, K(k)^2 =
+# 2.6.
+# With EA L^2 / EI = 1e3 it is 0.3836 L; 26 nodes err by 1e-4.
 @pytest.mark.parametrize("ratio", [1.0, 1.2])
 @pytest.mark.parametrize(("stretching", "tip"), [(1e3, 0.3836), (1e7, 0.39228), (1e9, 0.39228)])
 def test_column_past_buckling(device, stretching, tip, ratio):
@@ -42,7 +43,7 @@ def test_column_past_buckling(device, stretching, tip, ratio):
 
 @pytest.mark.parametrize("length", [1e-9, 1e-3, 1e5])
 def test_column_at_any_length(device, length):
-    """The same shape over its length from nanometres to a hundred kilometres."""
+    """Relative shapes agree from nanometres to a hundred kilometres."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     add_column(scene, 1e7, 1.2, 2.6, length)
     state, solver = searched(scene, device, 6)
@@ -50,24 +51,24 @@ def test_column_at_any_length(device, length):
     assert solver.iterations <= 40
 
 
-def test_columns_search_apart(device):
-    """A rod past buckling beside a straight one and one that merely bends: each is found as if it were alone, to rounding."""
+def test_columns_converge_independently(device):
+    """A buckled rod, a straight and a bent one in one scene equal single scenes, to rounding."""
     loads, ratios = (2.6, 1.0, 20.0), (1.2, 1.2, 1.2)
-    together, alone = ddg.Scene(gravity=(0, 0, 0)), []
+    together, singles = ddg.Scene(gravity=(0, 0, 0)), []
     for index, (load, ratio) in enumerate(zip(loads, ratios, strict=True)):
-        add_column(together, 1e7, ratio, load, at=float(index))
+        add_column(together, 1e7, ratio, load, y=float(index))
         scene = ddg.Scene(gravity=(0, 0, 0))
-        add_column(scene, 1e7, ratio, load, at=float(index))
-        alone.append(searched(scene, device, 6))
+        add_column(scene, 1e7, ratio, load, y=float(index))
+        singles.append(searched(scene, device, 6))
     state, solver = searched(together, device, 6)
-    single = np.concatenate([one.points() for one, _ in alone])
+    single = np.concatenate([state_of_one.points() for state_of_one, _ in singles])
     np.testing.assert_allclose(state.points(), single, rtol=0.0, atol=1e-9)
-    assert solver.iterations <= 1.2 * max(one.iterations for _, one in alone)
+    assert solver.iterations <= 1.2 * max(state_of_one.iterations for _, state_of_one in singles)
     assert state.stable is True
 
 
 def test_worlds_know_their_own_outcome(device):
-    """Of two worlds one is loaded past buckling; in mode "follow" both stay straight, and only one of them is stable."""
+    """One of two worlds is loaded past buckling; mode "follow" keeps both straight, and only one of them is stable."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     add_column(scene, 1e5, 1.2, 1.0)
     model = scene.build(device, "float64", worlds=2)
@@ -76,15 +77,18 @@ def test_worlds_know_their_own_outcome(device):
     state = solve(model, controls=ddg.Controls(forces=force), mode="follow")
     assert list(state.stable) == [True, False]
     assert state.outcome.shape == state.unbalanced.shape == (2,)
-    found = solve(model, controls=ddg.Controls(forces=force), load_steps=6)
-    assert list(found.stable) == [True, True]
-    off = np.hypot(*found.points()[:, -1, 1:].T)
-    assert off[0] < 1e-9
-    assert off[1] == pytest.approx(0.392, abs=5e-4)
+    buckled = solve(model, controls=ddg.Controls(forces=force), load_steps=6)
+    assert list(buckled.stable) == [True, True]
+    deflection = np.hypot(*buckled.points()[:, -1, 1:].T)
+    assert deflection[0] < 1e-9
+    assert deflection[1] == pytest.approx(0.392, abs=5e-4)
 
 
 def catenary(span: float, rise: float, length: float, axial: float, weight: float) -> np.ndarray:
-    """Horizontal force and vertical force at the first end of an elastic catenary [N] (Irvine, Cable structures, 1981, eq. 1.19)."""
+    """Return horizontal and vertical force at the first end of an elastic catenary [N].
+
+    Irvine, Cable structures, 1981, eq. 1.19.
+    """
 
     def missing(forces):
         along, up = forces
@@ -100,15 +104,15 @@ def catenary(span: float, rise: float, length: float, axial: float, weight: floa
 @pytest.mark.parametrize("bend", [True, False])
 @pytest.mark.parametrize("how", ["V", "moved"])
 def test_slack_cable(device, how, bend):
-    """A limp cable of 1 m that is drawn as a V, or straight with an end moved by a fifth of its length in one load step."""
+    """A limp cable of 1 m starts as a V, or straight with one end moved by a fifth of the length in one load step."""
     span, rise, weight, edges, motion = 0.8, 0.1, 0.05, 60, None
-    at, end = np.linspace(0.0, 1.0, edges + 1), np.array([0.8, 0.0, 0.1])
+    arc, end = np.linspace(0.0, 1.0, edges + 1), np.array([0.8, 0.0, 0.1])
     if how == "V":
         chord = 0.5 * np.hypot(span, rise)
         low = 0.5 * end + np.sqrt(0.25 - chord**2) * np.array([rise, 0.0, -span]) / (2.0 * chord)
-        points = np.minimum(at, 0.5)[:, None] / 0.5 * low + np.maximum(at - 0.5, 0.0)[:, None] / 0.5 * (end - low)
+        points = np.minimum(arc, 0.5)[:, None] / 0.5 * low + np.maximum(arc - 0.5, 0.0)[:, None] / 0.5 * (end - low)
     else:
-        points = at[:, None] * [1.0, 0.0, 0.0]
+        points = arc[:, None] * [1.0, 0.0, 0.0]
         motion = ddg.Motion(translation=lambda t: tuple((end - [1.0, 0.0, 0.0]) * t))
     scene = ddg.Scene(gravity=(0, 0, -9.81))
     section = ddg.Stiffness(EA=200.0, EI1=1e-7, GJ=1e-7, mass_per_length=weight / 9.81, rotary_inertia=1e-9)
@@ -129,8 +133,9 @@ def test_slack_cable(device, how, bend):
 def test_hinged_bars_collapse(device, steps, solver):
     """An arch of three nearly rigid hinged bars falls over and hangs: moments about both hinges vanish.
 
-    Bars turn by up to 150 degrees with EA = 1e6 times their loads, in a closed loop. Loads (0.1, 0, -1) act on both inner hinges: each
-    outer bar takes along itself the load of its hinge and the pull of the middle bar. Conjugate gradients alone do not get there.
+    Bars rotate by up to 150 degrees with EA = 1e6 times their loads, in a closed loop. Loads (0.1, 0, -1) act on both
+    inner hinges: each outer bar carries the load of its hinge and the force of the middle bar. Conjugate gradients
+    alone do not converge.
     """
     scene = ddg.Scene(gravity=(0, 0, 0))
     section, load = ddg.Stiffness(EA=1e6, EI1=1e3, GJ=1e3), np.array([0.1, 0.0, -1.0])
@@ -143,21 +148,21 @@ def test_hinged_bars_collapse(device, steps, solver):
     scene.fix(bars[-1], [-1])
     for bar in bars:
         scene.fix_twist(bar, [0])
-    state, found = searched(scene, device, steps, solver=solver)
+    state, search = searched(scene, device, steps, solver=solver)
     a, b = state.points()[[4, 9]]
-    for hinge, other, support in ((a, b, corners[0]), (b, a, corners[3])):
-        outer, middle = hinge - support, other - hinge
+    for hinge, opposite, support in ((a, b, corners[0]), (b, a, corners[3])):
+        outer, middle = hinge - support, opposite - hinge
         pull = -np.cross(outer, load)[1] / np.cross(outer, middle)[1]  # tension over length of the middle bar
         assert pull > 0.0
         assert np.linalg.norm(np.cross(outer, load + pull * middle)) < 1e-6
     assert max(a[2], b[2]) < -0.8
     if solver == "direct":
-        assert found.iterations <= 30 * steps
+        assert search.iterations <= 30 * steps
         assert state.stable is True
 
 
-def test_an_equilibrium_is_at_rest(device):
-    """Whatever velocities a search starts with, the state that it finds has none, and the next step stays there."""
+def test_equilibria_have_zero_velocity(device):
+    """Initial velocities of a static solve do not appear in the equilibrium, and the next step stays there."""
     scene = ddg.Scene()
     rod = scene.add_rod(
         np.linspace((0, 0, 0), (1, 0, 0), 11), section=ddg.Circle(0.01), material=ddg.Material(1e7, density=1000.0)
@@ -170,8 +175,8 @@ def test_an_equilibrium_is_at_rest(device):
     np.testing.assert_allclose(after.points(), state.points(), rtol=0.0, atol=1e-8)
 
 
-def stepped(edges: int):
-    """A cantilever whose outer half is a million times as stiff as the inner one, under 1e-5 N: rounding competes with the load."""
+def two_stiffnesses(edges: int):
+    """Return a cantilever with an outer half a million times stiffer, under 1e-5 N, where rounding rivals the load."""
     bending = np.where(np.arange(edges) < edges // 2, 1.0, 1e6)
     scene = ddg.Scene(gravity=(0, 0, 0))
     section = ddg.Stiffness(EA=1e6, EI1=bending, EI2=bending, GJ=bending)
@@ -182,9 +187,9 @@ def stepped(edges: int):
 
 
 @pytest.mark.parametrize("edges", [40, 160])
-def test_supports_carry_the_loads_or_the_state_says_so(device, edges):
-    """The reaction misses no more of the load than `unbalanced` says, and that is below 1e-3."""
-    state, solver = searched(stepped(edges), device)
+def test_unbalanced_bounds_the_missing_reaction(device, edges):
+    """The reaction misses no more of the load than `unbalanced` states, which is below 1e-3."""
+    state, solver = searched(two_stiffnesses(edges), device)
     missing = abs(solver.model.reactions(state)[0].force[2] / 1e-5 + 1.0)
     assert missing <= 1.05 * state.unbalanced + 1e-9
     assert state.unbalanced < 1e-3
@@ -193,5 +198,5 @@ def test_supports_carry_the_loads_or_the_state_says_so(device, edges):
 
 def test_loads_that_rounding_hides_are_refused(device):
     with pytest.raises(ddg.SolverError, match=r"lost_in_rounding.*supports miss .* of the loads") as caught:
-        searched(stepped(640), device)
+        searched(two_stiffnesses(640), device)
     assert caught.value.outcome == "lost_in_rounding"

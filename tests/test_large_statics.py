@@ -1,4 +1,4 @@
-"""Equilibria by conjugate gradients on the device: the same as by factors, balance, repeat, worlds, failures, choice by size."""
+"""Equilibria by conjugate gradients on the device: agreement with factors, repeats, worlds, failures, choice by size."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ STRETCHING = 1e5 / (1.0 - 0.3**2)  # E h / (1 - nu^2) [N/m]
 
 
 def sheet(cells: int, gravity: float = 0.0, **options):
-    """A square of 1 m, its points, and masks of its vertices at the ends of x and y (2, V, 2)."""
+    """Return a square of 1 m, its points, and masks of vertices at the ends of x and y (2, V, 2)."""
     points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, -gravity), **options)
     scene.add_shell(points, triangles, thickness=THICKNESS, material=RUBBER, bending="midedge_dof")
@@ -27,7 +27,7 @@ def sheet(cells: int, gravity: float = 0.0, **options):
 
 
 def plate(cells: int, pressure: float = 2e3):
-    """Clamped all around; 2 kPa deflect it by eight thicknesses."""
+    """Return a plate clamped all around; 2 kPa deflect it by eight thicknesses."""
     scene, _, ends = sheet(cells)
     scene.clamp_boundary(0, np.flatnonzero(ends.any((0, 2))))
     scene.add_pressure(0, pressure)
@@ -35,14 +35,14 @@ def plate(cells: int, pressure: float = 2e3):
 
 
 def hanging(cells: int, analysis=None):
-    """Pinned at its corners, under its weight."""
+    """Return a sheet pinned at the corners, under its weight."""
     scene, _, ends = sheet(cells, gravity=9.81, **({"analysis": analysis} if analysis else {}))
     scene.hold(0, np.flatnonzero(ends.any(0).all(1)))
     return scene
 
 
 def moved(cells: int, motion: ddg.Motion):
-    """One side held, the other clamped with a motion, under its weight."""
+    """Return a heavy sheet with one fixed side and one clamped side in motion."""
     scene, _, ends = sheet(cells, gravity=9.81)
     scene.hold(0, np.flatnonzero(ends[0, :, 0]))
     scene.clamp_boundary(0, np.flatnonzero(ends[1, :, 0]), "xyz", motion)
@@ -50,18 +50,18 @@ def moved(cells: int, motion: ddg.Motion):
 
 
 def wrung(cells: int):
-    """Stretched, lifted and turned."""
+    """Return a sheet stretched, lifted and rotated at one side."""
     motion = ddg.Motion(lambda t: (0.05 * t, 0.0, 0.1 * t), lambda t: 0.4 * t, (1.0, 0.0, 0.0), (0.0, 0.5, 0.0))
     return moved(cells, motion)
 
 
-def pushed(cells: int):
-    """The other side comes nearer and rises: the sheet buckles and sags, and has several equilibria that are stable."""
+def compressed(cells: int):
+    """Return a sheet with an approaching and rising side: it buckles and has several stable equilibria."""
     return moved(cells, ddg.Motion(lambda t: (-0.2 * t, 0.0, 0.1 * t)))
 
 
 def stiffened(cells: int):
-    """A clamped plate with a rod along its middle, which a couple bends."""
+    """Return a clamped plate with a rod along the middle, which a couple bends."""
     scene, points, ends = sheet(cells)
     scene.clamp_boundary(0, np.flatnonzero(ends.any((0, 2))))
     scene.add_pressure(0, 500.0, dead=True)
@@ -86,21 +86,21 @@ CASES += [pytest.param(name, size, marks=pytest.mark.slow) for name, (_, _, size
 
 @pytest.mark.parametrize(("name", "size"), CASES)
 def test_same_equilibrium(device, name, size):
-    """Both solvers find one equilibrium, to their tolerance; 32 cells are 2,048 triangles."""
+    """PCG and direct solves find one equilibrium, to the tolerance; 32 cells are 2,048 triangles."""
     model = SCENES[name][0](size).build(device, "float64")
     start = model.state()
     searches = [Equilibrium(model, StaticsOptions(solver=solver)) for solver in ("pcg", "direct")]
-    found, expected = (search.load(start, 2).points() for search in searches)
+    points, expected = (search.load(start, 2).points() for search in searches)
     moved = np.abs(expected - start.points()).max()
     assert moved > 1e-3
-    assert np.abs(found - expected).max() < 1e-6 * moved
+    assert np.abs(points - expected).max() < 1e-6 * moved
     assert searches[0].pcg_iterations > 0 == searches[1].pcg_iterations
     assert searches[0].outcome in ("converged", "converged_to_rounding")
 
 
-@pytest.mark.parametrize("build", [plate, pushed])
+@pytest.mark.parametrize("build", [plate, compressed])
 def test_converged_is_balanced_and_stable(device, build):
-    """The residual of every free dof, by the host's own forces, is below rtol times the load scale; moments times a length."""
+    """The residual of every free dof, by host forces, is below rtol times the load scale; moments times a length."""
     model = build(8).build(device, "float64")
     search = Equilibrium(model, StaticsOptions(solver="pcg", rtol=1e-9))
     state = search.load(model.state(), 2)
@@ -114,7 +114,7 @@ def test_converged_is_balanced_and_stable(device, build):
 
 
 def test_supports_carry_the_weight(device):
-    """Reactions of the corners add up to the weight, rho h g over 1 m^2."""
+    """Reactions of the corners sum to the weight, rho h g over 1 m^2."""
     model = hanging(10).build(device, "float64")
     reactions = model.reactions(solve(model, load_steps=2, solver="pcg"))
     weight = RUBBER.density * THICKNESS * 9.81
@@ -122,7 +122,7 @@ def test_supports_carry_the_weight(device):
 
 
 def test_pressure_follows_and_does_its_work(device):
-    """Forces on the iterate are those of the host; the work along a step is that of their mean at its ends, (f0 + f1) . u / 2."""
+    """Device forces equal host forces; the work of a step is that of the mean end force, (f0 + f1) . u / 2."""
     model = plate(6).build(device, "float64")
     search, tangent = Equilibrium(model, StaticsOptions(solver="pcg")), Tangent(model)
     q0, random = tangent.dofs(model.state()), np.random.default_rng(1)
@@ -131,7 +131,7 @@ def test_pressure_follows_and_does_its_work(device):
     solver = search.net.newton
     solver.begin(q1, tangent.parts[-1].dead_loads(0.7), 0.7, np.ones(1))
     solver.base.assign(q0.reshape(-1, 3))
-    solver.balance()  # nothing is evaluated: elements bring no forces
+    solver.balance()  # no element is evaluated, so internal forces are zero
     first, second = tangent.loads(0.7, q0), tangent.loads(0.7, q1)
     expected = np.where(tangent.free, second, 0.0)
     np.testing.assert_allclose(solver.right.numpy().ravel(), expected, atol=1e-12 * np.abs(second).max())
@@ -141,31 +141,31 @@ def test_pressure_follows_and_does_its_work(device):
 
 
 def test_repeats_bitwise(device):
-    model = pushed(8).build(device, "float64")
+    model = compressed(8).build(device, "float64")
     runs = [solve(model, load_steps=2, solver="pcg").snapshot() for _ in range(2)]
     for name, values in runs[0].items():
         np.testing.assert_array_equal(values, runs[1][name], err_msg=name)
 
 
 def test_worlds_and_changed_parameters(device):
-    """Worlds of other stiffness find their own equilibria, also after a change of what has been captured."""
+    """Worlds of different stiffness find separate equilibria, also when captured data change."""
     names = ("shell_stretch", "stiffness")
-    alone = plate(6).build(device, "float64")
+    single = plate(6).build(device, "float64")
     together = plate(6).build(device, "float64", worlds=2)
-    searches = [Equilibrium(model, StaticsOptions(solver="pcg")) for model in (alone, together)]
+    searches = [Equilibrium(model, StaticsOptions(solver="pcg")) for model in (single, together)]
     searches[1].load(together.state(), 1)
     stiffness = np.array([1.0, 3.0]) * STRETCHING
     together.set_parameter(*names, stiffness)
-    found = searches[1].load(together.state(), 1).points()
+    points = searches[1].load(together.state(), 1).points()
     for world in range(2):
-        alone.set_parameter(*names, stiffness[world])
-        expected = searches[0].load(alone.state(), 1).points()
-        np.testing.assert_allclose(found[world], expected, atol=1e-9)
-    assert np.abs(found[0] - found[1]).max() > 1e-4
+        single.set_parameter(*names, stiffness[world])
+        expected = searches[0].load(single.state(), 1).points()
+        np.testing.assert_allclose(points[world], expected, atol=1e-9)
+    assert np.abs(points[0] - points[1]).max() > 1e-4
 
 
 def test_failure_is_named(device):
-    """Too few iterations for any increment: the error carries the outcome, the place and the last good state."""
+    """Too few iterations for any increment: the error has the outcome, the position and the last good state."""
     model = plate(6).build(device, "float64")
     with pytest.raises(ddg.SolverError, match=r"max_iterations, largest residual .* of shell 0") as caught:
         solve(model, solver="pcg", max_iterations=2, max_cuts=2)
@@ -173,7 +173,7 @@ def test_failure_is_named(device):
     assert np.isfinite(caught.value.state.points()).all()
 
 
-def test_what_needs_factors_says_so(device):
+def test_options_that_need_factors_are_refused(device):
     with pytest.raises(ddg.SceneError, match="'follow' passes limit points by the inertia"):
         StaticsOptions(solver="pcg", mode="follow")
     with pytest.raises(ddg.SceneError, match="it is 'auto', 'direct' or 'pcg'"):
@@ -186,7 +186,7 @@ def test_what_needs_factors_says_so(device):
 
 
 def test_choice_by_size(device, monkeypatch):
-    """Small nets take factors, large ones conjugate gradients; what counts unstable directions always takes factors."""
+    """Small coupled systems take factors, large ones conjugate gradients; counting instabilities always takes factors."""
     scene = hanging(6, ddg.Statics(load_steps=2))
     model = scene.build(device, "float64")
     assert choice.static_solver(model) == "direct"

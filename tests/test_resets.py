@@ -1,4 +1,4 @@
-"""Worlds that fail or start anew: the others never notice."""
+"""Failed and reset worlds leave other worlds unchanged."""
 
 import numpy as np
 import pytest
@@ -11,18 +11,20 @@ KINDS = pytest.mark.parametrize("build", [some_rods, joined, sheet, everything],
 
 
 def controls(k: int, worlds=(0, 1, 2), whip: int | None = None) -> ddg.Controls:
-    """Of step k, of some worlds; one of them may be whipped to where squares overflow."""
-    given = poses(k * DT)
+    """Return controls of step k for some worlds; `whip` moves one world so far that squares overflow."""
+    poses_given = poses(k * DT)
     if whip is not None:
-        given[whip, 0, 0] = 1e200
-    given, gravity = (
-        (given[worlds], GRAVITY[worlds]) if isinstance(worlds, int) else (given[[*worlds]], GRAVITY[[*worlds]])
+        poses_given[whip, 0, 0] = 1e200
+    poses_given, gravity = (
+        (poses_given[worlds], GRAVITY[worlds])
+        if isinstance(worlds, int)
+        else (poses_given[[*worlds]], GRAVITY[[*worlds]])
     )
-    return ddg.Controls(given, gravity=gravity)
+    return ddg.Controls(poses_given, gravity=gravity)
 
 
 def same(state, world: int, expected) -> None:
-    """A world of a state is a state of one world, bit for bit."""
+    """Check that a world of a state equals a state of one world, bit for bit."""
     np.testing.assert_array_equal(state.points()[world], expected.points())
     np.testing.assert_array_equal(state.velocities()[world], expected.velocities())
     np.testing.assert_array_equal(state.poses()[world], expected.poses())
@@ -33,10 +35,10 @@ def same(state, world: int, expected) -> None:
 
 @SCHEMES
 @KINDS
-def test_a_world_that_fails_rests_and_starts_anew(device, build, scheme):
-    """World 1 is whipped in step 3: it rests as it was, all its rods; the others go on, bit for bit as they would alone.
+def test_failed_world_is_frozen_until_reset(device, build, scheme):
+    """World 1 fails in step 3 and keeps all rods as before; other worlds equal single builds bit for bit.
 
-    Reset, it steps as a fresh one does.
+    After a reset the world steps like a new one.
     """
     model, single = model_of(build, ddg.Grip(PIVOT), device, worlds=3), model_of(build, ddg.Grip(PIVOT), device)
     integrator, state = ddg.Integrator(model, scheme, failures="flag"), model.state()
@@ -47,39 +49,39 @@ def test_a_world_that_fails_rests_and_starts_anew(device, build, scheme):
     assert all(word in text for word in ("world 1", "non_finite", "20 retries"))
     assert integrator.failure(state, 0) == ""
     for world, steps in ((0, 4), (1, 2), (2, 4)):
-        alone, _ = run(single, steps, scheme, lambda k, w=world: controls(k, w))
-        same(state, world, alone)
+        single_state, _ = run(single, steps, scheme, lambda k, w=world: controls(k, w))
+        same(state, world, single_state)
 
     before = state.snapshot()
-    other = integrator.reset(state, [False, True, False])
+    reset = integrator.reset(state, [False, True, False])
     assert integrator.outcomes().tolist() == ["converged"] * 3
-    assert other.time == state.time
-    same(other, 1, single.state())
+    assert reset.time == state.time
+    same(reset, 1, single.state())
     for world in (0, 2):
-        np.testing.assert_array_equal(other.points()[world], state.points()[world])
+        np.testing.assert_array_equal(reset.points()[world], state.points()[world])
     for name, values in before.items():
         np.testing.assert_array_equal(state.snapshot()[name], values, err_msg=name)
 
     straight = ddg.Integrator(model, scheme)
     expected, fresh = model.state(), ddg.Integrator(single, scheme)
-    alone = single.state()
+    single_state = single.state()
     for k in range(1, 5):
         expected = straight.step(expected, DT, controls(k))
-    state = other
+    state = reset
     for k in range(1, 4):
         expected = straight.step(expected, DT, controls(4 + k))
-        given = np.array([poses((4 + k) * DT)[0], poses(k * DT)[1], poses((4 + k) * DT)[2]])
-        state = integrator.step(state, DT, ddg.Controls(given, gravity=GRAVITY))
-        alone = fresh.step(alone, DT, controls(k, 1))
-        same(state, 1, alone)
+        poses_given = np.array([poses((4 + k) * DT)[0], poses(k * DT)[1], poses((4 + k) * DT)[2]])
+        state = integrator.step(state, DT, ddg.Controls(poses_given, gravity=GRAVITY))
+        single_state = fresh.step(single_state, DT, controls(k, 1))
+        same(state, 1, single_state)
         for world in (0, 2):
             np.testing.assert_array_equal(state.points()[world], expected.points()[world])
     assert integrator.outcomes().tolist() == ["converged"] * 3
 
 
 @pytest.mark.parametrize("build", [some_rods, joined], ids=lambda build: build.__name__)
-def test_a_state_of_one_s_own_starts_all_worlds(device, build):
-    """What failed before does not stick to a state that the integrator has not made: the step is a function of what it is given."""
+def test_external_state_clears_failures(device, build):
+    """Failure flags do not carry over to a state of other origin: the step depends on its inputs alone."""
     model = model_of(build, ddg.Grip(PIVOT), device, worlds=3)
     state, integrator = run(model, 2, controls=controls, failures="flag")
     kept = state.copy()
@@ -92,8 +94,8 @@ def test_a_state_of_one_s_own_starts_all_worlds(device, build):
 
 
 @SCHEMES
-def test_energy_accounts_start_anew_with_their_worlds(device, scheme):
-    """The account of a world that is reset is that of a fresh one; those of others go on."""
+def test_energy_account_is_reset_per_world(device, scheme):
+    """The account of a reset world equals a new one; other accounts continue."""
     model = model_of(some_rods, ddg.Grip(PIVOT), device, worlds=2, gravity=(0.0, 0.0, -3.0))
     state, integrator = run(model, 5, scheme)
     state = integrator.reset(state, [True, False])
@@ -102,14 +104,16 @@ def test_energy_accounts_start_anew_with_their_worlds(device, scheme):
     if scheme == "implicit_euler":
         return
     for world, steps in ((0, 3), (1, 8)):
-        _, alone = run(model, steps, scheme)
-        for part, expected in zip(integrator._parts, alone._parts, strict=True):
-            account, wanted = (p.energy.account.numpy().reshape(4, 2, -1)[:, world] for p in (part, expected))
+        _, single = run(model, steps, scheme)
+        for stepper, expected in zip(integrator._parts, single._parts, strict=True):
+            account, wanted = (p.energy.account.numpy().reshape(4, 2, -1)[:, world] for p in (stepper, expected))
             np.testing.assert_array_equal(account, wanted)
 
 
 def test_worlds_start_from_any_state(device):
-    """From a state of the model each from its own world, or from that of one world all alike; viscous rods and lagged frames, too."""
+    """Worlds start from the same world of a state, or all from a state of one world, including viscous rods and
+    frames.
+    """
 
     def viscous(scene, moved):
         one_rod(scene, moved)
@@ -135,8 +139,8 @@ def test_worlds_start_from_any_state(device):
     np.testing.assert_array_equal(nothing.points(), after.points())
 
 
-def test_time_goes_on(device):
-    """What is a function of time does not start anew: a load goes on, and a support that a Motion moves is refused."""
+def test_time_continues_after_a_reset(device):
+    """Functions of time are not reset: a load continues, and a support moved by a Motion is refused."""
     single, model = (
         model_of(one_rod, None, device, worlds, load=lambda s: s.add_force(0, -1, (0.0, 1.0, 0.0), lambda t: t))
         for worlds in (1, 2)
@@ -155,7 +159,7 @@ def test_time_goes_on(device):
     np.testing.assert_array_equal(integrator.reset(state, [True, False], kept).points(), kept.points())
 
 
-def test_a_failure_that_is_raised_names_its_world(device):
+def test_raised_failure_names_its_world(device):
     model = model_of(one_rod, ddg.Grip(PIVOT), device, 3)
     integrator = ddg.Integrator(model, retry_limit=4, check_every=1)
     with pytest.raises(ddg.SolverError, match=r"rod 0 \('rod'\) of world 1 could not"):
@@ -163,8 +167,8 @@ def test_a_failure_that_is_raised_names_its_world(device):
     assert integrator.outcomes().tolist() == ["converged", "non_finite", "converged"]
 
 
-def test_flags_read_nothing_back(device, monkeypatch):
-    """A step that flags failures, with controls, neither copies from the device nor waits for it."""
+def test_flagged_steps_do_not_synchronise(device, monkeypatch):
+    """Flagging failures, with controls, neither copies from the device nor waits for it."""
     import warp as wp
 
     model = model_of(everything, ddg.Grip(PIVOT), device, 3)

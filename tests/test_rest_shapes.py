@@ -1,4 +1,4 @@
-"""Rest shapes: forms from principal values, growth, curvature, creases and pre-stress of one shell among others, and named mistakes."""
+"""Rest shapes of shells: forms from principal values, growth, curvature, creases, pre-stress, and named mistakes."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ THICKNESS = 0.02
 
 
 def patch(bending="midedge_dof", shells=1, fold=None):
-    """Jittered squares, a metre apart, held as little as statics allows."""
+    """Return jittered squares a metre apart, with statically determinate supports."""
     points, triangles = meshes.jittered_rectangle(4, 4, jitter=0.2)
     if fold is not None:
         points = fold(points)
@@ -32,13 +32,13 @@ def patch(bending="midedge_dof", shells=1, fold=None):
 
 
 def bowl(points):
-    """A surface with every kind of curvature."""
+    """Return points of a surface with every kind of curvature."""
     x, y = points[:, 0], points[:, 1]
     return np.stack([x, y, 0.3 * x * y + 0.2 * x**2 - 0.1 * y**2], -1)
 
 
 def test_principal_form_of_the_plane():
-    """Stretches one give the metric; principal values and directions are those of the form, in every basis."""
+    """Unit stretches give the metric; principal values and directions equal the form, in any basis."""
     points, triangles = meshes.jittered_rectangle(4, 4)
     np.testing.assert_allclose(
         grown_metric(points, triangles, 1.0), metric(Surface(points, triangles), points), atol=1e-15
@@ -53,7 +53,7 @@ def test_principal_form_of_the_plane():
 
 
 def test_curvature_is_positive_towards_the_normal():
-    """A cylinder that faces outwards bends away from its normal: -1 / R around it, 0 along it."""
+    """An outward-facing cylinder bends away from the normal: -1 / R around, 0 along the axis."""
     points, triangles = meshes.cylinder(64, 12, 2.0, 1.0)
     surface = Surface(points, triangles)
     kinds = edge_kinds(surface)
@@ -67,7 +67,7 @@ def test_curvature_is_positive_towards_the_normal():
 @pytest.mark.parametrize("bending", ["midedge_dof", pytest.param("midedge", marks=pytest.mark.slow), "hinge"])
 @pytest.mark.parametrize("size", [0.9, 1.1])
 def test_growth_alone_changes_the_size(device, bending, size):
-    """A metric size^2 times as large is met by a surface `size` times as large, and no other shell notices."""
+    """A metric size^2 times as large gives a surface `size` times as large; other shells stay."""
     scene, points, _ = patch(bending, shells=2)
     model = scene.build(device, "float64")
     before = model.version
@@ -79,8 +79,8 @@ def test_growth_alone_changes_the_size(device, bending, size):
 
 
 @pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
-def test_points_of_a_rest_shape_bear_no_force(device, bending):
-    """The second of two shells gets another shape: it is free of force there, not where it was; the first is as before."""
+def test_rest_shape_has_no_force(device, bending):
+    """The second of two shells gets another rest shape: forces vanish there, not at the old one; the first stays."""
     scene, points, _ = patch(bending, shells=2)
     model = scene.build(device, "float64")
     tangent = Tangent(model)
@@ -90,28 +90,28 @@ def test_points_of_a_rest_shape_bear_no_force(device, bending):
     bent, flat = (np.abs(tangent.gradient(model.state(points=x))) for x in states)
     assert bent.max() < 1e-12 * flat.max()
     assert flat.max() > 1.0
-    alone = patch(bending, shells=1)[0].build(device, "float64")
+    single_model = patch(bending, shells=1)[0].build(device, "float64")
     moved = bowl(points)
     both = tangent.gradient(model.state(points=np.concatenate([moved, states[0][len(points) :]]))).reshape(-1, 3)
-    single = Tangent(alone).gradient(alone.state(points=moved)).reshape(-1, 3)
+    single = Tangent(single_model).gradient(single_model.state(points=moved)).reshape(-1, 3)
     np.testing.assert_allclose(both[: len(points)], single[: len(points)], atol=1e-12 * np.abs(single).max())
 
 
-def test_rest_at_start_is_rest_set_later(device):
-    """`add_shell(rest=(abar, bbar))` and `set_rest` give the same energies and forces, bit for bit."""
+def test_rest_in_add_shell_equals_set_rest(device):
+    """`add_shell(rest=(abar, bbar))` and `set_rest` give equal energies and forces, bit for bit."""
     scene, points, triangles = patch()
     forms = grown_metric(points, triangles, 1.05, 0.98), principal_form(points, triangles, 0.7, 0.2, (1.0, 1.0, 0.0))
     model = scene.build(device, "float64")
     model.set_rest(0, metric=forms[0], curvature=forms[1])
     scene.shells[0].rest = forms
-    other = scene.build(device, "float64")
-    state = model.state(points=bowl(points)), other.state(points=bowl(points))
-    one, two = Tangent(model), Tangent(other)
+    rebuilt = scene.build(device, "float64")
+    state = model.state(points=bowl(points)), rebuilt.state(points=bowl(points))
+    one, two = Tangent(model), Tangent(rebuilt)
     np.testing.assert_array_equal(one.gradient(state[0]), two.gradient(state[1]))
     assert one.energy(state[0]) == two.energy(state[1])
 
 
-def test_one_after_the_other_keeps_what_is_not_given(device):
+def test_set_rest_keeps_forms_that_are_not_given(device):
     scene, points, triangles = patch()
     forms = {"metric": grown_metric(points, triangles, 1.05), "curvature": principal_form(points, triangles, 0.7)}
     gradients = []
@@ -125,7 +125,7 @@ def test_one_after_the_other_keeps_what_is_not_given(device):
 
 
 def test_crease(device):
-    """Two triangles with a rest angle between them fold by it."""
+    """Two triangles fold by the given rest angle."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]])
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     shell = scene.add_shell(
@@ -138,12 +138,12 @@ def test_crease(device):
     angle[surface.edge_between(0, 1)] = 0.8
     model.set_rest(shell, angle=angle)
     end = solve(model, rtol=1e-12).points()[3]
-    # convex on the side of the normal +z: the free triangle goes down
+    # convex on the side of the normal +z: the free triangle moves down
     np.testing.assert_allclose(end, [0.5, -np.cos(0.8), -np.sin(0.8)], atol=1e-9)
 
 
 def test_pre_stress(device):
-    """A membrane shrunk by 2 % and held has the energy A K (1 + nu) E^2 with E = (1 / 0.98^2 - 1) / 2 and A its rest area."""
+    """A fixed membrane shrunk by 2 % has the energy A K (1 + nu) E^2 with E = (1 / 0.98^2 - 1) / 2 and rest area A."""
     scene, points, triangles = patch()
     model = scene.build(device, "float64")
     model.set_rest(0, metric=grown_metric(points, triangles, 0.98))
@@ -152,8 +152,8 @@ def test_pre_stress(device):
     assert Tangent(model).energy(model.state())["shell_stretch"] == pytest.approx(exact, rel=1e-12)
 
 
-def test_curved_membrane_gets_it(device):
-    """Its elements are others than those of the flat one; a bowl set as rest shape bears no force."""
+def test_set_rest_of_a_curved_membrane(device):
+    """Growth set later equals growth at build for elements of the curved membrane."""
     points, triangles = meshes.rectangle(4, 3)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, membrane="curved")
@@ -163,14 +163,14 @@ def test_curved_membrane_gets_it(device):
     start = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rest = (grown, np.zeros_like(grown))
     start.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, membrane="curved", rest=rest)
-    other = start.build(device, "float64")
-    forces = [Tangent(m).gradient(m.state()) for m in (model, other)]
+    rebuilt = start.build(device, "float64")
+    forces = [Tangent(m).gradient(m.state()) for m in (model, rebuilt)]
     assert np.abs(forces[0]).max() > 0.0
     np.testing.assert_allclose(forces[0], forces[1], rtol=1e-12, atol=1e-12 * np.abs(forces[1]).max())
 
 
-def test_what_fails_changes_nothing(device):
-    """All that may fail comes before the first change: the plate and the elements stay those of before."""
+def test_failed_set_rest_changes_nothing(device):
+    """Everything that may fail comes before the first change: plate and elements stay."""
     scene, points, triangles = patch()
     model = scene.build(device, "float64")
     plate, version = model.net.host.shells[0].plate, model.version
@@ -185,14 +185,14 @@ def test_what_fails_changes_nothing(device):
     np.testing.assert_array_equal(Tangent(model).gradient(model.state()), before)
 
 
-def test_every_world_gets_it(device):
+def test_set_rest_applies_to_every_world(device):
     scene, points, triangles = patch()
     model = scene.build(device, "float64", worlds=2)
     model.set_parameter("shell_bend_dof", "stiffness", np.array([1.0, 2.0]))
     model.set_rest(0, curvature=principal_form(points, triangles, 0.5))
     one, two = np.split(Tangent(model).gradient(model.state()), 2)
     assert np.abs(one).max() > 0.0
-    # rounding of the membrane, whose stiffness the worlds share
+    # rounding of the membrane, whose stiffness is equal in both worlds
     rounding = 64 * np.finfo(float).eps * MATERIAL.young * THICKNESS
     np.testing.assert_allclose(two, 2.0 * one, rtol=1e-14, atol=rounding)  # the stiffness of each world stays
 
@@ -233,21 +233,23 @@ def test_direction_across_the_surface_is_refused():
 
 
 def test_growth_by_load_steps(device):
-    """A strip that gets the rest curvature of a bilayer by load steps is an arc, as when it is set step by step."""
+    """Rest curvature of a bilayer applied by load steps gives an arc, as does setting it stepwise."""
     points, triangles = meshes.rectangle(16, 2, (0.1, 0.0125), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     strip = scene.add_shell(points, triangles, thickness=5e-4, material=ddg.Material(1e6, 0.0), name="strip")
     scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
-    curvature = 15.0  # a quarter of a turn
+    curvature = 15.0  # a quarter of a revolution
     form = principal_form(points, triangles, curvature, 0.0)
     model = scene.build(device, "float64")
-    way = []
-    state = solve(model, rest={"strip": dict(curvature=form)}, load_steps=4, way=way)
+    states = []
+    state = solve(model, rest={"strip": dict(curvature=form)}, load_steps=4, way=states)
     end = state.points()[np.argmax(points[:, 0])]  # of an arc with that curvature
     assert np.hypot(*end[[0, 2]]) == pytest.approx(2.0 * np.sin(0.5 * curvature * 0.1) / curvature, rel=2e-2)
     half = scene.build(device, "float64")
     half.set_rest(strip, curvature=0.5 * form)
-    np.testing.assert_allclose(way[1].points(), solve(half, half.state(points=way[1].points())).points(), atol=1e-9)
+    np.testing.assert_allclose(
+        states[1].points(), solve(half, half.state(points=states[1].points())).points(), atol=1e-9
+    )
     whole = scene.build(device, "float64")
     whole.set_rest(strip, curvature=form)
     np.testing.assert_allclose(solve(whole, whole.state(points=state.points())).points(), state.points(), atol=1e-9)
@@ -255,9 +257,9 @@ def test_growth_by_load_steps(device):
 
 @pytest.mark.parametrize("kind", ["planar", "alone", "joined"])
 def test_natural_curvature_by_load_steps(device, kind):
-    """A cantilever that gets natural curvature pi / L along itself ends as half a circle, in one load step or five.
+    """A cantilever with natural curvature pi / L ends as half a circle, in one load step or five.
 
-    The rigid joint in the middle of two rods keeps its own rest shape, so that these turn by 39 of 40 vertices' angles.
+    The rigid joint between two rods keeps its rest shape, so that these rotate by 39 of 40 vertex angles.
     """
     for steps in (1, 5):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2 if kind == "planar" else 3)
@@ -271,9 +273,9 @@ def test_natural_curvature_by_load_steps(device, kind):
         bent = np.pi if kind == "planar" else (np.pi, 0.0)
         state = solve(model, rest={rod: dict(curvature=bent) for rod in rods}, load_steps=steps)
         x = state.points()
-        turn = np.pi * (39.0 / 40.0 if kind == "joined" else 1.0)
-        assert np.linalg.norm(x[-1] - x[0]) == pytest.approx(2.0 / turn * np.sin(0.5 * turn), rel=2e-2)
-        energy = sum(float(np.sum(own)) for own in model.energies(state).values())
+        rotation = np.pi * (39.0 / 40.0 if kind == "joined" else 1.0)
+        assert np.linalg.norm(x[-1] - x[0]) == pytest.approx(2.0 / rotation * np.sin(0.5 * rotation), rel=2e-2)
+        energy = sum(float(np.sum(value)) for value in model.energies(state).values())
         assert energy < 1e-10 or kind == "joined"
 
 
@@ -287,12 +289,12 @@ def test_rest_shapes_that_do_not_fit_are_refused(device):
         scene.add_rod(np.linspace((0, 0, 1), (1, 0, 1), 5), section=ddg.Circle(0.01), material=ddg.Material(1e6))
     )
     model = scene.build(device, "float64")
-    for rest, words in (
+    for rest, message in (
         ({"none": dict(curvature=1.0)}, r"rest\['none'\] is no shell or rod"),
         ({0: dict(metrics=1.0)}, r"rest\[0\] has \['metrics'\]; there are"),
         ({"sheet": dict(metric=np.zeros((3, 3)))}, r"rest\['sheet'\].*shape"),
         ({0: dict(twist=(1.0, 2.0))}, r"rest\[0\]\['twist'\]"),
         (3, "give a dictionary"),
     ):
-        with pytest.raises(ddg.SceneError, match=words):
+        with pytest.raises(ddg.SceneError, match=message):
             solve(model, rest=rest)

@@ -1,4 +1,4 @@
-"""Single precision where its rounding decides the motion: warned of at build, refused by name, or counted by name if allowed."""
+"""Single precision dominated by rounding: warning at build, named refusal, or named outcome if allowed."""
 
 import warnings
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*precision 'float32' (leaves|ro
 
 
 def wire(scene, nodes=101):
-    """Steel, 1 m long, 2 mm thick, held at its first edge."""
+    """Add a steel wire 1 m long and 2 mm thick, clamped at the first edge."""
     points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], nodes)
     scene.clamp(scene.add_rod(points, section=ddg.Circle(2e-3), material=STEEL, name="wire"), edges=[0])
 
@@ -38,7 +38,7 @@ def joined(scene):
 
 
 def foil(scene, material=STEEL):
-    """Steel of 0.05 mm, 1 m wide, held along one side."""
+    """Add a steel foil of 0.05 mm, 1 m wide, fixed along one side."""
     points, triangles = meshes.rectangle(40, 40)
     shell = scene.add_shell(points, triangles, thickness=5e-5, material=material, bending="hinge", name="foil")
     scene.hold(shell, np.flatnonzero(points[:, 0] == points[:, 0].min()))
@@ -49,7 +49,7 @@ THINGS = {
     "net": (joined, "rod . \\('half'\\)"),
     "shell": (foil, "shell 0 \\('foil'\\)"),
 }
-# The rod stands for all every day: nets and shells take kernels of their own in each precision.
+# The rod stands for all in daily tests: coupled systems and shells have separate kernels in each precision.
 DAILY_THE_ROD = pytest.mark.parametrize(
     "name", ["rod", *(pytest.param(name, marks=pytest.mark.slow) for name in THINGS if name != "rod")]
 )
@@ -69,8 +69,8 @@ def fall(model, dt: float, steps: int):
 
 
 @DAILY_THE_ROD
-def test_what_rounding_decides_is_refused(device, name):
-    """The error names object, outcome and remedies; a warning came at build; other precisions and short steps go."""
+def test_motion_dominated_by_rounding_is_refused(device, name):
+    """The error names object, outcome and remedies after a warning at build; other precisions and short steps pass."""
     build, where = THINGS[name]
     with pytest.warns(UserWarning, match=f"{where}: precision 'float32' leaves a relative error"):
         model = scene_of(build).build(device, "float32")
@@ -96,7 +96,7 @@ def test_what_rounding_decides_is_refused(device, name):
 
 @DAILY_THE_ROD
 def test_allowed_rounding_is_counted_by_its_name(device, name):
-    """Who asks for it gets it, under its name and not as converged to rounding; finely divided it is off by more than mixed has it."""
+    """Allowed rounding has an outcome name distinct from convergence; on fine meshes the error exceeds that of mixed."""
     build, _ = THINGS[name]
     state, outcomes = fall(scene_of(build).build(device, "float32", allow_rounding=True), 0.01, 20)
     assert outcomes.get("lost_in_rounding", 0) > 0 == outcomes.get("converged_to_rounding", 0)
@@ -112,8 +112,8 @@ def test_allowed_rounding_is_counted_by_its_name(device, name):
 
 
 @pytest.mark.slow
-def test_soft_things_go_on_in_silence(device):
-    """A rod and a sheet of rubber: errors below the bound say nothing, and the motion is that of float64 to its share."""
+def test_soft_objects_pass_without_warning(device):
+    """Rubber rods and sheets have errors below the bound: no warning, and float64 motion up to that error."""
     for build in (wire_of_rubber, lambda scene: foil(scene, RUBBER)):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -131,31 +131,33 @@ def wire_of_rubber(scene):
 
 
 def strut(scene):
-    """Clamped at one end, pushed by 1 % at the other: twice its critical strain or so."""
+    """Add a strut clamped at one end and compressed by 1 % at the other, about twice the critical strain."""
     points = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 101)
     rod = scene.add_rod(points, section=ddg.Circle(2e-3), material=STEEL, name="strut")
     scene.clamp(rod, edges=[0])
     scene.clamp(rod, edges=[-1], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -0.01 * t)))
 
 
-def test_at_rest_too(device):
-    """Equilibria, paths and spectra, displacement-driven ones as well, where no load could tell."""
+def test_equilibria_dominated_by_rounding_are_refused(device):
+    """Equilibria, paths and spectra are refused, also under prescribed displacements, where no load reveals it."""
     scene = scene_of(strut)
     scene.gravity = (0.0, 0.0, 0.0)
     model = scene.build(device, "float32")
-    for ask in (
+    for solve in (
         lambda: statics.solve(model),
         lambda: Continuation(model, {}).trace(model.state()),
         lambda: spectrum(model, model.state()),
     ):
         with pytest.raises(SolverError, match=r"rod 0 \('strut'\).*at rest.*lost_in_rounding") as caught:
-            ask()
+            solve()
         assert caught.value.outcome == "lost_in_rounding"
     assert lost_in_rounding(scene.build(device, "float32", allow_rounding=True))
 
 
-def test_the_bound(device):
-    """Half a rounding unit times EA / l over m / s^2 + EI l (pi / L)^4, l = L / n; m = rho A l in the mean of n + 1 nodes."""
+def test_rounding_bound_of_a_wire(device):
+    """Half a rounding unit times EA / l over m / s^2 + EI l (pi / L)^4, l = L / n; m = rho A l averaged over n + 1
+    nodes.
+    """
     model = scene_of(wire).build(device, "float32", allow_rounding=True)
     n, r, s = 100, 2e-3, 0.01
     stiff = 2e11 * np.pi * r**2 * n
@@ -164,16 +166,16 @@ def test_the_bound(device):
     assert rounding(model, s)[0] > FLOAT32_LOST > FLOAT32_LIMIT
 
 
-def test_solver_that_takes_over_leaves_out_compression_where_it_must(device):
-    """Buckling in one long step, after a short one that float32 carried: another solver takes over and goes as it would on its own."""
-    found = {}
+def test_changed_solver_drops_compression(device):
+    """A column buckles in one long step, after a short step in float32: the new solver acts as if used from the start."""
+    results = {}
     for precision in ("mixed", "float64"):
         scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3))
         points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 12)
         section = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=1.0, mass_per_length=1e-6, rotary_inertia=1e-9)
         rod = scene.add_rod(points, section=section)
         scene.clamp_end(rod)
-        scene.add_force(rod, -1, (-50.0, 0.0, 0.0))  # twenty times the load of Euler
+        scene.add_force(rod, -1, (-50.0, 0.0, 0.0))  # twenty times Euler's load
         integrator = ddg.Integrator(scene.build(device, precision), psd="gauss_newton")
         bent = points * [0.9999, 1.0, 1.0] + [0.0, 0.0, 1e-4] * np.arange(12)[:, None] ** 2
         state = integrator.step(integrator.model.state(points=bent), 1e-7)
@@ -183,15 +185,15 @@ def test_solver_that_takes_over_leaves_out_compression_where_it_must(device):
         assert statistics["linear"] == ["float32 with tensions" if precision == "mixed" else "float64"]
         assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
         assert integrator._chains[0].newton.islands.clamped.numpy().tolist() == [1]
-        found[precision] = statistics["newton_iterations"]["max"], np.abs(state.points()[-1])
-    assert found["mixed"][0] <= 1.5 * found["float64"][0]
-    np.testing.assert_allclose(found["mixed"][1], found["float64"][1], atol=1e-6)
+        results[precision] = statistics["newton_iterations"]["max"], np.abs(state.points()[-1])
+    assert results["mixed"][0] <= 1.5 * results["float64"][0]
+    np.testing.assert_allclose(results["mixed"][1], results["float64"][1], atol=1e-6)
 
 
 def loaded(device, precision: str, size: float, joined: bool):
-    """Points over the length of a soft cantilever of so many metres, 50 steps after a load on its tip, and the integrator.
+    """Return relative points of a soft cantilever of `size` metres, 50 steps after a tip load, and the integrator.
 
-    Load, radius and steps are such that all sizes and precisions move alike.
+    Load, radius and steps make all sizes and precisions move alike.
     """
     section, material = ddg.Circle(0.01 * size), ddg.Material(1e6, density=1000.0)
     stiffness = section.stiffness(material)
@@ -212,26 +214,28 @@ def loaded(device, precision: str, size: float, joined: bool):
 
 
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
-def test_single_precision_goes_as_far_as_it_can(device, joined):
-    """Its rounding in a stretch is 40 % of the load, and none of what bends: iterations go on until they move nothing, in silence."""
+def test_single_precision_converges_to_its_rounding(device, joined):
+    """Rounding of stretch is 40 % of the load, but does not affect bending: iterations end without a warning when
+    nothing moves.
+    """
     exact, _ = loaded(device, "float64", 1.0, joined)
     for size in (1.0, 1e-6, 1e5):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             warnings.filterwarnings("ignore", message=".*precision 'float32' leaves")
-            found, integrator = loaded(device, "float32", size, joined)
-        np.testing.assert_allclose(found, exact, atol=2e-5)
+            points, integrator = loaded(device, "float32", size, joined)
+        np.testing.assert_allclose(points, exact, atol=2e-5)
         assert set(integrator.statistics()["outcomes"]) <= {"converged", "converged_to_rounding"}
 
 
-def test_what_rounding_still_moves_is_told_once(device):
-    """A fine steel wire, where rounding decides: iterations move nodes on and on, and leave residuals above 1e-4 of the weight."""
+def test_rounding_warning_is_given_once(device):
+    """Rounding moves the nodes of a fine steel wire in every iteration, with residuals above 1e-4 of the weight."""
     model = scene_of(fine).build(device, "float32", allow_rounding=True)
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always")
         integrator, state = ddg.Integrator(model, check_every=1), model.state()
         for _ in range(5):
             state = integrator.step(state, 0.01)
-    told = [str(each.message) for each in told if "rounding has ended steps" in str(each.message)]
-    assert len(told) == 1
-    assert "rod 0 ('wire')" in told[0]
+    messages = [str(each.message) for each in messages if "rounding has ended steps" in str(each.message)]
+    assert len(messages) == 1
+    assert "rod 0 ('wire')" in messages[0]

@@ -1,4 +1,4 @@
-"""Steps that are as long as an error allows: what falls, what rests, what swings; every kind of object, worlds, and refusals."""
+"""Adaptive steps from an error tolerance: free fall, rest, vibration, every kind of object, worlds, and refusals."""
 
 import numpy as np
 import pytest
@@ -43,8 +43,8 @@ def shell() -> ddg.Scene:
 
 
 @pytest.mark.parametrize("kind", [rods, planar, joined, touching, shell])
-def test_what_falls_errs_by_what_is_allowed(device, kind):
-    """By steps of h it is h g / 2 t too far, the longest h of 1/60 s halved again and again with h g / 2 below the error."""
+def test_error_of_free_fall_is_the_tolerance(device, kind):
+    """Implicit Euler falls h g / 2 t too far; h is the largest halving of 1/60 s with h g / 2 below the error."""
     error, model = 5e-3, kind().build(device)
     steps, state = ddg.StepControl(ddg.Integrator(model), error, halvings=6), model.state()
     start = state.points()
@@ -59,38 +59,38 @@ def test_what_falls_errs_by_what_is_allowed(device, kind):
     assert (fallen > 0.5 * G * t**2 + 0.4 * error * t).all()
 
 
-def test_what_rests_takes_the_longest(device):
+def test_objects_at_rest_take_the_longest_step(device):
     model = rods(gravity=(0.0, 0.0, 0.0)).build(device)
     steps, state = ddg.StepControl(ddg.Integrator(model), 1e-4, halvings=3), model.state()
     for _ in range(5):
         state = steps.advance(state, 0.08)
     assert steps.level == 0 and steps.estimate == 0.0
-    # 1/8, doubled as soon as it may be: the next begins at a multiple of its length
+    # starts at 1/8 and doubles as soon as allowed: a step begins at a multiple of its length
     assert steps.lengths == {0.01: 2, 0.02: 1, 0.04: 1, 0.08: 4}
 
 
-def test_they_are_steps_of_the_integrator(device):
-    """The same states to the bit as by as many steps of these lengths; and who holds a state keeps it."""
+def test_adaptive_steps_are_integrator_steps(device):
+    """Integrator steps of the same lengths give the same states to the bit; referenced states stay."""
     scene = rods()
     scene.clamp(0, edges=[0])
     model = scene.build(device)
     steps, state = ddg.StepControl(ddg.Integrator(model), 1e-1, halvings=4), model.state()
-    other, expected, lengths = ddg.Integrator(model), model.state(), []
+    integrator, expected, lengths = ddg.Integrator(model), model.state(), []
     step = steps.integrator.step
     steps.integrator.step = lambda state, dt, controls: lengths.append(dt) or step(state, dt, controls)
-    held = []
+    kept = []
     for _ in range(12):
         state = steps.advance(state, 0.02)
-        held.append((state, state.points()))
+        kept.append((state, state.points()))
     for dt in lengths:
-        expected = other.step(expected, dt)
+        expected = integrator.step(expected, dt)
     assert len(set(lengths)) > 2 and sum(steps.lengths.values()) == len(lengths)
     np.testing.assert_array_equal(state.points(), expected.points())
-    assert all((one.points() == points).all() for one, points in held)
+    assert all((kept_state.points() == points).all() for kept_state, points in kept)
 
 
 def test_the_error_is_of_first_order(device):
-    """A cantilever that swings for a while: four times the error allowed, four times the error there is."""
+    """Four times the tolerance gives about four times the error of a vibrating cantilever."""
     scene = rods()
     scene.clamp(0, edges=[0])
     model = scene.build(device, "float64")
@@ -112,14 +112,14 @@ def test_the_error_is_of_first_order(device):
     assert 2.0 < errors[0] / errors[1] < 8.0
 
 
-def test_the_world_that_changes_most_says(device):
-    """Of three, one is pushed: all go by steps as short as it takes alone."""
+def test_fastest_world_sets_the_step(device):
+    """One of three worlds moves: all take the short steps that it takes as a single model."""
     scene = rods(gravity=(0.0, 0.0, 0.0))
 
-    def lengths(worlds: int, pushed: int) -> dict:
+    def lengths(worlds: int, moving_world: int) -> dict:
         model = scene.build(device, worlds=worlds)
         speed = np.zeros((worlds, 9, 3))
-        speed[pushed, -1, 2] = 1.0
+        speed[moving_world, -1, 2] = 1.0
         state = model.state(velocities=speed if worlds > 1 else speed[0])
         steps = ddg.StepControl(ddg.Integrator(model), 5e-2, halvings=5)
         for _ in range(3):
@@ -132,16 +132,16 @@ def test_the_world_that_changes_most_says(device):
 def test_refusals(device):
     model = rods().build(device)
     integrator = ddg.Integrator(model)
-    for given, named in (({"error": 0.0}, "error"), ({"error": 1.0, "halvings": -1}, "halvings")):
-        with pytest.raises(ddg.SceneError, match=named):
-            ddg.StepControl(integrator, **given)
+    for options, message in (({"error": 0.0}, "error"), ({"error": 1.0, "halvings": -1}, "halvings")):
+        with pytest.raises(ddg.SceneError, match=message):
+            ddg.StepControl(integrator, **options)
     with pytest.raises(ddg.SceneError, match="implicit_midpoint"):
         ddg.StepControl(ddg.Integrator(model, scheme="implicit_midpoint"), 1e-3)
     with pytest.raises(ddg.SceneError, match="dt"):
         ddg.StepControl(integrator, 1e-3).advance(model.state(), -1.0)
 
 
-def held_by_a_grip() -> ddg.Scene:
+def rod_on_a_grip() -> ddg.Scene:
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     points = np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 12)
     rod = scene.add_rod(points, section=ddg.Circle(0.004), material=ddg.Material(1e6, density=1000.0))
@@ -150,29 +150,32 @@ def held_by_a_grip() -> ddg.Scene:
 
 
 def test_grips_move_evenly_over_the_steps(device):
-    """10 mm and 0.4 rad in 20 ms: 0.5 m/s and 20 rad/s in all steps, from wherever the grip is; at the end it is where it was told."""
-    seen, scene = [], held_by_a_grip()
-    scene.callbacks = [lambda state: seen.append((state.time, state.poses()[0]))]
+    """10 mm and 0.4 rad in 20 ms: 0.5 m/s and 20 rad/s in all steps, from any pose, ending at the given pose."""
+    recorded, scene = [], rod_on_a_grip()
+    scene.callbacks = [lambda state: recorded.append((state.time, state.poses()[0]))]
     model = scene.build(device, "float64")
     steps, state = ddg.StepControl(ddg.Integrator(model), 5e-3), model.state()
     ends = np.array([[0.0, 0.0, 0.01, 0.0, 0.4, 0.0], [0.004, 0.0, 0.01, 0.3, 0.4, 0.0]])
     for end in ends:
-        begin, first = state.poses()[0].copy(), len(seen)
+        begin, first = state.poses()[0].copy(), len(recorded)
         start = state.time
         state = steps.advance(state, 0.02, ddg.Controls(poses=[end]))
         np.testing.assert_array_equal(state.poses()[0], end)
-        turn = Rotation.from_rotvec(end[3:]) * Rotation.from_rotvec(begin[3:]).inv()
-        assert len(seen) - first > 4
-        for time, pose in seen[first:]:
-            part = (time - start) / 0.02
-            np.testing.assert_allclose(pose[:3], begin[:3] + part * (end - begin)[:3], atol=1e-12)
-            rotation = Rotation.from_rotvec(part * turn.as_rotvec()) * Rotation.from_rotvec(begin[3:])
+        increment = Rotation.from_rotvec(end[3:]) * Rotation.from_rotvec(begin[3:]).inv()
+        assert len(recorded) - first > 4
+        for time, pose in recorded[first:]:
+            fraction = (time - start) / 0.02
+            np.testing.assert_allclose(pose[:3], begin[:3] + fraction * (end - begin)[:3], atol=1e-12)
+            rotation = Rotation.from_rotvec(fraction * increment.as_rotvec()) * Rotation.from_rotvec(begin[3:])
             np.testing.assert_allclose(pose[3:], rotation.as_rotvec(), atol=1e-12)
 
 
-def test_loads_are_constant_or_go_linearly(device):
-    """A free rod of mass m under F for T gains F T / m; under one that grows from zero, by steps of implicit Euler of length h,
-    F / m (T / 2 + h / 2), whose force is that at the end of each step."""
+def test_control_loads_are_constant_or_linear(device):
+    """A free rod of mass m under F for T gains F T / m.
+
+    A load that grows from zero gives F / m (T / 2 + h / 2) by implicit Euler steps of length h, with the force at the
+    end of each step.
+    """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_rod(
         np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 5),
@@ -181,20 +184,20 @@ def test_loads_are_constant_or_go_linearly(device):
     )
     model = scene.build(device, "float64")
     mass = 1e3 * np.pi * 0.004**2 * 0.3
-    whole = np.array([0.5, 1.0, 1.0, 1.0, 0.5])[:, None] / 4.0 * [0.0, 0.0, 1e-3]  # as the masses are
+    total_force = np.array([0.5, 1.0, 1.0, 1.0, 0.5])[:, None] / 4.0 * [0.0, 0.0, 1e-3]  # distributed like the masses
     T, halvings = 0.02, 3
-    for start, wanted in ((None, T), (ddg.Controls(forces=0.0 * whole), 0.5 * T + 0.5 * T / 2**halvings)):
+    for start, duration in ((None, T), (ddg.Controls(forces=0.0 * total_force), 0.5 * T + 0.5 * T / 2**halvings)):
         steps = ddg.StepControl(ddg.Integrator(model), 1e-12, halvings)
-        state = steps.advance(model.state(), T, ddg.Controls(forces=whole), start)
-        np.testing.assert_allclose(state.velocities()[:, 2], 1e-3 / mass * wanted, rtol=1e-9)
-    # what one of both leaves out is the scene's: gravity of zero
+        state = steps.advance(model.state(), T, ddg.Controls(forces=total_force), start)
+        np.testing.assert_allclose(state.velocities()[:, 2], 1e-3 / mass * duration, rtol=1e-9)
+    # a missing start or end takes the value of the scene: zero gravity
     steps = ddg.StepControl(ddg.Integrator(model), 1e-12, halvings)
     state = steps.advance(model.state(), T, None, ddg.Controls(gravity=(0.0, 0.0, -8.0)))
     np.testing.assert_allclose(state.velocities()[:, 2], -8.0 * (0.5 * T - 0.5 * T / 2**halvings), rtol=1e-9)
 
 
 def test_poses_are_no_start(device):
-    model = held_by_a_grip().build(device, "float64")
+    model = rod_on_a_grip().build(device, "float64")
     steps = ddg.StepControl(ddg.Integrator(model), 5e-3)
     with pytest.raises(ddg.SceneError, match="poses begin where the state has them"):
         steps.advance(model.state(), 0.02, None, ddg.Controls(poses=np.zeros((1, 6))))
