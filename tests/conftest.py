@@ -1,4 +1,4 @@
-"""What all tests share: the device they run on, and floating-point errors that count as errors."""
+"""Shared fixtures: the device under test, and strict floating-point errors."""
 
 import numpy as np
 import pytest
@@ -30,12 +30,12 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(scope="session")
 def device(request) -> str:
-    """The Warp device under test."""
+    """Return the Warp device under test."""
     return request.config.getoption("--device")
 
 
 @pytest.fixture(autouse=True)
 def strict_numpy():
-    """An overflow, an invalid operation or a division by zero on the host fails the test."""
+    """Fail the test on overflow, invalid operation or division by zero on the host."""
     with np.errstate(over="raise", invalid="raise", divide="raise"):
         yield

@@ -1,4 +1,4 @@
-"""What the hard cases of rods and of nets share: a run of which nothing that failed was called done."""
+"""Run of a hard case, in which no failed attempt counts as converged."""
 
 import numpy as np
 
@@ -8,14 +8,15 @@ DONE = ("converged", "converged_to_rounding", "lost_in_rounding")
 
 
 def attempt(scene, device, dt, count, names, start=None, precision="float64", fails=(), lossy=False, **options):
-    """Take steps from the rest state, or from points `start`, and check what holds for every run.
+    """Take steps from the rest state or from points `start`, and check properties of every run.
 
-    `fails`: the outcomes by which the run may end early, and no others; none by default.
-    `lossy`: whether float32 may lose its motion in rounding.
+    Args:
+        fails: the only outcomes by which the run may end early; none by default.
+        lossy: allow float32 to lose the motion in rounding.
 
     Returns:
-        Model, last state, total energy after every step with the start first [J], statistics, and the error that ended the run or
-        None; its message has the outcome and all of `names`.
+        Model, last state, total energy after every step with the start first [J], statistics, and an error or None.
+        The error ended the run; its message has the outcome and all of `names`.
     """
     model = scene.build(device, precision, allow_rounding=lossy)
     state, integrator, error = model.state(points=start), ddg.Integrator(model, check_every=1, **options), None
@@ -31,7 +32,7 @@ def attempt(scene, device, dt, count, names, start=None, precision="float64", fa
         energy.append(sum(model.energies(state).values()))
     statistics = integrator.statistics()
     failed = {k: v for k, v in statistics["outcomes"].items() if k not in DONE}
-    assert sum(failed.values()) == statistics["retries"]  # no attempt that failed was called done
+    assert sum(failed.values()) == statistics["retries"]  # no failed attempt counts as converged
     assert np.isfinite(state.points()).all()
     assert np.isfinite(state.velocities()).all()
     if error:

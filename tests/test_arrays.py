@@ -1,4 +1,4 @@
-"""Launches that may run at once are done before what follows, and readings are of what was launched before them."""
+"""Order of concurrent launches and later ones, and readings of earlier launches."""
 
 from functools import partial
 
@@ -12,7 +12,7 @@ LENGTH = 100_000
 
 @wp.kernel(enable_backward=False)
 def slow_sum(values: wp.array(dtype=float), rounds: int, out: wp.array(dtype=float)):
-    """out + rounds * values, long after others that start with it are done."""
+    """Add rounds * values to out, slowly enough to outlast concurrent launches."""
     i = wp.tid()
     total = out[i]
     for _ in range(rounds):
@@ -22,31 +22,34 @@ def slow_sum(values: wp.array(dtype=float), rounds: int, out: wp.array(dtype=flo
 
 @wp.kernel(enable_backward=False)
 def add(
-    one: wp.array(dtype=float), other: wp.array(dtype=float), third: wp.array(dtype=float), out: wp.array(dtype=float)
+    first: wp.array(dtype=float),
+    second: wp.array(dtype=float),
+    third: wp.array(dtype=float),
+    out: wp.array(dtype=float),
 ):
     i = wp.tid()
-    out[i] = one[i] + other[i] + third[i]
+    out[i] = first[i] + second[i] + third[i]
 
 
-def test_what_follows_has_all_that_was_launched_side_by_side(device):
-    """Captured and not, one of them with others beside it in turn, and in what is conditional."""
+def test_concurrent_launches_end_before_dependent_ones(device):
+    """Concurrent launches, some nested, direct, captured, and in a conditional graph."""
     values = wp.array(np.arange(LENGTH) % 7, dtype=float, device=device)
-    one, other, third, total = (wp.zeros(LENGTH, dtype=float, device=device) for _ in range(4))
+    first, second, third, total = (wp.zeros(LENGTH, dtype=float, device=device) for _ in range(4))
     arrays.load_kernels([slow_sum, add], device)
 
     def launch():
-        for array in (one, other, third, total):
+        for array in (first, second, third, total):
             array.zero_()
 
         def sum_up(values, rounds, out):
             wp.launch(slow_sum, LENGTH, [values, rounds], [out], device=device)
 
         def inner():
-            arrays.side_by_side([partial(sum_up, values, 300, one), partial(sum_up, values, 200, other)], device)
-            sum_up(other, 2, one)  # 300 + 2 * 200
+            arrays.side_by_side([partial(sum_up, values, 300, first), partial(sum_up, values, 200, second)], device)
+            sum_up(second, 2, first)  # 300 + 2 * 200
 
         arrays.side_by_side([inner, partial(sum_up, values, 100, third)], device)
-        wp.launch(add, LENGTH, [one, other, third], [total], device=device)
+        wp.launch(add, LENGTH, [first, second, third], [total], device=device)
 
     expected = (700 + 200 + 100) * (np.arange(LENGTH) % 7)
     launch()
@@ -62,12 +65,12 @@ def test_what_follows_has_all_that_was_launched_side_by_side(device):
         np.testing.assert_array_equal(total.numpy(), expected)
 
 
-def test_readings_are_of_what_was_launched_before(device):
+def test_readings_see_earlier_launches(device):
     values = wp.zeros(5, dtype=wp.int64, device=device)
     reading = arrays.Reading(values)
     np.testing.assert_array_equal(reading(), 0)
     for number in (3, 4):
         values.fill_(number)
-        found = reading()
-        np.testing.assert_array_equal(found, number)
-        assert found is reading()
+        result = reading()
+        np.testing.assert_array_equal(result, number)
+        assert result is reading()

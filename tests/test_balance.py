@@ -1,4 +1,4 @@
-"""Supports and obstacles carry the loads in the equilibria of every scene: reactions and loads add up to nothing."""
+"""Reactions of supports and obstacles balance the loads in the equilibria of every scene."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ FAST = {
 
 
 def scenes() -> list:
-    """Scenes that are equilibria, those that are not quick marked as slow."""
+    """Return scenes that are equilibria, long ones marked as slow."""
     result = []
     for name in scene_files():
         if name == "identify_from_statics":
@@ -31,7 +31,7 @@ def scenes() -> list:
 
 @pytest.mark.parametrize("name", scenes())
 def test_reactions_carry_the_loads(device, name):
-    """Sum of reactions = - sum of loads, to what `State.unbalanced` says; nothing of a rod, shell or obstacle is left out."""
+    """The sum of reactions is minus the sum of loads, up to `State.unbalanced`, for all rods, shells and obstacles."""
     scene = load_scene(name).build()
     model = scene.build(device, "float64")
     solver = Equilibrium(model)
@@ -40,7 +40,7 @@ def test_reactions_carry_the_loads(device, name):
     loads = np.where(tangent.angle, 0.0, tangent.loads(1.0, tangent.dofs(state)))
     if model.net is None:
         loads = tangent.at_points(loads).reshape(-1, 3)
-    else:  # where joined rods share nodes, of which `at_points` has one a rod
+    else:  # joined rods have common nodes, of which `at_points` has one a rod
         assert not model.groups
         loads = tangent.parts[-1].back(loads).reshape(-1, 3)
     size = np.abs(loads).sum()

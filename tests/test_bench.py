@@ -1,4 +1,4 @@
-"""Benchmarks: error and time come together, of every case; `tools/bench_rods.py` runs and finds the published tip."""
+"""Benchmarks: error and time of every case; `tools/bench_rods.py` runs and reproduces the published tip."""
 
 import csv
 import json
@@ -28,7 +28,7 @@ def cantilever() -> ModuleType:
 
 @pytest.fixture
 def study(cantilever) -> bench.Study:
-    """The cantilever's study on a grid that takes a moment."""
+    """Return the cantilever's study on a small grid."""
     grid = {"dt": (0.02, 0.01), "n": (8,), "scheme": ("implicit_euler", "implicit_midpoint"), "rtol": (1e-6,)}
     reference = {"dt": 0.0025, "n": 8, "scheme": "implicit_midpoint", "rtol": 1e-8}
     fixed = {"duration": 0.1, "precision": "float64"}
@@ -50,18 +50,18 @@ def test_every_case_has_its_error_and_its_time(cantilever, study, device):
     assert not any(row["default"] for row in rows)
     assert [row["steps"] for row in rows] == [5, 5, 10, 10]
     euler, midpoint = ([row["error"] for row in rows if row["scheme"] == scheme] for scheme in study.grid["scheme"])
-    assert euler[1] < euler[0]  # the step is what makes the error: nodes are those of the reference
+    assert euler[1] < euler[0]  # the step dominates the error: nodes equal the reference
     assert max(midpoint) < min(euler)
 
 
 def test_reference_is_run_once(cantilever, study, device, monkeypatch):
-    asked = []
+    cases = []
     run = bench.run
-    monkeypatch.setattr(bench, "run", lambda module, case, where: asked.append(case) or run(module, case, where))
+    monkeypatch.setattr(bench, "run", lambda module, case, place: cases.append(case) or run(module, case, place))
     bench.measure(cantilever, study, device=device)
-    # the defaults, too; and the first of each scheme a second time, since its first run loads kernels
-    assert len(asked) == len(study.cases()) + 2 + len(study.grid["scheme"])
-    assert [case["dt"] for case in asked].count(study.reference["dt"]) == 1
+    # plus the defaults, and the first case of each scheme twice, since its first run loads kernels
+    assert len(cases) == len(study.cases()) + 2 + len(study.grid["scheme"])
+    assert [case["dt"] for case in cases].count(study.reference["dt"]) == 1
 
 
 def test_failed_case_has_no_error(cantilever, study, device, monkeypatch):
@@ -75,7 +75,7 @@ def test_failed_case_has_no_error(cantilever, study, device, monkeypatch):
     assert bench.best(study, rows) == []
 
 
-def test_best_cases_are_those_that_none_of_their_series_beats(study):
+def test_best_cases_are_the_pareto_front_of_a_series(study):
     def row(scheme, seconds, error):
         return {"scheme": scheme, "seconds": seconds, "error": error}
 
@@ -84,7 +84,7 @@ def test_best_cases_are_those_that_none_of_their_series_beats(study):
     assert bench.best(replace(study, series=()), rows) == rows
 
 
-def test_unknown_setting_is_told(cantilever, device):
+def test_unknown_setting_is_refused(cantilever, device):
     with pytest.raises(InputError, match="sets 'color'"):
         bench.run(cantilever, {"color": 1}, device)
 
@@ -114,7 +114,7 @@ def test_many_rods(tmp_path):
 @pytest.mark.parametrize(
     ("tool", "options", "rows"), [("nets", ["--edges", "4"], 10), ("sheets", ["--quick", "--bending", "hinge"], 1)]
 )
-def test_nets_and_sheets_are_timed(tmp_path, tool, options, rows):
+def test_coupled_rods_and_sheets_are_timed(tmp_path, tool, options, rows):
     command = [
         sys.executable,
         str(ROOT / f"tools/bench_{tool}.py"),
@@ -126,9 +126,9 @@ def test_nets_and_sheets_are_timed(tmp_path, tool, options, rows):
     ]
     subprocess.run(command, capture_output=True, text=True, check=True)
     with open(tmp_path / f"{tool}_cpu.csv", newline="") as file:
-        found = list(csv.DictReader(file))
-    assert len(found) == rows
-    for row in found:
+        measured = list(csv.DictReader(file))
+    assert len(measured) == rows
+    for row in measured:
         assert float(row["ms_per_step"]) > 0.0
         assert row["outcomes"].endswith("converged")
         assert tool == "sheets" or 0.0 < float(row["error"]) < 1e-6
@@ -144,8 +144,8 @@ def test_builds_are_timed(tmp_path):
     assert all(float(row["model_s"]) >= float(row["build_s"]) > 0.0 for row in rows)
 
 
-def test_order_of_what_converges():
-    """error = c n^-2 over edges and c dt over steps, with the least error of other settings held."""
+def test_convergence_orders():
+    """error = c n^-2 over edges and c dt over steps, at the smallest error of the other settings."""
     study = bench.Study({"n": (10, 20, 40), "dt": (0.1, 0.05, 0.025)}, "tip", 0.0)
     rows = [{"n": n, "dt": dt, "error": 3.0 * n**-2.0 + 1e-9 * dt} for n in (10, 20, 40) for dt in (0.1, 0.05, 0.025)]
     assert bench.orders(study, rows)["n"] == pytest.approx(2.0, abs=1e-4)
@@ -154,34 +154,34 @@ def test_order_of_what_converges():
 
 
 def test_settings_are_varied_one_by_one(cantilever, study, device, tmp_path):
-    """Each beside the defaults, which are run once; orders and lines go through these."""
+    """Each setting varies from the defaults, which are run once; orders and lines include them."""
     grid = {"dt": (0.02, 0.01, 0.005), "n": (25, 50), "rtol": (1e-4,)}
-    alone = replace(study, grid=grid, reference={"dt": 0.0003125}, series=(), one_by_one=True)
-    rows, unit = bench.measure(cantilever, alone, device=device)
+    single_study = replace(study, grid=grid, reference={"dt": 0.0003125}, series=(), one_by_one=True)
+    rows, unit = bench.measure(cantilever, single_study, device=device)
     usual = {"dt": 0.01, "n": 50, "rtol": 1e-6}
     differ = [{name: row[name] for name in grid if row[name] != usual[name]} for row in rows]
     assert differ == [{"dt": 0.02}, {"dt": 0.005}, {"n": 25}, {"rtol": 1e-4}, {}]
     assert [row["default"] for row in rows] == [False] * 4 + [True]
-    assert bench.orders(alone, rows)["dt"] == pytest.approx(1.0, abs=0.1)
-    assert set(bench.orders(alone, rows)) == {"dt"}
-    bench.plot(alone, rows, tmp_path / "one.png", "cantilever", unit)
+    assert bench.orders(single_study, rows)["dt"] == pytest.approx(1.0, abs=0.1)
+    assert set(bench.orders(single_study, rows)) == {"dt"}
+    bench.plot(single_study, rows, tmp_path / "one.png", "cantilever", unit)
     assert {path.name for path in tmp_path.iterdir()} == {"one.png", "one_settings.png"}
     with pytest.raises(InputError, match="varies 'scheme' one by one; it varies numbers"):
-        replace(alone, grid={"scheme": ("implicit_euler",)})
+        replace(single_study, grid={"scheme": ("implicit_euler",)})
     with pytest.raises(InputError, match="names of the grid are its series; leave series out"):
-        replace(alone, series=("dt",))
+        replace(single_study, series=("dt",))
 
 
 def scenes() -> list:
-    """Names of all scenes; those that are learned when they are built take minutes, and torch."""
+    """Return names of all scenes; scenes that learn at build are slow and need torch."""
     marks = (pytest.mark.slow, pytest.mark.skipif(find_spec("torch") is None, reason="needs torch"))
     learned = {name: "require_torch" in path.read_text() for name, path in catalog.scene_files().items()}
-    return [pytest.param(name, marks=marks) if own else name for name, own in learned.items()]
+    return [pytest.param(name, marks=marks) if is_learned else name for name, is_learned in learned.items()]
 
 
 @pytest.mark.parametrize("name", scenes())
 def test_every_scene_has_a_study(name):
-    """Its grid names what a run can set, and holds the scene's defaults or gets them as a case of their own."""
+    """The grid names settings of a run; the scene's defaults are in it or a separate case."""
     module = load_scene(name)
     study = bench.study_of(module)
     usual = bench.defaults(module, study, "cpu")
@@ -191,7 +191,9 @@ def test_every_scene_has_a_study(name):
 
 
 def test_a_scene_without_benchmark_gets_a_study(tmp_path, device):
-    """By its first check over its resolution: a hanging chain of springs, L = m g / k (n + 1) / 2n over its n edges."""
+    """The study measures the first check over resolution: a hanging chain of springs, L = m g / k (n + 1) / 2n over n
+    edges.
+    """
     path = tmp_path / "springs.py"
     path.write_text(
         """
@@ -214,7 +216,7 @@ def check(result):
     assert [row["n"] for row in content["rows"]] == [4, 8, 16]
     assert [row["default"] for row in content["rows"]] == [False, False, True]
     assert content["unit"] == "m"
-    # consistent nodal loads: the ends of straight springs are exact whatever n
+    # consistent nodal loads: ends of straight springs are exact at any n
     assert all(row["error"] < 1e-9 for row in content["rows"])
     assert (tmp_path / "springs.png").stat().st_size > 0
 
@@ -231,6 +233,6 @@ def test_overview_of_scenes(tmp_path, device):
     assert (tmp_path / "overview.png").stat().st_size > 0
 
 
-def test_all_and_one_are_two_things(capsys):
+def test_all_excludes_a_scene_name(capsys):
     assert main(["bench", "cantilever", "--all"]) != 0
     assert "leave out 'cantilever'" in capsys.readouterr().err

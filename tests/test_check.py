@@ -1,4 +1,4 @@
-"""A check passes within its tolerance and never on NaN."""
+"""Checks pass within the tolerance and never on NaN."""
 
 import math
 
@@ -15,7 +15,7 @@ from ddg_warp.run.check import Check
         (0.7, 1.0, 0.25, False, False),
         (-5.0, -4.0, 0.25, True, True),
         (-5.0, -4.0, 0.24, True, False),
-        (0.0, 0.0, 1.0, True, False),  # an error relative to zero means nothing
+        (0.0, 0.0, 1.0, True, False),  # an error relative to zero is undefined
         (math.nan, 1.0, math.inf, False, False),
         (1.0, math.nan, math.inf, False, False),
         (math.inf, math.inf, 1.0, False, False),

@@ -1,4 +1,4 @@
-"""Frames of clamped ends: extrapolated or prescribed, and the moments there, of rods on their own and of joined ones."""
+"""Frames of clamped ends, extrapolated or prescribed, and end moments, of uncoupled and joined rods."""
 
 import numpy as np
 import pytest
@@ -19,18 +19,18 @@ def straight(edges: int) -> np.ndarray:
 
 
 def add_halves(scene, points, **options) -> list[int]:
-    """The rod as one (its only index), or in two halves that are joined rigidly."""
+    """Add a rod as two rigidly joined halves and return the indices."""
     middle = len(points) // 2
     directors = options.pop("director", None)
     rods = []
     for half in (slice(0, middle + 1), slice(middle, None)):
-        own = None if directors is None else directors[half.start : (middle if half.stop else None)]
-        rods.append(scene.add_rod(points[half], director=own, **options))
+        half_directors = None if directors is None else directors[half.start : (middle if half.stop else None)]
+        rods.append(scene.add_rod(points[half], director=half_directors, **options))
     scene.join([(rods[0], -1), (rods[1], 0)])
     return rods
 
 
-# Directors that turn at rate tau along a straight rod that is free of twist when free: M = GJ tau everywhere, whatever the mesh.
+# Directors that rotate at rate tau along a straight rod without natural twist: M = GJ tau everywhere, for any mesh.
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
 @pytest.mark.parametrize("edges", [10, 16])
 def test_pretwisted_rod(device, edges, joined):
@@ -49,14 +49,14 @@ def test_pretwisted_rod(device, edges, joined):
         np.testing.assert_allclose(stresses["rod_bend_twist"][rod][:, 2], SECTION.GJ * rate, rtol=1e-9)
         if joined:
             np.testing.assert_allclose(stresses["rigid_joint"][rod][:, 2], SECTION.GJ * rate, rtol=1e-9)
-    turns = sum(ddg.inquiry.total_twist(model, state, rod) for rod in rods)
-    assert turns == pytest.approx(rate / (2.0 * np.pi), rel=1e-9)
+    revolutions = sum(ddg.inquiry.total_twist(model, state, rod) for rod in rods)
+    assert revolutions == pytest.approx(rate / (2.0 * np.pi), rel=1e-9)
     first, last = model.reactions(state)
     np.testing.assert_allclose(first.moment, -SECTION.GJ * rate * X, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(last.moment, SECTION.GJ * rate * X, rtol=1e-8, atol=1e-8)
 
 
-# A clamp that holds the end of a straight rod at an angle: equilibrium is the rod turned as a whole, without energy.
+# A clamp prescribes the end of a straight rod at an angle: the equilibrium is the rotated rod, without energy.
 def test_prescribed_tangent_and_director(device):
     tangent = np.array([np.cos(0.3), np.sin(0.3), 0.2])
     tangent /= np.linalg.norm(tangent)
@@ -69,13 +69,13 @@ def test_prescribed_tangent_and_director(device):
         model = scene.build(device, "float64")
         state = statics.solve(model)
         points = state.points()
-        held, free = (points[0], points[-1]) if end == "first" else (points[-1], points[0])
-        np.testing.assert_allclose(free, held + sign * tangent, atol=1e-8)
+        fixed, free = (points[0], points[-1]) if end == "first" else (points[-1], points[0])
+        np.testing.assert_allclose(free, fixed + sign * tangent, atol=1e-8)
         np.testing.assert_allclose(state.directors(), np.tile(director, (8, 1)), atol=1e-7)
         assert sum(model.energies(state).values()) < 1e-12
 
 
-# The natural shape takes the prescribed tangent: a rod of that shape rests as it is, with any tangent.
+# The natural shape takes the prescribed tangent: a rod of that shape is in equilibrium for any tangent.
 def test_natural_shape_has_the_prescribed_tangent(device):
     angle = np.linspace(0.0, 1.0, 9)
     points = np.stack([np.sin(angle), 0.0 * angle, 1.0 - np.cos(angle) + 0.1 * angle**3], -1)
@@ -85,8 +85,9 @@ def test_natural_shape_has_the_prescribed_tangent(device):
     assert np.abs(model.stresses(model.state())["rod_bend_twist"][0]).max() < 1e-12
 
 
-# Of a curved cantilever with a force at its tip the clamp's moment is that of the force about it: M = -(x_tip - x_0) x F, in the
-# clamp's directors. Stresses converge to it with order 2, beside rigid joints, too.
+# The clamp moment of a curved cantilever is that of the tip force about the clamp: M = -(x_tip - x_0) x F, in the
+# directors
+# of the clamp. Stresses converge with order 2, next to rigid joints too.
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
 def test_moments_at_clamp_and_joint_are_of_second_order(device, joined):
     errors = []
@@ -101,30 +102,33 @@ def test_moments_at_clamp_and_joint_are_of_second_order(device, joined):
         state = statics.solve(model, load_steps=2)
         lever, force = state.points()[-1], np.array([0.0, 0.3, 4.0])
         stresses = model.stresses(state)
-        errors.append([_apart(stresses["rod_bend_twist"][0][0], np.cross(lever, force), Z, Y)])
-        if joined:  # both sides of the joint say what the clamp says about the middle, in directors between theirs
+        errors.append([_relative_error(stresses["rod_bend_twist"][0][0], np.cross(lever, force), Z, Y)])
+        if joined:  # both sides of the joint give the moment at its node, in the mean directors
             node = state.points()[edges // 2]
             one, two = stresses["rigid_joint"][0][0], stresses["rigid_joint"][1][0]
             u, v = state.directors()[edges // 2 - 1 : edges // 2 + 1]
             t, s = np.diff(state.points()[[edges // 2 - 1, edges // 2, edges // 2 + 1 + 1]], axis=0)
             director, tangent = (u + v) / np.linalg.norm(u + v), t / np.linalg.norm(t) + s / np.linalg.norm(s)
             moment = np.cross(lever - node, force)
-            errors[-1] += [_apart(each, moment, director, tangent) for each in (one, two)]
+            errors[-1] += [_relative_error(each, moment, director, tangent) for each in (one, two)]
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert np.abs(orders - 2.0).max() < 0.1, (errors, orders)
 
 
-def _apart(found: np.ndarray, moment: np.ndarray, director: np.ndarray, tangent: np.ndarray) -> float:
-    """Relative distance of moments (about the second, minus the first director, and the tangent) from a moment in space."""
+def _relative_error(moments: np.ndarray, moment: np.ndarray, director: np.ndarray, tangent: np.ndarray) -> float:
+    """Return the relative error of moments against a moment in space.
+
+    Moments are about the second, minus the first director, and the tangent.
+    """
     tangent = tangent / np.linalg.norm(tangent)
     director = director - tangent * (director @ tangent)
     director /= np.linalg.norm(director)
     expected = np.array([moment @ np.cross(tangent, director), -moment @ director, moment @ tangent])
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+    return float(np.linalg.norm(moments - expected) / np.linalg.norm(expected))
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "phrases"),
     {
         "tangent of zero": ({"tangent": (0.0, 0.0, 0.0)}, ("tangent of rod 0", "not zero")),
         "tangent not finite": ({"tangent": (np.nan, 0.0, 1.0)}, ("tangent of rod 0", "finite")),
@@ -133,16 +137,16 @@ def _apart(found: np.ndarray, moment: np.ndarray, director: np.ndarray, tangent:
         "director along": ({"director": (1.0, 0.0, 0.0)}, ("rod 0", "first end", "across")),
     }.values(),
 )
-def test_bad_end_frames(device, options, words):
+def test_bad_end_frames(device, options, phrases):
     scene = weightless()
     scene.add_rod(straight(4), section=SECTION)
     with pytest.raises(ddg.SceneError) as caught:
         scene.clamp_end(0, **options)
         scene.build(device)
-    assert all(word in str(caught.value) for word in words), caught.value
+    assert all(word in str(caught.value) for word in phrases), caught.value
 
 
-def test_end_frames_that_cannot_be(device):
+def test_inconsistent_end_frames_are_refused(device):
     scene = weightless()
     scene.add_rod(straight(4), section=ddg.Stiffness(EA=1.0, EI1=1.0), twist=False)
     with pytest.raises(ddg.SceneError, match=r"rod 0 .* has no twist"):

@@ -1,4 +1,4 @@
-"""Copies and pickles of models and states go on bit for bit; what holds captured launches says how else it is done."""
+"""Copies and pickles of models and states continue bit for bit; objects with captured launches refuse them."""
 
 import copy
 import pickle
@@ -25,35 +25,42 @@ def scene(kind: str) -> ddg.Scene:
 
 @pytest.mark.parametrize("worlds", [1, 2])
 @pytest.mark.parametrize("kind", ["rods", "net"])
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda own: pickle.loads(pickle.dumps(own))], ids=["copy", "pickle"])
-def test_copies_go_on_bit_for_bit(device, kind, worlds, copied):
-    """A model with parameters that were set, and a state on the way, together; and the state alone."""
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda obj: pickle.loads(pickle.dumps(obj))], ids=["copy", "pickle"])
+def test_copies_continue_bitwise(device, kind, worlds, copied):
+    """Copied together: a model with changed parameters and a state after some steps; copied alone: the state."""
     model = scene(kind).build(device, "float64", worlds=worlds)
     model.set_parameter("rod_stretch", "stiffness", 900.0 + np.arange(worlds))
     integrator, state = ddg.Integrator(model), model.state(spins=0.1 * np.ones(model.order.edges_count))
     for _ in range(3):
         state = integrator.step(state, DT)
-    other_model, other = copied((model, state))
-    assert other.model is other_model is not model
-    assert (other.time, other.spun, other.lead) == (state.time, state.spun, state.lead)
-    alone = copied(state)
+    model_copy, state_copy = copied((model, state))
+    assert state_copy.model is model_copy is not model
+    assert (state_copy.time, state_copy.spun, state_copy.lead) == (state.time, state.spun, state.lead)
+    single_copy = copied(state)
     wanted = integrator.step(state, DT).snapshot()
-    for found in (ddg.Integrator(other_model).step(other, DT), ddg.Integrator(alone.model).step(alone, DT)):
-        for name, values in found.snapshot().items():
+    for copied_step in (
+        ddg.Integrator(model_copy).step(state_copy, DT),
+        ddg.Integrator(single_copy.model).step(single_copy, DT),
+    ):
+        for name, values in copied_step.snapshot().items():
             np.testing.assert_array_equal(values, wanted[name], err_msg=name)
     assert (copy.deepcopy(state).model is model) and (copy.copy(state).model is model)
 
 
-def test_what_solvers_told_of_an_equilibrium_is_kept(device):
+def test_copies_keep_the_outcome_of_an_equilibrium(device):
     state = statics.solve(scene("rods").build(device, "float64"))
-    for found in (copy.deepcopy(state), pickle.loads(pickle.dumps(state))):
-        assert (found.stable, found.outcome, found.unbalanced) == (state.stable, state.outcome, state.unbalanced)
+    for duplicate in (copy.deepcopy(state), pickle.loads(pickle.dumps(state))):
+        assert (duplicate.stable, duplicate.outcome, duplicate.unbalanced) == (
+            state.stable,
+            state.outcome,
+            state.unbalanced,
+        )
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, pickle.dumps])
-def test_what_stays_on_its_device_says_so(device, copied):
+def test_copies_of_solvers_are_refused(device, copied):
     model = scene("rods").build(device, "float64")
     integrator = ddg.Integrator(model)
-    for own in (integrator, ddg.StepControl(integrator, 1e-3), statics.Equilibrium(model), Continuation(model)):
-        with pytest.raises(ddg.SceneError, match=f"{type(own).__name__}: .* make another"):
-            copied(own)
+    for solver in (integrator, ddg.StepControl(integrator, 1e-3), statics.Equilibrium(model), Continuation(model)):
+        with pytest.raises(ddg.SceneError, match=f"{type(solver).__name__}: .* make another"):
+            copied(solver)

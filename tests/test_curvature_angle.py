@@ -1,4 +1,4 @@
-"""Rods whose curvature is the turning angle over the length: polygons that are exact, and what joins, ends and directors make of it."""
+"""Curvature as turning angle over length: exact polygons, joints, ends, directors, and the registry."""
 
 import numpy as np
 import pytest
@@ -20,14 +20,14 @@ def equilibrium(scene, device, load_steps: int = 1, **options):
     return model, Equilibrium(model, StaticsOptions(floor_factor=1.0, **options)).load(model.state(), load_steps)
 
 
-def turning(points: np.ndarray) -> np.ndarray:
-    """Angles between neighbouring edges [rad]."""
+def turning_angles(points: np.ndarray) -> np.ndarray:
+    """Return angles between neighbouring edges [rad]."""
     t = polyline.unit(np.diff(points, axis=0))
     return np.arctan2(np.linalg.norm(np.cross(t[:-1], t[1:]), axis=1), np.sum(t[:-1] * t[1:], 1))
 
 
 def bent_by_a_couple(kind: str, curvature: str, n: int = 12) -> ddg.Scene:
-    """A cantilever of length 1, a full turn about -y in n equal edges."""
+    """Return a cantilever of length 1 in n equal edges, bent by a couple to a full revolution about -y."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2 if kind.startswith("planar") else 3)
     points = np.linspace(0.0 * X, X, n + 1)
     parts = [points[:6], points[5:]] if "joined" in kind else [points]
@@ -40,8 +40,9 @@ def bent_by_a_couple(kind: str, curvature: str, n: int = 12) -> ddg.Scene:
     return scene
 
 
-# A couple M on the last edge turns each cell by M h / EI = 2 pi / n, the half cell at the clamp and those at a joint by half of that:
-# edge k points at (k + 1/2) 2 pi / n, and the polygon closes.
+# A couple M on the last edge rotates each cell by M h / EI = 2 pi / n, half cells at the clamp and at a joint by half
+# of it.
+# Edge k points at (k + 1/2) 2 pi / n, and the polygon closes.
 @pytest.mark.parametrize(
     "kind", ["planar", *(pytest.param(k, marks=slow) for k in ("in space", "without twist", "joined"))]
 )
@@ -53,11 +54,11 @@ def test_a_couple_makes_a_regular_polygon(device, kind):
     angle = (np.arange(n) + 0.5) * 2.0 * np.pi / n
     exact = np.cumsum(np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], 1), 0) / n
     np.testing.assert_allclose(points[1:], exact, atol=1e-7)
-    np.testing.assert_allclose(turning(points), 2.0 * np.pi / n, atol=1e-7)
+    np.testing.assert_allclose(turning_angles(points), 2.0 * np.pi / n, atol=1e-7)
 
 
 def test_a_ring_has_the_energy_of_its_circle(device):
-    """B (2 pi)^2 / 2 L of a regular polygon of any number of edges; by the tangent it is (tan(a) / a)^2 as much, a = pi / n."""
+    """B (2 pi)^2 / 2 L for any regular polygon; the tangent measure gives (tan(a) / a)^2 times that, a = pi / n."""
     for n in (5, 12):
         angle = 2.0 * np.pi * np.arange(n) / n
         points = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
@@ -70,8 +71,8 @@ def test_a_ring_has_the_energy_of_its_circle(device):
             assert energy == pytest.approx(2.0 * np.pi**2 / length * factor, rel=1e-12)
 
 
-def test_order_is_the_second_with_both(device):
-    """A force across the tip, against elliptic integrals."""
+def test_both_curvature_measures_converge_with_order_two(device):
+    """Reference: elliptic integrals for a transverse tip force."""
     edges, x, z = (20, 40, 80), *tip_load.exact(10.0)[:2]
     for curvature in ("tangent", "angle"):
         errors = []
@@ -86,8 +87,9 @@ def test_order_is_the_second_with_both(device):
         assert order == pytest.approx(2.0, abs=0.2 if curvature == "tangent" else 0.1)
 
 
-# Free of stress every vertex turns by its natural curvature, whatever the twist between its edges: phi = h |k|. By the tangent the
-# means of directors that differ by m = h t see cos(m / 2) of it: 2 tan(phi / 2) = h |k| / cos(m / 2).
+# Free of stress every vertex rotates by its natural curvature at any twist between its edges: phi = h |k|. With the
+# tangent
+# measure, means of directors that differ by m = h t see cos(m / 2) of it: 2 tan(phi / 2) = h |k| / cos(m / 2).
 @pytest.mark.parametrize("curvature", ["tangent", "angle"])
 def test_a_twisted_natural_helix(device, curvature):
     n, first, second, twist = 10, 2.0, 1.0, 9.0
@@ -99,17 +101,17 @@ def test_a_twisted_natural_helix(device, curvature):
     assert sum(model.energies(state).values()) < 1e-12
     size, m = np.hypot(first, second) / n, twist / n
     phi = size if curvature == "angle" else 2.0 * np.arctan(0.5 * size / np.cos(0.5 * m))
-    np.testing.assert_allclose(turning(state.points()), phi, atol=1e-7)
+    np.testing.assert_allclose(turning_angles(state.points()), phi, atol=1e-7)
     tangents = polyline.unit(np.diff(state.points(), axis=0))[None]
     directors = state.directors()[None]
     np.testing.assert_allclose(polyline.reference_twist(tangents, directors, False), m, atol=1e-7)
-    found = polyline.curvatures(tangents, directors, False, by_angle=curvature == "angle")
-    np.testing.assert_allclose(found, np.array([[[first]], [[second]]]) / n * np.ones((2, 1, n - 1)), atol=1e-7)
+    curvatures = polyline.curvatures(tangents, directors, False, by_angle=curvature == "angle")
+    np.testing.assert_allclose(curvatures, np.array([[[first]], [[second]]]) / n * np.ones((2, 1, n - 1)), atol=1e-7)
 
 
 @pytest.mark.parametrize("m", [1.0, 3.0, np.pi])
 def test_energy_of_any_twist(device, m):
-    """B phi^2 / 2 l + C m^2 / 2 l, also with half a turn between two edges, where the means of their directors vanish."""
+    """B phi^2 / 2 l + C m^2 / 2 l, even at half a revolution between two edges, where the director means vanish."""
     phi = 0.6
     directors = np.array([[Z, np.cos(m) * Z - np.sin(m) * Y]])
     bent = np.array([-X, 0.0 * X, np.cos(phi) * X + np.sin(phi) * Y])
@@ -125,8 +127,8 @@ def test_energy_of_any_twist(device, m):
 
 
 @slow
-def test_curvatures_side_by_side(device):
-    """Rods of both kinds have groups, and in a net sets, of their own, and one name in energies, laws and parameters."""
+def test_both_curvature_measures_in_one_scene(device):
+    """Rods of each measure have separate groups and element sets, and one name in energies, laws and parameters."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     for curvature in ("tangent", "angle"):
         first = scene.add_rod(np.linspace(0.0 * X, X, 5), section=SECTION, curvature=curvature)
@@ -148,7 +150,7 @@ def test_curvatures_side_by_side(device):
 
 
 def test_a_fold_has_finite_energy(device):
-    """B phi^2 / 2 l up to phi = pi, where 2 tan(phi / 2) grows without bound."""
+    """B phi^2 / 2 l up to phi = pi, where 2 tan(phi / 2) is unbounded."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     scene.add_rod([-X, 0.0 * X, X], section=ROUND, curvature="angle")
     model = scene.build(device, "float64")
@@ -159,7 +161,7 @@ def test_a_fold_has_finite_energy(device):
 
 
 def test_both_are_in_the_registry():
-    """Every term of rods that bends is there with both, under one name."""
+    """Every bending term of rods has both measures, under one name."""
     bending = {name for name, term in REGISTRY.items() if term.measure.span == 2 and not term.measure.by_angle}
     angles = {name.replace("_angle", "") for name, term in REGISTRY.items() if term.measure.by_angle}
     assert bending == angles

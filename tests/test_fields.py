@@ -1,4 +1,4 @@
-"""Fields that are recorded: closed forms along rods of every kind, alone and joined; the same numbers in HDF5, VTK and USD."""
+"""Recorded fields: closed forms along rods of every kind; equal values in HDF5, VTK and USD."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ KINDS = {
 
 
 def arc(nodes: int = 9) -> np.ndarray:
-    """A regular polygon's part in the plane of x and z, of a circle through its nodes."""
+    """Return points of a regular polygon on a circle in the xz plane."""
     angle = np.linspace(0.0, 1.0, nodes)
     return RADIUS * np.stack([np.sin(angle), 0.0 * angle, 1.0 - np.cos(angle)], axis=1)
 
@@ -37,30 +37,29 @@ def model_of(device, joined=False, dimension=3, worlds=1, section=SECTION, **opt
     points = arc() if natural == "straight" else np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 9)
     rod = scene.add_rod(points, section=section, **options)
     if joined:
-        other = scene.add_rod(
+        second = scene.add_rod(
             points[-1] + [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 1.0, 0.0]], section=section, **options
         )
-        scene.join([(rod, -1), (other, 0)], rigid=False)
+        scene.join([(rod, -1), (second, 0)], rigid=False)
     return scene.build(device, "float64", worlds=worlds)
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("name", KINDS)
 def test_rods_in_closed_form(device, name, worlds):
-    """An arc, straight at rest, stretched by a factor: N = EA (s - 1), kappa = 2 tan(phi / 2) / l0 or phi / l0,
-    psi = EA (s - 1)^2 / 2 + EI kappa^2 / 2.
+    """A stretched arc, straight at rest: N = EA (s - 1), psi = EA (s - 1)^2 / 2 + EI kappa^2 / 2.
 
-    Rods that cannot be curved at rest are straight.
+    kappa is 2 tan(phi / 2) / l0 or phi / l0. Rods that cannot be curved at rest are straight.
     """
     model = model_of(device, worlds=worlds, **KINDS[name])
     rest = model.state().points().reshape(worlds, -1, 3)[0]
-    found = point_fields(model, model.state(points=STRETCH * rest), list(POINT_FIELDS))
+    fields = point_fields(model, model.state(points=STRETCH * rest), list(POINT_FIELDS))
     curved = np.ptp(rest[:9, 2]) > 0.0
     length = np.linalg.norm(rest[1] - rest[0])
-    turn = 1.0 / 8.0 if "curvature" in KINDS[name] else 2.0 * np.tan(0.5 / 8.0)
-    kappa = turn / length if curved else 0.0
+    tangent_or_angle = 1.0 / 8.0 if "curvature" in KINDS[name] else 2.0 * np.tan(0.5 / 8.0)
+    kappa = tangent_or_angle / length if curved else 0.0
     for world in range(worlds):
-        mine = {name: values[world, :9] for name, values in found.items()}
+        mine = {name: values[world, :9] for name, values in fields.items()}
         np.testing.assert_allclose(mine["axial_force"], EA * (STRETCH - 1.0), rtol=1e-9)
         if "bend" not in KINDS[name]:
             size = np.hypot(mine["curvature_1"], np.nan_to_num(mine["curvature_2"]))
@@ -72,7 +71,7 @@ def test_rods_in_closed_form(device, name, worlds):
 
 
 def test_twist_in_closed_form(device):
-    """A straight rod clamped at both ends, one of which is turned by 0.6 rad: 0.6 / L everywhere."""
+    """A straight rod clamped at both ends, one rotated by 0.6 rad, has the twist 0.6 / L everywhere."""
     from ddg_warp.solve import statics
 
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -85,7 +84,7 @@ def test_twist_in_closed_form(device):
 
 
 def mixed(device, worlds: int = 1):
-    """A rod on a sheet, and the state that stretches both."""
+    """Return a model of a rod and a sheet, and a state that stretches both."""
     points, triangles = meshes.rectangle(2, 2)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_rod(np.linspace([0.0, 0.0, 1.0], [1.0, 0.0, 1.0], 5), section=SECTION)
@@ -96,7 +95,9 @@ def mixed(device, worlds: int = 1):
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_recorded_fields_are_read_back(tmp_path, device, worlds):
-    """Points and triangles; Green's strain of the sheet is (s^2 - 1) / 2, its energy per area E h of its square / 2."""
+    """Fields at points and triangles; Green's strain of the sheet is (s^2 - 1) / 2, its energy per area E h times the
+    square / 2.
+    """
     model, state = mixed(device, worlds)
     names = ["axial_force", "energy_density", "shell_strain", "shell_energy"]
     with Recorder(model, tmp_path, fields=names) as recorder:
@@ -130,7 +131,7 @@ def shown_in_usd(path, green: float) -> None:
 
 
 def test_vtk_reads_fields_by_the_name_of_the_link(tmp_path, device):
-    """The file that ParaView opens: trajectory.vtkhdf, with data at points and cells of every step."""
+    """ParaView opens trajectory.vtkhdf, with data at points and cells of every step."""
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 

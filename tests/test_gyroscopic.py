@@ -1,4 +1,4 @@
-"""The spin of a rod resists turns of its axis: tops, whose motion is known, and what steps must keep."""
+"""Gyroscopic couples of spinning rods: tops in closed form, conservation laws, and options."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ X, Y, Z = np.eye(3)
 
 
 class Top:
-    """A stiff straight rod along x, of one piece or of two that are joined rigidly."""
+    """Stiff straight rod along x, in one piece or two rigidly joined ones."""
 
     def __init__(self, device, first: float, joined: bool = False, hinged: bool = False, **scene):
         scene = ddg.Scene(**({"gravity": (0.0, 0.0, 0.0)} | scene))
@@ -28,28 +28,29 @@ class Top:
         line = DENSITY * np.pi * RADIUS**2
         halves = [np.concatenate([[0.5], np.ones(b - a - 2), [0.5]]) for a, b in self.pieces]
         self.mass = np.concatenate(halves) * line * LENGTH / EDGES
-        self.inertia = 0.5 * line * RADIUS**2 * LENGTH  # about its axis
+        self.inertia = 0.5 * line * RADIUS**2 * LENGTH  # about the axis
         self.model = scene.build(device, "float64")
 
     def turning(self, rate: float, spin: float):
-        """State that turns about z at a rate and spins."""
+        """Return a state that rotates about z at a rate and spins."""
         points = self.model.state().points()
         return self.model.state(velocities=np.cross(rate * Z, points), spins=np.full(EDGES, spin))
 
     def momentum(self, state, spin: float) -> np.ndarray:
-        """Angular momentum about the origin; spins stay as they are, nothing twists the rod."""
+        """Return the angular momentum about the origin, for constant spins of an untwisted rod."""
         x, v = state.points(), state.velocities()
         edges = np.concatenate([np.diff(x[a:b], axis=0) for a, b in self.pieces])
         tangents = edges / np.linalg.norm(edges, axis=1, keepdims=True)
         return (self.mass[:, None] * np.cross(x, v)).sum(0) + self.inertia / EDGES * spin * tangents.sum(0)
 
     def energy(self, state) -> float:
-        """Kinetic, without that of spins, and elastic [J]."""
+        """Return kinetic energy without spins plus elastic energy [J]."""
         return 0.5 * (self.mass * (state.velocities() ** 2).sum(1)).sum() + sum(self.model.energies(state).values())
 
 
-# A free symmetric top with I3 w along its axis and J W across it: the axis cones about the angular momentum, tilted by
-# atan(I3 w / J W) from the plane across that, and leaves the first plane by at most the sine of twice as much.
+# A free symmetric top has I3 w along its axis and J W across it. The axis cones about the angular momentum,
+# tilted by atan(I3 w / J W) from the transverse plane. It leaves the initial plane by at most the sine of twice that
+# angle.
 @STORAGES
 def test_a_free_top_cones_and_keeps_its_angular_momentum(device, joined):
     rate, spin = 10.0, 200.0
@@ -75,7 +76,7 @@ def test_a_free_top_cones_and_keeps_its_angular_momentum(device, joined):
 
 @STORAGES
 def test_a_heavy_top_precesses(device, joined):
-    """Hinged at an end and let go level at the rate W = (moment of its weight) / (I3 w), it stays level and turns at W."""
+    """Hinged at an end and released level at W = (moment of weight) / (I3 w), the top stays level and precesses at W."""
     spin = 3e3
     top = Top(device, 0.0, joined, hinged=True, gravity=(0.0, 0.0, -9.81))
     rate = 9.81 * (top.mass * top.model.state().points()[:, 0]).sum() / (top.inertia * spin)
@@ -90,8 +91,8 @@ def test_a_heavy_top_precesses(device, joined):
 
 @STORAGES
 @pytest.mark.parametrize("spin", [200.0, 2e3])
-def test_implicit_euler_makes_no_energy(device, joined, spin):
-    """Kinetic and elastic energy only fall, also where the couple turns velocities by a tenth of a radian in a step."""
+def test_implicit_euler_never_gains_energy(device, joined, spin):
+    """Kinetic and elastic energy only fall, even if the couple rotates velocities by a tenth of a radian in a step."""
     top = Top(device, -0.5 * LENGTH, joined)
     state, energies = top.turning(10.0, spin), []
     integrator = ddg.Integrator(top.model, rtol=1e-10)
@@ -102,7 +103,7 @@ def test_implicit_euler_makes_no_energy(device, joined, spin):
 
 
 @STORAGES
-def test_a_step_that_is_given_up_leaves_velocities_as_they_were(device, joined):
+def test_failed_step_keeps_velocities(device, joined):
     top = Top(device, -0.5 * LENGTH, joined)
     state = top.turning(10.0, 2e3)
     options = {"retry_limit": 1, "max_iterations": 1, "rtol": 1e-15, "check_every": 10**9}
@@ -112,8 +113,8 @@ def test_a_step_that_is_given_up_leaves_velocities_as_they_were(device, joined):
     np.testing.assert_allclose(after.velocities(), state.velocities(), atol=1e-12)
 
 
-def test_only_states_that_were_given_spins_pay(device):
-    """What follows from these goes on so, from snapshots too, bit by bit; `gyroscopic` decides for all states."""
+def test_gyroscopic_couples_act_only_on_states_with_spins(device):
+    """Later states inherit the spins, from snapshots too, bit by bit; `gyroscopic` decides for all states."""
     top = Top(device, -0.5 * LENGTH)
 
     def run(integrator, state, steps: int):
@@ -132,8 +133,8 @@ def test_only_states_that_were_given_spins_pay(device):
     assert np.abs(without.points()[:, 2]).max() < 1e-12 < np.abs(through.points()[:, 2]).max()
     silent = top.turning(10.0, 200.0)
     silent.spun = False
-    asked = run(ddg.Integrator(top.model, gyroscopic=True), silent, 6)
-    np.testing.assert_array_equal(asked.velocities(), through.velocities())
+    enabled = run(ddg.Integrator(top.model, gyroscopic=True), silent, 6)
+    np.testing.assert_array_equal(enabled.velocities(), through.velocities())
 
 
 def test_gradients_are_refused(device):
@@ -149,5 +150,5 @@ def test_gradients_are_refused(device):
         Simulator(top.model, 1e-3).world_state(state)
     Adjoint(ddg.Integrator(top.model, gyroscopic=False)).step(state, 1e-3)
     taken = Simulator(top.model, 1e-3, gyroscopic=True)
-    found = taken.step(taken.world_state(state)).velocities.detach().cpu().numpy()
-    np.testing.assert_array_equal(found[0], ddg.Integrator(top.model).step(state, 1e-3).velocities())
+    velocities = taken.step(taken.world_state(state)).velocities.detach().cpu().numpy()
+    np.testing.assert_array_equal(velocities[0], ddg.Integrator(top.model).step(state, 1e-3).velocities())

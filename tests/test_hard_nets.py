@@ -1,6 +1,6 @@
-"""Hard cases of nets in dynamics: crumpled, folded, thin, in long steps, on bad meshes.
+"""Hard cases of coupled systems in dynamics: crumpled, folded, thin, in long steps, on bad meshes.
 
-Every run ends in finite states by converged steps only, or in an error that names the outcome, the place and the remedy.
+Every run ends in finite states by converged steps only, or in an error that names outcome, position and remedy.
 """
 
 import numpy as np
@@ -22,31 +22,35 @@ def sheet(cells=8, bending="midedge_dof", thickness=1e-2, gravity=0.0, material=
 
 
 def run(scene, device, dt, count, start=None, **options):
-    """The last state and total energies; steps that failed have been retried, or an error names what and where."""
+    """Return the last state and total energies; failed steps were retried, or an error names outcome and position."""
     return attempt(scene, device, dt, count, ("world 0", "of shell 0", "smaller dt"), start, **options)[1:]
 
 
-def assert_no_energy_is_made(energy) -> None:
+def assert_energy_never_grows(energy) -> None:
     assert np.diff(energy).max() <= 1e-8 * (np.ptp(energy) + np.abs(energy).max())
 
 
 def edge_strain(scene, state) -> float:
-    """Largest relative change of an edge's length."""
+    """Return the largest relative change of an edge length."""
     shell = scene.shells[0]
     edges = np.concatenate([shell.triangles[:, [0, 1]], shell.triangles[:, [1, 2]], shell.triangles[:, [2, 0]]])
-    rest, now = (np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1) for p in (shell.points, state.points()))
-    return float(np.abs(now / rest - 1.0).max())
+    rest_lengths, lengths = (
+        np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1) for p in (shell.points, state.points())
+    )
+    return float(np.abs(lengths / rest_lengths - 1.0).max())
 
 
 @pytest.mark.parametrize("size", [0.1, 0.5, 1.0], ids=["crumpled", "inverted", "scrambled"])
 @pytest.mark.parametrize("bending", BENDING)
 def test_random_perturbation(device, bending, size):
-    """Vertices thrown about by a fraction of the cells, so that triangles invert: it springs back, and energy only falls."""
+    """Vertices moved by a fraction of the cells, which inverts triangles: the sheet springs back, and energy only
+    falls.
+    """
     scene = sheet(6, bending)
     start = scene.shells[0].points
     start = start + size / 6.0 * np.random.default_rng(1).normal(size=start.shape)
     state, energy, statistics, _ = run(scene, device, 0.01, 10, start)
-    assert_no_energy_is_made(energy)
+    assert_energy_never_grows(energy)
     assert statistics["retries"] == 0
     assert energy[-1] < 0.2 * energy[0]
     assert edge_strain(scene, state) < 0.5
@@ -54,23 +58,25 @@ def test_random_perturbation(device, bending, size):
 
 @pytest.mark.parametrize("thickness", [1e-3, pytest.param(1e-4, marks=pytest.mark.slow)])
 def test_random_perturbation_in_long_steps(device, thickness):
-    """144 cells with triangles inverted, thin, in steps of 0.1 s: no step fails, and after ten of them little energy is left."""
+    """A thin sheet of 144 cells with inverted triangles, steps of 0.1 s: no step fails, and ten steps leave little
+    energy.
+    """
     scene = sheet(12, thickness=thickness)
     start = scene.shells[0].points
     start = start + 0.5 / 12.0 * np.random.default_rng(1).normal(size=start.shape)
     _, energy, statistics, _ = run(scene, device, 0.1, 10, start)
-    assert_no_energy_is_made(energy)
+    assert_energy_never_grows(energy)
     assert statistics["retries"] == 0
     assert energy[-1] < 1e-4 * energy[0]
 
 
 @pytest.mark.parametrize("bending", BENDING)
 def test_thickness_of_a_ten_thousandth(device, bending):
-    """h / L = 1e-4, held at two corners: it swings by its weight; nothing is stretched but by that."""
+    """A sheet of h / L = 1e-4 hangs from two corners and swings, stretched by its weight alone."""
     scene = sheet(8, bending, thickness=1e-4, gravity=9.81, material=ddg.Material(1e8, 0.3, 1000.0))
     scene.hold(0, [0, 8])
     state, energy, statistics, _ = run(scene, device, 0.01, 20)
-    assert_no_energy_is_made(energy)
+    assert_energy_never_grows(energy)
     assert statistics["retries"] == 0
     assert edge_strain(scene, state) < 0.02
     assert state.points()[:, 2].min() < -0.1
@@ -79,30 +85,30 @@ def test_thickness_of_a_ten_thousandth(device, bending):
 @pytest.mark.parametrize("bending", BENDING)
 @pytest.mark.parametrize("dt", [1.0 / 30.0, 0.2])
 def test_long_steps(device, bending, dt):
-    """A hanging sheet in steps far beyond its waves: 1e6 Pa, cells of 1/8 m, sqrt(E / rho) h / l = 8 and 50."""
+    """The step is far beyond the wave time of a hanging sheet: 1e6 Pa, cells of 1/8 m, sqrt(E / rho) h / l = 8 and 50."""
     scene = sheet(8, bending, thickness=1e-3, gravity=9.81)
     scene.hold(0, [0, 8])
     _, energy, statistics, _ = run(scene, device, dt, 12)
-    assert_no_energy_is_made(energy)
+    assert_energy_never_grows(energy)
     assert statistics["newton_iterations"]["mean"] < 40
 
 
-def folded(points, angle: float, at: float = 0.0) -> np.ndarray:
-    """The half x > at turned about the y axis through `at` by an angle."""
-    x = points[:, 0] - at
-    turned = np.maximum(x, 0.0)
-    return np.stack([at + np.minimum(x, 0.0) + turned * np.cos(angle), points[:, 1], turned * np.sin(angle)], -1)
+def folded(points, angle: float, x0: float = 0.0) -> np.ndarray:
+    """Return points with the half x > x0 rotated about the y axis through x0 by an angle."""
+    x = points[:, 0] - x0
+    beyond = np.maximum(x, 0.0)
+    return np.stack([x0 + np.minimum(x, 0.0) + beyond * np.cos(angle), points[:, 1], beyond * np.sin(angle)], -1)
 
 
 @pytest.mark.parametrize("bending", BENDING)
 @pytest.mark.parametrize("degrees", [85.0, 175.0])
 def test_crease_opens(device, bending, degrees):
-    """A flat sheet let go folded: it opens, and energy only falls; normals that turn do not turn over."""
+    """A flat sheet released from a fold opens, and energy only falls; rotating normals do not flip."""
     scene = sheet(4, bending)
     points = scene.shells[0].points
     start = folded(points, np.radians(degrees), float(np.median(points[:, 0])))
     state, energy, statistics, _ = run(scene, device, 0.02, 40, start)
-    assert_no_energy_is_made(energy)
+    assert_energy_never_grows(energy)
     assert statistics["retries"] == 0
     far = points[:, 0] == points[:, 0].max()
     assert np.abs(state.points()[far] - start[far]).max() > 0.05
@@ -111,7 +117,7 @@ def test_crease_opens(device, bending, degrees):
 
 @pytest.mark.parametrize("bending", BENDING)
 def test_crease_of_175_degrees_at_rest_stays(device, bending):
-    """A sheet creased by 175 degrees in its rest shape is at rest."""
+    """A sheet with a rest shape creased by 175 degrees stays at rest."""
     points, triangles = meshes.rectangle(4, 4, (1.0, 1.0), "alternating")
     points = folded(points, np.radians(175.0), float(np.median(points[:, 0])))
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -122,7 +128,7 @@ def test_crease_of_175_degrees_at_rest_stays(device, bending):
 
 @pytest.mark.parametrize("bending", BENDING)
 def test_needle_triangles(device, bending):
-    """Cells of 1 : 1000: finite, and falling freely at rest in their shape."""
+    """Cells of 1 : 1000 stay finite and fall freely in their rest shape."""
     points, triangles = meshes.rectangle(4, 4, (1.0, 1e-3), "right")
     scene = ddg.Scene()
     scene.add_shell(points, triangles, thickness=1e-3, material=RUBBER, bending=bending)
@@ -140,8 +146,8 @@ def test_triangles_without_area_are_refused(device):
         scene.build(device)
 
 
-def test_turned_over_neighbours_are_refused(device):
-    """Two triangles of opposite orientation: no surface."""
+def test_inverted_neighbours_are_refused(device):
+    """Neighbouring triangles of opposite orientation form no surface."""
     points, triangles = meshes.rectangle(2, 2, (1.0, 1.0), "right")
     triangles = np.array(triangles)
     triangles[3] = triangles[3][::-1]
@@ -153,14 +159,14 @@ def test_turned_over_neighbours_are_refused(device):
 
 @pytest.mark.parametrize("bending", BENDING)
 def test_collapsed_to_a_point(device, bending):
-    """All vertices at one place, where no direction exists: given up with a name, as there is nothing to converge to."""
+    """Coincident vertices have no direction: the run ends with a named outcome."""
     scene = sheet(3, bending)
     *_, error = run(scene, device, 0.01, 3, np.zeros((16, 3)), fails=("non_finite",))
     assert error.outcome == "non_finite"
 
 
 def test_crumpled_between_moving_supports(device):
-    """Opposite sides pushed together in 0.5 s, in steps of 1/30 s: folds, lengths kept."""
+    """Opposite sides approach in 0.5 s, in steps of 1/30 s: the sheet folds and keeps lengths."""
     scene = sheet(16, "hinge", thickness=2e-3)
     points = scene.shells[0].points
     noise = 1e-3 * np.random.default_rng(0).normal(size=points.shape)

@@ -1,4 +1,4 @@
-"""Imports run downwards: no folder knows of those above it."""
+"""Imports run downwards: no folder imports from a higher layer."""
 
 import ast
 from collections.abc import Iterator
@@ -10,18 +10,18 @@ import ddg_warp
 
 PACKAGE = Path(ddg_warp.__file__).parent
 LAYERS = ("geometry", "scene", "compile", "io", "model", "solve", "ask", "run", "learn")
-# What a user calls on an object of a lower layer, which imports its answer when it is asked.
+# Methods of lower-layer objects that import their implementation when called.
 FACADES = {"scene/scene.py": "model", "model/model.py": "ask", "run/cli.py": "learn"}
 
 
 def layer(module: str) -> int:
-    """Of a module of the package, by its name from there; those beside the folders serve all."""
+    """Return the layer of a module from the name in the package, -1 for top-level modules."""
     folder = module.split(".", maxsplit=1)[0]
     return LAYERS.index(folder) if folder in LAYERS else -1
 
 
 def imports(path: Path, lazy: bool) -> Iterator[str]:
-    """What a file imports of the package, as it is loaded or `lazy`, inside of functions."""
+    """Yield package imports of a file, at module level or `lazy`, inside functions."""
     tree = ast.parse(path.read_text())
     inside = {
         id(node)
@@ -43,19 +43,19 @@ FILES = sorted(path for folder in LAYERS for path in (PACKAGE / folder).rglob("*
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_run_downwards(path):
     name = str(path.relative_to(PACKAGE))
-    own = LAYERS.index(name.split("/", maxsplit=1)[0])
-    above = [module for module in imports(path, lazy=False) if layer(module) > own]
+    own_layer = LAYERS.index(name.split("/", maxsplit=1)[0])
+    above = [module for module in imports(path, lazy=False) if layer(module) > own_layer]
     assert not above
-    reach = max(own, LAYERS.index(FACADES[name])) if name in FACADES else own
+    reach = max(own_layer, LAYERS.index(FACADES[name])) if name in FACADES else own_layer
     assert not [module for module in imports(path, lazy=True) if layer(module) > reach]
 
 
-def test_every_folder_has_its_place():
+def test_every_folder_has_a_layer():
     folders = {path.relative_to(PACKAGE).parts[0] for path in PACKAGE.glob("*/**/*.py")}
     assert folders == set(LAYERS)
 
 
-def test_io_and_geometry_know_no_solver():
+def test_io_and_geometry_import_no_solver():
     for path in (path for path in FILES if path.relative_to(PACKAGE).parts[0] in ("io", "geometry")):
-        known = {*imports(path, lazy=False), *imports(path, lazy=True)}
-        assert not [module for module in known if layer(module) > LAYERS.index("io")]
+        imported = {*imports(path, lazy=False), *imports(path, lazy=True)}
+        assert not [module for module in imported if layer(module) > LAYERS.index("io")]

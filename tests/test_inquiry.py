@@ -36,8 +36,8 @@ def test_energy_of_stretch(device):
     assert energies["rod_bend_twist"] == pytest.approx(0.0, abs=1e-12)
 
 
-# A closed rod, straight when free, on a polygon of n edges l: kappa = 2 tan(pi / n) / l at all vertices, E = n EI kappa^2 l / 2,
-# which goes to pi EI / R.
+# A closed rod, straight when free, on a polygon of n edges l: kappa = 2 tan(pi / n) / l at all vertices.
+# E = n EI kappa^2 l / 2, which tends to pi EI / R.
 @pytest.mark.parametrize("director", [(0.0, 0.0, 1.0), None], ids=["out of plane", "chosen"])
 def test_energy_of_bending(device, director):
     for n, tolerance in ((10, None), (400, 1e-3)):
@@ -73,7 +73,7 @@ def test_kinetic_and_potential_energy(device):
 
 
 def test_reactions_balance_all_loads(device):
-    """Forces, a twisting moment, a couple and weight on a curved cantilever: force and moment about any point."""
+    """Reactions of a curved cantilever balance forces, a twisting moment, a couple and weight about any point."""
     angle = np.linspace(0.0, 1.5, 31)
     points = np.stack([np.sin(angle), 1.0 - np.cos(angle), 0.2 * angle], -1)
     scene = ddg.Scene(gravity=(0.0, 0.0, -2.0))
@@ -93,17 +93,17 @@ def test_reactions_balance_all_loads(device):
     weight = model.groups[0].host.mass[1:, 0, None] * [0.0, 0.0, -2.0]  # node 0 of the column is the ghost
     force = weight.sum(0) + sum(forces.values())
     for point in (None, (1.0, -2.0, 0.5)):
-        about = x[0] if point is None else np.array(point)
-        moment = sum(np.cross(x[node] - about, f) for node, f in forces.items())
-        moment = moment + np.cross(x - about, weight).sum(0) + couple + 0.35 * edge / np.linalg.norm(edge)
+        pole = x[0] if point is None else np.array(point)
+        moment = sum(np.cross(x[node] - pole, f) for node, f in forces.items())
+        moment = moment + np.cross(x - pole, weight).sum(0) + couple + 0.35 * edge / np.linalg.norm(edge)
         (reaction,) = reactions(model, state, point)
         np.testing.assert_allclose(reaction.force, -force, atol=1e-7)
         np.testing.assert_allclose(reaction.moment, -moment, atol=1e-7)
-        np.testing.assert_allclose(reaction.point, about)
+        np.testing.assert_allclose(reaction.point, pole)
 
 
 def test_reactions_of_several_supports(device):
-    """A beam on two supports that hold different components, in the plane and in space: each holds half the weight."""
+    """Supports that fix different components of a beam carry half the weight each, in the plane and in space."""
     for dimension in (2, 3):
         scene = ddg.Scene(gravity=(0.0, 0.0, -1.0), dimension=dimension)
         rod = scene.add_rod(straight(21), section=ddg.Stiffness(EA=1e4, EI1=50.0, GJ=50.0, mass_per_length=0.8))
@@ -137,13 +137,13 @@ def test_stresses_of_a_uniform_moment(device):
 
 
 def test_stresses_of_a_hanging_rod(device):
-    """Axial force: the weight below."""
+    """The axial force is the weight below."""
     scene = ddg.Scene(gravity=(10.0, 0.0, 0.0))
     rods = scene.add_rods(np.stack([straight(11), straight(11) + [0.0, 1.0, 0.0]]), section=SECTION)
     scene.clamp(rods)
     model = scene.build(device, "float64")
     mass = 0.8 * 0.2
-    below = mass * 10.0 * (np.arange(9, 0, -1) - 0.5)  # what hangs on edges 1 to 9
+    below = mass * 10.0 * (np.arange(9, 0, -1) - 0.5)  # weight below edges 1 to 9
     for forces in stresses(model, statics.solve(model))["rod_stretch"]:
         np.testing.assert_allclose(forces[1:, 0], below, rtol=1e-8)
 
@@ -155,7 +155,7 @@ def trefoil(nodes: int, height: float = 1.0) -> np.ndarray:
 
 
 def gauss_integral(curve, nodes: int) -> float:
-    """Writhe of a smooth closed curve by the trapezoidal rule on Gauss' double integral."""
+    """Return the writhe of a smooth closed curve by the trapezoidal rule on Gauss' double integral."""
     fine, h = curve(nodes), 2.0 * np.pi / nodes
     modes = np.fft.fftfreq(nodes, 1.0 / nodes)[:, None]
     tangent = np.fft.ifft(1j * modes * np.fft.fft(fine, axis=0), axis=0).real
@@ -169,12 +169,12 @@ def gauss_integral(curve, nodes: int) -> float:
 
 def test_writhe_of_a_planar_curve():
     assert writhe(circle(30)) == pytest.approx(0.0, abs=1e-12)
-    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
-    assert writhe(circle(31) @ turn.T + [1.0, 2.0, 3.0]) == pytest.approx(0.0, abs=1e-12)
+    rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    assert writhe(circle(31) @ rotation.T + [1.0, 2.0, 3.0]) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_writhe_of_a_knot():
-    """Converges to Gauss' integral of the smooth curve with the square of the edge; a mirror image changes the sign."""
+    """The writhe converges to Gauss' integral with order two in the edge; a mirror image changes the sign."""
     reference = gauss_integral(trefoil, 1200)
     errors = np.array([writhe(trefoil(n)) - reference for n in (50, 100, 200)])
     assert abs(reference) > 3.0
@@ -183,36 +183,36 @@ def test_writhe_of_a_knot():
     assert writhe(trefoil(60) * [1.0, 1.0, -1.0]) == pytest.approx(-writhe(trefoil(60)), rel=1e-12)
 
 
-def test_writhe_does_not_depend_on_place_or_seam():
+def test_writhe_is_invariant_under_similarity_and_seam():
     random = np.random.default_rng(0)
     for _ in range(20):
         curve = random.normal(size=(12, 3))
-        turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
-        turn *= np.linalg.det(turn)
+        rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        rotation *= np.linalg.det(rotation)
         value = writhe(curve)
-        assert writhe(3.0 * curve @ turn.T + 0.7) == pytest.approx(value, abs=1e-9)
+        assert writhe(3.0 * curve @ rotation.T + 0.7) == pytest.approx(value, abs=1e-9)
         assert writhe(np.roll(curve, 5, axis=0)) == pytest.approx(value, abs=1e-9)
         assert writhe(curve[::-1]) == pytest.approx(value, abs=1e-9)
 
 
-def wound_ring(nodes: int, turns: int, device):
-    """A closed ring whose first director turns so many times about the tangent on the way round."""
+def wound_ring(nodes: int, revolutions: int, device):
+    """Return a closed ring with a first director that winds about the tangent `turns` times."""
     ring = circle(nodes)
     tangents = np.roll(ring, -1, axis=0) - ring
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    angle = 2.0 * np.pi * turns * np.arange(nodes)[:, None] / nodes
+    angle = 2.0 * np.pi * revolutions * np.arange(nodes)[:, None] / nodes
     up = np.array([0.0, 0.0, 1.0])
     directors = np.cos(angle) * up + np.sin(angle) * np.cross(tangents, up)
     return built(ring, device, closed=True, director=directors[None])
 
 
-@pytest.mark.parametrize("turns", [0, 1, -3, 12])
-def test_link_is_twist_plus_writhe(device, turns):
-    """White 1969, Fuller 1971; exact for polygons whose frames are carried by parallel transport."""
+@pytest.mark.parametrize("revolutions", [0, 1, -3, 12])
+def test_link_is_twist_plus_writhe(device, revolutions):
+    """White 1969, Fuller 1971; exact for polygons with parallel-transported frames."""
     nodes = 60
-    model = wound_ring(nodes, turns, device)
+    model = wound_ring(nodes, revolutions, device)
     state = model.state()
-    assert total_twist(model, state) == pytest.approx(turns, abs=1e-10)
+    assert total_twist(model, state) == pytest.approx(revolutions, abs=1e-10)
     random, shape, writhes = np.random.default_rng(1), circle(nodes), []
     s = 2.0 * np.pi * np.arange(nodes) / nodes
     for amount in np.linspace(0.0, 1.0, 11):  # in steps, as a simulation deforms it
@@ -223,7 +223,7 @@ def test_link_is_twist_plus_writhe(device, turns):
         q[:, :3] = shape
         tangent.assign(state, q.ravel())
         writhes.append(writhe(shape))
-        assert total_twist(model, state) + writhes[-1] == pytest.approx(turns, abs=1e-9)
+        assert total_twist(model, state) + writhes[-1] == pytest.approx(revolutions, abs=1e-9)
     assert np.abs(writhes).max() > 0.1
 
 

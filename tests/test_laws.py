@@ -1,4 +1,4 @@
-"""Laws: parameters by name, damping of any law, and laws of one's own in scenes and in the derivative table."""
+"""Constitutive laws: named parameters, damping, and user laws in scenes and in the derivative table."""
 
 import tempfile
 from dataclasses import replace
@@ -36,7 +36,7 @@ def cantilever(laws=None, viscosity: float = 0.0, gravity=(0.0, -1.0, -3.0), **o
 
 
 def moved(scene: ddg.Scene, device, precision: str = "float64", **options) -> tuple[np.ndarray, ddg.Integrator]:
-    """Points after 20 steps of 20 ms."""
+    """Return points after 20 steps of 20 ms, and the integrator."""
     model = scene.build(device, precision)
     integrator, state = ddg.Integrator(model, rtol=1e-10, **options), model.state()
     for _ in range(20):
@@ -49,18 +49,18 @@ def moved(scene: ddg.Scene, device, precision: str = "float64", **options) -> tu
     ("couple", "curvature"),
     [(1.0, "tangent"), (4.0, "tangent"), (5.9, "tangent"), pytest.param(4.0, "angle", marks=pytest.mark.slow)],
 )
-def test_a_law_of_ones_own_bends_to_its_own_circle(device, couple, curvature):
-    """Under an end couple M the curvature k is uniform, and work says M d phi = l m(k) dk, with k = 2 tan(phi / 2) / l of edges l.
+def test_user_law_bends_to_its_circle(device, couple, curvature):
+    """An end couple M gives uniform curvature k, with M d phi = l m(k) dk and k = 2 tan(phi / 2) / l of edges l.
 
-    So M = m(k) (1 + (k l / 2)^2), m = K k / sqrt(1 + (k / c)^2), which cannot exceed K c = 6. With k = phi / l it is M = m(k).
+    Hence M = m(k) (1 + (k l / 2)^2), m = K k / sqrt(1 + (k / c)^2), at most K c = 6. With k = phi / l it is M = m(k).
     """
     scene, length = cantilever(LAW, gravity=(0.0, 0.0, 0.0), curvature=curvature), 1.0 / 12.0
     scene.add_couple(0, -1, (0.0, couple, 0.0))
     model = scene.build(device, "float64")
     state = solve(model, load_steps=8)
     tangents = np.diff(state.points(), axis=0) / length
-    turned = np.arccos(np.clip((tangents[:-1] * tangents[1:]).sum(1), -1.0, 1.0))
-    k = (2.0 * np.tan(turned / 2.0) if curvature == "tangent" else turned) / length
+    angles = np.arccos(np.clip((tangents[:-1] * tangents[1:]).sum(1), -1.0, 1.0))
+    k = (2.0 * np.tan(angles / 2.0) if curvature == "tangent" else angles) / length
     moment = K * k / np.sqrt(1.0 + (k / LIMIT) ** 2)
     work = 1.0 + (0.5 * k * length) ** 2 if curvature == "tangent" else 1.0
     assert moment * work == pytest.approx(couple, rel=1e-7)
@@ -80,17 +80,17 @@ def test_the_quadratic_law_given_by_hand_is_the_usual_one(device, viscosity, psd
 
 @pytest.mark.parametrize("viscosity", [0.0, 0.05])
 def test_far_from_its_limit_the_law_is_linear(device, viscosity):
-    """Strains of 1e-2 of the limit: the answers differ by their square."""
+    """Strains of 1e-2 of the limit: the results differ by the square of that."""
     usual, _ = moved(cantilever(None, viscosity), device)
     law = {"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=300.0)}
-    found, _ = moved(cantilever(law, viscosity), device)
-    assert 1e-9 < np.abs(found - usual).max() < 1e-4
-    near, _ = moved(cantilever({"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=1.0)}, viscosity), device)
-    assert np.abs(near - usual).max() > 1e-3
+    weak, _ = moved(cantilever(law, viscosity), device)
+    assert 1e-9 < np.abs(weak - usual).max() < 1e-4
+    strong, _ = moved(cantilever({"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=1.0)}, viscosity), device)
+    assert np.abs(strong - usual).max() > 1e-3
 
 
-def test_damping_takes_energy_and_nothing_else(device):
-    """A damped law comes to rest where it would rest without: the hanging shape is that of statics."""
+def test_damping_keeps_the_equilibrium(device):
+    """A damped law comes to rest in the static shape without damping."""
     scene = cantilever(LAW, viscosity=0.3)
     rest = solve(cantilever(LAW).build(device, "float64"), load_steps=4).points()
     model = scene.build(device, "float64")
@@ -101,23 +101,23 @@ def test_damping_takes_energy_and_nothing_else(device):
 
 
 def test_a_joined_rod_keeps_its_law(device):
-    """Joined to a stub by a hinge that carries no moment it moves as alone; the stub keeps the quadratic law."""
-    alone, _ = moved(cantilever(LAW), device)
+    """A hinge to a stub carries no moment: the rod moves as a single one; the stub keeps the quadratic law."""
+    single, _ = moved(cantilever(LAW), device)
     scene = cantilever(LAW)
     stub = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
     scene.clamp(stub, edges=[0, 1, 2])
     scene.join([(0, 0), (stub, 0)], rigid=False)
     model = scene.build(device, "float64")
-    assert len([part for part in model.net.sets if part.term.name == "rod_bend_twist"]) == 2
+    assert len([element_set for element_set in model.net.sets if element_set.term.name == "rod_bend_twist"]) == 2
     names = model.parameters().keys()
     assert {"net/rod_bend_twist/limit", "net/rod_bend_twist 1/stiffness_1"} <= names
     joined, _ = moved(scene, device)
-    np.testing.assert_allclose(joined[:13], alone, atol=1e-8)
+    np.testing.assert_allclose(joined[:13], single, atol=1e-8)
 
 
-@pytest.mark.slow  # the README's command is one of every day
+@pytest.mark.slow  # the README's command runs daily
 @pytest.mark.parametrize("damped", [False, True])
-def test_derivatives_of_a_law_of_ones_own(device, damped):
+def test_derivatives_of_a_user_law(device, damped):
     term = replace(REGISTRY["rod_bend_twist"], density=saturating).damped(damped)
     for row in derivatives.table(term, "float64", device):
         assert row["passed"], row
@@ -131,11 +131,11 @@ def test_the_command_line_checks_a_law_in_a_file(device, capsys):
     assert "no term or law 'nothing'" in capsys.readouterr().err
 
 
-def test_every_law_says_its_parameters():
+def test_every_law_names_its_parameters():
     for term in ALL.values():
         names = term.parameter_names
         assert len(set(names)) == len(names) and names[0] == "measure"
-        assert all(known.unit and known.valid[0] for known in term.parameters)
+        assert all(parameter.unit and parameter.valid[0] for parameter in term.parameters)
         assert len(term.rest) == (0 if term.name in {*MAGNETS, *CONTACT, *FRICTION} else len(term.measure.strains))
         assert ("viscosity" in names) == (term.density.undamped is not None)
 
@@ -153,16 +153,16 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_does_not_fit_is_refused(device, name):
-    laws, options, words = WRONG[name]
-    with pytest.raises(ddg.SceneError, match=words):
+def test_mismatched_laws_are_refused(device, name):
+    laws, options, message = WRONG[name]
+    with pytest.raises(ddg.SceneError, match=message):
         cantilever(laws, **options).build(device)
 
 
 def test_rigid_joints_refuse_other_laws(device):
     scene = cantilever(LAW)
-    other = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
-    scene.join([(0, 0), (other, 0)])
+    second = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
+    scene.join([(0, 0), (second, 0)])
     with pytest.raises(ddg.SceneError, match="law of its own"):
         scene.build(device)
 

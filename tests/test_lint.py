@@ -1,4 +1,4 @@
-"""The kernel lint finds each fault where it is and leaves sound code alone."""
+"""Kernel lint: every fault is found at its position, and sound code passes."""
 
 import subprocess
 import sys
@@ -78,7 +78,7 @@ def test_function_used_by_a_differentiated_file_is_differentiated(tmp_path):
     assert [finding.path.name for finding in lint([tmp_path])] == ["frames.py"]
 
 
-def test_place_and_exit_code(tmp_path):
+def test_position_and_exit_code(tmp_path):
     path = tmp_path / "sample.py"
     path.write_text(HEAD + FAULTS["literal in a product"][1])
     command = [sys.executable, ROOT / "tools/lint_kernels.py", path]

@@ -1,4 +1,4 @@
-"""Shells of revolution in scenes: refusals name the shell and the remedy; runs, worlds, growth, and surfaces in USD."""
+"""Shells of revolution in scenes: named refusals, runs, worlds, growth, and surfaces in USD."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def moved(node, radius, height):
 
 
 @pytest.mark.parametrize(
-    ("action", "words"),
+    ("action", "phrases"),
     [
         (lambda: scene_of(CAP[:2]), ("odd", "(n, 2)")),
         (lambda: scene_of(np.zeros((4, 3))), ("odd", "(4, 3)")),
@@ -60,10 +60,10 @@ def moved(node, radius, height):
         (lambda: Equilibrium(scene_of().build()), ("shell 0", "hold_ring")),
     ],
 )
-def test_refused(action, words):
+def test_refused(action, phrases):
     with pytest.raises(ddg.SceneError) as caught:
         action()
-    assert not [word for word in words if word not in str(caught.value)], caught.value
+    assert not [word for word in phrases if word not in str(caught.value)], caught.value
 
 
 def test_a_pole_is_not_clamped():
@@ -73,7 +73,7 @@ def test_a_pole_is_not_clamped():
 
 @pytest.mark.parametrize("points", [CAP, TUBE], ids=["cap", "tube"])
 def test_following_pressure_in_dynamics(device, points):
-    """Raised slowly and damped, it ends in the static solution, from which that of a dead pressure differs."""
+    """Pressure raised slowly with damping reaches the static solution, which differs from a dead pressure."""
 
     def pressed(dead=False, **options):
         scene = scene_of(points, mass_damping=60.0, **options)
@@ -93,8 +93,8 @@ def test_following_pressure_in_dynamics(device, points):
     np.testing.assert_allclose(state.points(), static, atol=1e-9)
 
 
-def test_a_rim_that_is_turned(device):
-    """A disc whose rim is turned by a small angle: a paraboloid, w(0) = phi a / 2, with energy pi a^2 D (1 + nu) (phi / a)^2."""
+def test_rotated_rim_of_a_disc(device):
+    """A small rim rotation makes a disc a paraboloid, w(0) = phi a / 2, with energy pi a^2 D (1 + nu) (phi / a)^2."""
     angle, radius = 1e-3, 0.5
 
     def disc(ramp, **options):
@@ -115,8 +115,8 @@ def test_a_rim_that_is_turned(device):
     np.testing.assert_allclose(state.points(), static.points(), atol=1e-10)
 
 
-def test_a_rigid_turn_of_a_meridian(device):
-    """A clamped tube with all nodes but one held, too: they are where the motion about y has them, in statics and dynamics."""
+def test_rigid_rotation_of_a_meridian(device):
+    """All nodes of a clamped tube but one follow the motion about y, in statics and dynamics."""
     motion = ddg.Motion(lambda t: (0.1 * t, 0.0, 0.2 * t), lambda t: 0.8 * t, (0.0, 2.0, 0.0), (1.0, 0.0, 0.5))
     scene = scene_of(TUBE)
     scene.clamp_ring(0, "first", motion=motion)
@@ -128,8 +128,8 @@ def test_a_rigid_turn_of_a_meridian(device):
     for _ in range(5):
         states[1] = integrator.step(states[1], 0.2)
     for state in states:
-        held = np.array([0, 1, 3, 4])
-        np.testing.assert_allclose(state.points()[held], motion.place(1.0, points)[held], atol=1e-12)
+        fixed = np.array([0, 1, 3, 4])
+        np.testing.assert_allclose(state.points()[fixed], motion.place(1.0, points)[fixed], atol=1e-12)
         (rim,) = state.net.data.values()
         np.testing.assert_allclose(rim.numpy()[:3, 0], motion.rotation(0.8) @ [0.0, 0.0, 1.0], atol=1e-12)
     bent = [model.energies(state)["axisymmetric_rim"] for state in states]
@@ -137,11 +137,11 @@ def test_a_rigid_turn_of_a_meridian(device):
 
 
 def test_following_pressure_on_many_worlds(device):
-    """Stiffer worlds give way less, and each moves as it would alone, bit by bit."""
+    """Stiffer worlds deform less, and each equals a single build, bit by bit."""
     scene = scene_of(TUBE)
     scene.clamp_ring(0, "last")
     scene.add_axisymmetric_pressure(0, -50.0)  # outwards: the meridian runs upwards
-    factors, found = np.array([1.0, 3.0]), []
+    factors, results = np.array([1.0, 3.0]), []
     for worlds in (factors, factors[1:]):
         model = scene.build(device, "float64", worlds=len(worlds))
         stiffness = float(model.parameters()["net/axisymmetric_stretch/stiffness"].flat[0])
@@ -151,13 +151,15 @@ def test_following_pressure_on_many_worlds(device):
         state, integrator = model.state(), ddg.Integrator(model)
         for _ in range(6):
             state = integrator.step(state, 0.01)
-        found.append(state.points())
-    assert found[0][0, 0, 0] > found[0][1, 0, 0] > 1.0
-    (np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose)(found[0][1], found[1])
+        results.append(state.points())
+    assert results[0][0, 0, 0] > results[0][1, 0, 0] > 1.0
+    (np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose)(results[0][1], results[1])
 
 
 def test_worlds_and_growth(device):
-    """Each world grows by its own rest strain: a tube with a_tt / 2 at rest half of (g R)^2 and free ends has radius g R."""
+    """Worlds grow by separate rest strains: a tube with rest a_tt / 2 equal to (g R)^2 / 2 and free ends has radius g
+    R.
+    """
     scene = scene_of(TUBE)
     scene.hold_ring(0, 0, "z")
     model = scene.build(device, "float64", worlds=2)
@@ -168,11 +170,11 @@ def test_worlds_and_growth(device):
     np.testing.assert_allclose(points[:, :, 2], [TUBE[:, 1]] * 2, atol=1e-9)
 
 
-def test_beside_rods_and_shells(device):
-    """Rows of points: rods, meridians, vertices; the shell of revolution moves as it does alone."""
-    alone = scene_of()
-    alone.clamp_ring(0, "last")
-    alone.add_pole_force(0, -1.0)
+def test_shell_of_revolution_with_rods_and_shells(device):
+    """Points are ordered as rods, meridians, vertices; the shell of revolution deforms as in a separate scene."""
+    single = scene_of()
+    single.clamp_ring(0, "last")
+    single.add_pole_force(0, -1.0)
     both = scene_of()
     both.clamp_ring(0, "last")
     both.add_pole_force(0, -1.0)
@@ -181,13 +183,15 @@ def test_beside_rods_and_shells(device):
     rod = both.add_rod(triangle + 2.0, section=ddg.Circle(0.01), material=RUBBER)
     both.clamp(rod, [0])
     points = [
-        Equilibrium(m).load(m.state(), 1).points() for m in (scene.build(device, "float64") for scene in (alone, both))
+        Equilibrium(m).load(m.state(), 1).points() for m in (scene.build(device, "float64") for scene in (single, both))
     ]
     np.testing.assert_allclose(points[1], np.concatenate([triangle + 2.0, points[0], triangle]), atol=1e-9)
 
 
 def test_surface_of_revolution_in_usd(device, tmp_path):
-    """A cap turned with N sides: one triangle a side at the pole, two elsewhere; its surface tends to 2 pi (1 - cos 1)."""
+    """A cap revolved with N sides has one triangle a side at the pole, two elsewhere; its area tends to 2 pi (1 - cos
+    1).
+    """
     from pxr import Usd, UsdGeom
 
     model = scene_of().build(device)
@@ -201,6 +205,6 @@ def test_surface_of_revolution_in_usd(device, tmp_path):
     normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert len(triangles) == 64 * (1 + 2 * 7)
     assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(2.0 * np.pi * (1.0 - np.cos(1.0)), rel=5e-3)
-    assert (np.sum(normals * corners.mean(1), 1) > 0.0).all()  # to the left of the meridian as it runs is outwards here
+    assert (np.sum(normals * corners.mean(1), 1) > 0.0).all()  # to the left of the meridian, which is outwards here
     turned = Revolution(model.curves, model.state().points(), 64)
     np.testing.assert_allclose(np.linalg.norm(turned.points(model.state().points()), axis=1), 1.0, rtol=1e-12)

@@ -1,4 +1,4 @@
-"""Only what a scene needs: no twist in a chain of springs, nothing heavy in the import."""
+"""Scenes use only needed features: no twist in springs, no heavy package on import."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ HEAVY = ("warp", "torch", "pxr", "h5py", "scipy", "matplotlib")
 
 @pytest.fixture
 def launched(monkeypatch) -> list:
-    """Kernels launched while the test runs."""
+    """Return kernels launched during the test."""
     kernels, launch = [], wp.launch
 
     def record(kernel, *arguments, **options):
@@ -28,7 +28,7 @@ def launched(monkeypatch) -> list:
 
 
 def run(device, steps=3, **options):
-    """A hanging chain after some steps: model, integrator and state."""
+    """Return model, integrator and state of a hanging rod after some steps."""
     scene = ddg.Scene(dimension=options.pop("dimension", 3))
     points = np.zeros((6, 3))
     points[:, 0] = np.arange(6.0)
@@ -45,7 +45,7 @@ def run(device, steps=3, **options):
 
 
 def sources(kernels) -> dict[str, str]:
-    """Generated code of kernels by name."""
+    """Return generated code of kernels by name."""
     result = {}
     for kernel in kernels:
         threads = next(threads for _, threads in kernel.module.execs)  # in a block
@@ -55,14 +55,14 @@ def sources(kernels) -> dict[str, str]:
     return result
 
 
-def test_chain_of_springs_has_no_angles_and_no_frames(device):
+def test_springs_have_no_angles_and_no_frames(device):
     model, integrator, state = run(device, bend=False)
     (group,) = model.groups
     assert [term.name for term in group.kind.terms] == ["rod_stretch"]
     assert (group.kind.block, group.kind.window, group.kind.factor_rows) == (3, 3, 4)
     (data,) = state.groups
     for name in ("theta", "omega", "frame", "last"):
-        assert getattr(data, name).size == 1, name  # a placeholder for the kernels' signatures
+        assert getattr(data, name).size == 1, name  # a placeholder for kernel signatures
     assert data.x.shape == data.v.shape == (6, 1)
     newton = integrator._chains[0].newton
     assert newton.direction.shape[0] == 3
@@ -71,13 +71,13 @@ def test_chain_of_springs_has_no_angles_and_no_frames(device):
     assert state.points()[-1, 2] < 0.0  # it falls
 
 
-def test_rods_of_two_nodes_are_springs_and_say_so(device):
-    """They neither bend nor twist, whatever is asked for; a ring of two nodes is none."""
+def test_rods_of_two_nodes_are_springs_with_a_warning(device):
+    """Two nodes neither bend nor twist, with any options; a ring of two nodes is refused."""
     scene = ddg.Scene()
-    given = {"section": ddg.Circle(0.01), "material": ddg.Material(1e6), "name": "hair"}
+    options = {"section": ddg.Circle(0.01), "material": ddg.Material(1e6), "name": "hair"}
     strands = np.array([[[0.0, y, 0.0], [0.1, y, 0.0]] for y in (0.0, 1.0)])
     with pytest.warns(ddg.SceneWarning, match="'hair' have 2 nodes each, and no vertex"):
-        scene.add_rods(strands, **given)
+        scene.add_rods(strands, **options)
     scene.fix(0, [0])
     model = scene.build(device=device)
     assert [term.name for group in model.groups for term in group.kind.terms] == ["rod_stretch"]
@@ -85,7 +85,7 @@ def test_rods_of_two_nodes_are_springs_and_say_so(device):
     z = state.points()[:, 2]
     assert z[0] == 0.0 and (z[1:] < 0.0).all()
     with pytest.raises(ddg.SceneError, match=r"rod 2 .* has 2 nodes; it needs at least 3"):
-        scene.add_rods(strands, closed=True, **given)
+        scene.add_rods(strands, closed=True, **options)
         scene.build(device=device)
 
 
@@ -94,19 +94,19 @@ def test_rods_of_two_nodes_are_springs_and_say_so(device):
     [({}, 4), ({"twist": False}, 3), ({"bend": False}, 3), ({"dimension": 2}, 2), ({"dimension": 2, "bend": False}, 2)],
     ids=["full", "untwisted", "stretch", "planar", "planar stretch"],
 )
-def test_twist_is_launched_only_where_it_is(device, launched, options, block):
+def test_twist_kernels_are_launched_only_for_rods_with_twist(device, launched, options, block):
     model, _, state = run(device, **options)
     code = sources(launched)
-    found = {word for text in code.values() for word in TWIST if word in text}
+    words = {word for text in code.values() for word in TWIST if word in text}
     names = {key.split("_kernel")[0] for key in code}
     assert model.groups[0].kind.block == block
     assert {"evaluate", "sweep", "begin", "finish_nodes", "advance"} <= names
     if block == 4:
-        assert found == set(TWIST)
+        assert words == set(TWIST)
         assert "finish_frames" in names
         assert state.angles().shape == (5,)
     else:
-        assert not found
+        assert not words
         assert not names & {"finish_frames", "motion", "load", "strain"}
         assert state.angles() is None
 
@@ -117,8 +117,8 @@ def test_no_directors_without_twist(device, options):
     assert state.directors() is None
 
 
-def test_no_bending_kernels_in_a_chain_of_springs(device, launched):
-    """Its element kernel knows no second edge: the window is one edge."""
+def test_no_bending_kernels_for_springs(device, launched):
+    """The element kernel of springs reads one edge."""
     run(device, bend=False)
     springs = sources(launched)
     launched.clear()
@@ -131,7 +131,7 @@ def test_no_bending_kernels_in_a_chain_of_springs(device, launched):
 
 
 def test_import_is_light_and_fast():
-    """`import ddg_warp` in a fresh interpreter: best of three under half a second, and nothing heavy comes with it."""
+    """`import ddg_warp` in a fresh interpreter takes under half a second, best of three, without heavy packages."""
     program = (
         "import sys, time\n"
         "before = set(sys.modules)\n"
@@ -151,7 +151,7 @@ def test_import_is_light_and_fast():
 
 
 def test_describing_a_scene_needs_no_warp():
-    """A scene is NumPy only; Warp comes with `build`."""
+    """Describing a scene needs NumPy only; Warp comes with `build`."""
     program = (
         "import sys, numpy as np, ddg_warp as ddg\n"
         "scene = ddg.Scene()\n"

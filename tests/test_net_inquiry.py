@@ -1,4 +1,4 @@
-"""What can be asked of nets: resultants of shells, forces of joined rods, reactions, reports; and their recordings."""
+"""Post-processing of coupled systems: shell resultants, rod forces, reactions, reports, and recordings."""
 
 import numpy as np
 import pytest
@@ -24,13 +24,13 @@ def sheet(bending="midedge_dof", cells=4, gravity=0.0):
 
 
 def in_space(scene, values) -> np.ndarray:
-    """Tensors (T, 2, 2) in the axes x and y of a flat sheet, from components along the first edge of every triangle."""
+    """Return tensors (T, 2, 2) in the x and y axes of a flat sheet from components along first triangle edges."""
     shell = scene.shells[0]
     edge = shell.points[shell.triangles[:, 1]] - shell.points[shell.triangles[:, 0]]
     c, s = (edge[:, :2] / np.linalg.norm(edge, axis=1)[:, None]).T
-    turn = np.stack([c, -s, s, c], -1).reshape(-1, 2, 2)
+    rotation = np.stack([c, -s, s, c], -1).reshape(-1, 2, 2)
     tensor = np.stack([values[:, 0], values[:, 2], values[:, 2], values[:, 1]], -1).reshape(-1, 2, 2)
-    return turn @ tensor @ turn.transpose(0, 2, 1)
+    return rotation @ tensor @ rotation.transpose(0, 2, 1)
 
 
 def test_membrane_forces(device):
@@ -41,29 +41,33 @@ def test_membrane_forces(device):
     state = model.state(points=model.state().points() @ F.T)
     E = 0.5 * (F.T @ F - np.eye(3))[:2, :2]
     expected = STRETCHING * (0.7 * E + 0.3 * np.trace(E) * np.eye(2))
-    (found,) = model.stresses(state)["shell_stretch"]
-    np.testing.assert_allclose(in_space(scene, found), np.tile(expected, (32, 1, 1)), rtol=1e-9, atol=1e-9 * STRETCHING)
+    (forces,) = model.stresses(state)["shell_stretch"]
+    np.testing.assert_allclose(
+        in_space(scene, forces), np.tile(expected, (32, 1, 1)), rtol=1e-9, atol=1e-9 * STRETCHING
+    )
 
 
 def test_moments_of_a_bent_sheet(device):
-    """Rolled to a radius of 10 m about y: moments D / R along x and nu D / R across, up to the chords' (l / R)^2."""
+    """Rolling to a radius of 10 m about y gives moments D / R along x and nu D / R across, up to chord errors (l /
+    R)^2.
+    """
     scene, radius = sheet("midedge"), 10.0
     model = scene.build(device, "float64")
     x, y, _ = model.state().points().T
     state = model.state(points=np.stack([radius * np.sin(x / radius), y, radius * (np.cos(x / radius) - 1.0)], -1))
-    (found,) = model.stresses(state)["shell_bend"]
-    moments = in_space(scene, found)
+    (values,) = model.stresses(state)["shell_bend"]
+    moments = in_space(scene, values)
     shell = scene.shells[0]
     middle = shell.points[shell.triangles].mean(1)
     inside = np.abs(middle[:, :2] - shell.points[:, :2].mean(0)).max(1) < 0.25
-    # alternating diagonals make single triangles of this model uneven; their mean is right
+    # alternating diagonals make single triangles of this model uneven; the mean is correct
     mean = np.abs(moments[inside].mean(0))
     assert mean[0, 0] == pytest.approx(BENDING / radius, rel=0.1)
     assert mean[1, 1] == pytest.approx(0.3 * BENDING / radius, rel=0.35)
 
 
 def test_reactions_carry_the_weight(device):
-    """In equilibrium they balance the weight of sheet and rod; the rod hangs like a thread."""
+    """Reactions in equilibrium balance the weight of sheet and rod; the rod hangs like a thread."""
     scene = sheet(gravity=0.02)
     points = scene.shells[0].points
     root = np.flatnonzero(points[:, 0] == points[:, 0].min())
@@ -79,12 +83,12 @@ def test_reactions_carry_the_weight(device):
     (reaction,) = model.reactions(state)
     np.testing.assert_allclose(reaction.force, -weight.sum(0), atol=1e-7 * np.abs(weight).sum())
     tension = model.stresses(state)["rod_stretch"][0][:, 0]
-    # a hanging thread: each edge carries the weight of what is below
+    # a hanging thread: each edge carries the weight below
     below = 0.3 * 0.02 * 0.3 * (1.0 - (np.arange(4) + 0.5) / 4.0)
     np.testing.assert_allclose(tension, below, rtol=0.05)
 
 
-def test_report_names_what_is_in_the_net(device):
+def test_report_names_terms_of_the_coupled_system(device):
     scene = sheet()
     text = scene.build(device, "float64").report()
     assert "1 shells of 32 triangles" in text
@@ -141,7 +145,7 @@ def test_surfaces_are_colored_in_usd(device, tmp_path, color_by, high):
     assert raw.max() > 0.0
 
 
-def test_a_recorded_net_resumes_bit_by_bit(device, tmp_path):
+def test_recorded_coupled_system_resumes_bitwise(device, tmp_path):
     straight = frames(hanging().build(device, "float64"), 8, tmp_path / "straight")
     frames(hanging().build(device, "float64"), 4, tmp_path / "broken")
     resumed = frames(hanging().build(device, "float64"), 8, tmp_path / "broken", resume=True)
@@ -151,7 +155,7 @@ def test_a_recorded_net_resumes_bit_by_bit(device, tmp_path):
 
 
 def test_fields_of_a_strained_sheet(device):
-    """The largest principal strain, and the energy per area K ((1 - nu) E : E + nu (tr E)^2) / 2."""
+    """Fields are the largest principal strain and the energy per area K ((1 - nu) E : E + nu (tr E)^2) / 2."""
     scene = sheet()
     model = scene.build(device, "float64")
     state = model.state(points=model.state().points() * [1.05, 0.98, 1.0])
@@ -162,7 +166,7 @@ def test_fields_of_a_strained_sheet(device):
     assert fields["curvature"].max() < 1e-12
 
 
-def test_export_of_a_net(device, tmp_path):
+def test_export_of_a_coupled_system(device, tmp_path):
     frames(hanging().build(device, "float64"), 4, tmp_path)
     assert main(["export", str(tmp_path), "--to", str(tmp_path / "out.usda")]) == 0
     text = (tmp_path / "out.usda").read_text()

@@ -1,4 +1,4 @@
-"""Differential geometry of meshes: identities hold to rounding, integrals and pointwise curvatures converge with order 2."""
+"""Differential geometry of meshes: exact identities, and convergence of integrals and curvatures with order 2."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ WARP = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.2], [0.1, 0.0, 1.2]])
 
 
 def wavy(points):
-    """A shape without symmetry: curved both ways, sheared, 10 % waves."""
+    """Return a shape without symmetry: doubly curved, sheared, with 10 % waves."""
     return points @ WARP + 0.1 * np.sin(3.0 * points @ WARP.T + [0.0, 1.0, 2.0])
 
 
@@ -26,13 +26,13 @@ CHARACTERISTIC = {"sphere": 2, "torus": 0, "disc": 1, "annulus": 0, "jittered": 
 
 @pytest.fixture(params=SURFACES)
 def case(request):
-    """(surface, positions that are not its own)."""
+    """Return a surface and other positions of the vertices."""
     surface = SURFACES[request.param]
     return surface, wavy(surface.points)
 
 
-def test_two_derivatives_are_nothing(case):
-    """d1 d0 = 0, exactly; both have as many entries as the surface has corners and ends."""
+def test_d1_of_d0_is_zero(case):
+    """d1 d0 = 0, exactly; both have as many entries as the surface has corners and edge ends."""
     surface, _ = case
     assert np.count_nonzero((operators.d1(surface) @ operators.d0(surface)).toarray()) == 0
     assert operators.d0(surface).nnz == 2 * len(surface.edges)
@@ -40,7 +40,7 @@ def test_two_derivatives_are_nothing(case):
 
 
 def test_stokes(case):
-    """The sum of d1 of a 1-form over all triangles is its sum along the boundary."""
+    """The sum of d1 of a 1-form over all triangles equals the sum of the form along the boundary."""
     surface, _ = case
     form = np.cos(np.arange(len(surface.edges)))
     along = sum(
@@ -53,7 +53,7 @@ def test_stokes(case):
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_gauss_bonnet(name):
-    """Angle defects, with the boundary's, sum to 2 pi chi, whatever the shape."""
+    """Angle defects, the boundary's included, sum to 2 pi chi for any shape."""
     surface = SURFACES[name]
     for points in (surface.points, wavy(surface.points)):
         defects = operators.angle_defects(surface, points)
@@ -63,7 +63,9 @@ def test_gauss_bonnet(name):
 
 
 def test_geodesic_curvature_of_the_boundary():
-    """Plane circles of an annulus turn by 2 pi, the outer one to the left, the inner one to the right; inside it is flat."""
+    """Boundary circles of a plane annulus rotate by 2 pi, the outer one left, the inner one right; the interior is
+    flat.
+    """
     surface = SURFACES["annulus"]
     defects = operators.angle_defects(surface)
     inner, outer = surface.boundary_loops()
@@ -100,12 +102,12 @@ def test_mixed_areas_of_single_triangles():
 
 
 def test_laplacian_is_exterior_calculus(case):
-    """L = d0^T star1 d0; symmetric; constants in its kernel; u^T L u = integral of |grad u|^2 > 0."""
+    """L = d0^T star1 d0 is symmetric with constants in the kernel; u^T L u = integral of |grad u|^2 > 0."""
     surface, points = case
     matrix, difference = operators.laplacian(surface, points), operators.d0(surface)
-    other = difference.T @ operators.star1(surface, points) @ difference
+    product = difference.T @ operators.star1(surface, points) @ difference
     scale = np.abs(matrix.toarray()).max()
-    assert np.abs((matrix - other).toarray()).max() < 1e-13 * scale
+    assert np.abs((matrix - product).toarray()).max() < 1e-13 * scale
     assert np.abs((matrix - matrix.T).toarray()).max() < 1e-15 * scale
     assert np.abs(matrix @ np.ones(len(points))).max() < 1e-12 * scale
     u = np.sin(5.0 * points[:, 0]) + points[:, 1]
@@ -121,14 +123,14 @@ def test_divergence_is_minus_the_adjoint_of_the_gradient(case):
     u = np.sin(7.0 * points[:, 2]) + points[:, 0]
     slopes = operators.gradient(surface, u, points)
     expected = -np.sum(operators.face_areas(surface, points) * np.einsum("ij,ij->i", field, slopes))
-    found = operators.divergence(surface, field, points)
-    assert u @ found == pytest.approx(expected, rel=1e-11) and abs(expected) > 1e-3
-    assert abs(found.sum()) < 1e-12 * np.abs(found).sum()
+    divergence = operators.divergence(surface, field, points)
+    assert u @ divergence == pytest.approx(expected, rel=1e-11) and abs(expected) > 1e-3
+    assert abs(divergence.sum()) < 1e-12 * np.abs(divergence).sum()
 
 
 @pytest.mark.parametrize("name", ["disc", "annulus", "jittered"])
 def test_linear_functions_are_exact_in_the_plane(name):
-    """grad (a . x + b) = a; its Laplacian is 0 at all vertices inside."""
+    """grad (a . x + b) = a; the Laplacian is 0 at all interior vertices."""
     surface = SURFACES[name]
     u = surface.points @ [2.0, -3.0, 0.0] + 5.0
     np.testing.assert_allclose(
@@ -158,7 +160,7 @@ def test_mean_curvature_is_half_the_gradient_of_the_area(case):
 
 
 def test_dihedral_angles_of_a_roof():
-    """Two triangles folded by an angle about their edge: positive where the ridge is up, also beyond 90 degrees."""
+    """Two triangles folded about a common edge: the angle is positive for a ridge above, also beyond 90 degrees."""
     for fold in (-2.5, -0.3, 0.0, 0.3, 2.5):
         points = [[0, 0, 0], [0, 2, 0], [-1, 1, 0], [np.cos(fold), 1, -np.sin(fold)]]
         for triangles in ([[0, 1, 2], [1, 0, 3]], [[1, 0, 3], [2, 0, 1]]):
@@ -204,31 +206,31 @@ def test_pointwise_curvatures_converge_with_order_two_on_a_regular_torus():
         cosine = (np.hypot(surface.points[:, 0], surface.points[:, 1]) - major) / minor
         mean = (major + 2.0 * minor * cosine) / (2.0 * minor * (major + minor * cosine))
         gauss = cosine / (minor * (major + minor * cosine))
-        found = operators.mean_curvature(surface), operators.gaussian_curvature(surface)
-        errors.append([np.abs(found[0] - mean).max(), np.abs(found[1] - gauss).max()])
+        curvatures = operators.mean_curvature(surface), operators.gaussian_curvature(surface)
+        errors.append([np.abs(curvatures[0] - mean).max(), np.abs(curvatures[1] - gauss).max()])
     orders = np.log2(np.divide(*errors))
     assert (np.abs(orders - 2.0) < 0.1).all(), orders
     assert np.max(errors[1]) < 0.01
 
 
 def test_a_cylinder_is_bent_one_way():
-    """H = 1 / (2 R), K = 0; facing inwards, H changes its sign."""
+    """H = 1 / (2 R), K = 0; an inward orientation changes the sign of H."""
     points, triangles = meshes.cylinder(96, 24, 2.0, 3.0)
     for order, sign in (([0, 1, 2], 1.0), ([0, 2, 1], -1.0)):
         surface = Surface(points, triangles[:, order])
         inside = ~surface.boundary_vertices
         np.testing.assert_allclose(operators.mean_curvature(surface)[inside], sign / 4.0, rtol=1e-3)
         assert np.abs(operators.gaussian_curvature(surface)).max() < 1e-10
-        # the edges' dihedral angles along the cylinder sum to those of a polygon: the sum of |e| theta / 2 is pi L
+        # dihedral angles along the cylinder sum as in a polygon: the sum of |e| theta / 2 is pi L
         assert operators.edge_mean_curvatures(surface).sum() == pytest.approx(sign * np.pi * 3.0, rel=1e-12)
 
 
 def test_vertex_normals():
-    """Angle weights do not see how a face is cut into triangles: the corner of a cube looks along its diagonal."""
+    """Angle weights are independent of the triangulation of a face: a cube corner's normal is the diagonal."""
     corner = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1], [1, 0, 1]]
     quads = ([0, 3, 2, 1], [0, 5, 4, 3], [0, 1, 6, 5])
     triangles = [[q[0], q[1], q[2]] for q in quads] + [[q[0], q[2], q[3]] for q in quads]
-    triangles = [*triangles[:2], [0, 1, 5], *triangles[3:5], [1, 6, 5]]  # the third quad is cut the other way
+    triangles = [*triangles[:2], [0, 1, 5], *triangles[3:5], [1, 6, 5]]  # the third quad has the other diagonal
     normal = operators.vertex_normals(Surface(corner, triangles))[0]
     np.testing.assert_allclose(normal, -np.ones(3) / np.sqrt(3.0), rtol=1e-14)
     sphere = SURFACES["sphere"]

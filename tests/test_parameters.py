@@ -1,4 +1,4 @@
-"""Parameters of any shape are read by the same code: one number, one a rod, one an element, one each; and worlds."""
+"""Parameters of any shape read by the same code: one number, per rod, per element, per rod and element; and worlds."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ KINDS = {"full": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, 
 
 
 def build(device, scale=1.0, kind="full", worlds=1, viscosity=0.0):
-    """Three cantilevers of random rest lengths, all sections `scale` times a common one."""
+    """Return three cantilevers of random rest lengths, with all sections `scale` times a common one."""
     options = dict(KINDS[kind])
     dimension = options.pop("dimension", 3)
     across = 1.0 if dimension == 3 else 0.0
@@ -41,7 +41,7 @@ def build(device, scale=1.0, kind="full", worlds=1, viscosity=0.0):
 
 
 def simulate(model, steps=5):
-    """Points and angles after some steps."""
+    """Return points and angles after some steps."""
     integrator, state = ddg.Integrator(model), model.state()
     for _ in range(steps):
         state = integrator.step(state, 0.01)
@@ -53,24 +53,24 @@ def set_parameters(model, change):
     for group in model.groups:
         values = group.parameters.values
         values |= {name: change(v, group.nodes, group.columns) for name, v in values.items()}
-        group.parameters.upload()  # which keeps their forms, where `set` would spread them over those before
+        group.parameters.upload()  # keeps their forms, where `set` would expand them to the previous shapes
     return model
 
 
 def expand(model):
-    """Write every parameter of every element out."""
+    """Expand every parameter to one value per element."""
     return set_parameters(model, lambda values, nodes, rods: np.broadcast_to(values, (nodes, rods)).copy())
 
 
-def assert_same(one, other):
-    for a, b in zip(one, other, strict=True):
+def assert_same(first, second):
+    for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("form", STRIDES)
 @pytest.mark.parametrize("viscosity", [0.0, 0.01], ids=["elastic", "damped"])
 def test_every_stride_reads_the_same(device, form, viscosity):
-    """All rows in one form, rest measures and rest strains too, against the same numbers written out."""
+    """All rows in one form, rest measures and rest strains included, equal the expanded values."""
 
     def in_form(values, nodes, rods):
         shape = (nodes if STRIDES[form][0] else 1, rods if STRIDES[form][1] else 1)
@@ -87,13 +87,13 @@ def test_every_stride_reads_the_same(device, form, viscosity):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("viscosity", [0.0, 0.01], ids=["elastic", "damped"])
 def test_shape_of_section_does_not_matter(device, form, viscosity):
-    """A section given in one form, against the same section given for each element of each rod."""
+    """A section in one form equals the same section given for each element of each rod."""
     every = np.broadcast_to(FORMS[form], (RODS, NODES - 1)).copy()
     model, written_out = (build(device, scale, viscosity=viscosity) for scale in (FORMS[form], every))
     points, angles = simulate(model)
     assert_same((points, angles), simulate(written_out))
     assert_same((points, angles), simulate(expand(model)))
-    assert np.abs(points - model.state().points()).max() > 0.01  # something happened
+    assert np.abs(points - model.state().points()).max() > 0.01  # the rods moved
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -105,13 +105,13 @@ def test_every_kind_reads_every_shape(device, kind):
 
 
 def test_parameters_belong_to_their_rod(device):
-    """Each rod moves as it does alone with its parameters; rods with others move otherwise."""
+    """Each rod moves as if all rods had the parameters of that rod; rods with different parameters differ."""
     each = FORMS["each"]
     together, _ = simulate(build(device, each))
     together = together.reshape(RODS, NODES, 3)
     for rod in range(RODS):
-        alone, _ = simulate(build(device, each[rod]))  # all three rods with the parameters of this one
-        np.testing.assert_allclose(alone.reshape(RODS, NODES, 3)[rod], together[rod], rtol=0, atol=1e-14)
+        single, _ = simulate(build(device, each[rod]))  # all three rods with the parameters of this one
+        np.testing.assert_allclose(single.reshape(RODS, NODES, 3)[rod], together[rod], rtol=0, atol=1e-14)
     assert np.abs(together[0] - together[1]).max() > 1e-6
 
 
@@ -120,15 +120,15 @@ def test_worlds_are_bitwise_equal(device, form):
     scale = FORMS[form]
     points, angles = simulate(build(device, scale, worlds=3))
     assert points.shape == (3, RODS * NODES, 3)
-    alone, alone_angles = simulate(build(device, scale))
+    single, alone_angles = simulate(build(device, scale))
     for world in range(3):
-        np.testing.assert_array_equal(points[world], alone)
+        np.testing.assert_array_equal(points[world], single)
         np.testing.assert_array_equal(angles[world], alone_angles)
 
 
 @pytest.mark.parametrize("kind", ["untwisted", "planar", "stretch"])
 def test_worlds_of_other_kinds(device, kind):
     points, _ = simulate(build(device, FORMS["each"], kind, worlds=3))
-    alone, _ = simulate(build(device, FORMS["each"], kind))
+    single, _ = simulate(build(device, FORMS["each"], kind))
     for world in range(3):
-        np.testing.assert_array_equal(points[world], alone)
+        np.testing.assert_array_equal(points[world], single)

@@ -1,4 +1,4 @@
-"""Pictures say what they show: buckled modes, units, the load parameter, stability, titles that fit."""
+"""Pictures with labels of modes, units, load parameter and stability, and with titles that fit."""
 
 import numpy as np
 import pytest
@@ -14,18 +14,18 @@ from ddg_warp.scenes import _touching
 
 @pytest.fixture
 def drawn(monkeypatch) -> list:
-    """The figures that are drawn instead of written."""
+    """Return figures that are drawn instead of written."""
     figures = []
     monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
     return figures
 
 
 def labels(figure) -> list[str]:
-    """All labels of all axes."""
+    """Return all labels of all axes."""
     return [text for plot in figure.axes for text in (plot.get_xlabel(), plot.get_ylabel()) if text]
 
 
-# Scene, parameters, how large its mode is drawn, and the direction in which it moves.
+# Scene, parameters, drawn amplitude of the mode, and its direction.
 MODES = {
     "greenhill": ({"n": 24}, 0.1, (0.0, 1.0, 1.0)),
     "michell_ring": ({"n": 24}, 0.3, (1.0, 1.0, 1.0)),
@@ -38,7 +38,7 @@ MODES = {
     "name", [pytest.param(name, marks=() if name != "greenhill" else pytest.mark.slow) for name in MODES]
 )
 def test_scenes_that_buckle_show_the_mode(name):
-    """The lowest mode leaves the straight rod, the plane of ring and frame, the plane of the plate, by the size given."""
+    """The lowest mode leaves the straight rod, the plane of ring and frame, or the plate, by the given amplitude."""
     parameters, size, across = MODES[name]
     module = load_scene(name)
     result = simulate(module.build(**parameters), device="cpu", progress=False)
@@ -70,13 +70,13 @@ def test_the_plate_shows_its_deflection():
 
 
 def test_paths_and_statics_have_a_load_and_their_units(drawn, tmp_path):
-    """The frame in millimetres; branches told apart in the legend; nothing is a time."""
+    """The frame is in millimetres, the legend separates branches, and no axis is a time."""
     assert main(["run", "right_angle_frame", "--n", "4", "--device", "cpu", "--out", str(tmp_path)]) == 0
     picture, path = drawn
     assert labels(picture)[0] == "x [mm]" and "amplitude of the buckling mode" in labels(picture)
     assert labels(path) == ["displacement [mm]", "load parameter"]
-    told = [text.get_text() for text in path.axes[0].get_legend().get_texts()]
-    assert told == ["deflection", "stable", "unstable", "bifurcation"]
+    legend = [text.get_text() for text in path.axes[0].get_legend().get_texts()]
+    assert legend == ["deflection", "stable", "unstable", "bifurcation"]
     styles = {tuple(map(str, each.get_linestyle())) for each in path.axes[0].collections if len(each.get_segments())}
     assert len(styles) == 2
     assert main(["run", "tip_load", "--n", "10", "--device", "cpu", "--out", str(tmp_path / "b")]) == 0
@@ -84,7 +84,7 @@ def test_paths_and_statics_have_a_load_and_their_units(drawn, tmp_path):
 
 
 def test_axes_are_equal_and_without_offsets(drawn):
-    """A rod far from the origin: numbers of the axes are whole, both directions have one scale."""
+    """A rod far from the origin has axes with full numbers and one scale."""
     points = np.array([[1e4, 0.0, 0.0], [1e4 + 1e-3, 0.0, 0.0], [1e4 + 2e-3, 0.0, 1e-3]])
     scene = ddg.Scene()
     scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))
@@ -96,7 +96,7 @@ def test_axes_are_equal_and_without_offsets(drawn):
 
 
 def test_shapes_of_a_path_keep_their_order(drawn):
-    """The last point of a path is on top, also where its load is not the largest, and points of equal load are all drawn."""
+    """The last point of a path is on top even if the load is not the largest, and equal loads are all drawn."""
     points = np.eye(3)
     scene = ddg.Scene()
     scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))
@@ -121,8 +121,8 @@ def test_hair_is_shown_with_its_head_side_by_side(drawn):
     assert len(drawn[0].axes) == 3
 
 
-def test_rods_as_thick_as_they_are(drawn):
-    """Tubes of an open and a closed rod have their surfaces, each in a color of its own, with obstacles in grey, instead of lines."""
+def test_rods_are_drawn_as_tubes(drawn):
+    """Tubes of open and closed rods have correct surface areas and colors, with obstacles in grey, instead of lines."""
     angle = 2.0 * np.pi * np.arange(60) / 60
     scene = ddg.Scene()
     section = {"section": ddg.Circle(0.05), "material": ddg.Material(1e6)}
@@ -134,20 +134,20 @@ def test_rods_as_thick_as_they_are(drawn):
     points, triangles, colors = _touching.colored_tubes(model, model.state().points(), t=2.0)
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    own = [(colors == color).all(axis=1) for color in [*_touching.colors(model), [_touching.GREY] * 3]]
-    assert np.sum(own) == len(triangles)
+    masks = [(colors == color).all(axis=1) for color in [*_touching.colors(model), [_touching.GREY] * 3]]
+    assert np.sum(masks) == len(triangles)
     perimeter = 2.0 * SIDES * 0.05 * np.sin(np.pi / SIDES)
     ring = 120.0 * np.sin(np.pi / 60)
-    assert [area[mine].sum() for mine in own[:2]] == pytest.approx([2.0 * perimeter, ring * perimeter], rel=1e-3)
-    assert points[triangles[own[2]], 2].min() == pytest.approx(4.9, abs=1e-3)
+    assert [area[mine].sum() for mine in masks[:2]] == pytest.approx([2.0 * perimeter, ring * perimeter], rel=1e-3)
+    assert points[triangles[masks[2]], 2].min() == pytest.approx(4.9, abs=1e-3)
     bodies = {0.0: (points, triangles, colors)}
     figure.rods_picture(model, {0.0: model.state().points()}, "unused.png", bodies=bodies, lines=False)
     (faces,) = drawn[0].axes[0].collections
     assert len(faces.get_facecolor()) == len(triangles)
 
 
-def test_what_is_learned_is_drawn(drawn):
-    """Lines of one label have one color and one entry of the legend; shapes that have names are told by them."""
+def test_learned_lines_and_named_shapes_are_labelled(drawn):
+    """Lines of one label have one color and one legend entry; named shapes are labelled by name."""
     x = np.arange(3.0)
     lines = [("seen", x, x, "o"), ("learned", x, 2.0 * x, "-"), ("learned", x, 3.0 * x, "-")]
     figure.lines_plot("unused.png", lines, "time [s]", "height [m]")
@@ -165,7 +165,7 @@ def test_what_is_learned_is_drawn(drawn):
 
 
 def test_slim_shapes_fit_their_panels(drawn):
-    """Strands that hang are seen whole, and as slim as they are."""
+    """Hanging strands are drawn whole, in their proportions."""
     module = load_scene("hair")
     result = simulate(module.build(strands=4), device="cpu", duration=1.0 / 60.0, progress=False)
     figure.rods_picture(result.model, path="unused.png", **module.picture(result, {0.0: result.state.points()}))
@@ -175,16 +175,16 @@ def test_slim_shapes_fit_their_panels(drawn):
     matrix = plot.get_proj()
     scales = np.linalg.norm(
         (matrix @ (np.eye(4)[:, :3]))[:3], axis=0
-    )  # of what is seen and its depth, along x, y and z
+    )  # of the picture plane and its depth, along x, y and z
     np.testing.assert_allclose(scales, scales[0], rtol=1e-6)
     assert limits[2, 1] - limits[2, 0] > 3.0 * (limits[0, 1] - limits[0, 0])
     homogeneous = np.column_stack([result.state.points(), np.ones(len(result.state.points()))]) @ matrix.T
-    seen = plot.transData.transform(homogeneous[:, :2] / homogeneous[:, 3:])
-    assert (seen > plot.bbox.min).all() and (seen < plot.bbox.max).all()
+    pixels = plot.transData.transform(homogeneous[:, :2] / homogeneous[:, 3:])
+    assert (pixels > plot.bbox.min).all() and (pixels < plot.bbox.max).all()
 
 
 def test_titles_fit(drawn):
-    """Of every scene, in both kinds of pictures."""
+    """Titles of all scenes fit, in both kinds of pictures."""
     points = np.eye(3)
     scene = ddg.Scene()
     scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))

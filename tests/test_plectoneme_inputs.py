@@ -1,4 +1,4 @@
-"""A plectoneme is found for the angles that its scene takes, and others are refused as it is built."""
+"""Plectoneme scene: accepted angles, and refused parameters."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from ddg_warp.scenes import plectoneme
 
 
 @pytest.mark.parametrize("angle", [0.3, 0.4, 0.5])
-def test_a_weaker_tension_has_a_larger_loop(angle):
-    """Lengths of a loop under tension go as sqrt(B / T)."""
+def test_loop_size_grows_as_tension_falls(angle):
+    """Loop lengths under tension are proportional to sqrt(B / T)."""
     high = 2.0 * np.pi * plectoneme.WOUND * plectoneme.CLOSE * plectoneme.RADIUS / np.tan(angle)
     points = plectoneme.looped(angle, 0.07, 5e-4)
     tall = points[:, 1].max() - plectoneme.BEND - high
@@ -17,8 +17,8 @@ def test_a_weaker_tension_has_a_larger_loop(angle):
 
 
 @pytest.mark.parametrize(
-    "given, match", [({"angle": 0.2}, "0.3 to 0.5"), ({"angle": 0.6}, "0.3 to 0.5"), ({"angle": 0.5}, "0.696")]
+    "arguments, match", [({"angle": 0.2}, "0.3 to 0.5"), ({"angle": 0.6}, "0.3 to 0.5"), ({"angle": 0.5}, "0.696")]
 )
-def test_what_is_not_found_is_refused(given, match):
+def test_angles_without_a_plectoneme_are_refused(arguments, match):
     with pytest.raises(ValueError, match=match):
-        plectoneme.build(**given)
+        plectoneme.build(**arguments)

@@ -229,9 +229,9 @@ def hair(support: str, motion=None, joined: int | None = None, gravity: float = 
 
     Args:
         support: "root" or "tip" clamps an edge, "end" the first node and its tangent. "partly" fixes x and z of the
-    root, "both" fixes the root and moves the tip.
+            root, "both" fixes the root and moves the tip.
         joined: node of every strand, 0 or -1, that a hinge joins to a stub, which makes a coupled system. The stub has
-    the same support and motion where the supported edge is there, else it hangs free.
+            the same support and motion where the supported edge is there, else it hangs free.
     """
     scene, points = ddg.Scene(gravity=(0.0, 0.0, -gravity), mass_damping=0.5), curls()
     kind = {"section": ddg.Circle(4e-5), "material": HAIR}

@@ -1,4 +1,4 @@
-"""What is read and written at once is what Warp's own indexing reads and writes."""
+"""Vectorised reads and writes equal Warp's own indexing."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ SIZES = [1, 2, 3, 4, 6, 8]
 ROWS, COLUMNS = 3, 50
 
 
-def made(dtype):
-    """twice(...): elements of arrays of two dimensions and of one, read and doubled; those of one are written at once, too."""
+def doubling_kernel(dtype):
+    """Return the kernel that doubles elements of a matrix and of a vector by vectorised reads and writes."""
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
     read, read_one = read_function(dtype, 2), read_function(dtype)
     vector = dtype not in TYPES
@@ -20,13 +20,13 @@ def made(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def twice(
-        given: wp.array2d(dtype=dtype),
+        matrix: wp.array2d(dtype=dtype),
         line: wp.array(dtype=dtype),
         out: wp.array2d(dtype=dtype),
         line_out: wp.array(dtype=dtype),
     ):
         i, j = wp.tid()
-        out[i, j] = scalar(2) * read(given, i, j)
+        out[i, j] = scalar(2) * read(matrix, i, j)
         if i == 0:
             if wp.static(vector):
                 write(line_out, j, scalar(2) * read_one(line, j))
@@ -38,23 +38,23 @@ def made(dtype):
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("scalar", TYPES)
-def test_elements_are_where_indexing_has_them(device, scalar, size):
+def test_vectorised_elements_equal_indexed_elements(device, scalar, size):
     dtype = scalar if size == 1 else wp.types.vector(size, scalar)
     values = np.arange(ROWS * COLUMNS * size).reshape(ROWS, COLUMNS, size) * 1.5
-    given = wp.array(values.squeeze(), dtype=dtype, device=device)
+    matrix = wp.array(values.squeeze(), dtype=dtype, device=device)
     line = wp.array(values[1].squeeze(), dtype=dtype, device=device)
-    out, line_out = wp.zeros_like(given), wp.zeros_like(line)
-    wp.launch(made(dtype), (ROWS, COLUMNS), [given, line], [out, line_out], device=device)
-    assert (out.numpy() == 2 * given.numpy()).all()
+    out, line_out = wp.zeros_like(matrix), wp.zeros_like(line)
+    wp.launch(doubling_kernel(dtype), (ROWS, COLUMNS), [matrix, line], [out, line_out], device=device)
+    assert (out.numpy() == 2 * matrix.numpy()).all()
     assert (line_out.numpy() == 2 * line.numpy()).all()
 
 
 def test_rows_last_in_memory_are_read_like_others(device):
-    """As matrices of pairs lie on the CPU."""
+    """Transposed arrays, as pair matrices on the CPU, are read alike."""
     dtype = wp.types.vector(8, wp.float32)
     values = np.arange(ROWS * COLUMNS * 8, dtype=np.float32).reshape(COLUMNS, ROWS, 8)
-    given = wp.array(values, dtype=dtype, device=device).transpose((1, 0))
+    matrix = wp.array(values, dtype=dtype, device=device).transpose((1, 0))
     line = wp.zeros(COLUMNS, dtype=dtype, device=device)
-    out, line_out = wp.zeros_like(given), wp.zeros_like(line)
-    wp.launch(made(dtype), (ROWS, COLUMNS), [given, line], [out, line_out], device=device)
+    out, line_out = wp.zeros_like(matrix), wp.zeros_like(line)
+    wp.launch(doubling_kernel(dtype), (ROWS, COLUMNS), [matrix, line], [out, line_out], device=device)
     assert (out.numpy() == 2 * values.transpose(1, 0, 2)).all()

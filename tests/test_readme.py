@@ -1,4 +1,4 @@
-"""Every example of the README runs as it stands there."""
+"""Examples of the README run as printed."""
 
 import re
 import shlex
@@ -19,17 +19,19 @@ OPTIONAL = {
     "torch": "import torch",
     "gymnasium": "gymnasium_env",
     "jax": "import jax",
-}  # packages, and words of the examples that need them
+}  # packages, and text of the examples that need them
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Where the examples run, one after the other."""
+    """Return the directory for running the examples in sequence."""
     return tmp_path_factory.mktemp("readme")
 
 
 def test_examples(folder, device):
-    """One script of all of them, in their order; a block with a file is that file, and one of what is not installed is left out."""
+    """Run all blocks in order as one script; blocks with a file name are files, blocks of missing packages are
+    skipped.
+    """
     assert BLOCKS
     missing = [name for name, words in OPTIONAL.items() if find_spec(name) is None]
     lines = [f"import warp as wp; wp.set_device({device!r})"]
@@ -47,7 +49,7 @@ def test_examples(folder, device):
 
 
 def test_commands(folder):
-    """Short ones, in their order, since some read what others wrote; those of a scene file find it from the examples."""
+    """Run short commands in order, since some read files of others; scene files come from the examples."""
     for file, text in BLOCKS:
         if file:
             (folder / file).write_text(text)

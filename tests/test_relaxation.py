@@ -1,4 +1,4 @@
-"""Dynamic relaxation: to the equilibrium that Newton finds, from where it does not, and failures by name."""
+"""Dynamic relaxation: the equilibrium of Newton's method from difficult starts, and failures by name."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from ddg_warp.solve.statics import solve
 
 
 def cable(device, edges: int = 12):
-    """A string of springs without bending, laid out in a bow above its two supports."""
+    """Return a string of springs without bending in a bow above two supports, and its points."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     angle = np.linspace(-1.0, 1.0, edges + 1)
     points = np.stack([np.sin(angle), 0.1 * np.cos(0.5 * np.pi * angle), np.cos(angle) - np.cos(1.0)], axis=1)
@@ -20,9 +20,9 @@ def cable(device, edges: int = 12):
     return model, points
 
 
-# Every node in equilibrium: the horizontal force is the same in all edges, the vertical one grows by the weight of a node.
+# Every node in equilibrium: the horizontal force is constant, the vertical force grows by the weight of a node.
 def test_cable_falls_through(device):
-    """From a bow above its supports, pressed together, where the tangent is indefinite."""
+    """The start is a compressed bow above the supports with an indefinite tangent."""
     model, points = cable(device)
     start = model.state(points=points * [1.0, 0.9, 0.9])
     assert spectrum(model, start).negative > 5
@@ -30,10 +30,10 @@ def test_cable_falls_through(device):
     state = solve(model, near, start=1.0)
     edges = np.diff(state.points(), axis=0)
     lengths = np.linalg.norm(edges, axis=1, keepdims=True)
-    rest = np.linalg.norm(np.diff(points, axis=0), axis=1, keepdims=True)
-    force = 200.0 * (lengths / rest - 1.0) * edges / lengths
+    rest_lengths = np.linalg.norm(np.diff(points, axis=0), axis=1, keepdims=True)
+    force = 200.0 * (lengths / rest_lengths - 1.0) * edges / lengths
     np.testing.assert_allclose(force[:, 0], force[0, 0], rtol=1e-8)
-    weight = 9.81 * 0.5 * (rest[1:, 0] + rest[:-1, 0])
+    weight = 9.81 * 0.5 * (rest_lengths[1:, 0] + rest_lengths[:-1, 0])
     np.testing.assert_allclose(np.diff(force[:, 2]), weight, rtol=1e-7)
     assert state.points()[6, 2] < -0.5
     np.testing.assert_allclose(near.points(), state.points(), atol=2e-3)
@@ -41,7 +41,7 @@ def test_cable_falls_through(device):
 
 
 def test_bent_rod(device):
-    """A soft cantilever with twist, its angles relaxed too: within the residual of what Newton finds."""
+    """A soft cantilever with twist, twist angles included: within the residual of Newton's solution."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     section = ddg.Stiffness(EA=300.0, EI1=1.0, EI2=2.0, GJ=0.7, mass_per_length=0.4)
     s = np.linspace(0.0, 1.0, 9)
@@ -51,7 +51,7 @@ def test_bent_rod(device):
     near, exact = relax(model, residual=1e-5), solve(model)
     assert exact.points()[-1, 2] < -0.2
     np.testing.assert_allclose(near.points(), exact.points(), atol=1e-4)
-    # angles count from frames that are carried along, and depend on the way; directors do not
+    # twist angles refer to updated frames, so that they depend on the path; directors do not
     np.testing.assert_allclose(near.directors(), exact.directors(), atol=1e-3)
     assert np.abs(exact.directors() - model.state().directors()).max() > 0.1
 

@@ -1,7 +1,7 @@
-"""The same relative answer at every length: objects from a nanometre to a hundred kilometres, in equilibria, steps, paths and spectra.
+"""Scale invariance: equal relative results from a nanometre to a hundred kilometres.
 
-A scene of size L with the moduli of one of 1 m, forces by L^2, gravity by 1 / L, drag coefficients and time by L has
-the same shape over L, and frequencies by 1 / L.
+Covers equilibria, steps, paths and spectra. A scene of size L has the moduli of 1 m, forces scaled by L^2, gravity by 1
+/ L, drag coefficients and time by L. It then has the same shape over L, and frequencies scaled by 1 / L.
 """
 
 from functools import cache
@@ -25,16 +25,16 @@ def line(length: float, edges: int = 12) -> np.ndarray:
 
 
 def scene_of(length: float, dimension: int = 3, weight: float = 1e-3) -> ddg.Scene:
-    """A scene whose gravity is that of 1 m, as a part of g, over its length."""
+    """Return a scene with gravity `weight` g [1 m] over the length."""
     return ddg.Scene(gravity=(0, 0, -weight * 9.81 / length), dimension=dimension)
 
 
 def rod(length, **options):
     scene = scene_of(length, options.pop("dimension", 3))
     section = options.pop("section", ddg.Circle(0.02 * length))
-    own = scene.add_rod(line(length), section=section, material=MATERIAL, **options)
-    scene.clamp_end(own)
-    scene.add_force(own, -1, (0, 0, 0.1 * length**2))
+    index = scene.add_rod(line(length), section=section, material=MATERIAL, **options)
+    scene.clamp_end(index)
+    scene.add_force(index, -1, (0, 0, 0.1 * length**2))
     return scene
 
 
@@ -102,7 +102,7 @@ OBJECTS = {
 
 @cache
 def answers(name: str, length: float, precision: str, device: str) -> dict:
-    """Shapes over the length, and frequencies times it, of one object."""
+    """Return relative shapes and frequencies times length of one object."""
     model = OBJECTS[name](length).build(device, precision)
     state = solve(model, load_steps=2)
     result = {"equilibrium": state.points() / length}
@@ -120,8 +120,10 @@ def answers(name: str, length: float, precision: str, device: str) -> dict:
 @pytest.mark.parametrize("length", LENGTHS)
 @pytest.mark.parametrize("name", OBJECTS)
 def test_scale(device, name, length, precision):
-    found, expected = (answers(name, each, precision, str(device)) for each in (length, 1.0))
+    results, expected = (answers(name, each, precision, str(device)) for each in (length, 1.0))
     assert np.abs(expected["equilibrium"] - OBJECTS[name](1.0).build("cpu").state().points()).max() > 1e-3
-    for what, values in expected.items():
+    for quantity, values in expected.items():
         scale = np.abs(values).max()
-        np.testing.assert_allclose(found[what], values, rtol=0.0, atol=TOLERANCE[precision] * scale, err_msg=what)
+        np.testing.assert_allclose(
+            results[quantity], values, rtol=0.0, atol=TOLERANCE[precision] * scale, err_msg=quantity
+        )

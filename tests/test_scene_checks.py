@@ -1,5 +1,4 @@
-"""Checks of scenes mean what they say: wrong results fail, parameters that leave them no meaning are refused, and what a short
-run cannot show is skipped by name."""
+"""Checks of scenes: failures on wrong results, refused parameters, and named skips of short runs."""
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from ddg_warp.run.summary import checks_table
 
 
 def run(name: str, duration=None, **parameters) -> list[Check]:
-    """The checks of a scene."""
+    """Return the checks of a scene."""
     module = load_scene(name)
     observe = getattr(module, "observe", None)
     scene = module.build(**parameters)
@@ -22,14 +21,14 @@ def run(name: str, duration=None, **parameters) -> list[Check]:
 
 
 def test_a_coarse_plate_fails():
-    """8 cells are 17 % too soft, 16 are 4 %: the check of the former fails, that of the latter passes."""
+    """A plate of 8 cells is 17 % too soft and fails, one of 16 cells is 4 % too soft and passes."""
     (coarse,) = run("plate_square", cells=8)
     assert coarse.error > 0.1 and coarse.failed
     (fine,) = run("plate_square", cells=16)
     assert fine.error < 0.045 and fine.passed
 
 
-# Parameters with which what is loaded or measured is not where the scene says, and the words that name them.
+# Parameters at which the loaded or measured node is not at its position, and the words that name them.
 REFUSED = {
     "plate_square": ({"cells": 7}, {"cells": 6, "mesh": "equilateral"}),
     "deep_arch": ({"n": 31},),
@@ -53,10 +52,12 @@ def test_parameters_without_a_meaning_are_refused(name):
 
 
 @pytest.mark.parametrize("flags", [["tip_load", "--n", "0"], ["roll_up", "--n", "-3"], ["strands", "--count", "-1"]])
-def test_parameters_that_break_the_build_are_told_in_one_line(flags, capsys, tmp_path):
+def test_parameters_that_break_the_build_are_reported_in_one_line(flags, capsys, tmp_path):
     assert main(["run", *flags, "--device", "cpu", "--out", str(tmp_path)]) == 2
-    (told,) = capsys.readouterr().err.splitlines()
-    assert told.startswith("ddg-warp: ") and ("with n = -3" in told or "1 nodes" in told or "strands: take" in told)
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith("ddg-warp: ") and (
+        "with n = -3" in message or "1 nodes" in message or "strands: take" in message
+    )
 
 
 # Scene, a duration that is too short [s], and the checks that need more.
@@ -70,7 +71,7 @@ SHORT = {
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_what_a_short_run_cannot_show_is_skipped(name):
+def test_checks_beyond_the_duration_are_skipped(name):
     duration, count = SHORT[name]
     checks = run(name, duration)
     skipped = [check for check in checks if check.skipped]
@@ -88,7 +89,7 @@ def test_a_skipped_check_neither_passes_nor_fails():
 
 
 def test_once_reached():
-    """To a thousandth of a step; in statics the load counts."""
+    """Times count to a thousandth of a step; in statics the load counts."""
     made = [Check("a", 1.0, 1.0, 0.0)]
     for dt, times, t, reached in (
         (0.1, [0.0, 0.1], 0.1 + 5e-5, True),
@@ -107,27 +108,27 @@ def test_numbers_without_a_reference_are_skipped():
 
 
 def test_the_precision_of_a_scene_is_that_of_its_models(device):
-    """Unless one is asked for; without either it is what suits the device."""
+    """A requested precision comes first; without any, the device decides."""
     usual = "mixed" if wp.get_device(device).is_cuda else "float64"
-    for own, asked, found in (
+    for scene_precision, requested, expected in (
         (None, None, usual),
         ("float32", None, "float32"),
         ("mixed", None, "mixed"),
         ("mixed", "float64", "float64"),
     ):
-        scene = ddg.Scene(analysis=ddg.Dynamics(precision=own))
+        scene = ddg.Scene(analysis=ddg.Dynamics(precision=scene_precision))
         scene.add_rod(
             [[0.0, 0.0, 0.1 * i] for i in range(4)],
             section=ddg.Circle(0.01),
             material=ddg.Material(young=1e5, density=1e3, poisson=0.5),
         )
-        assert scene.build(device, asked).precision == found
+        assert scene.build(device, requested).precision == expected
     with pytest.raises(ddg.SceneError, match="Dynamics: precision"):
         ddg.Dynamics(precision="double")
 
 
 def test_the_tolerance_of_a_scene_is_that_of_its_run(device):
-    """A looser one takes fewer iterations; options of the run come first."""
+    """A looser tolerance takes fewer iterations; options of the run come first."""
     work, rubber = {}, ddg.Material(young=1e6, density=1000.0, poisson=0.5)
     for rtol, options in ((1e-6, {}), (1e-1, {}), (1e-1, {"rtol": 1e-6})):
         scene = ddg.Scene(analysis=ddg.Dynamics(dt=0.02, duration=0.2, rtol=rtol))

@@ -1,4 +1,4 @@
-"""Every scene's own check at a small size; by its defaults, and those that take longer, they are slow."""
+"""Checks of every scene at a small size; defaults and long scenes are slow tests."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ SMALL = {
     "crossed_beams": {"n": 20},
     "deep_arch": {},
     "drawn_rod": {},
-    "entangled_worms": {"n": 30, "dt": 0.02},  # of seven worms one bundle in fifty stays too loose
+    "entangled_worms": {"n": 30, "dt": 0.02},  # one bundle of seven worms in fifty stays too loose
     "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},
     "flying_beam": {"n": 20},
@@ -117,13 +117,15 @@ LEARNED = (
 )
 
 
-def checked(name: str, device: str, **given) -> None:
-    """Run a scene and hold it to its own check, of which there is one at least."""
+def checked(name: str, device: str, **arguments) -> None:
+    """Run a scene and require all checks, at least one, to pass."""
     if name in LEARNED:
         pytest.importorskip("torch")
     module = load_scene(name)
-    assert set(given) <= set(parameters(module, {})), "the scene has no such parameter"
-    result = simulate(module.build(**given), device=device, observe=getattr(module, "observe", None), progress=False)
+    assert set(arguments) <= set(parameters(module, {})), "the scene has no such parameter"
+    result = simulate(
+        module.build(**arguments), device=device, observe=getattr(module, "observe", None), progress=False
+    )
     assert not result.failure
     checks = module.check(result)
     failed = [f"{check.name}: {check.error:.2e} > {check.tolerance:.2e}" for check in checks if not check.passed]
@@ -136,18 +138,18 @@ def test_small(device, name):
     checked(name, device, **SMALL[name])
 
 
-def test_hair_that_touches(device):
+def test_hair_in_contact(device):
     checked("strands", device, count=16, contact=True)
 
 
 @pytest.mark.slow
-def test_hair_that_touches_and_is_sag_free(device):
+def test_sag_free_hair_in_contact(device):
     checked("strands", device, count=16, contact=True, sag_free=True)
 
 
 @pytest.mark.parametrize("contact", [False, True])
-def test_hair_hangs_as_drawn_while_the_head_has_hardly_turned(device, contact):
-    """It would fall by g t^2 / 2 = 1.4 mm; sag-free it moves by the turn of the head, and where it touches from the start."""
+def test_sag_free_hair_hangs_as_drawn(device, contact):
+    """Free fall would be g t^2 / 2 = 1.4 mm; sag-free hair moves by the head's rotation, and near initial contacts."""
     from ddg_warp.scenes import strands
 
     moved = {}
@@ -160,9 +162,9 @@ def test_hair_hangs_as_drawn_while_the_head_has_hardly_turned(device, contact):
         moved[sag_free] = np.linalg.norm(state.points() - model.state().points(), axis=1)
     batch = scene.batches[0]
     arm = np.linalg.norm(batch.points - batch.points[:, 0].mean(0), axis=-1).max()
-    turned = arm * strands.head_motion(batch.points, 0.0).angle(4 / 240)
+    head_motion = arm * strands.head_motion(batch.points, 0.0).angle(4 / 240)
     assert np.median(moved[False]) > 1e-3
-    assert np.percentile(moved[True], 75 if contact else 100) < turned + 1e-6
+    assert np.percentile(moved[True], 75 if contact else 100) < head_motion + 1e-6
 
 
 @pytest.mark.slow
@@ -177,5 +179,5 @@ def test_no_scene_is_left_out():
 
 @pytest.mark.parametrize("name", ["capstan", "cloth_on_sphere", "cloth_twist", "flag_on_pole", "rod_pile"])
 def test_scenes_build_without_friction(name):
-    """Though a speed of slip, which has no effect without friction, is refused."""
+    """A slip speed, which has no effect without friction, would be refused."""
     assert load_scene(name).build(friction=0.0).touching.friction == 0.0

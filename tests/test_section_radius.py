@@ -1,4 +1,4 @@
-"""A section that is given by stiffnesses alone has no radius: what goes by one asks for it, and it is drawn by one that is told."""
+"""Sections given by stiffnesses have no radius: contact and drag require one, drawing reports a default."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def scene(**section) -> ddg.Scene:
     return made
 
 
-def touching(radius=None, **section) -> ddg.Scene:
+def rod_on_a_plane(radius=None, **section) -> ddg.Scene:
     made = scene(**section)
     made.add_obstacle(ddg.Plane())
     made.contact(radius=radius)
@@ -28,17 +28,17 @@ def viscous(**section) -> ddg.Scene:
     return made
 
 
-def test_contact_asks_for_it():
+def test_contact_requires_a_radius():
     with pytest.raises(ddg.SceneError, match=r"rod 0 \('cable'\) .* give Stiffness\(radius=...\)"):
-        touching().build("cpu")
-    assert touching(radius={"cable": 0.02}).build("cpu").net.host.touching.bodies[0].radius == 0.02
+        rod_on_a_plane().build("cpu")
+    assert rod_on_a_plane(radius={"cable": 0.02}).build("cpu").net.host.touching.bodies[0].radius == 0.02
     made = scene(radius=0.03)
     made.add_obstacle(ddg.Plane())
     made.contact()
     assert made.build("cpu").net.host.touching.bodies[0].radius == 0.03
 
 
-def test_viscous_drag_asks_for_it():
+def test_viscous_drag_requires_a_radius():
     with pytest.raises(ddg.SceneError, match=r"rods 'cable'.* no radius.* Stiffness\(radius=...\)"):
         viscous().build("cpu")
     viscous(radius=0.01).build("cpu")
@@ -47,7 +47,7 @@ def test_viscous_drag_asks_for_it():
     made.build("cpu")
 
 
-def test_it_is_drawn_by_one_that_is_told():
+def test_default_drawing_radius_is_reported():
     model = scene().build("cpu")
     assert (model.curves.radius == 1e-3).all()
     assert "drawn 0.002 m thick, as their section has no radius: cable" in model.report()

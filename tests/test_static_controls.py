@@ -1,4 +1,4 @@
-"""Equilibria under controls: as those of scenes that are built with the same loads, world by world."""
+"""Equilibria under controls equal scenes with the same loads, world by world."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ MOMENTS = np.array([0.01, 0.0, -0.02])
 NODE, EDGE = 6, 4
 
 
-def given(model, moments: bool = True) -> ddg.Controls:
-    """A force on a point, a moment on an edge and gravity of each world of a model."""
+def controls_of(model, moments: bool = True) -> ddg.Controls:
+    """Return a force on a point, a moment on an edge and gravity for each world of a model."""
     forces, twisting = np.zeros((3, model.points_count, 3)), np.zeros((3, model.order.edges_count))
     forces[:, NODE] = FORCES
     if moments:
@@ -24,8 +24,8 @@ def given(model, moments: bool = True) -> ddg.Controls:
     return ddg.Controls(forces=forces, moments=twisting, gravity=GRAVITY)
 
 
-def push(scene, world: int) -> None:
-    """The same loads in a scene of one world."""
+def add_loads(scene, world: int) -> None:
+    """Add the loads of one world to a scene of one world."""
     if not scene.shells:
         scene.add_force(0, NODE, FORCES[world])
         scene.add_twisting_moment(0, EDGE, MOMENTS[world])
@@ -45,31 +45,33 @@ def push(scene, world: int) -> None:
     ],
     ids=lambda value: getattr(value, "__name__", value),
 )
-def test_an_equilibrium_is_that_of_a_scene_with_these_loads(device, build, solver):
+def test_equilibrium_under_controls_equals_scene_loads(device, build, solver):
     model = model_of(build, None, device, worlds=3)
     options = TIGHT | {"solver": solver, "load_steps": 3}
-    found = statics.solve(model, controls=given(model, build is not sheet), **options)
+    equilibrium = statics.solve(model, controls=controls_of(model, build is not sheet), **options)
     for world in range(3):
-        alone = model_of(build, None, device, 1, GRAVITY[world], lambda scene, w=world: push(scene, w))
-        expected = statics.solve(alone, **options)
+        single = model_of(build, None, device, 1, GRAVITY[world], lambda scene, w=world: add_loads(scene, w))
+        expected = statics.solve(single, **options)
         size = np.ptp(expected.points(), axis=0).max()
-        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-9 * size)
+        np.testing.assert_allclose(equilibrium.points()[world], expected.points(), rtol=0.0, atol=1e-9 * size)
         if solver == "direct":
-            assert expected.stable == found.stable[world]
+            assert expected.stable == equilibrium.stable[world]
 
 
 @pytest.mark.parametrize("solver", ["direct", "pcg"])
-def test_loads_that_follow_stay_beside_what_each_world_is_given(device, solver):
+def test_follower_loads_add_to_controls(device, solver):
     def load(scene):
         scene.add_pressure(0, 20.0)
 
     model = model_of(sheet, None, device, worlds=3, load=load)
     options = TIGHT | {"solver": solver, "load_steps": 4}
-    found = statics.solve(model, controls=given(model, False), **options)
+    equilibrium = statics.solve(model, controls=controls_of(model, False), **options)
     for world in range(3):
-        alone = model_of(sheet, None, device, 1, GRAVITY[world], lambda scene, w=world: (load(scene), push(scene, w)))
-        expected = statics.solve(alone, **options)
-        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-9)
+        single = model_of(
+            sheet, None, device, 1, GRAVITY[world], lambda scene, w=world: (load(scene), add_loads(scene, w))
+        )
+        expected = statics.solve(single, **options)
+        np.testing.assert_allclose(equilibrium.points()[world], expected.points(), rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -77,30 +79,32 @@ def test_loads_that_follow_stay_beside_what_each_world_is_given(device, solver):
     [(some_rods, "direct"), (joined, "direct"), (joined, "pcg"), (sheet, "direct"), (sheet, "pcg")],
     ids=lambda value: getattr(value, "__name__", value),
 )
-def test_grips_end_where_motions_would(device, build, solver):
-    """Poses world by world, against a scene in which functions of the load parameter lead to them; kept by a search without any."""
-    turns, shifts = np.array([0.3, -0.5, 0.0]), np.array([[0.02, 0.0, 0.01], [0.0, -0.01, 0.03], [0.0, 0.0, 0.0]])
+def test_grips_reach_the_end_of_motions(device, build, solver):
+    """Poses of worlds equal motions by load parameter in single scenes; a solve without controls keeps them."""
+    rotations, shifts = np.array([0.3, -0.5, 0.0]), np.array([[0.02, 0.0, 0.01], [0.0, -0.01, 0.03], [0.0, 0.0, 0.0]])
     model = model_of(build, ddg.Grip(PIVOT), device, worlds=3, gravity=(0.0, 0.0, -1.0))
-    poses = np.concatenate([shifts, turns[:, None] * AXIS], axis=1)[:, None]
+    poses = np.concatenate([shifts, rotations[:, None] * AXIS], axis=1)[:, None]
     options = TIGHT | {"solver": solver, "load_steps": 2}
-    found = statics.solve(model, controls=ddg.Controls(poses), **options)
-    np.testing.assert_array_equal(found.poses(), poses)
+    equilibrium = statics.solve(model, controls=ddg.Controls(poses), **options)
+    np.testing.assert_array_equal(equilibrium.poses(), poses)
     for world in range(3):
-        moved = ddg.Motion(lambda t, w=world: tuple(t * shifts[w]), lambda t, w=world: t * turns[w], tuple(AXIS), PIVOT)
+        moved = ddg.Motion(
+            lambda t, w=world: tuple(t * shifts[w]), lambda t, w=world: t * rotations[w], tuple(AXIS), PIVOT
+        )
         expected = statics.solve(model_of(build, moved, device, gravity=(0.0, 0.0, -1.0)), **options)
-        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-8)
-    kept = statics.solve(model, found, start=1.0, **TIGHT | {"solver": solver})
+        np.testing.assert_allclose(equilibrium.points()[world], expected.points(), rtol=0.0, atol=1e-8)
+    kept = statics.solve(model, equilibrium, start=1.0, **TIGHT | {"solver": solver})
     np.testing.assert_array_equal(kept.poses(), poses)
-    np.testing.assert_allclose(kept.points(), found.points(), rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(kept.points(), equilibrium.points(), rtol=0.0, atol=1e-8)
 
 
-def test_controls_are_of_one_search(device):
-    """A search with controls, then one without on the same solver: the bits of one that never had any, and the same twice."""
+def test_controls_apply_to_one_solve(device):
+    """A solve without controls after one with controls equals a fresh solver bitwise, and repeats."""
     model = model_of(everything, None, device, worlds=3)
     solver = Equilibrium(model, StaticsOptions(rtol=1e-10))
-    first = solver.load(model.state(), 1, controls=given(model)).snapshot()
+    first = solver.load(model.state(), 1, controls=controls_of(model)).snapshot()
     plain = solver.load(model.state(), 1).snapshot()
-    again = solver.load(model.state(), 1, controls=given(model)).snapshot()
+    again = solver.load(model.state(), 1, controls=controls_of(model)).snapshot()
     fresh = Equilibrium(model, StaticsOptions(rtol=1e-10)).load(model.state(), 1).snapshot()
     for name, values in first.items():
         np.testing.assert_array_equal(again[name], values, err_msg=name)
@@ -108,12 +112,12 @@ def test_controls_are_of_one_search(device):
     assert (first["0/x"] != plain["0/x"]).any()
 
 
-def test_what_does_not_fit_is_named(device):
+def test_mismatched_controls_are_refused(device):
     model = model_of(one_rod, None, device, worlds=3)
-    for controls, words in (
+    for controls, message in (
         (3, "statics: controls are 3; give Controls"),
         (ddg.Controls(forces=np.zeros((2, 3))), r"forces have shape \(2, 3\)"),
         (ddg.Controls(poses=np.zeros((0, 6))), "poses of no grip"),
     ):
-        with pytest.raises(SceneError, match=words):
+        with pytest.raises(SceneError, match=message):
             statics.solve(model, controls=controls)

@@ -1,4 +1,4 @@
-"""Supports that hold the same component of a node conflict by what their motions move, and not by what they name."""
+"""Supports of one component conflict only where motions differ."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ MATERIAL = ddg.Material(young=1e6, density=1000.0)
 
 
 def sheet(motion=ABOUT_Y) -> ddg.Scene:
-    """Half a sheet beside its plane of symmetry y = 0, one edge of which a motion turns."""
+    """Return half a sheet with a plane of symmetry y = 0 and one edge moved by a motion."""
     points, triangles = meshes.rectangle(4, 2)[:2]
     points = np.array(points, float)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -21,20 +21,20 @@ def sheet(motion=ABOUT_Y) -> ddg.Scene:
     return scene
 
 
-def test_a_turn_about_the_normal_is_no_conflict_with_a_plane_of_symmetry():
+def test_rotation_about_the_normal_of_a_symmetry_plane():
     model = sheet().build("cpu")
     state, integrator = model.state(), ddg.Integrator(model)
-    held = np.flatnonzero(state.points()[:, 0] == 0.0)
+    moved = np.flatnonzero(state.points()[:, 0] == 0.0)
     plane = np.flatnonzero(state.points()[:, 1] == 0.0)
     for _ in range(5):
         state = integrator.step(state, 0.1)
     assert not state.points()[plane, 1].any()
-    rest = model.state().points()[held]
-    turned = ABOUT_Y.place(0.5, rest)
-    np.testing.assert_allclose(state.points()[held], turned, atol=1e-9)
+    points = model.state().points()[moved]
+    expected = ABOUT_Y.place(0.5, points)
+    np.testing.assert_allclose(state.points()[moved], expected, atol=1e-9)
 
 
-def test_translations_within_the_plane_are_none_either():
+def test_translation_within_a_symmetry_plane():
     sheet(ddg.Motion(translation=lambda t: (0.1 * t, 0.0, np.sin(t)))).build("cpu")
 
 
@@ -47,7 +47,7 @@ def test_translations_within_the_plane_are_none_either():
         ddg.Grip(pivot=(0.0, 0.0, 0.0)),
     ],
 )
-def test_what_moves_along_the_normal_is_refused(motion):
+def test_motion_along_the_normal_is_refused(motion):
     with pytest.raises(ddg.SceneError, match="held still by one support and moved by another along y"):
         sheet(motion).build("cpu")
 

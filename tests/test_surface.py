@@ -1,4 +1,4 @@
-"""Triangle meshes: what `Surface` says of neighbours holds edge by edge, bad meshes are refused, shapes are what they are called."""
+"""Triangle meshes: neighbour tables of `Surface`, refused meshes, and geometry of mesh generators."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,13 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry import meshes
 from ddg_warp.geometry.surface import Surface
 
-# Shape, its volume under the surface (divergence theorem: sum of det(a, b, c) / 6) as the mesh is refined, Euler characteristic.
+# Shape, its volume under the surface (divergence theorem: sum of det(a, b, c) / 6) in the fine limit, Euler
+# characteristic.
 CLOSED = {
     "sphere": (meshes.sphere(4), 4.0 / 3.0 * np.pi, 2),
     "torus": (meshes.torus(48, 40, 2.0, 0.5), 2.0 * np.pi**2 * 2.0 * 0.5**2, 0),
 }
-# Shape, area as the mesh is refined, Euler characteristic, lengths of the boundary loops, direction that it faces at vertex 0
+# Shape, area in the fine limit, Euler characteristic, lengths of the boundary loops, normal direction at vertex 0
 OPEN = {
     "right": (meshes.rectangle(6, 4, (3.0, 1.0)), 3.0, 1, [20], (0, 0, 1)),
     "alternating": (meshes.rectangle(6, 4, (3.0, 1.0), "alternating"), 3.0, 1, [20], (0, 0, 1)),
@@ -35,7 +36,7 @@ def vector_areas(points, triangles):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_neighbours_are_what_they_are_called(name):
+def test_neighbour_tables(name):
     surface = Surface(*SHAPES[name])
     triangles, edges = surface.triangles, surface.edges
     assert (edges[:, 0] < edges[:, 1]).all()
@@ -43,7 +44,7 @@ def test_neighbours_are_what_they_are_called(name):
     for i in range(3):
         start, end = triangles[:, (i + 1) % 3], triangles[:, (i + 2) % 3]
         edge, sign = surface.triangle_edges[:, i], surface.triangle_signs[:, i]
-        # a triangle of sign +1 is the first of its edge, one of sign -1 the second; corner i is opposite to it
+        # a triangle of sign +1 is the first of its edge, one of sign -1 the second; corner i is opposite
         assert np.array_equal(edges[edge], np.where(sign[:, None] > 0, [*zip(start, end)], [*zip(end, start)]))  # noqa: B905
         side = np.where(sign > 0, 0, 1)
         assert np.array_equal(surface.edge_triangles[edge, side], np.arange(len(triangles)))
@@ -81,9 +82,9 @@ def test_open_shapes(name):
 def test_boundary_loops_run_with_the_surface_to_the_left(name):
     surface = Surface(*SHAPES[name])
     loops = surface.boundary_loops()
-    found = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
+    pairs = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
     directed = {(t[i], t[(i + 1) % 3]) for t in surface.triangles.tolist() for i in range(3)}
-    assert set(map(tuple, found.tolist())) == {(a, b) for a, b in directed if (b, a) not in directed}
+    assert set(map(tuple, pairs.tolist())) == {(a, b) for a, b in directed if (b, a) not in directed}
     assert np.array_equal(np.sort(np.concatenate(loops)), np.flatnonzero(surface.boundary_vertices))
     assert [loop[0] for loop in loops] == sorted(loop.min() for loop in loops)
 
@@ -98,9 +99,9 @@ def test_edges_are_found():
     for wrong in ([0, 12], [True, False], [0.5]):
         with pytest.raises(SceneError, match=r"no edges on these vertices .* give \(P,\) bool or indices"):
             surface.edges_on(wrong)
-    found = surface.edge_between([0, 8, 5], [4, 4, 0])
-    assert surface.edges[found].tolist() == [[0, 4], [4, 8], [0, 5]]
-    assert surface.boundary[found].tolist() == [True, True, False]
+    edges = surface.edge_between([0, 8, 5], [4, 4, 0])
+    assert surface.edges[edges].tolist() == [[0, 4], [4, 8], [0, 5]]
+    assert surface.boundary[edges].tolist() == [True, True, False]
     for a, b in ((1, 4), (0, 12), (-1, 3), (2, 2)):
         with pytest.raises(SceneError, match=f"surface 'surface': there is no edge between the vertices {a} and {b}"):
             surface.edge_between([0, a], [1, b])
@@ -114,9 +115,9 @@ def test_grids_are_numbered_as_documented():
     points, triangles = meshes.rectangle(4, 3, (4.0, 3.0 * np.sqrt(0.75)), "equilateral")
     np.testing.assert_allclose(points[5 * 3 + 1 + np.arange(6), 0], [0.0, 0.5, 1.5, 2.5, 3.5, 4.0])  # row 3
     sides = np.linalg.norm(points[triangles] - points[np.roll(triangles, 1, axis=1)], axis=-1)
-    whole = np.ptp(sides, axis=1) < 1e-12
-    assert np.count_nonzero(~whole) == 2 * 3  # a half one at each end of a row
-    np.testing.assert_allclose(sides[whole], 1.0)
+    full = np.ptp(sides, axis=1) < 1e-12
+    assert np.count_nonzero(~full) == 2 * 3  # a half triangle at each end of a row
+    np.testing.assert_allclose(sides[full], 1.0)
     points, _ = meshes.annulus(2, 8, 1.0, 2.0)
     np.testing.assert_allclose(points[1 + 3 * 2], [0.0, 1.5, 0.0], atol=1e-15)
     points, _ = meshes.annulus(2, 8, 1.0, 2.0, slit=True)
@@ -136,7 +137,7 @@ def test_grids_are_numbered_as_documented():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_jittered_rectangles_are_whole_and_repeat(seed):
-    """Every boundary vertex is kept, no triangle lies on the boundary: 2 V - 2 - B = 2 nx ny triangles (Euler)."""
+    """Boundary vertices stay, no triangle lies on the boundary: 2 V - 2 - B = 2 nx ny triangles (Euler)."""
     nx, ny = 37, 11
     points, triangles = meshes.jittered_rectangle(nx, ny, (1.0, 2.0), 0.45, seed)
     surface = Surface(points, triangles)
@@ -184,15 +185,15 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_bad_meshes_are_refused(name):
-    points, triangles, *words = REFUSED[name]
+    points, triangles, *phrases = REFUSED[name]
     with pytest.raises(SceneError) as caught:
         Surface(points, triangles, name="sail")
-    missing = [word for word in ["'sail'", *words] if word not in str(caught.value)]
+    missing = [word for word in ["'sail'", *phrases] if word not in str(caught.value)]
     assert not missing, f"{missing} not in: {caught.value}"
 
 
 def test_a_moebius_band_is_refused():
-    """Triangles in a band whose ends are joined with half a turn: no orientation is consistent."""
+    """A band joined with half a twist has no consistent orientation."""
     n, angle = 12, 2.0 * np.pi * np.arange(12) / 12
     side = np.array([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)]).T
     centre = 3.0 * np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)

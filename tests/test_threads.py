@@ -1,4 +1,4 @@
-"""Several threads, each with a model of its own: as one after the other, bit by bit."""
+"""Concurrent threads with separate models or states give sequential results, bit by bit."""
 
 import subprocess
 import sys
@@ -51,26 +51,26 @@ print("alike")
 """
 
 
-def test_each_thread_its_own_model(device):
-    """In a process of its own, where nothing has been loaded before the threads start."""
+def test_threads_with_separate_models(device):
+    """Threads start in a fresh process, before anything is loaded."""
     done = subprocess.run([sys.executable, "-c", SCRIPT, device], capture_output=True, text=True, check=False)
     assert done.stdout.endswith("alike\n"), done.stderr[-2000:]
 
 
-def test_capture_waits_for_those_who_launch():
+def test_capture_waits_for_launches():
     from ddg_warp.threads import capturing, launches
 
-    inside, seen, release = threading.Event(), [], threading.Event()
+    inside, events, release = threading.Event(), [], threading.Event()
 
     @launches
     def launch():
         inside.set()
         release.wait()
-        seen.append("launched")
+        events.append("launched")
 
     def capture():
         with capturing():
-            seen.append("captured")
+            events.append("captured")
 
     threads = [threading.Thread(target=launch), threading.Thread(target=capture)]
     threads[0].start()
@@ -79,20 +79,20 @@ def test_capture_waits_for_those_who_launch():
     release.set()
     for thread in threads:
         thread.join()
-    assert seen == ["launched", "captured"]
+    assert events == ["launched", "captured"]
     with np.testing.assert_raises(ZeroDivisionError), capturing():
         raise ZeroDivisionError
-    launch()  # what failed inside left nothing locked
+    launch()  # the failure inside released the lock
     capture()
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_calls_are_alone_where_threads_share_a_stream(monkeypatch, shared):
-    """Of two threads that launch the second waits for the first there, and meets it elsewhere."""
+def test_launches_are_exclusive_on_a_shared_stream(monkeypatch, shared):
+    """The second of two launching threads waits for the first on a shared stream, and overlaps it elsewhere."""
     from ddg_warp import threads
 
     monkeypatch.setattr(threads._turns, "shared", shared)
-    inside, met, release = threading.Event(), threading.Event(), threading.Event()
+    inside, overlapped, release = threading.Event(), threading.Event(), threading.Event()
 
     @threads.launches
     def first():
@@ -101,17 +101,17 @@ def test_calls_are_alone_where_threads_share_a_stream(monkeypatch, shared):
 
     @threads.launches
     def second():
-        met.set()
+        overlapped.set()
 
     both = [threading.Thread(target=first), threading.Thread(target=second)]
     both[0].start()
     inside.wait()
     both[1].start()
-    assert met.wait(None if not shared else 0.2) is not shared
+    assert overlapped.wait(None if not shared else 0.2) is not shared
     release.set()
     for thread in both:
         thread.join()
-    assert met.is_set()
+    assert overlapped.is_set()
 
 
 SHARED = """
@@ -149,6 +149,6 @@ print("alike")
 
 
 def test_one_integrator_serves_several_threads(device):
-    """Each with states of its own: every step, and every question about contact, is what it is in one thread."""
+    """Threads have separate states: every step and contact query equals that of a single thread."""
     done = subprocess.run([sys.executable, "-c", SHARED, device], capture_output=True, text=True, check=False)
     assert done.stdout.endswith("alike\n"), done.stderr[-2000:]

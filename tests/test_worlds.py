@@ -1,4 +1,4 @@
-"""Worlds: copies of one topology with parameters, supports and outcomes of their own."""
+"""Worlds: copies of one topology with separate parameters, supports and outcomes."""
 
 import time
 
@@ -25,7 +25,7 @@ def tips(model, steps=10):
     return state.points()[..., -1, :]
 
 
-def test_a_world_moves_as_it_would_alone(device):
+def test_world_equals_a_single_model(device):
     factors = np.array([0.5, 1.0, 3.0])
     model = cantilever().build(device, "float64", worlds=3)
     terms = {"rod_stretch": ("stiffness",), "rod_bend_twist": ("stiffness_1", "stiffness_2", "stiffness_3")}
@@ -35,8 +35,8 @@ def test_a_world_moves_as_it_would_alone(device):
     together = tips(model)
     assert np.ptp(together[:, 2]) > 1e-3
     for world, factor in enumerate(factors):
-        alone = tips(cantilever(1e7 * factor).build(device, "float64"))
-        np.testing.assert_allclose(together[world], alone, rtol=0.0, atol=1e-12)
+        single = tips(cantilever(1e7 * factor).build(device, "float64"))
+        np.testing.assert_allclose(together[world], single, rtol=0.0, atol=1e-12)
 
 
 def test_parameters_changed_between_steps_are_used(device):
@@ -52,7 +52,7 @@ def test_parameters_changed_between_steps_are_used(device):
 
 
 def test_elements_have_their_own_rest_strain(device):
-    """A natural curvature kappa on all vertices from the state at rest makes a circle without gravity: phi = kappa l."""
+    """A natural curvature kappa at all vertices makes a circle from the rest state without gravity: phi = kappa l."""
     scene = cantilever()
     scene.gravity = (0.0, 0.0, 0.0)
     model = scene.build(device, "float64")
@@ -68,7 +68,7 @@ def test_elements_have_their_own_rest_strain(device):
 
 
 @pytest.mark.parametrize(
-    ("term", "parameter", "values", "words"),
+    ("term", "parameter", "values", "message"),
     [
         ("rod_bend", "stiffness_1", 1.0, "no rod or shell has the term"),
         ("rod_stretch", "EA", 1.0, "no parameter 'EA'"),
@@ -76,13 +76,13 @@ def test_elements_have_their_own_rest_strain(device):
         ("rod_stretch", "stiffness", np.ones(7), r"shape \(7,\)"),
     ],
 )
-def test_wrong_parameters_are_refused(device, term, parameter, values, words):
-    with pytest.raises(ValueError, match=words):
+def test_wrong_parameters_are_refused(device, term, parameter, values, message):
+    with pytest.raises(ValueError, match=message):
         cantilever().build(device, worlds=2).set_parameter(term, parameter, values)
 
 
-def test_one_bad_world_does_not_stop_the_others(device):
-    """A world that starts folded back is given up; the other is as it is alone, and the error names the outcome."""
+def test_failed_world_does_not_stop_the_others(device):
+    """A world that starts folded back fails; the other equals a single model, and the error names the outcome."""
     scene = cantilever()
     model = scene.build(device, "float64", worlds=2)
     points = model.state().points()
@@ -92,9 +92,9 @@ def test_one_bad_world_does_not_stop_the_others(device):
     for _ in range(5):
         state = integrator.step(state, 0.01)
     single = scene.build(device, "float64")
-    alone, expected = ddg.Integrator(single), single.state()
+    single_integrator, expected = ddg.Integrator(single), single.state()
     for _ in range(5):
-        expected = alone.step(expected, 0.01)
+        expected = single_integrator.step(expected, 0.01)
     np.testing.assert_array_equal(state.points()[1], expected.points())
     np.testing.assert_array_equal(state.points()[0], points[0])
     with pytest.raises(ddg.SolverError, match="non_finite"):
@@ -104,7 +104,7 @@ def test_one_bad_world_does_not_stop_the_others(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [8, 64])
 def test_many_worlds_cost_what_many_rods_do(device, count):
-    """Worlds of one rod step as fast as that many rods of one world, to what a busy machine makes of a time."""
+    """Worlds of one rod step as fast as equally many rods of one world, up to timing noise."""
     points = np.zeros((count, 32, 3))
     points[:, :, 0] = np.linspace(0.0, 1.0, 32)
     integrators = []
@@ -113,7 +113,7 @@ def test_many_worlds_cost_what_many_rods_do(device, count):
         scene.clamp(scene.add_rods(rods, section=ddg.Circle(0.02), material=ddg.Material(1e7, 0.5, 1000.0)))
         integrators.append(ddg.Integrator(scene.build(device, "float64", worlds=worlds)))
     best = [np.inf, np.inf]
-    for _ in range(6):  # in turns, so that both meet the same neighbours
+    for _ in range(6):  # alternately, so that both see the same machine load
         for i, integrator in enumerate(integrators):
             state, started = integrator.model.state(), time.perf_counter()
             for _ in range(20):
@@ -123,8 +123,8 @@ def test_many_worlds_cost_what_many_rods_do(device, count):
     assert best[1] < 1.25 * best[0]
 
 
-def test_a_step_reads_nothing_back(device, monkeypatch):
-    """Between two readings of the outcomes a step neither copies from the device nor waits for it."""
+def test_a_step_does_not_synchronise(device, monkeypatch):
+    """No step between two checks of outcomes copies from the device or waits for it."""
     model = cantilever().build(device, "float64")
     integrator, state = ddg.Integrator(model, check_every=10**9), model.state()
     for _ in range(2):
