@@ -191,9 +191,7 @@ def test_every_scene_has_a_study(name):
 
 
 def test_a_scene_without_benchmark_gets_a_study(tmp_path, device):
-    """The study measures the first check over resolution: a hanging chain of springs, L = m g / k (n + 1) / 2n over n
-    edges.
-    """
+    """The study measures the first check over resolution: a hanging chain of springs, L = m g / k (n + 1) / 2n over n edges."""
     path = tmp_path / "springs.py"
     path.write_text(
         """

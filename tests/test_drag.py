@@ -266,9 +266,7 @@ SAND = ddg.Granular(lateral=5.0, friction=2.0, leading=1.0, angle=0.3, speed=1e-
 
 
 def test_granular_drag_depends_on_direction_alone(device):
-    """Forces along and across a rod of unit length by angle, at two speeds; far below v0 they vanish with the
-    velocity.
-    """
+    """Forces along and across a rod of unit length by angle, at two speeds; far below v0 they vanish with the velocity."""
     model, _ = filament(device, n=4, law=SAND)
     for psi in (0.1, 0.7, 1.3):
         sine = np.sin(psi) / np.hypot(np.tan(0.3), np.sin(psi))  # sin(beta)
@@ -285,9 +283,7 @@ def test_granular_drag_depends_on_direction_alone(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_sand_stops_a_rod(device, scheme):
-    """Moving axially, the rod slows down evenly, v = v0 - (C_F + C_L) t / m, and stops after m v0 / (C_F + C_L), here
-    0.2 s.
-    """
+    """Moving axially, the rod slows down evenly, v = v0 - (C_F + C_L) t / m, and stops after m v0 / (C_F + C_L), here 0.2 s."""
     model, integrator = filament(device, n=4, scheme=scheme, law=SAND, mass_per_length=1.0)
     state, speeds, dt = model.state(velocities=np.tile((0.6, 0.0, 0.0), (5, 1))), [], 1e-3
     for _ in range(300):

@@ -95,9 +95,7 @@ def mixed(device, worlds: int = 1):
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_recorded_fields_are_read_back(tmp_path, device, worlds):
-    """Fields at points and triangles; Green's strain of the sheet is (s^2 - 1) / 2, its energy per area E h times the
-    square / 2.
-    """
+    """Fields at points and triangles; Green's strain of the sheet is (s^2 - 1) / 2, its energy per area E h times the square / 2."""
     model, state = mixed(device, worlds)
     names = ["axial_force", "energy_density", "shell_strain", "shell_energy"]
     with Recorder(model, tmp_path, fields=names) as recorder:

@@ -43,9 +43,7 @@ def edge_strain(scene, state) -> float:
 @pytest.mark.parametrize("size", [0.1, 0.5, 1.0], ids=["crumpled", "inverted", "scrambled"])
 @pytest.mark.parametrize("bending", BENDING)
 def test_random_perturbation(device, bending, size):
-    """Vertices moved by a fraction of the cells, which inverts triangles: the sheet springs back, and energy only
-    falls.
-    """
+    """Vertices moved by a fraction of the cells, which inverts triangles: the sheet springs back, and energy only falls."""
     scene = sheet(6, bending)
     start = scene.shells[0].points
     start = start + size / 6.0 * np.random.default_rng(1).normal(size=start.shape)
@@ -58,9 +56,7 @@ def test_random_perturbation(device, bending, size):
 
 @pytest.mark.parametrize("thickness", [1e-3, pytest.param(1e-4, marks=pytest.mark.slow)])
 def test_random_perturbation_in_long_steps(device, thickness):
-    """A thin sheet of 144 cells with inverted triangles, steps of 0.1 s: no step fails, and ten steps leave little
-    energy.
-    """
+    """A thin sheet of 144 cells with inverted triangles, steps of 0.1 s: no step fails, and ten steps leave little energy."""
     scene = sheet(12, thickness=thickness)
     start = scene.shells[0].points
     start = start + 0.5 / 12.0 * np.random.default_rng(1).normal(size=start.shape)

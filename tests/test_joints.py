@@ -118,9 +118,7 @@ def test_derivatives(device, name, rotation):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_rigid_rotation_costs_nothing(device, name):
-    """Rods and joint rotate alike: angles between rods stay, and no element has energy, before and after frame
-    updates.
-    """
+    """Rods and joint rotate alike: angles between rods stay, and no element has energy, before and after frame updates."""
     model = SCENES[name]().build(device, "float64")
     tangent, state = Tangent(model), model.state()
     host, rotation = model.net.host, Rotation.from_rotvec([0.7, -0.4, 0.9])
@@ -169,9 +167,7 @@ def halves(device, load, couple, joined: bool, curvature: str = "tangent"):
 
 
 def test_collinear_rods_twist_as_one(device):
-    """Two half cells in series equal one cell in twist, which is linear: GJ = 0.8, M = 1.3, up to the last edge's
-    midpoint.
-    """
+    """Two half cells in series equal one cell in twist, which is linear: GJ = 0.8, M = 1.3, up to the last edge's midpoint."""
     whole, joined_rods = (halves(device, (0.0, 0.0, 0.0), 1.3, joined) for joined in (False, True))
     np.testing.assert_allclose(joined_rods[1], whole[1], rtol=1e-10)
     np.testing.assert_allclose(joined_rods[1], 1.3 / 0.8 * (0.05 + 0.1 * np.arange(10)), rtol=1e-9)
@@ -193,9 +189,7 @@ def test_collinear_rods_bend_as_one(device):
 
 @pytest.mark.slow  # kernels of its own
 def test_collinear_rods_are_one_by_the_angle(device):
-    """Half cells in series halve the angle: 2 B (a/2)^2 / l equals B a^2 / 2 l of the cell, at any load in a principal
-    plane.
-    """
+    """Half cells in series halve the angle: 2 B (a/2)^2 / l equals B a^2 / 2 l of the cell, at any load in a principal plane."""
     one, two = (halves(device, (0.0, 0.0, -2.0), 0.0, joined, "angle") for joined in (False, True))
     np.testing.assert_allclose(two[0], one[0], atol=1e-8)
     assert one[0][-1, 2] < -0.3

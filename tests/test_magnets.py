@@ -48,9 +48,7 @@ ACROSS = {
     "load", [pytest.param(load, marks=() if load in (0.5, 5.0) else pytest.mark.slow) for load in ACROSS]
 )
 def test_cantilever_across_the_field(device, load):
-    """Errors are of second order in the edges; the tip angle is that of the last edge's midpoint, where th' = 0 to
-    first order.
-    """
+    """Errors are of second order in the edges; the tip angle is that of the last edge's midpoint, where th' = 0 to first order."""
     errors, sizes = [], (50, 100, 200)
     for n in sizes:
         points = statics.solve(cantilever(n, load / MA * Z, dimension=2).build(device), load_steps=4).points()
@@ -72,9 +70,7 @@ def test_rods_in_space_bend_as_planar_ones(device, kind):
 
 
 def test_rod_magnetised_across_twists(device):
-    """M along the first director z, B along y: GJ phi'' = -M A B cos(phi), the equation of bending with twist as
-    angle.
-    """
+    """M along the first director z, B along y: GJ phi'' = -M A B cos(phi), the equation of bending with twist as angle."""
     scene = cantilever(40, 2.0 / MA * Y, magnetisation=(MA / 1e-4, 0.0, 0.0), director=Z)
     model = scene.build(device)
     state = statics.solve(model)
@@ -131,9 +127,7 @@ def test_antiparallel_field_buckles(device, n):
 
 
 def test_path_branches_at_the_critical_field(device):
-    """The load parameter scales the field: continuation finds the bifurcation and the lateral tip position of its
-    branch.
-    """
+    """The load parameter scales the field: continuation finds the bifurcation and the lateral tip position of its branch."""
     model = cantilever(20, -3.0 / MA * X, dimension=2).build(device, "float64")
     follow = Continuation(model, {"tip": ddg.Displacement.of(-1, "z")}, max_step=0.3)
     path = follow.trace(stop=ddg.Stop(load=(-1.0, 1.0)))
@@ -171,9 +165,7 @@ def test_field_along_the_rod_raises_its_frequency(device):
 
 
 def compass(field, angle: float = 0.0, EA: float = 1e7) -> tuple[ddg.Scene, float]:
-    """Return a stiff needle of two edges pivoted at the middle, rotated by a small angle, and V M over inertia [1/(T
-    s^2)].
-    """
+    """Return a stiff needle of two edges pivoted at the middle, rotated by a small angle, and V M over inertia [1/(T s^2)]."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     points = np.outer([-0.5, 0.0, 0.5], [np.cos(angle), 0.0, np.sin(angle)])
     section = ddg.Stiffness(EA=EA, EI1=1e4, area=1e-4, mass_per_length=1.0)
@@ -208,9 +200,7 @@ def test_order_in_a_field_that_changes(device, scheme, expected):
 
 @pytest.mark.slow
 def test_needle_reverses(device):
-    """A needle 1 degree off an antiparallel strong field reverses and swings on: every step converges and keeps the
-    energy.
-    """
+    """A needle 1 degree off an antiparallel strong field reverses and swings on: every step converges and keeps the energy."""
     B = 0.5
     scene, rate = compass(tuple(-B * X), angle=np.radians(1.0), EA=1e3)
     model = scene.build(device, "float64")
@@ -342,9 +332,7 @@ def test_pair_of_dipoles(device, across):
 
 
 def test_parallel_rods_repel(device):
-    """Parallel rods magnetised across: each pair of short distant edges has the force 3 mu0 m^2 / (4 pi d^4), carried
-    by supports.
-    """
+    """Parallel rods magnetised across: each pair of short distant edges has the force 3 mu0 m^2 / (4 pi d^4), carried by supports."""
     d, length = 0.2, 0.002
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     for y in (0.0, d):

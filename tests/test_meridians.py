@@ -157,9 +157,7 @@ def test_following_pressure_on_many_worlds(device):
 
 
 def test_worlds_and_growth(device):
-    """Worlds grow by separate rest strains: a tube with rest a_tt / 2 equal to (g R)^2 / 2 and free ends has radius g
-    R.
-    """
+    """Worlds grow by separate rest strains: a tube with rest a_tt / 2 equal to (g R)^2 / 2 and free ends has radius g R."""
     scene = scene_of(TUBE)
     scene.hold_ring(0, 0, "z")
     model = scene.build(device, "float64", worlds=2)
@@ -189,9 +187,7 @@ def test_shell_of_revolution_with_rods_and_shells(device):
 
 
 def test_surface_of_revolution_in_usd(device, tmp_path):
-    """A cap revolved with N sides has one triangle a side at the pole, two elsewhere; its area tends to 2 pi (1 - cos
-    1).
-    """
+    """A cap revolved with N sides has one triangle a side at the pole, two elsewhere; its area tends to 2 pi (1 - cos 1)."""
     from pxr import Usd, UsdGeom
 
     model = scene_of().build(device)

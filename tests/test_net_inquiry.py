@@ -48,9 +48,7 @@ def test_membrane_forces(device):
 
 
 def test_moments_of_a_bent_sheet(device):
-    """Rolling to a radius of 10 m about y gives moments D / R along x and nu D / R across, up to chord errors (l /
-    R)^2.
-    """
+    """Rolling to a radius of 10 m about y gives moments D / R along x and nu D / R across, up to chord errors (l / R)^2."""
     scene, radius = sheet("midedge"), 10.0
     model = scene.build(device, "float64")
     x, y, _ = model.state().points().T

@@ -71,9 +71,7 @@ def test_free_fall(device, bending):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_momentum(device, scheme):
-    """Linear momentum is conserved; the midpoint rule conserves angular momentum, as x_mid x f of internal forces is
-    zero.
-    """
+    """Linear momentum is conserved; the midpoint rule conserves angular momentum, as x_mid x f of internal forces is zero."""
     model = sheet(4).build(device, "float64")
     mass = model.net.host.mass[: model.net.host.nodes]
     start = moving(model)
@@ -121,9 +119,7 @@ def test_order_in_time(device, scheme, order):
 
 
 def modes(model, count=3):
-    """Return lowest angular frequencies and modes (count, blocks, 3) of a model. Massless dofs are condensed by the
-    pencil.
-    """
+    """Return lowest angular frequencies and modes (count, blocks, 3) of a model. Massless dofs are condensed by the pencil."""
     tangent, state = Tangent(model), model.state()
     free = tangent.free
     K = tangent.hessian(state)[free][:, free]
@@ -233,9 +229,7 @@ def test_joined_halves_step_as_one_rod(device, bent, scheme):
 
 
 def test_hinged_joint_is_a_hinge(device):
-    """The slow mode of two equal stiff hanging bars has w^2 = (3 - 6 / sqrt 7) g / L; it is zero after a quarter
-    period.
-    """
+    """The slow mode of two equal stiff hanging bars has w^2 = (3 - 6 / sqrt 7) g / L; it is zero after a quarter period."""
     scene = ddg.Scene()
     stiff = ddg.Stiffness(EA=1e7, EI1=1e4, GJ=1e4, mass_per_length=1.0, rotary_inertia=1e-3)
     rods = [scene.add_rod(np.outer(np.linspace(a, a + 1.0, 11), [0.0, 0.0, -1.0]), section=stiff) for a in (0.0, 1.0)]
@@ -499,9 +493,7 @@ def test_motion_keeps_components_fixed_by_other_supports(device):
 
 @pytest.mark.slow
 def test_mixed_precision_falls_back_to_float64_for_stiff_rods(device):
-    """Rods have 16 edges between crossings: stretching is 6e5 times as stiff as all else over 1/60 s, 1e4 times over
-    1/480 s.
-    """
+    """Rods have 16 edges between crossings: stretching is 6e5 times as stiff as all else over 1/60 s, 1e4 times over 1/480 s."""
     model = gridshell_dome.build(5, 16).build(device, "mixed")
     exact = gridshell_dome.build(5, 16).build(device, "float64")
     for dt, linear in ((1 / 480, "float32"), (1 / 60, "float64")):

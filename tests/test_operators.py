@@ -63,9 +63,7 @@ def test_gauss_bonnet(name):
 
 
 def test_geodesic_curvature_of_the_boundary():
-    """Boundary circles of a plane annulus rotate by 2 pi, the outer one left, the inner one right; the interior is
-    flat.
-    """
+    """Boundary circles of a plane annulus rotate by 2 pi, the outer one left, the inner one right; the interior is flat."""
     surface = SURFACES["annulus"]
     defects = operators.angle_defects(surface)
     inner, outer = surface.boundary_loops()

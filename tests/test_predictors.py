@@ -61,9 +61,7 @@ def edges_and_steps(dim: int):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_transverse_increment_rotates_an_edge(device, dim):
-    """The edge rotates by |across| / |e| towards the increment, and lengthens by the component along e, to a tenth at
-    least.
-    """
+    """The edge rotates by |across| / |e| towards the increment, and lengthens by the component along e, to a tenth at least."""
     e, de, length, stretch = edges_and_steps(dim)
     end = e + de + rotation_excess(device, e, de, 0)
     np.testing.assert_allclose(lengths(end), np.maximum(length + stretch, 0.1 * length), rtol=1e-12)
@@ -178,9 +176,7 @@ def spinning(solver: str, supported: bool, angle: float, dt: float) -> tuple[ddg
 @pytest.mark.parametrize("supported", [False, True])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_predictor_continues_the_rotation_of_a_spinning_rod(device, solver, supported):
-    """Implicit Euler: all nodes rotate by the angle of the last step. (Linear extrapolation would lengthen edges by 4
-    %.)
-    """
+    """Implicit Euler: all nodes rotate by the angle of the last step. (Linear extrapolation would lengthen edges by 4 %.)"""
     angle, dt = 0.3, 0.01
     scene, points, pivot = spinning(solver, supported, angle, dt)
     integrator = ddg.Integrator(model := scene.build(device, "float64"), linear=linear_of(solver))

@@ -29,9 +29,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_examples(folder, device):
-    """Run all blocks in order as one script; blocks with a file name are files, blocks of missing packages are
-    skipped.
-    """
+    """Run all blocks in order as one script; blocks with a file name are files, blocks of missing packages are skipped."""
     assert BLOCKS
     missing = [name for name, words in OPTIONAL.items() if find_spec(name) is None]
     lines = [f"import warp as wp; wp.set_device({device!r})"]

@@ -111,9 +111,7 @@ def test_energy_account_is_reset_per_world(device, scheme):
 
 
 def test_worlds_start_from_any_state(device):
-    """Worlds start from the same world of a state, or all from a state of one world, including viscous rods and
-    frames.
-    """
+    """Worlds start from the same world of a state, or all from a state of one world, including viscous rods and frames."""
 
     def viscous(scene, moved):
         one_rod(scene, moved)

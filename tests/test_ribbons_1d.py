@@ -67,9 +67,7 @@ def test_derivatives(device, name, damped):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_exact_matrix_holds_where_the_law_is_not_convex(device, name):
-    """Twist beyond the crossover softens the ribbon, which the exact matrix contains and the Gauss-Newton factor
-    omits.
-    """
+    """Twist beyond the crossover softens the ribbon, which the exact matrix contains and the Gauss-Newton factor omits."""
     term = replace(REGISTRY["rod_bend_twist"], density=LAWS[name])
     (sample,) = derivatives.samples_of(term, "float64", device, chains=(False,))
     sample.data["buffer"][term.parameter_names.index("crossover")] /= 8.0
@@ -80,9 +78,7 @@ def test_the_exact_matrix_holds_where_the_law_is_not_convex(device, name):
 @pytest.mark.parametrize("real", [wp.float64, pytest.param(wp.float32, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
 def test_laws_from_the_narrow_to_the_wide_limit(device, name, real):
-    """psi' and psi'' equal differences over six decades of bending and both branches of phi; psi >= 0, smooth at k =
-    0.
-    """
+    """psi' and psi'' equal differences over six decades of bending and both branches of phi; psi >= 0, smooth at k = 0."""
     k = np.concatenate([[0.0], *(s * np.geomspace(1e-3, 1e3, 61) for s in (1.0, -1.0))])
     k, t = (v.ravel() for v in np.meshgrid(k, [0.3, 1.0, 4.0]))
     p = [50.0, 1.0 - NU**2, 2.0 * (1.0 - NU), NU, 1.0, 0.1, 0.5, -0.2]
@@ -258,9 +254,7 @@ def test_a_hinged_ribbon_keeps_its_law(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["audoly_neukirch", "sano_wada"])
 def test_lateral_buckling_of_an_arch_by_ribbon_width(device, law):
-    """Critical loads agree with the plate to a few per cent at three widths; Kirchhoff's rod is 6 % high at the
-    largest.
-    """
+    """Critical loads agree with the plate to a few per cent at three widths; Kirchhoff's rod is 6 % high at the largest."""
     widths = list(ribbon_bistable.PLATE)
     ribbon, rod = (
         [ribbon_bistable.pitchfork(ribbon_bistable.build(w, name).build(device, "float64")) for w in widths]

@@ -155,9 +155,7 @@ def test_equilibria_dominated_by_rounding_are_refused(device):
 
 
 def test_rounding_bound_of_a_wire(device):
-    """Half a rounding unit times EA / l over m / s^2 + EI l (pi / L)^4, l = L / n; m = rho A l averaged over n + 1
-    nodes.
-    """
+    """Half a rounding unit times EA / l over m / s^2 + EI l (pi / L)^4, l = L / n; m = rho A l averaged over n + 1 nodes."""
     model = scene_of(wire).build(device, "float32", allow_rounding=True)
     n, r, s = 100, 2e-3, 0.01
     stiff = 2e11 * np.pi * r**2 * n
@@ -215,9 +213,7 @@ def loaded(device, precision: str, size: float, joined: bool):
 
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
 def test_single_precision_converges_to_its_rounding(device, joined):
-    """Rounding of stretch is 40 % of the load, but does not affect bending: iterations end without a warning when
-    nothing moves.
-    """
+    """Rounding of stretch is 40 % of the load, but does not affect bending: iterations end without a warning when nothing moves."""
     exact, _ = loaded(device, "float64", 1.0, joined)
     for size in (1.0, 1e-6, 1e5):
         with warnings.catch_warnings():

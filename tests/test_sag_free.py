@@ -87,9 +87,7 @@ def test_a_hanging_rod_is_shorter_at_rest():
 
 
 def test_loads_at_the_tip():
-    """A transverse force P gives k0 = P (L - s) / EI, a twisting moment M the rest twist -M / GJ; weightless, at half
-    the load.
-    """
+    """A transverse force P gives k0 = P (L - s) / EI, a twisting moment M the rest twist -M / GJ; weightless, at half the load."""
 
     def load(scene, rod):
         scene.gravity = (0.0, 0.0, 0.0)
@@ -185,9 +183,7 @@ def test_least_stiffness_of_a_column_is_greenhills(n):
 
 
 def test_least_stiffness_is_the_limit_of_stability():
-    """Curled rods are stable one per cent above the least stiffness and not one per cent below; both give the same
-    value.
-    """
+    """Curled rods are stable one per cent above the least stiffness and not one per cent below; both give the same value."""
     model = scene_of_all().build("cpu", "float64")
     with_rest_strains(model, rest_strains(model))
     (least,) = least_stiffness(model, model.state())

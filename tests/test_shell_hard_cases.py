@@ -90,9 +90,7 @@ def test_needles(device, aspect):
 
 @pytest.mark.slow
 def test_loads_lost_in_rounding_are_named(device):
-    """Needles of aspect 1e4 are so stiff across that rounding of forces exceeds the weight: no state counts as
-    equilibrium.
-    """
+    """Needles of aspect 1e4 are so stiff across that rounding of forces exceeds the weight: no state counts as equilibrium."""
     with pytest.raises(ddg.SolverError, match=r"lost_in_rounding.*better shaped") as caught:
         needles(device, 1e4, 0.01)
     assert caught.value.outcome == "lost_in_rounding"
@@ -108,9 +106,7 @@ def square_with_sliver(shift: float) -> tuple[np.ndarray, np.ndarray, int]:
 
 @pytest.mark.slow
 def test_slivers(device):
-    """A vertex 1e-3 and 4e-6 cells from the next keeps the deflection of a clamped square within 3 %; nearer is
-    refused.
-    """
+    """A vertex 1e-3 and 4e-6 cells from the next keeps the deflection of a clamped square within 3 %; nearer is refused."""
     heights = []
     for shift in (0.0, 0.999, 1.0 - 4e-6, 1.0 - 1e-12):
         points, triangles, _ = square_with_sliver(shift)

@@ -141,9 +141,7 @@ def test_free_spin_is_no_instability(device):
 
 
 def test_follow_passes_the_critical_load(device):
-    """The exactly straight column loaded from zero stays an equilibrium, with one negative eigenvalue past the
-    critical load.
-    """
+    """The exactly straight column loaded from zero stays an equilibrium, with one negative eigenvalue past the critical load."""
     model = column(device, 4.0)
     solver = Equilibrium(model, StaticsOptions(mode="follow"))
     state, before = model.state(), 0.0

@@ -110,9 +110,7 @@ def test_every_bending_model_rotates_the_rod(device, bending):
 
 @pytest.mark.slow
 def test_stiffness_of_the_glue_does_not_matter(device):
-    """A tenfold glue stiffness changes the torque by some thousandths, less on finer meshes; a tenth by less than a
-    tenth.
-    """
+    """A tenfold glue stiffness changes the torque by some thousandths, less on finer meshes; a tenth by less than a tenth."""
     changes = []
     for cells in (10, 20, 40):
         base = torsional_stiffness(device, cells)
@@ -233,9 +231,7 @@ def pendulum(device, cells: int, spin="glued", stiff=1e3):
 
 
 def test_torsional_pendulum(device):
-    """Plates of inertia I = rho t l b^3 / 12 on a wire have w^2 = GJ / (L I), first order; without glue the plate
-    spins freely.
-    """
+    """Plates of inertia I = rho t l b^3 / 12 on a wire have w^2 = GJ / (L I), first order; without glue the plate spins freely."""
     inertia = 1000.0 * 0.02 * 0.5 * 0.2**3 / 12.0
     exact = np.sqrt(0.02 / (0.5 * inertia))
     errors = []

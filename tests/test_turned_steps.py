@@ -186,9 +186,7 @@ def test_winding_by_20_revolutions(device):
 
 
 def test_stiffness_is_decided_per_world(device):
-    """The world with a thousandfold stretching stiffness always rotates edges, the other updates small rotations
-    straight.
-    """
+    """The world with a thousandfold stretching stiffness always rotates edges, the other updates small rotations straight."""
     scene, names = cantilever(20, ddg.Circle(0.02), RUBBER), ("rod_stretch", "stiffness")
     scene.clamp(0, edges=[0])
 

@@ -68,9 +68,7 @@ ACTIONS = pytest.mark.parametrize("action", [rotate_end, twist_edge, add_couples
 @ACTIONS
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_coupled_rod_moves_as_uncoupled(device, scheme, action):
-    """Conjugate gradients of a coupled system and the sweep of a rod agree for ends that rotate past 2 pi, and for
-    couples.
-    """
+    """Conjugate gradients of a coupled system and the sweep of a rod agree for ends that rotate past 2 pi, and for couples."""
     results = []
     for is_coupled in (False, True):
         scene = one_rod(is_coupled)
@@ -224,9 +222,7 @@ def test_rotation_out_of_the_plane_is_refused():
 
 @pytest.mark.parametrize("is_coupled", [False, True], ids=["uncoupled", "coupled"])
 def test_motions_apply_to_the_components_of_their_supports(device, is_coupled):
-    """x and z of a node have one motion each, y is fixed by a third support; a second motion of one is refused by
-    name.
-    """
+    """x and z of a node have one motion each, y is fixed by a third support; a second motion of one is refused by name."""
     scene = one_rod(is_coupled)
     scene.fix(0, [-1], "y")
     scene.fix(0, [-1], "x", motion=ddg.Motion(translation=lambda t: (-t, 9.0, 9.0)))

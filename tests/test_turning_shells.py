@@ -142,9 +142,7 @@ def test_torsion_of_a_strip(device):
     ids=["twisted", "hinge", "wound"],
 )
 def test_a_slow_motion_ends_in_the_static_solution(device, bending, angle, load_steps):
-    """A strip twisted in 2 s comes to rest in the static solution; wound by 420 degrees it is a helicoid, b12 = -phi /
-    L.
-    """
+    """A strip twisted in 2 s comes to rest in the static solution; wound by 420 degrees it is a helicoid, b12 = -phi / L."""
     model, middle = twisted(device, angle, cells=16, bending=bending)
     static = solve(model, load_steps=load_steps)
     ramp = lambda t: angle * min(1.0, 0.5 * t)  # noqa: E731
@@ -165,9 +163,7 @@ def test_a_slow_motion_ends_in_the_static_solution(device, bending, angle, load_
 
 @pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "midedge_boundary"])
 def test_sliding_clamp_bends_a_strip_into_an_arc(device, bending):
-    """The clamp normal rotates by 4 rad, vertices slide in the bending plane: M = E h^3 b / 12 * 4 / L, no force, nu =
-    0.
-    """
+    """The clamp normal rotates by 4 rad, vertices slide in the bending plane: M = E h^3 b / 12 * 4 / L, no force, nu = 0."""
     scene = strip((24, 2), (1.0, 0.1), bending, material=ddg.Material(1e6, 0.0, 1000.0))
     scene.clamp_boundary(0, end(scene))
     motion = ddg.Motion(angle=lambda t: 4.0 * t, axis=(0.0, 1.0, 0.0))
