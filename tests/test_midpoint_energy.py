@@ -174,7 +174,7 @@ def test_couple_does_not_feed_an_instability(device, joined):
     The beam of `flying_beam` in steps of 0.02 s, at which the rule is unstable. Work of loads: force times path, couple
     times rotation.
 
-    Measured: 12,000 J for 260 J of work where a couple acted at the predicted edge without the bound.
+    Measured: a couple at the predicted edge fed 12,000 J into an instability by 260 J of work.
     """
     scene = joined_beam() if joined else flying_beam.build(40)
     model, work, dt = scene.build(device, "float64"), 0.0, 0.02
