@@ -1,4 +1,4 @@
-"""A Newton iteration of a net at a random state, with its matrices as dense ones."""
+"""One Newton iteration of a coupled system at a random state, with its matrices as dense arrays."""
 
 import numpy as np
 import warp as wp
@@ -24,7 +24,7 @@ def sheet(bending: str, cells: int = 3) -> ddg.Scene:
 
 
 def membrane_with_springs() -> ddg.Scene:
-    """A sheet and a chain of springs along one of its edges: tension apart, every Hessian here is a constant of the geometry."""
+    """Build a sheet with a row of springs along an edge: without stress all Hessians are constants of the geometry."""
     scene = sheet("isometric")
     points = scene.shells[0].points
     edge = np.flatnonzero(points[:, 0] == points[:, 0].max())
@@ -36,7 +36,7 @@ def membrane_with_springs() -> ddg.Scene:
 
 
 def frame_and_sheet(bending: str = "midedge_dof") -> ddg.Scene:
-    """A sheet with a rod along an edge, and a second rod that leaves a corner, joined rigidly: every kind of slot."""
+    """Build a sheet with a rod along an edge and a second rod joined rigidly at a corner: every kind of dof block."""
     scene = sheet(bending)
     points = scene.shells[0].points
     edge = np.flatnonzero(points[:, 0] == points[:, 0].max())
@@ -54,7 +54,7 @@ def line(start, end, nodes: int) -> np.ndarray:
 
 
 def branches() -> ddg.Scene:
-    """A clamped trunk with two branches at its tip, a twig across one of them, of 7, 5, 6 and 7 nodes; a held node between."""
+    """Build a clamped trunk with two branches and a twig across one, of 7, 5, 6 and 7 nodes; one inner node is fixed in x, z."""
     scene = ddg.Scene()
     trunk = scene.add_rod(line((0, 0, 0), (0.1, 0, 1), 7), section=SECTION)
     left = scene.add_rod(line((0.1, 0, 1), (0.5, 0.3, 1.6), 5), section=SECTION)
@@ -69,7 +69,7 @@ def branches() -> ddg.Scene:
 
 
 def ring_and_spokes() -> ddg.Scene:
-    """A closed rod of ten nodes, two spokes joined rigidly to it, and a cable between these."""
+    """Build a closed rod of ten nodes, two spokes joined rigidly to it, and a cable between the spokes."""
     scene = ddg.Scene()
     angle = 2.0 * np.pi * np.arange(10) / 10
     circle = np.column_stack([np.cos(angle), np.sin(angle), 0.1 * np.cos(2.0 * angle)])
@@ -86,19 +86,19 @@ def ring_and_spokes() -> ddg.Scene:
 
 
 def hinged_grid() -> ddg.Scene:
-    """Three rods across two, hinged where they cross: they bend on over the joints."""
+    """Build a grid of three by two rods with hinged crossings: bending continues across the joints."""
     scene = ddg.Scene()
     along = [scene.add_rod(line((0, y, 0), (3, y, 0), 13), section=SECTION) for y in (0.5, 1.0, 1.5)]
     across = [scene.add_rod(line((x, 0, 0), (x, 2, 0), 9), section=SECTION) for x in (0.75, 2.0)]
     for i, rod in enumerate(along):
         scene.fix(rod, [0])
-        for other, node in zip(across, (3, 8), strict=True):
-            scene.join([(rod, node), (other, 2 * (i + 1))], rigid=False)
+        for crossing, node in zip(across, (3, 8), strict=True):
+            scene.join([(rod, node), (crossing, 2 * (i + 1))], rigid=False)
     return scene
 
 
 class Problem:
-    """One Newton iteration at a random state of two worlds, dense."""
+    """Newton iteration at a random state of two worlds, with dense matrices."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class Problem:
         newton.evaluate(self.state.net)
         newton.balance()
         newton.assemble()
-        if newton.chains and newton.chains.exact:  # which assembles as it solves
+        if newton.chains and newton.chains.exact:  # direct substructuring assembles during the solve
             newton.chains.assemble(newton.matrix, newton.mass, newton.islands)
         return self
 
@@ -143,14 +143,17 @@ class Problem:
         return self
 
     def matrix(self, world: int) -> np.ndarray:
-        """H of a world, from its slices and bands, if these have not been factored in place; of held dofs they hold the identity."""
+        """Return the assembled H of a world (3 N, 3 N) from slices and bands; fixed dofs have identity rows.
+
+        Bands must not have been factorised.
+        """
         table, N = self.newton.system, self.blocks
         rows, columns = table.rows.numpy(), table.columns.numpy()
         values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world].copy()
         padding = rows < 0
         assert not values[:, padding].any()
         if self.newton.chains and self.newton.chains.exact:
-            values[:, self.newton.chains.plan.taken] = 0.0  # nobody clears them
+            values[:, self.newton.chains.plan.taken] = 0.0  # never cleared: the bands hold these blocks
         H = np.zeros((N, 3, N, 3))
         for p in np.flatnonzero(~padding):
             H[rows[p], :, columns[p]] += values[:, p].reshape(3, 3)
@@ -164,27 +167,28 @@ class Problem:
         free = self.free()
 
         def dofs(k, c):
-            own = [*(3 * node[k, c] + np.arange(3))] if node[k, c] >= 0 else [-1] * 3
-            return np.array(own + ([3 * angle[k, c] if angle[k, c] >= 0 else -1] if plan.twist else []))
+            node_dofs = [*(3 * node[k, c] + np.arange(3))] if node[k, c] >= 0 else [-1] * 3
+            return np.array(node_dofs + ([3 * angle[k, c] if angle[k, c] >= 0 else -1] if plan.twist else []))
 
         for c, count in enumerate(plan.count):
             for k in range(count):
                 for s in range(min(plan.span + 1, count - k)):
                     block = bands[s * nb**2 : (s + 1) * nb**2, k, c].reshape(nb, nb)
-                    one, other = dofs(k, c), dofs(k + s, c)
-                    there = np.outer((one >= 0) & free[one], (other >= 0) & free[other])
-                    i, j = np.nonzero(there)
-                    np.add.at(H, (one[i], other[j]), block[i, j])
+                    row_dofs, column_dofs = dofs(k, c), dofs(k + s, c)
+                    valid = np.outer((row_dofs >= 0) & free[row_dofs], (column_dofs >= 0) & free[column_dofs])
+                    i, j = np.nonzero(valid)
+                    np.add.at(H, (row_dofs[i], column_dofs[j]), block[i, j])
                     if s:
-                        np.add.at(H, (other[j], one[i]), block[i, j])
+                        np.add.at(H, (column_dofs[j], row_dofs[i]), block[i, j])
         return H
 
     def exact(self, world: int) -> np.ndarray:
-        """Exact Hessian of the elastic energy, and inertia."""
+        """Return the exact Hessian of elastic energy and inertia of a world (3 N, 3 N)."""
         size = 3 * self.blocks
-        own = slice(world * size, (world + 1) * size)
-        H = Tangent(self.model).hessian(self.state).toarray()[own, own]
+        of_world = slice(world * size, (world + 1) * size)
+        H = Tangent(self.model).hessian(self.state).toarray()[of_world, of_world]
         return H + np.diag(self.net.host.mass.ravel() * self.newton.islands.coefficient.numpy()[world])
 
     def free(self) -> np.ndarray:
+        """Return the mask of free dofs (3 N,)."""
         return ~self.net.host.fixed.ravel()

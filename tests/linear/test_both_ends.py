@@ -1,4 +1,4 @@
-"""Chains that are eliminated from both ends, against dense solves."""
+"""Twisted factorisation (elimination from both ends) against dense solves."""
 
 from types import SimpleNamespace
 
@@ -13,54 +13,56 @@ from ddg_warp.solve.net.both_ends import BothEnds
 
 COUNTS = (1, 2, 3, 4, 5, 6, 17, 32, 33)
 LONGEST, WIDTH = max(COUNTS), len(COUNTS)
-FROM = np.cumsum([0, *COUNTS])  # node that chains start with
+FROM = np.cumsum([0, *COUNTS])  # first node of each rod
 
 
-def layout(twist: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Places (2, longest, chains) of nodes one after the other, with angles after all of them, and a dof (longest, chains) held."""
-    places, held = np.full((2, LONGEST, WIDTH), -1), np.zeros((LONGEST, WIDTH), np.uint8)
+def dof_map(twist: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the dof map (2, longest, rods) of consecutive rods, twist angles last, and fixed-dof bits (longest, rods)."""
+    places, fixed = np.full((2, LONGEST, WIDTH), -1), np.zeros((LONGEST, WIDTH), np.uint8)
     for c, n in enumerate(COUNTS):
         places[0, :n, c] = np.arange(FROM[c], FROM[c] + n)
         if twist:
             places[1, : n - 1, c] = FROM[-1] + np.arange(FROM[c], FROM[c] + n - 1)
-        held[n // 3, c] = 2  # y
-    return places, held
+        fixed[n // 3, c] = 2  # y
+    return places, fixed
 
 
-def constrained(bands: np.ndarray, matrices: list, places: np.ndarray, held: np.ndarray, nb: int) -> list[np.ndarray]:
-    """Make rows and columns of dofs that are held, or not there, those of the identity in both; and which are free."""
+def constrain_fixed_dofs(
+    bands: np.ndarray, matrices: list, places: np.ndarray, fixed: np.ndarray, nb: int
+) -> list[np.ndarray]:
+    """Replace rows and columns of fixed and absent dofs by the identity in bands and matrices; return masks of free dofs."""
     free = []
     bands = bands.reshape(3, nb, nb, LONGEST, WIDTH)
     for c, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
-        own = np.array([[not held[k, c] >> d & 1 for d in range(nb)] for k in range(n)])
+        is_free = np.array([[not fixed[k, c] >> d & 1 for d in range(nb)] for k in range(n)])
         if nb > 3:
-            own[:, 3] &= places[1, :n, c] >= 0
-        off = ~own.ravel()
-        H[off] = H[:, off] = 0.0
-        H[off, off] = 1.0
+            is_free[:, 3] &= places[1, :n, c] >= 0
+        removed = ~is_free.ravel()
+        H[removed] = H[:, removed] = 0.0
+        H[removed, removed] = 1.0
         blocks = H.reshape(n, nb, n, nb)
         for k in range(n):
-            for ahead in range(min(3, n - k)):
-                bands[ahead, :, :, k, c] = blocks[k, :, k + ahead]
-        free.append(own)
+            for offset in range(min(3, n - k)):
+                bands[offset, :, :, k, c] = blocks[k, :, k + offset]
+        free.append(is_free)
     return free
 
 
 @pytest.mark.parametrize(("twist", "span"), [(False, 1), (False, 2), (True, 2)])
 @pytest.mark.parametrize("in_place", [False, True])
-def test_solutions_are_those_of_dense_solves(device, twist, span, in_place):
-    """Of two worlds, of which the second wants nothing, and of all chains but one that is idle; what these have is left alone."""
-    rng, nb, worlds, idle = np.random.default_rng(5), place_dofs(twist), 2, 4
-    places, held = layout(twist)
+def test_solutions_match_dense_solves(device, twist, span, in_place):
+    """Solve nine rods of two worlds; an inactive world and an inactive rod keep their values."""
+    rng, nb, worlds, inactive = np.random.default_rng(5), place_dofs(twist), 2, 4
+    places, fixed = dof_map(twist)
     bands, matrices = system(nb, COUNTS, rng, span)
-    free = constrained(bands, matrices, places, held, nb)
+    free = constrain_fixed_dofs(bands, matrices, places, fixed, nb)
     total = FROM[-1] * (2 if twist else 1)
     columns = worlds * WIDTH
-    given = (
+    inputs = (
         arrays.upload(places.astype(np.int32), int, device),
-        arrays.upload(held, wp.uint8, device),
+        arrays.upload(fixed, wp.uint8, device),
         wp.array(COUNTS, dtype=int, device=device),
-        wp.array(np.arange(columns) % WIDTH == idle, dtype=int, device=device),
+        wp.array(np.arange(columns) % WIDTH == inactive, dtype=int, device=device),
     )
     both = BothEnds(SimpleNamespace(twist=twist, span=span, block=nb), columns, wp.float64, device, 32)
     rows = np.concatenate([np.tile(bands, (1, 1, worlds)), np.zeros((nb, LONGEST, columns))])
@@ -71,41 +73,41 @@ def test_solutions_are_those_of_dense_solves(device, twist, span, in_place):
     z = wp.array(np.full((worlds * total, 3), 7.0), dtype=wp.vec3d, device=device)
     dots = wp.array(np.full((worlds, total), 7.0), dtype=wp.float64, device=device)
     values = arrays.allocate((nb, LONGEST, columns), wp.float64, device)
-    both.factorise(matrix, *given[2:], wanted, factors, lost)
-    at = wp.array(residual, dtype=wp.vec3d, device=device), *given, wanted, total
-    both.solve(factors, at, values, z, dots)
+    both.factorise(matrix, *inputs[2:], wanted, factors, lost)
+    solve_inputs = wp.array(residual, dtype=wp.vec3d, device=device), *inputs, wanted, total
+    both.solve(factors, solve_inputs, values, z, dots)
     z, dots = z.numpy(), dots.numpy()
     assert (lost.numpy() == 0).all()
     assert (z[total:] == 7.0).all()
     assert (dots[1] == 7.0).all()
     for c, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
         nodes = np.arange(FROM[c], FROM[c] + n)
-        if c == idle:
+        if c == inactive:
             assert (z[nodes] == 7.0).all()
             continue
         right = np.zeros((n, nb))
         right[:, :3] = residual[nodes]
         if twist:
             right[:-1, 3] = residual[FROM[-1] + nodes[:-1], 0]
-        found = np.linalg.solve(H, (right * free[c]).ravel()).reshape(n, nb)
-        np.testing.assert_allclose(z[nodes], found[:, :3], rtol=0, atol=1e-11 * abs(found).max())
+        expected = np.linalg.solve(H, (right * free[c]).ravel()).reshape(n, nb)
+        np.testing.assert_allclose(z[nodes], expected[:, :3], rtol=0, atol=1e-11 * abs(expected).max())
         np.testing.assert_allclose(dots[0, nodes], (residual[nodes] * z[nodes]).sum(1), rtol=1e-12, atol=1e-14)
         if twist:
             angles = FROM[-1] + nodes[:-1]
-            np.testing.assert_allclose(z[angles, 0], found[:-1, 3], rtol=0, atol=1e-11 * abs(found).max())
+            np.testing.assert_allclose(z[angles, 0], expected[:-1, 3], rtol=0, atol=1e-11 * abs(expected).max())
             np.testing.assert_allclose(dots[0, angles], residual[angles, 0] * z[angles, 0], rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("place", [0, 3, 4, 7])
-def test_negative_pivots_are_noted(device, place):
-    """Wherever they are: on either side, or at one of the places in the middle."""
+@pytest.mark.parametrize("node", [0, 3, 4, 7])
+def test_negative_pivots_are_counted(device, node):
+    """A negative pivot is counted on either side and at the two middle nodes."""
     n, nb = 8, 3
     bands = np.zeros((3 * nb**2 + nb, n, 1))
     bands[: nb**2 : nb + 1] = 1.0
-    bands[nb + 1, place] = -1.0
+    bands[nb + 1, node] = -1.0
     factors = arrays.upload(bands, wp.float64, device)
     both = BothEnds(SimpleNamespace(twist=False, span=2, block=nb), 1, wp.float64, device, 32)
-    count, idle = wp.full(1, n, dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
+    count, inactive = wp.full(1, n, dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
     lost = wp.zeros(1, dtype=int, device=device)
-    both.factorise(factors, count, idle, wp.full(1, 1, dtype=int, device=device), factors, lost)
+    both.factorise(factors, count, inactive, wp.full(1, 1, dtype=int, device=device), factors, lost)
     assert lost.numpy()[0] == 1

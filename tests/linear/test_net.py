@@ -1,4 +1,4 @@
-"""The sparse system of a net: H, its products and directions against dense matrices and exact Hessians."""
+"""Sparse matrix of a coupled system: H, its products and Newton directions against dense matrices and exact Hessians."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from ddg_warp.solve.tangent import Tangent
 
 
 @pytest.mark.parametrize("stretch", [1.05, 0.97], ids=["tension", "compression"])
-def test_matrix_is_the_exact_hessian_of_membranes(device, stretch):
-    """Green's strain is quadratic, isometric bending linear: with signed stresses nothing is left out, whatever the sign."""
+def test_matrix_is_exact_hessian_of_membranes(device, stretch):
+    """Signed stresses make H exact: Green's strain is quadratic, isometric bending linear in the positions."""
     problem = Problem(membrane_with_springs(), device, stretch).iterate(0.1)
     names = [part.term.name for part in problem.net.sets]
     assert sorted(names) == ["rod_stretch", "shell_isometric", "shell_stretch"]
@@ -21,7 +21,7 @@ def test_matrix_is_the_exact_hessian_of_membranes(device, stretch):
         np.testing.assert_allclose(problem.matrix(world), exact, rtol=0.0, atol=1e-12 * np.abs(exact).max())
 
 
-def test_projected_matrix_leaves_out_compression(device):
+def test_projected_matrix_drops_compression(device):
     problem = Problem(membrane_with_springs(), device, 0.9)
     problem.newton.islands.coefficient.fill_(0.0)
     free = problem.free()
@@ -36,7 +36,7 @@ def test_projected_matrix_leaves_out_compression(device):
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
-def test_directions_against_a_dense_solve(device, bending, precision):
+def test_directions_match_dense_solve(device, bending, precision):
     problem = Problem(frame_and_sheet(bending), device, 1.02, precision)
     problem.newton.islands.clamped.fill_(1)
     problem.iterate(1e-7 if precision == "mixed" else 1e-13)
@@ -53,18 +53,18 @@ def test_directions_against_a_dense_solve(device, bending, precision):
         np.testing.assert_allclose(direction[world], expected, rtol=0.0, atol=tolerance * np.abs(expected).max())
 
 
-def test_residual_is_that_of_the_tangent(device):
+def test_residual_matches_tangent(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(0.1)
     tangent, newton, host = Tangent(problem.model), problem.newton, problem.net.host
     q = newton.q.numpy()
     inertia = np.tile(host.mass, (2, 1)) * np.repeat(newton.islands.coefficient.numpy(), problem.blocks)[:, None]
     force = tangent.loads(1.0, q.ravel()) - tangent.gradient(problem.state)
     expected = np.where(tangent.free, force - (inertia * (q - newton.target.numpy())).ravel(), 0.0)
-    found = newton.right.numpy().ravel()
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+    residual = newton.right.numpy().ravel()
+    np.testing.assert_allclose(residual, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_product_is_that_of_the_matrix(device):
+def test_product_matches_matrix(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(1e-13)
     newton, size, free = problem.newton, 3 * problem.blocks, problem.free()
     vector = np.random.default_rng(0).normal(size=(2 * problem.blocks, 3)) * np.tile(~problem.net.host.fixed, (2, 1))
@@ -79,23 +79,23 @@ def test_product_is_that_of_the_matrix(device):
 
 
 @pytest.mark.parametrize("preconditioner", PRECONDITIONERS)
-def test_negative_curvature_ends_the_solve_and_projects(device, preconditioner):
-    """Where compression makes H indefinite the direction still descends, and the next matrix leaves compression out."""
+def test_negative_curvature_stops_pcg_and_projects(device, preconditioner):
+    """An indefinite H under compression still yields a descent direction; the next matrix drops compression."""
     problem = Problem(membrane_with_springs(), device, 0.8, preconditioner=preconditioner)
     problem.newton.islands.coefficient.fill_(1e-3)
     newton = problem.iterate(1e-10).newton
     assert newton.islands.clamped.numpy().tolist() == [1, 1]
     assert newton.iterations.numpy().max() < 10
-    right, direction = (a.numpy().reshape(2, -1) for a in (newton.right, newton.direction))
+    right, direction = (array.numpy().reshape(2, -1) for array in (newton.right, newton.direction))
     assert ((right * direction).sum(1) > 0.0).all()
     assert np.isfinite(direction).all()
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
-def test_multilevel_takes_fewer_iterations_to_the_same_step(device, precision):
-    """Groups of 8, 64 and 512 nodes carry what block Jacobi passes on edge by edge; both stop at the same residual of the step."""
+def test_multilevel_saves_iterations_for_the_same_step(device, precision):
+    """Levels of 8, 64 and 512 nodes need fewer iterations than block Jacobi, at the same residual tolerance."""
     points, triangles = meshes.rectangle(24, 24, (1.0, 1.0), "alternating")
-    found, iterations = [], []
+    points_by_solver, iterations = [], []
     for linear in ("block_jacobi", "multilevel"):
         scene = ddg.Scene()
         shell = scene.add_shell(
@@ -106,16 +106,16 @@ def test_multilevel_takes_fewer_iterations_to_the_same_step(device, precision):
         integrator, state = ddg.Integrator(model, linear=linear, check_every=1), model.state()
         for _ in range(3):
             state = integrator.step(state, 1.0 / 30.0)
-        found.append(state.points())
+        points_by_solver.append(state.points())
         statistics = integrator.statistics()
         iterations.append(statistics["pcg_iterations"] / statistics["newton_iterations"]["mean"])
-    np.testing.assert_allclose(found[1], found[0], rtol=0.0, atol=1e-6)
-    np.testing.assert_array_equal(found[1][0], found[1][1])
+    np.testing.assert_allclose(points_by_solver[1], points_by_solver[0], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(points_by_solver[1][0], points_by_solver[1][1])
     assert iterations[1] < 0.7 * iterations[0]
 
 
-def test_blocks_of_groups_are_those_of_the_matrix(device):
-    """D_l is the diagonal of P^T H P, with P the translations of the groups of a level on free dofs."""
+def test_level_blocks_are_galerkin_products(device):
+    """D_l is the diagonal of P^T H P, with P the translations of the node groups of a level on free dofs."""
     points, triangles = meshes.rectangle(9, 7, (1.0, 0.8), "right")
     scene = ddg.Scene()
     shell = scene.add_shell(points, triangles, thickness=0.01, material=ddg.Material(1e6, 0.3, 1000.0))

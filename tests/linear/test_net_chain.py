@@ -1,4 +1,4 @@
-"""The chain preconditioner of nets: against dense elimination, as an operator, and in steps of nets of rods and of stiffened sheets."""
+"""Substructuring preconditioner of the coupled system: against dense condensation, as an operator, and in steps."""
 
 from itertools import chain
 
@@ -17,57 +17,57 @@ STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 
 
-def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
-    """The preconditioner on rows of vectors (n, worlds, 3 N), block by block as in a solve."""
+def apply_preconditioner(problem: Problem, vectors: np.ndarray) -> np.ndarray:
+    """Apply the preconditioner to vectors (n, worlds, 3 N), after the block Jacobi stage as in a solve."""
     newton = problem.newton
     newton.islands.wanted.fill_(1)
     inverse = newton.krylov.inverse.numpy().astype(float)
-    found = []
+    results = []
     for vector in vectors:
         r = vector.reshape(-1, 3)
         newton.krylov.rest.assign(r)
         newton.krylov.z.assign(np.einsum("bij,bj->bi", inverse, r))
         newton.krylov.precondition(newton.krylov.z)
-        found.append(newton.krylov.z.numpy().astype(float).reshape(vector.shape))
+        results.append(newton.krylov.z.numpy().astype(float).reshape(vector.shape))
         dots = newton.krylov_dots.numpy().reshape(-1)
         np.testing.assert_allclose(
             dots, (r * newton.krylov.z.numpy()).sum(1), rtol=1e-4, atol=1e-6 * np.abs(dots).max()
         )
-    return np.array(found)
+    return np.array(results)
 
 
-def solved(problem: Problem, forcing: float) -> np.ndarray:
-    """Iterations of conjugate gradients of each world to a residual `forcing` times the first, with a projected matrix."""
+def pcg_iterations(problem: Problem, forcing: float) -> np.ndarray:
+    """Return the PCG iterations of each world to the relative residual `forcing`, with a projected matrix."""
     problem.newton.islands.clamped.fill_(1)
     return problem.iterate(forcing).newton.iterations.numpy()
 
 
-def dense(problem: Problem, world: int) -> np.ndarray:
-    """Elimination of rods between joints, then of single joints, by the formulas of `kernels.solve.elimination` with dense matrices."""
+def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
+    """Condense rod interiors, then single joints, by the formulas of `kernels.solve.elimination` with dense matrices."""
     host, free = problem.net.host, problem.free()
     H = np.where(np.outer(free, free), problem.matrix(world), np.diag(~free))
     pairs = problem.newton.chains.plan.pairs
     joints = [[int(b) for b in pair if b >= 0] for pair in pairs]
     taken = {b for joint in joints for b in joint}
-    chains = [[int(b) for b in (*rod.all_nodes, *rod.all_edges) if b not in taken] for rod in host.rods]
+    interiors = [[int(b) for b in (*rod.all_nodes, *rod.all_edges) if b not in taken] for rod in host.rods]
 
     def dofs(blocks):
         return (3 * np.array(blocks, int)[:, None] + np.arange(3)).ravel()
 
-    eliminated = list(chain.from_iterable(chains))
+    eliminated = list(chain.from_iterable(interiors))
     inner = dofs(eliminated)
-    between = np.zeros_like(H)  # H_II^-1
-    for blocks in chains:
-        between[np.ix_(dofs(blocks), dofs(blocks))] = np.linalg.inv(H[np.ix_(dofs(blocks), dofs(blocks))])
+    interior_inverse = np.zeros_like(H)  # H_II^-1
+    for blocks in interiors:
+        interior_inverse[np.ix_(dofs(blocks), dofs(blocks))] = np.linalg.inv(H[np.ix_(dofs(blocks), dofs(blocks))])
     size = len(H)
-    result = between.copy()
+    result = interior_inverse.copy()
     for joint in joints:
         j = dofs(joint)
-        extension = np.zeros((size, len(j)))  # what a movement of the joint makes of everything
-        extension[inner] = -(between @ H[:, j])[inner]
+        extension = np.zeros((size, len(j)))  # response of all dofs to a displacement of the joint
+        extension[inner] = -(interior_inverse @ H[:, j])[inner]
         extension[j] = np.eye(len(j))
-        own = H[np.ix_(j, j)] - H[j] @ between @ H[:, j]
-        result += extension @ np.linalg.inv(own) @ extension.T
+        schur = H[np.ix_(j, j)] - H[j] @ interior_inverse @ H[:, j]
+        result += extension @ np.linalg.inv(schur) @ extension.T
     for block in set(range(problem.blocks)) - taken - set(eliminated):
         j = dofs([block])
         result[np.ix_(j, j)] = np.linalg.inv(H[np.ix_(j, j)])
@@ -76,22 +76,22 @@ def dense(problem: Problem, world: int) -> np.ndarray:
 
 @pytest.mark.parametrize("reduces", [False, True, "anew"])
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
-def test_is_the_elimination_of_chains_and_joints(device, monkeypatch, scene, reduces):
-    """Whether a thread walks along each chain, or many reduce it cyclically, once or for every right-hand side."""
+def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduces):
+    """Equal to dense condensation by the serial sweep and by cyclic reduction, with factors stored or recomputed."""
     monkeypatch.setattr(net_chains, "long_and_few", lambda *_: bool(reduces))
     monkeypatch.setattr(reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
     problem.newton.islands.clamped.fill_(1)
     problem.iterate(0.1)
     vectors = np.random.default_rng(1).normal(size=(3, 2, 3 * problem.blocks)) * problem.free()
-    found = applied(problem, vectors)
+    results = apply_preconditioner(problem, vectors)
     for world in range(2):
-        expected = vectors[:, world] @ dense(problem, world)
-        np.testing.assert_allclose(found[:, world], expected, rtol=0.0, atol=1e-10 * np.abs(expected).max())
+        expected = vectors[:, world] @ dense_preconditioner(problem, world)
+        np.testing.assert_allclose(results[:, world], expected, rtol=0.0, atol=1e-10 * np.abs(expected).max())
 
 
-def test_joints_of_a_net(device):
-    """Where rods meet, with the rotations of rigid joints, and the last two places of a ring, which couple to its first ones."""
+def test_joints_are_shared_nodes_and_ring_closures(device):
+    """Joints are shared nodes, rotations of rigid joints, and the last two nodes of a ring, which couple to its first."""
     problem = Problem(ring_and_spokes(), device, preconditioner="chain")
     plan, host = problem.newton.chains.plan, problem.net.host
     ring, one, two, cable = host.rods
@@ -114,7 +114,7 @@ def test_joints_of_a_net(device):
 
 
 def indefinite(problem: Problem) -> bool:
-    """Whether H of the first world is."""
+    """Return True if H of the first world is indefinite."""
     free = problem.free()
     return np.linalg.eigvalsh(problem.matrix(0)[np.ix_(free, free)])[0] < 0.0
 
@@ -125,8 +125,8 @@ def indefinite(problem: Problem) -> bool:
     [(frame_and_sheet, 1.02), (frame_and_sheet, 0.8), (hinged_grid, 1.02)],
     ids=["tension", "compression", "hinged"],
 )
-def test_is_symmetric_and_positive_definite(device, preconditioner, scene, stretch):
-    """Also where H is not, and where the columns of S of hinged joints hold some of other joints."""
+def test_preconditioner_is_symmetric_positive_definite(device, preconditioner, scene, stretch):
+    """Also where H is indefinite, and where hinged joints couple in columns of the joint Schur complement."""
     problem = Problem(scene(), device, stretch, preconditioner=preconditioner)
     problem.newton.islands.coefficient.fill_(1e-3)
     problem.iterate(0.5)
@@ -134,9 +134,9 @@ def test_is_symmetric_and_positive_definite(device, preconditioner, scene, stret
     assert indefinite(problem) or stretch > 0.9
     units = np.zeros((len(free), 2, 3 * problem.blocks))
     units[np.arange(len(free)), :, free] = 1.0
-    found = applied(problem, units)[:, 0]
-    assert not found[:, ~problem.free()].any()
-    M = found[:, free]
+    results = apply_preconditioner(problem, units)[:, 0]
+    assert not results[:, ~problem.free()].any()
+    M = results[:, free]
     assert np.abs(M - M.T).max() < 1e-9 * np.abs(M).max()
     scale = 1.0 / np.sqrt(M.diagonal())
     assert np.linalg.eigvalsh(0.5 * scale[:, None] * (M + M.T) * scale)[0] > 1e-12
@@ -161,8 +161,8 @@ def star() -> ddg.Scene:
     return scene
 
 
-def rod_on_a_held_sheet() -> ddg.Scene:
-    """The net is a rod: nothing else is free."""
+def rod_on_a_fixed_sheet() -> ddg.Scene:
+    """Build a rod attached to a fixed sheet: only the rod is free."""
     scene = sheet("hinge", 2)
     points = scene.shells[0].points
     scene.hold(0, range(len(points)))
@@ -172,9 +172,9 @@ def rod_on_a_held_sheet() -> ddg.Scene:
 
 
 @DAILY_IN_FLOAT64
-@pytest.mark.parametrize("scene", [bent_frame, star, rod_on_a_held_sheet])
-def test_nets_with_one_joint_at_most_are_solved_at_once(device, scene, precision):
-    """By elimination alone: H d = r."""
+@pytest.mark.parametrize("scene", [bent_frame, star, rod_on_a_fixed_sheet])
+def test_systems_with_at_most_one_joint_need_no_pcg(device, scene, precision):
+    """Substructuring alone solves H d = r, without PCG iterations."""
     problem = Problem(scene(), device, 1.02, precision, "chain")
     problem.newton.islands.clamped.fill_(1)
     matrices, newton, free = [problem.assemble().matrix(world) for world in range(2)], problem.newton, problem.free()
@@ -189,8 +189,8 @@ def test_nets_with_one_joint_at_most_are_solved_at_once(device, scene, precision
 
 
 @pytest.mark.parametrize("scene", [bent_frame, star])
-def test_elimination_notes_indefinite_matrices(device, scene):
-    """Rods and cables pressed to 0.7 of their length: the same iterate is to come again without compression, and is definite then."""
+def test_elimination_detects_indefinite_matrices(device, scene):
+    """Compressed to 0.7 of the length, the iterate is repeated without compression, with a definite matrix."""
     problem = Problem(scene(), device, 0.7, preconditioner="chain")
     islands = problem.newton.islands
     islands.coefficient.fill_(1e-3)
@@ -207,22 +207,22 @@ def test_elimination_notes_indefinite_matrices(device, scene):
 
 @pytest.mark.parametrize("rigid", [True, False])
 @DAILY_IN_FLOAT64
-def test_iterations_do_not_grow_with_the_nodes_of_a_rod(device, rigid, precision):
-    """5 or 6 of them at 5 and at 15 edges between crossings, where block Jacobi takes 55 and 250."""
+def test_iterations_are_independent_of_nodes_per_rod(device, rigid, precision):
+    """Measured: 5 or 6 iterations at 5 and at 15 edges between crossings, where block Jacobi takes 55 and 250."""
     iterations = {}
     for segments in (5, 15):
         for linear in ("block_jacobi", "chain"):
             scene = gridshell_dome.build(3, segments, rigid=rigid)
             problem = Problem(scene, device, 1.0, precision, linear, noise=0.0)
             problem.newton.islands.coefficient.fill_(3600.0)
-            iterations[linear, segments] = solved(problem, 1e-3).max()
+            iterations[linear, segments] = pcg_iterations(problem, 1e-3).max()
     assert iterations["chain", 15] <= iterations["chain", 5] + 2 <= 10
     assert iterations["chain", 15] < 0.1 * iterations["block_jacobi", 15]
     assert iterations["block_jacobi", 15] > 2 * iterations["block_jacobi", 5]
 
 
 def trajectory(scene, device, linear: str, dt: float, precision="float64", worlds=2):
-    """Points after some steps, and iterations of conjugate gradients a Newton iteration."""
+    """Return the points after some steps, and PCG iterations per Newton iteration."""
     model = scene.build(device, precision, worlds=worlds)
     integrator, state = ddg.Integrator(model, linear=linear, check_every=1), model.state()
     for _ in range(4):
@@ -232,20 +232,20 @@ def trajectory(scene, device, linear: str, dt: float, precision="float64", world
 
 
 @DAILY_IN_FLOAT64
-def test_same_steps_of_a_gridshell(device, precision):
+def test_gridshell_steps_match_block_jacobi(device, precision):
     scene = gridshell_dome.build(3, 8)
     expected, many = trajectory(scene, device, "block_jacobi", 1.0 / 60.0, precision)
-    found, few = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
+    points, few = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
     moved = np.abs(expected - scene.build("cpu", "float64", worlds=2).state().points()).max()
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-5 * moved)
-    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_allclose(points, expected, rtol=0.0, atol=1e-5 * moved)
+    np.testing.assert_array_equal(points[0], points[1])
     assert few < 0.2 * many
     again, _ = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
-    np.testing.assert_array_equal(again, found)
+    np.testing.assert_array_equal(again, points)
 
 
 def stiffened(spin: str, cells: int = 16) -> ddg.Scene:
-    """A hanging sheet with stiff ribs along five lines of its mesh, and across five more."""
+    """Build a hanging sheet with stiff ribs along five mesh lines in each direction."""
     points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
     scene = ddg.Scene()
     shell = scene.add_shell(points, triangles, thickness=1e-3, material=ddg.Material(1e6, 0.3, 1000.0), bending="hinge")
@@ -261,20 +261,20 @@ def stiffened(spin: str, cells: int = 16) -> ddg.Scene:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("spin", "most"), [("free", (0.25, 0.35)), ("glued", (0.25, 0.35))])
-def test_composes_with_levels_on_a_stiffened_sheet(device, spin, most):
-    """Chains know the ribs' own bending and twist; what glue couples to the sheet is left to the iterations."""
-    found = {
+def test_substructuring_saves_iterations_on_stiffened_sheet(device, spin, most):
+    """Substructuring condenses bending and twist of the ribs; their coupling to the sheet is left to the iterations."""
+    trajectories = {
         linear: trajectory(stiffened(spin), device, linear, 1.0 / 60.0, worlds=1)
         for linear in ("multilevel", "chain", "chain_multilevel")
     }
-    points, many = found["multilevel"]
-    for linear, share in zip(("chain", "chain_multilevel"), most, strict=True):
-        np.testing.assert_allclose(found[linear][0], points, rtol=0.0, atol=1e-7)
-        assert found[linear][1] < share * many
+    points, many = trajectories["multilevel"]
+    for linear, ratio in zip(("chain", "chain_multilevel"), most, strict=True):
+        np.testing.assert_allclose(trajectories[linear][0], points, rtol=0.0, atol=1e-7)
+        assert trajectories[linear][1] < ratio * many
 
 
-def test_choice(device):
-    """By the nodes between joints; and nets without rods launch nothing of it."""
+def test_preconditioner_choice_by_nodes_between_joints(device):
+    """The choice follows the number of nodes between joints; systems without rods launch no substructuring."""
     assert net_preconditioner(gridshell_dome.build(3, 12).build(device).net) == "chain"
     assert net_preconditioner(gridshell_dome.build(3, 2).build(device).net) == "block_jacobi"
     assert net_preconditioner(sheet("hinge").build(device).net) == "block_jacobi"
@@ -289,7 +289,7 @@ def test_choice(device):
 
 
 @pytest.mark.parametrize("linear", ["block_jacobi", "chain"])
-def test_only_nets_with_chains_load_its_kernels(device, linear):
+def test_kernels_load_only_for_substructuring(device, linear):
     newton = Problem(bent_frame(), device, preconditioner=linear).newton
     keys = [(entry[0] if isinstance(entry, tuple) else entry).key for entry in newton.kernels]
     assert any("chain_kernels" in key or "joint_kernels" in key for key in keys) == (linear == "chain")
@@ -313,33 +313,33 @@ def truss() -> ddg.Scene:
     ],
     ids=["sheet", "truss", "name"],
 )
-def test_what_has_no_chains_is_refused(device, scene, linear, message):
+def test_systems_without_rod_interiors_are_refused(device, scene, linear, message):
     with pytest.raises(ddg.SceneError, match=message):
         ddg.Integrator(scene().build(device), linear=linear)
 
 
 @pytest.mark.parametrize("psd", ["gauss_newton", "progressive"])
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet, hinged_grid])
-def test_places_and_bands_hold_what_lists_and_slices_hold(device, scene, psd):
-    """Residuals, what rounding leaves of them, changes of energy and H on free dofs, with elements along rods in either form."""
-    found = []
+def test_assembly_along_rods_matches_incidence_lists(device, scene, psd):
+    """Residuals, rounding bounds, energy changes and H on free dofs agree between the two forms of rod elements."""
+    results = []
     for preconditioner in ("block_jacobi", "chain"):
         problem = Problem(scene(), device, 1.02, preconditioner=preconditioner, psd=psd)
         newton, islands = problem.newton, problem.newton.islands
         random = np.random.default_rng(5)
         newton.base.assign(newton.q.numpy() + 0.01 * random.normal(size=(newton.all, 3)))
         islands.load_scale.fill_(1.0)
-        islands.iteration.fill_(3)  # late enough for second derivatives
-        for own in newton.parts:
-            own["energy"].fill_(0.25)  # of the accepted iterate
+        islands.iteration.fill_(3)  # second derivatives enter from here on
+        for element_set in newton.parts:
+            element_set["energy"].fill_(0.25)  # of the accepted iterate
         problem.assemble()
         free = problem.free()
         vectors = (newton.right, newton.allowed.least, newton.allowed.ratio, newton.square, newton.change, newton.noise)
-        found.append([*(v.numpy().astype(float) for v in vectors)])
-        found[-1] += [problem.matrix(world)[np.ix_(free, free)] for world in range(2)]
+        results.append([*(v.numpy().astype(float) for v in vectors)])
+        results[-1] += [problem.matrix(world)[np.ix_(free, free)] for world in range(2)]
         flags = islands.unbalanced.numpy().tolist(), islands.drowned.numpy().tolist()
         assert flags == ([1, 1], [1, 1])
     assert problem.newton.chains.banded and any(problem.newton.local)
-    for by_lists, by_places in zip(*found, strict=True):
+    for by_lists, by_dof_map in zip(*results, strict=True):
         assert np.abs(by_lists).max() > 0.0
-        np.testing.assert_allclose(by_places, by_lists, rtol=1e-11, atol=1e-12 * np.abs(by_lists).max())
+        np.testing.assert_allclose(by_dof_map, by_lists, rtol=1e-11, atol=1e-12 * np.abs(by_lists).max())

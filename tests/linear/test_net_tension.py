@@ -1,4 +1,4 @@
-"""Tensions as unknowns of islands whose chains are eliminated at once: directions as without, and motion as in float64."""
+"""Mixed axial-force formulation in the coupled system: directions equal the plain ones, motion equals float64."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,8 @@ from ddg_warp.solve.net.newton import NetNewton
 HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
 
 
-def held(axial: float = 1e4, twist: bool = True) -> ddg.Scene:
-    """Wavy rods that begin, end, and do both in held joints, one that bends on over a held joint; single nodes are held, too."""
+def rods_with_fixed_joints(axial: float = 1e4, twist: bool = True) -> ddg.Scene:
+    """Build wavy rods with fixed joints at the start, the end, both, and within; single nodes are fixed, too."""
     scene = ddg.Scene()
     along = np.linspace(0.0, 3.0, 25)
     bend = {"EI2": 0.9} if twist else {}
@@ -34,10 +34,10 @@ def held(axial: float = 1e4, twist: bool = True) -> ddg.Scene:
     return scene
 
 
-def direction(
+def first_direction(
     scene: ddg.Scene, device, linear, carried: float | None, noise: float = 1e-3
 ) -> tuple[NetNewton, np.ndarray]:
-    """A solver of two worlds, iterates off their rest by `noise` [m], and the first direction (worlds, blocks, 3)."""
+    """Return a solver of two worlds at iterates off rest by `noise` [m], and the first direction (worlds, blocks, 3)."""
     random, model = np.random.default_rng(3), scene.build(device, "float64", worlds=2)
     newton = NetNewton(model, NewtonOptions(psd="gauss_newton"), "chain", linear, split=carried is not None)
     state, islands = model.state().net, newton.islands
@@ -60,50 +60,50 @@ def direction(
 
 
 @pytest.mark.parametrize("twist", [True, False])
-def test_directions_are_those_of_the_whole_matrix(device, twist):
-    """Whatever the share of the stiffness that H carries; and edges with a tension lengthen by what it says."""
-    scene = held(twist=twist)
-    _, exact = direction(scene, device, wp.float64, None)
-    for carried in (1.0, 1e4, 1e9):  # edges have some 8e4; the last leaves no tension
-        newton, found = direction(scene, device, wp.float64, carried)
-        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
-        part = next(part for part in newton.net.sets if part.term.measure.tensions)
-        a, b = part.host.slots[:2]
+def test_directions_match_full_matrix(device, twist):
+    """Directions are equal for any fraction of axial stiffness kept in H; lengthenings of mixed edges match them."""
+    scene = rods_with_fixed_joints(twist=twist)
+    _, exact = first_direction(scene, device, wp.float64, None)
+    for carried in (1.0, 1e4, 1e9):  # axial stiffness is about 8e4: the last leaves no mixed edge
+        newton, mixed = first_direction(scene, device, wp.float64, carried)
+        np.testing.assert_allclose(mixed, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
+        element_set = next(element_set for element_set in newton.net.sets if element_set.term.measure.tensions)
+        a, b = element_set.host.slots[:2]
         q = newton.q.numpy().reshape(2, -1, 3)
-        edges, steps = q[:, b] - q[:, a], found[:, b] - found[:, a]
+        edges, steps = q[:, b] - q[:, a], mixed[:, b] - mixed[:, a]
         along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
-        at = newton.chains.plan.elements(newton.net.host, part.host)[1]
-        k, c = np.nonzero(at >= 0)
+        element = newton.chains.plan.elements(newton.net.host, element_set.host)[1]
+        k, c = np.nonzero(element >= 0)
         longer = arrays.download(newton.chains.longer).reshape(2, newton.chains.longest, 2, -1)
         slack, lengthening = longer[:, k, :, c].transpose(1, 2, 0)
         assert (slack > 0.0).any() == (carried < 1e9)
-        expected = along[:, at[k, c]]
-        there = slack > 0.0
+        expected = along[:, element[k, c]]
+        is_mixed = slack > 0.0
         np.testing.assert_allclose(
-            lengthening[there], expected[there], rtol=0, atol=1e-9 * np.abs(steps).max(initial=0.0)
+            lengthening[is_mixed], expected[is_mixed], rtol=0, atol=1e-9 * np.abs(steps).max(initial=0.0)
         )
 
 
-def test_float32_is_as_good_however_stiff_edges_are(device):
-    """Errors of directions with tensions do not grow with EA; without they do. Edges have kept their lengths."""
+def test_float32_error_is_independent_of_axial_stiffness(device):
+    """Errors of mixed directions do not grow with EA; without mixed tensions they do. Iterates have edges of rest length."""
     errors = {1e2: [], None: []}
     for axial in (1e4, 1e6, 1e8):
-        scene = held(axial)
-        _, exact = direction(scene, device, wp.float64, 1e2, 0.0)
-        for carried, found in errors.items():
-            _, got = direction(scene, device, wp.float32, carried, 0.0)
-            found.append(np.abs(got - exact).max() / np.abs(exact).max())
+        scene = rods_with_fixed_joints(axial)
+        _, exact = first_direction(scene, device, wp.float64, 1e2, 0.0)
+        for carried, error_list in errors.items():
+            _, inexact = first_direction(scene, device, wp.float32, carried, 0.0)
+            error_list.append(np.abs(inexact - exact).max() / np.abs(exact).max())
     assert max(errors[1e2]) < 1e-3
     assert errors[None][-1] > 30.0 * errors[1e2][-1]
 
 
-def island(nodes: int, strands: int = 3, backwards: bool = False) -> ddg.Scene:
-    """Hair in one island: the roots are joined to stubs that are held."""
+def hair_island(nodes: int, strands: int = 3, backwards: bool = False) -> ddg.Scene:
+    """Build hair in one island: each root is joined to a clamped stub."""
     scene = ddg.Scene(gravity=(3.0, 0.0, -9.81), analysis=ddg.Dynamics(dt=1.0 / 60.0, duration=1.0))
-    given = {"section": ddg.Circle(40e-6), "material": HAIR}
+    options = {"section": ddg.Circle(40e-6), "material": HAIR}
     for points in hair.curls(strands, nodes):
-        rod = scene.add_rod(points[::-1] if backwards else points, natural="shape", **given)
-        stub = scene.add_rod(np.linspace(points[0] + [0.0, 0.0, 0.02], points[0], 3), **given)
+        rod = scene.add_rod(points[::-1] if backwards else points, natural="shape", **options)
+        stub = scene.add_rod(np.linspace(points[0] + [0.0, 0.0, 0.02], points[0], 3), **options)
         scene.clamp(stub, edges=[0, 1])
         scene.join([(rod, -1 if backwards else 0), (stub, -1)], rigid=False)
     return scene
@@ -118,25 +118,25 @@ def island(nodes: int, strands: int = 3, backwards: bool = False) -> ddg.Scene:
         pytest.param(32, False, "implicit_midpoint", marks=pytest.mark.slow),
     ],
 )
-def test_hair_in_one_island_moves_as_in_float64(device, nodes, backwards, scheme):
+def test_hair_island_matches_float64(device, nodes, backwards, scheme):
     """Within 1e-6 m of float64 at rtol 1e-10, in as many iterations, and without retries."""
-    given = (1.0 / 60.0, 15) if scheme == "implicit_euler" else (1.0 / 120.0, 30)
+    steps = (1.0 / 60.0, 15) if scheme == "implicit_euler" else (1.0 / 120.0, 30)
     options = {"scheme": scheme} | ({"energy_bound": None} if scheme == "implicit_midpoint" else {})
-    scene = island(nodes, backwards=backwards)
-    exact, _ = advance(scene, device, "float64", *given, rtol=1e-10, **options)
-    _, usual = advance(scene, device, "float64", *given, **options)
-    found, mixed = advance(scene, device, "mixed", *given, **options)
-    assert mixed["linear"] == ["float32 with tensions"]
-    assert np.abs(found - exact).max() < 1e-6
-    assert mixed["newton_iterations"]["mean"] < 1.1 * usual["newton_iterations"]["mean"]
-    assert mixed["retries"] == mixed["pcg_iterations"] == 0
+    scene = hair_island(nodes, backwards=backwards)
+    exact, _ = advance(scene, device, "float64", *steps, rtol=1e-10, **options)
+    _, usual = advance(scene, device, "float64", *steps, **options)
+    points, statistics = advance(scene, device, "mixed", *steps, **options)
+    assert statistics["linear"] == ["float32 with tensions"]
+    assert np.abs(points - exact).max() < 1e-6
+    assert statistics["newton_iterations"]["mean"] < 1.1 * usual["newton_iterations"]["mean"]
+    assert statistics["retries"] == statistics["pcg_iterations"] == 0
 
 
-def test_the_report_says_what_islands_take(device):
-    """Chains on their own take tensions; those that meet a free joint are solved in float64."""
+def test_report_names_linear_algebra_of_islands(device):
+    """Uncoupled islands take mixed tensions; islands with a free joint are solved in float64."""
     said = "over steps of 0.0166667 s: edges turned, second derivatives, linear algebra in "
-    assert said + "float32 with tensions" in island(32).build(device, "mixed").report()
-    scene = island(32)
+    assert said + "float32 with tensions" in hair_island(32).build(device, "mixed").report()
+    scene = hair_island(32)
     tip = scene.batches[0].points[0, -1]
     twig = scene.add_rod(np.linspace(tip, tip + [0.1, 0.0, 0.0], 10), section=ddg.Circle(40e-6), material=HAIR)
     scene.join([(0, -1), (twig, 0)], rigid=False)

@@ -1,4 +1,4 @@
-"""Conjugate gradients that float32 leaves without a direction: said by name, never taken for rounding."""
+"""Conjugate gradients without a descent direction in float32: reported by name, never taken for rounding."""
 
 import numpy as np
 import warp as wp
@@ -9,29 +9,29 @@ from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve import step
 
 
-def test_solves_without_a_direction_are_noted(device):
-    """By r . z that is not positive, or no number, at the start of a solve; later, by more than what is asked for."""
+def test_solves_without_direction_are_flagged(device):
+    """Flag r . z <= 0 or not finite at the start of a solve, and later beyond the tolerance."""
     _, _, begin, *_, test = krylov.solver_kernels(wp.float32)
     first = [1.0, 0.0, -1.0, np.nan, np.inf, 1.0]
 
-    def put(values, dtype=wp.float32):
+    def upload(values, dtype=wp.float32):
         return wp.array(np.broadcast_to(values, 6).copy(), dtype=dtype, device=device)
 
-    wanted, negative, iterations, busy = (put(v, int) for v in ([1, 1, 1, 1, 1, 0], 0, 0, 0))
-    rho, start = put(0.0), put(0.0)
-    wp.launch(begin, 6, [put(first), wanted], [rho, start, iterations, negative, busy], device=device)
+    wanted, negative, iterations, busy = (upload(v, int) for v in ([1, 1, 1, 1, 1, 0], 0, 0, 0))
+    rho, start = upload(0.0), upload(0.0)
+    wp.launch(begin, 6, [upload(first), wanted], [rho, start, iterations, negative, busy], device=device)
     assert wanted.numpy().tolist() == [1, 3, 3, 3, 3, 0]
     assert negative.numpy().tolist() == [0, 1, 1, 1, 1, 0]
-    left = [1e-3, 1e-5, -1e-5, -1e-3, np.nan, 0.0]  # of 1; 1e-4 are asked for
-    wanted, negative = put(1, int), put(0, int)
-    given = [put(left), put(1.0), put(1.0), put(1e-2), 100]
-    wp.launch(test, 6, given, [put(1.0), iterations, negative, wanted, busy], device=device)
+    left = [1e-3, 1e-5, -1e-5, -1e-3, np.nan, 0.0]  # of 1; the tolerance is 1e-4
+    wanted, negative = upload(1, int), upload(0, int)
+    inputs = [upload(left), upload(1.0), upload(1.0), upload(1e-2), 100]
+    wp.launch(test, 6, inputs, [upload(1.0), iterations, negative, wanted, busy], device=device)
     assert wanted.numpy().tolist() == [1, 2, 2, 3, 3, 2]
     assert negative.numpy().tolist() == [0, 0, 0, 1, 1, 0]
 
 
-def test_where_there_is_no_direction_second_derivatives_are_left_out(device, monkeypatch):
-    """A slack gridshell, EA L^2 / EI = 1e8, whose exact Hessian overflows float32: all of its steps converge, as in float64."""
+def test_lost_direction_drops_second_derivatives(device, monkeypatch):
+    """A slack gridshell, EA L^2 / EI = 1e8, whose exact Hessian overflows float32: all steps converge, as in float64."""
     scene = gridshell_dome.build(3, 16)
     for batch in scene.batches:
         axial = 1e8 / gridshell_dome.SPAN**2
@@ -46,8 +46,10 @@ def test_where_there_is_no_direction_second_derivatives_are_left_out(device, mon
         return state.points(), integrator.statistics()
 
     exact, _ = advanced("float64", rtol=1e-10)
-    monkeypatch.setattr(step, "suited", lambda *_: step.Means(wp.float32, True, False))  # whatever suits
-    found, mixed = advanced("mixed")
+    monkeypatch.setattr(
+        step, "suited", lambda *_: step.Means(wp.float32, True, False)
+    )  # instead of the solver selection
+    points, mixed = advanced("mixed")
     assert mixed["linear"] == ["float32"]
     assert mixed["outcomes"] == {"converged": 4}
-    assert np.abs(found - exact).max() < 1e-7 * np.ptp(exact, axis=0).max()
+    assert np.abs(points - exact).max() < 1e-7 * np.ptp(exact, axis=0).max()

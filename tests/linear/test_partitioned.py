@@ -1,4 +1,4 @@
-"""Cyclic reduction against dense matrices, moves against those by one thread a rod, and steps against the chain sweep."""
+"""Cyclic reduction of uncoupled rods against dense matrices, the serial kernel and the sweep."""
 
 from types import SimpleNamespace
 
@@ -16,16 +16,16 @@ from ddg_warp.solve.chains.partitioned import PartitionedNewton
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 EVERY_KIND = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
-)  # each has kernels of its own: every day the one that has them all
-COUNTS = (2, 3, 4, 5, 17, 20, 64, 79, 100, 123)  # groups of one rod or of two of different lengths
+)  # separate kernels each: daily runs take the kind with all terms
+COUNTS = (2, 3, 4, 5, 17, 20, 64, 79, 100, 123)  # rod groups of one rod, or of two of different lengths
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
 
 
-def scene_of(name, counts=COUNTS, held=True) -> ddg.Scene:
-    """Rough rods of these numbers of nodes, with loads, and with supports anywhere."""
-    given = {"dimension": 3} | KINDS[name]
-    dimension = given.pop("dimension")
+def scene_of(name, counts=COUNTS, supported=True) -> ddg.Scene:
+    """Build rough rods of given node counts under loads, with supports at arbitrary nodes."""
+    options = {"dimension": 3} | KINDS[name]
+    dimension = options.pop("dimension")
     across = 1.0 if dimension == 3 else 0.0
     random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
     extra = {"EI2": 0.9, "rotary_inertia": 0.2} if name == "twist" else {}
@@ -34,9 +34,9 @@ def scene_of(name, counts=COUNTS, held=True) -> ddg.Scene:
         points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.2 * random.normal(size=(nodes, 3)), axis=0)
         points[:, 1] *= across
         bend = {} if nodes > 2 else {"bend": False, "twist": False}
-        rod = scene.add_rod(points, section=section, natural="straight", **(given | bend))
+        rod = scene.add_rod(points, section=section, natural="straight", **(options | bend))
         scene.add_force(rod, nodes // 2, (0.4, 0.2 * across, -0.6))
-        if held and nodes > 3:
+        if supported and nodes > 3:
             scene.fix(rod, [nodes // 3])
             scene.fix(rod, [nodes - 2], components="z")
             if nodes > 16:
@@ -47,7 +47,7 @@ def scene_of(name, counts=COUNTS, held=True) -> ddg.Scene:
 
 
 def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
-    """A solver of every group of the rods above in two worlds, at random iterates; clamped: without compression."""
+    """Yield a solver and a state of every rod group in two worlds, at random iterates; `clamped`: drop compression."""
     random = np.random.default_rng(11)
     model = scene_of(name, **options).build(device, precision, worlds=2)
     for group, state in zip(model.groups, model.state().groups, strict=True):
@@ -66,16 +66,16 @@ def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
 
 
 def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and residual of a rod from the blocks of its nodes."""
+    """Return the matrix and residual of a rod from assembled blocks."""
     kind, n = newton.group.kind, int(newton.group.count.numpy()[column])
     nb = kind.block
     stored = arrays.download(newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
     H = np.zeros((n, nb, n, nb))
     for k in range(n):
         H[k, :, k] = stored[0, ..., k]
-        for ahead in range(1, min(kind.span, n - 1 - k) + 1):
-            H[k, :, k + ahead] = stored[ahead, ..., k]
-            H[k + ahead, :, k] = stored[ahead, ..., k].T
+        for offset in range(1, min(kind.span, n - 1 - k) + 1):
+            H[k, :, k + offset] = stored[offset, ..., k]
+            H[k + offset, :, k] = stored[offset, ..., k].T
     return H.reshape(n * nb, n * nb), arrays.download(newton.right)[:, :n, column].T.ravel()
 
 
@@ -92,11 +92,11 @@ def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
         pytest.param("mixed", 1e-3, "planar", marks=pytest.mark.slow),
     ],
 )
-def test_direction_is_a_dense_solve(device, name, precision, tolerance):
-    """And the decrement is r . d, and a rod that wants nothing is left alone."""
-    found = 0
+def test_direction_matches_dense_solve(device, name, precision, tolerance):
+    """The predicted decrease is r . d, and a rod that needs no direction keeps its values."""
+    columns = 0
     for newton, state in solvers(name, device, clamped=True, precision=precision):
-        found += newton.group.columns
+        columns += newton.group.columns
         newton.iterate(state.last)
         arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
         wanted = newton.islands.wanted.numpy()
@@ -114,13 +114,13 @@ def test_direction_is_a_dense_solve(device, name, precision, tolerance):
                 direction[:, :n, column].T.ravel(), expected, rtol=0, atol=tolerance * np.abs(expected).max()
             )
             np.testing.assert_allclose(decrement[column], r @ expected, rtol=tolerance)
-    assert found == 2 * len(COUNTS)
+    assert columns == 2 * len(COUNTS)
 
 
 @pytest.mark.slow
-def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
-    """Compression makes some of the matrices so; those rods stay, to be tried without it, and the others move."""
-    seen = set()
+def test_indefinite_matrices_lose_pivots(device):
+    """A rod with an indefinite matrix stays and is retried without compression; the others move."""
+    outcomes = set()
     for newton, state in solvers("untwisted", device, clamped=False, noise=0.25):
         newton.islands.coefficient.fill_(0.3)
         before = arrays.download(newton.x)
@@ -128,7 +128,7 @@ def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
         clamped, moved = newton.islands.clamped.numpy(), np.abs(arrays.download(newton.x) - before).max(axis=(0, 2))
         for column in range(newton.group.columns):
             indefinite = np.linalg.eigvalsh(dense(newton, column)[0])[0] < 0.0
-            seen.add(bool(indefinite))
+            outcomes.add(bool(indefinite))
             assert clamped[column] == indefinite
             assert (moved[column] == 0.0) == indefinite
         assert (newton.islands.iteration.numpy() == 1 - clamped).all()
@@ -136,11 +136,11 @@ def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
         assert (newton.islands.iteration.numpy() >= 1).all()
         assert (newton.islands.step_length.numpy() > 0.0).all()
         assert (newton.islands.lost.numpy() == 0).all()
-    assert seen == {True, False}
+    assert outcomes == {True, False}
 
 
-def adjusted(newton, todo: int):
-    """What one thread a rod makes of the same task, as `x`, `theta` and `frame`."""
+def adjust_serially(newton, todo: int):
+    """Return `x`, `theta` and `frame` after the same iterate action by the serial kernel."""
     group = newton.group
     copies = [wp.clone(array) for array in (newton.x, newton.theta, newton.frame, newton.base)]
     newton.islands.todo.fill_(todo)
@@ -150,16 +150,16 @@ def adjusted(newton, todo: int):
         [group.count, group.fixed, group.anchor, newton.direction, *newton.islands.arrays, *copies],
         device=newton.device,
     )
-    newton.islands.todo.fill_(todo)  # which that has done
+    newton.islands.todo.fill_(todo)  # the serial kernel has reset it
     return [arrays.download(array) for array in copies[:3]]
 
 
 @EVERY_KIND
-@pytest.mark.parametrize("held", [True, False])
-def test_edges_are_turned_as_by_one_thread(device, name, held):
-    """From held nodes anywhere or from none, along steps that turn edges by about a radian."""
+@pytest.mark.parametrize("supported", [True, False])
+def test_edge_rotations_match_serial_kernel(device, name, supported):
+    """Edge rotations of about a radian, with fixed nodes anywhere or none."""
     random = np.random.default_rng(3)
-    for newton, state in solvers(name, device, clamped=True, held=held):
+    for newton, state in solvers(name, device, clamped=True, supported=supported):
         newton.iterate(state.last)
         group = newton.group
         mask = (arrays.download(group.fixed) >> np.arange(group.kind.block)[:, None, None]) & 1
@@ -167,7 +167,7 @@ def test_edges_are_turned_as_by_one_thread(device, name, held):
         arrays.assign(newton.direction, step)
         newton.islands.step_length.fill_(0.7)
         newton.islands.angle_change.fill_(-0.3)
-        expected = adjusted(newton, search.PLACE)
+        expected = adjust_serially(newton, search.PLACE)
         straight = arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
         newton.move()
         inside = np.arange(group.nodes)[:, None] < np.tile(group.host.count, 2)
@@ -178,20 +178,20 @@ def test_edges_are_turned_as_by_one_thread(device, name, held):
             np.testing.assert_array_equal(theta, expected[1])
 
 
-def test_frames_are_carried_as_by_one_thread(device):
+def test_frame_updates_match_serial_kernel(device):
     for newton, state in solvers("twist", device, clamped=True, noise=0.3):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
-            before, (x, _, expected) = arrays.download(newton.frame), adjusted(newton, search.RELAG)
+            before, (x, _, expected) = arrays.download(newton.frame), adjust_serially(newton, search.RELAG)
             newton.move()
-            found = arrays.download(newton.frame)
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
-            assert np.abs(found - before).max() > 0.1
+            frames = arrays.download(newton.frame)
+            np.testing.assert_allclose(frames, expected, rtol=0, atol=1e-13)
+            assert np.abs(frames - before).max() > 0.1
             np.testing.assert_array_equal(arrays.download(newton.x), x)
 
 
-def moved(scene, device, linear, *, dt=0.01, steps=10, precision="float64", start=None, **options):
-    """State and statistics after some steps."""
+def advance(scene, device, linear, *, dt=0.01, steps=10, precision="float64", start=None, **options):
+    """Return the state and statistics after some steps."""
     model = scene.build(device, precision)
     integrator, state = ddg.Integrator(model, linear=linear, **options), model.state(points=start)
     for _ in range(steps):
@@ -211,7 +211,7 @@ def cantilever(nodes=50, section=None, material=RUBBER, **options) -> ddg.Scene:
 
 
 def hanging() -> ddg.Scene:
-    """A rod of 1,000 nodes and 10 m hangs from its clamp and is pulled aside."""
+    """Build a rod of 1,000 nodes and 10 m that hangs from a clamp under gravity with a lateral component."""
     scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
     rod = scene.add_rod(straight(1000, (0.0, 0.0, -1.0), 10.0), section=ddg.Circle(2e-3), material=RUBBER)
     scene.clamp(rod, edges=[0])
@@ -219,13 +219,13 @@ def hanging() -> ddg.Scene:
 
 
 def stiff() -> ddg.Scene:
-    """EA L^2 / EI = 1e8, and it turns by a radian within ten steps: edges must be turned, not sheared."""
+    """Build a cantilever, EA L^2 / EI = 1e8, that rotates by a radian in ten steps: straight updates would stretch it."""
     section = ddg.Stiffness(EA=1e8, EI1=1.0, GJ=0.7, mass_per_length=1.0, rotary_inertia=1e-6)
     return cantilever(64, section, None, gravity=(0.0, 5.0, -300.0))
 
 
 def spanning() -> ddg.Scene:
-    """Held at nodes within, with free ends, one component held elsewhere, and a support that moves."""
+    """Build a rod with free ends on inner supports: one in z only, one with prescribed motion."""
     scene = ddg.Scene()
     rod = scene.add_rod(straight(80), section=ddg.Circle(0.005), material=RUBBER)
     scene.fix(rod, [20])
@@ -236,7 +236,7 @@ def spanning() -> ddg.Scene:
 
 
 def free() -> ddg.Scene:
-    """A rod that falls freely, pushed at one end and wound up at both."""
+    """Build a rod that falls freely, with a force at one end and opposite twisting moments at both."""
     scene = ddg.Scene()
     rod = scene.add_rod(straight(60), section=ddg.Circle(0.01), material=RUBBER)
     scene.add_force(rod, 0, (0.0, 0.0, 3.0))
@@ -256,56 +256,56 @@ SCENES = {
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", SCENES)
-def test_steps_are_those_of_the_sweep(device, name, scheme):
-    """Asked for all digits, the solvers agree to rounding; neither retries."""
-    build, given = SCENES[name]
-    # the midpoint rule makes energy in the stiff scene, and is to do so alike
-    given = {"rtol": 1e-13, "scheme": scheme, "energy_bound": None} | given
-    swept, exact = moved(build(), device, "sweep", **given)
-    state, found = moved(build(), device, "partitioned", **given)
+def test_steps_match_sweep(device, name, scheme):
+    """Solved to all digits, steps agree to rounding; neither solver retries."""
+    build, options = SCENES[name]
+    # no energy bound: the midpoint rule creates energy in the stiff scene, equally by both solvers
+    options = {"rtol": 1e-13, "scheme": scheme, "energy_bound": None} | options
+    swept, sweep_statistics = advance(build(), device, "sweep", **options)
+    state, statistics = advance(build(), device, "partitioned", **options)
     start = build().build(device).state().points()
     assert np.abs(swept.points() - start).max() > 0.005
     np.testing.assert_allclose(state.points(), swept.points(), rtol=0, atol=1e-12)
     np.testing.assert_allclose(state.velocities(), swept.velocities(), rtol=0, atol=1e-9)
-    assert found["retries"] == exact["retries"] == found["pcg_iterations"] == 0
+    assert statistics["retries"] == sweep_statistics["retries"] == statistics["pcg_iterations"] == 0
 
 
 @pytest.mark.parametrize("name", ["cantilever", "hanging"])
-def test_as_many_iterations_as_the_sweep(device, name):
-    build, given = SCENES[name]
-    (_, swept), (_, found) = (moved(build(), device, linear, **given) for linear in ("sweep", "partitioned"))
-    assert found["newton_iterations"] == swept["newton_iterations"]
-    assert found["outcomes"] == swept["outcomes"]
+def test_iterations_match_sweep(device, name):
+    build, options = SCENES[name]
+    (_, swept), (_, reduced) = (advance(build(), device, linear, **options) for linear in ("sweep", "partitioned"))
+    assert reduced["newton_iterations"] == swept["newton_iterations"]
+    assert reduced["outcomes"] == swept["outcomes"]
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
-def test_repeats_bit_by_bit(device, precision):
-    first, second = (moved(stiff(), device, "partitioned", precision=precision, steps=6)[0] for _ in range(2))
+def test_steps_repeat_bitwise(device, precision):
+    first, second = (advance(stiff(), device, "partitioned", precision=precision, steps=6)[0] for _ in range(2))
     np.testing.assert_array_equal(first.points(), second.points())
     np.testing.assert_array_equal(first.velocities(), second.velocities())
 
 
-def test_momentum_of_a_free_rod(device):
-    """It grows by the sum of the outer forces times h a step."""
+def test_free_rod_balances_momentum(device):
+    """Momentum grows by the sum of external forces times h per step."""
     dt, steps = 1e-3, 20
-    state, _ = moved(free(), device, "partitioned", dt=dt, steps=steps, rtol=1e-12)
+    state, _ = advance(free(), device, "partitioned", dt=dt, steps=steps, rtol=1e-12)
     host = state.model.groups[0].host
     mass = host.mass[:, 0]
     momentum = mass @ state.velocities()
     np.testing.assert_allclose(momentum, [0.0, 0.0, (3.0 - 9.81 * mass.sum()) * dt * steps], rtol=1e-9, atol=1e-9)
 
 
-def test_failure_is_named(device):
+def test_failures_name_their_outcome(device):
     with pytest.raises(ddg.SolverError, match="max_iterations"):
-        moved(stiff(), device, "partitioned", max_iterations=1, retry_limit=1)
+        advance(stiff(), device, "partitioned", max_iterations=1, retry_limit=1)
     folded = straight(21)
     folded[11:, 0] = 1.0 - folded[11:, 0]
     with pytest.raises(ddg.SolverError, match=r"non_finite.*fold back by 180 degrees"):
-        moved(cantilever(21), device, "partitioned", start=folded)
+        advance(cantilever(21), device, "partitioned", start=folded)
 
 
-def test_a_rod_that_fails_leaves_the_others_alone(device):
-    """Beside a folded one, of which the model says what it is, a rod falls as it does alone."""
+def test_failed_rod_leaves_others_unchanged(device):
+    """A rod next to a folded one, which the error names, falls bit for bit as it does alone."""
     scene = ddg.Scene()
     points = np.stack([straight(21), straight(21) + [0.0, 1.0, 0.0]])
     rods = scene.add_rods(points, section=ddg.Circle(0.02), material=RUBBER)
@@ -320,11 +320,11 @@ def test_a_rod_that_fails_leaves_the_others_alone(device):
         integrator.check(state)
     alone = ddg.Scene()
     alone.clamp(alone.add_rod(points[0], section=ddg.Circle(0.02), material=RUBBER), edges=[0])
-    np.testing.assert_array_equal(state.points()[:21], moved(alone, device, "partitioned", steps=5)[0].points())
+    np.testing.assert_array_equal(state.points()[:21], advance(alone, device, "partitioned", steps=5)[0].points())
 
 
-def test_what_auto_chooses(device):
-    """Cyclic reduction where rods are few, long, open and on a GPU; the report says so."""
+def test_auto_reduces_few_long_open_rods(device):
+    """Choose cyclic reduction for few, long, open rods on a GPU; the report names it."""
 
     def chosen(nodes, columns, closed=False, cuda=True):
         kind, where = SimpleNamespace(closed=closed), SimpleNamespace(is_cuda=cuda)

@@ -1,4 +1,4 @@
-"""Blocks, product, factors and conjugate gradients on open and closed chains, against dense matrices and the chain sweep."""
+"""Blocks, products, factors and PCG of open and closed rods, against dense matrices and the sweep."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.pcg import PcgNewton
 
 KINDS = {"twist": {}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
-# Every chain has kernels of its own: in the tests of every day a closed one with all of them stands for the others.
+# Every kind of rod compiles separate kernels: daily runs take the closed one with all terms.
 DAILY = (("twist", True),)
 EVERY_CHAIN = pytest.mark.parametrize(
     ("name", "closed"),
@@ -25,14 +25,14 @@ EVERY_CHAIN = pytest.mark.parametrize(
 
 
 def section(name) -> ddg.Stiffness:
-    given = {"EI2": 0.9, "rotary_inertia": 0.2} if name == "twist" else {}
-    return ddg.Stiffness(EA=9.0, EI1=0.6, GJ=0.5, mass_per_length=0.7, **given)
+    options = {"EI2": 0.9, "rotary_inertia": 0.2} if name == "twist" else {}
+    return ddg.Stiffness(EA=9.0, EI1=0.6, GJ=0.5, mass_per_length=0.7, **options)
 
 
 def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
-    """Rods of 7 and 6 nodes on rough polygons, with supports and loads."""
-    given = {"dimension": 3} | KINDS[name]
-    dimension = given.pop("dimension")
+    """Build rods of 7 and 6 nodes on rough polygons, with supports and loads."""
+    options = {"dimension": 3} | KINDS[name]
+    dimension = options.pop("dimension")
     across = 1.0 if dimension == 3 else 0.0
     random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
     for nodes in counts:
@@ -40,7 +40,7 @@ def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
         points = np.stack([np.cos(s), 0.3 * np.cos(2.0 * s), np.sin(s)], -1) if closed else np.outer(s, [1.0, 0.0, 0.2])
         points += 0.1 * random.normal(size=points.shape)
         points[:, 1] *= across
-        scene.add_rod(points, section=section(name), natural="straight", closed=closed, **given)
+        scene.add_rod(points, section=section(name), natural="straight", closed=closed, **options)
     scene.fix(0, [0])
     scene.fix(0, [3], components="z")
     scene.fix(1, [2], components="x")
@@ -52,7 +52,7 @@ def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
 
 
 class Problem:
-    """A Newton iteration of two rods in two worlds at a random state: dense matrices, and what the kernels made of them."""
+    """Newton iteration of two rods in two worlds at a random state, with dense matrices to compare kernels with."""
 
     def __init__(self, name, closed, device, preconditioner="chain", precision="float64", scale=1.0, **options):
         random = np.random.default_rng(11)
@@ -80,7 +80,7 @@ class Problem:
         return np.concatenate([q, arrays.download(self.newton.theta).T[..., None]], -1) if self.kind.twist else q
 
     def dense(self, column: int):
-        """Matrix (identity on held dofs) and residual (zero there), from the elements' factors and gradients."""
+        """Return matrix (identity on fixed dofs), residual (zero there) and free mask, from element factors and gradients."""
         kind, host, n = self.kind, self.group.host, int(self.count[column])
         F, g = (arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
         c, rod = float(arrays.download(self.newton.islands.coefficient)[column]), column % 2
@@ -111,7 +111,7 @@ class Problem:
         return np.where(np.outer(free, free), H, np.eye(len(H))), np.where(free, r, 0.0), free
 
     def window(self, k: int, n: int) -> np.ndarray:
-        """From a rod's dofs to the window of element k; indices run on past the seam of a closed rod."""
+        """Return the map from a rod's dofs to the local dofs of element k; indices wrap at the seam of a closed rod."""
         kind = self.kind
         B = np.zeros((kind.window, n, kind.block))
         for edge in range(kind.span):
@@ -124,21 +124,21 @@ class Problem:
         return B.reshape(kind.window, -1)
 
     def blocks(self, column: int) -> np.ndarray:
-        """The dense matrix that the kernel's blocks stand for."""
+        """Return the dense matrix of the kernel's blocks."""
         nb, n = self.kind.block, int(self.count[column])
         stored = arrays.download(self.newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
         H = np.zeros((n, nb, n, nb))
         for k in range(n):
             H[k, :, k] += stored[0, ..., k]
-            for ahead in range(1, self.kind.span + 1):
-                if self.kind.closed or k + ahead < n:
-                    j = (k + ahead) % n
-                    H[k, :, j] += stored[ahead, ..., k]
-                    H[j, :, k] += stored[ahead, ..., k].T
+            for offset in range(1, self.kind.span + 1):
+                if self.kind.closed or k + offset < n:
+                    j = (k + offset) % n
+                    H[k, :, j] += stored[offset, ..., k]
+                    H[j, :, k] += stored[offset, ..., k].T
         return H.reshape(n * nb, n * nb)
 
     def vector(self, array) -> np.ndarray:
-        """(columns, n, block) of a block vector on the device."""
+        """Return a device block vector as (columns, n, block)."""
         return arrays.download(array).transpose(2, 1, 0)
 
     def launch(self, kernel, dim, inputs, outputs):
@@ -146,7 +146,7 @@ class Problem:
 
 
 @EVERY_CHAIN
-def test_blocks_and_residual(device, name, closed):
+def test_blocks_and_residual_match_dense(device, name, closed):
     problem = Problem(name, closed, device)
     right = problem.vector(problem.newton.right)
     for column, n in enumerate(problem.count):
@@ -162,8 +162,8 @@ def test_blocks_and_residual(device, name, closed):
 
 
 @EVERY_CHAIN
-def test_product(device, name, closed):
-    """H v, and that a column that wants nothing is left alone."""
+def test_product_matches_dense(device, name, closed):
+    """Compute H v; an inactive column keeps its values."""
     problem = Problem(name, closed, device)
     newton, (nodes, columns) = problem.newton, (problem.group.nodes, problem.group.columns)
     random = np.random.default_rng(2)
@@ -178,18 +178,20 @@ def test_product(device, name, closed):
         [newton.blocks, newton.p, problem.group.count, newton.islands.wanted],
         [newton.q, newton.busy],
     )
-    found = problem.vector(newton.q)
+    product_values = problem.vector(newton.q)
     for column, n in enumerate(problem.count):
         if column == 2:
-            assert (found[column] == 7.0).all()
+            assert (product_values[column] == 7.0).all()
             continue
         expected = problem.dense(column)[0] @ v[:, :n, column].T.ravel()
-        np.testing.assert_allclose(found[column, :n].ravel(), expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            product_values[column, :n].ravel(), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
+        )
 
 
 @EVERY_CHAIN
-def test_factorisation_and_substitution(device, name, closed):
-    """Solves with the open part of the chain: the couplings across the seam left out."""
+def test_factors_solve_without_seam(device, name, closed):
+    """Factors solve with the open rod: couplings across the seam are omitted."""
     problem = Problem(name, closed, device)
     newton, kind = problem.newton, problem.kind
     substitute = block_band.substitute_function(kind.block, kind.span, newton.linear, dotted=True)
@@ -207,21 +209,21 @@ def test_factorisation_and_substitution(device, name, closed):
 
     total = wp.zeros(problem.group.columns, dtype=wp.float64, device=device)
     problem.launch(solve, problem.group.columns, [newton.factors, newton.right], [newton.z, problem.group.count, total])
-    found = problem.vector(newton.z)
+    solution = problem.vector(newton.z)
     for column, n in enumerate(problem.count):
         H, r, _ = problem.dense(column)
         node = np.arange(len(H)) // kind.block
         H = np.where(np.abs(node[:, None] - node) <= kind.span, H, 0.0)
         expected = np.linalg.solve(H, r)
-        np.testing.assert_allclose(found[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(solution[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
         assert total.numpy()[column] == pytest.approx(r @ expected, rel=1e-12)
     assert (arrays.download(newton.islands.lost) == 0).all()
 
 
 @EVERY_CHAIN
 @pytest.mark.parametrize("preconditioner", pcg.PRECONDITIONERS)
-def test_direction_is_a_dense_solve(device, name, closed, preconditioner):
-    """And the chain preconditioner, exact on open rods, takes one iteration there."""
+def test_direction_matches_dense_solve(device, name, closed, preconditioner):
+    """PCG matches; with the exact preconditioner an open rod takes one iteration."""
     problem = Problem(name, closed, device, preconditioner)
     newton = problem.newton
     direction, decrement = problem.vector(newton.direction), arrays.download(newton.islands.decrement)
@@ -234,13 +236,15 @@ def test_direction_is_a_dense_solve(device, name, closed, preconditioner):
     if preconditioner == "chain" and not closed:
         assert (iterations == 1).all()
     elif preconditioner == "chain":
-        assert (iterations <= 4 * problem.kind.block * problem.kind.span + 2).all()  # rank of what crosses the seam
+        assert (
+            iterations <= 4 * problem.kind.block * problem.kind.span + 2
+        ).all()  # rank of the coupling across the seam
     else:
         assert (iterations > 3).all()
 
 
 def falling(name, closed, device, precision="float64", **options):
-    """Points after 10 steps, with the statistics."""
+    """Return the points after 10 steps, the statistics, and the initial points."""
     model = scene_of(name, closed, (9, 8)).build(device, precision)
     integrator, state = ddg.Integrator(model, **options), model.state()
     for _ in range(10):
@@ -253,12 +257,12 @@ def falling(name, closed, device, precision="float64", **options):
     "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
 )
 @pytest.mark.parametrize("preconditioner", pcg.PRECONDITIONERS)
-def test_open_rods_move_as_by_the_sweep(device, name, preconditioner):
-    """Two solvers stop at slightly different iterates; asked for all digits, they agree to rounding."""
+def test_open_rods_match_sweep(device, name, preconditioner):
+    """Solvers stop at slightly different iterates; at a tolerance of all digits they agree to rounding."""
     exact, swept, start = falling(name, False, device, linear="sweep", rtol=1e-14)
-    found, statistics, _ = falling(name, False, device, linear=preconditioner, rtol=1e-14, linear_rtol=1e-12)
+    points, statistics, _ = falling(name, False, device, linear=preconditioner, rtol=1e-14, linear_rtol=1e-12)
     assert np.abs(exact - start).max() > 0.05
-    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(points, exact, rtol=0, atol=1e-11)
     assert swept["pcg_iterations"] == 0
     assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
     if preconditioner == "chain":
@@ -267,8 +271,8 @@ def test_open_rods_move_as_by_the_sweep(device, name, preconditioner):
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
-def test_closed_ring_with_every_preconditioner(device, precision):
-    """A ring with one edge clamped falls alike, whatever the preconditioner."""
+def test_preconditioners_agree_on_closed_ring(device, precision):
+    """A ring clamped at one edge falls equally with every preconditioner."""
     angle = 2.0 * np.pi * np.arange(40) / 40
     points = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
     ends, iterations = [], []
@@ -284,7 +288,7 @@ def test_closed_ring_with_every_preconditioner(device, precision):
         ends.append(state.points())
         iterations.append(integrator.statistics()["pcg_iterations"])
     assert np.abs(ends[0] - points).max() > 0.05
-    np.testing.assert_array_equal(ends[0], ends[3])  # "auto" is the chain preconditioner
+    np.testing.assert_array_equal(ends[0], ends[3])  # "auto" selects `chain`
     for end in ends[1:]:
         np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-7)
     assert iterations[3] < iterations[2] < iterations[1]

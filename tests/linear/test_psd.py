@@ -1,4 +1,4 @@
-"""Modes of the Newton matrix: the exact Hessian, made positive semi-definite or not, against Gauss-Newton."""
+"""Modes of the Newton matrix: exact Hessian, projected or not, against Gauss-Newton."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ CONVERGED = {"converged", "converged_to_rounding"}
 
 
 def elastic(problem: Problem, column: int) -> np.ndarray:
-    """The matrix of a Newton iteration on free dofs, without inertia."""
+    """Return the Newton matrix of a rod on free dofs, without inertia."""
     host, kind, n, rod = problem.group.host, problem.kind, int(problem.count[column]), column % 2
     c = float(arrays.download(problem.newton.islands.coefficient)[column])
     inertia = np.repeat(c * host.mass[:n, rod, None], kind.block, 1)
@@ -32,7 +32,7 @@ def free_dofs(problem: Problem, column: int) -> np.ndarray:
 
 
 def exact(problem: Problem) -> list[np.ndarray]:
-    """The same from the reverse mode of the gradient, of every rod."""
+    """Return the exact elastic Hessian of every rod on free dofs, by reverse-mode differentiation of the gradient."""
     kind, state = problem.kind, problem.model.state()
     data = state.groups[0]
     arrays.assign(data.x, np.ascontiguousarray(np.moveaxis(problem.before[..., : kind.dim], 0, 1)))
@@ -41,14 +41,14 @@ def exact(problem: Problem) -> list[np.ndarray]:
     full, size = Tangent(problem.model).hessian(state).toarray(), problem.group.nodes * kind.block
     result = []
     for column in range(len(problem.count)):
-        own = column * size + np.flatnonzero(free_dofs(problem, column))
-        result.append(full[np.ix_(own, own)])
+        dofs = column * size + np.flatnonzero(free_dofs(problem, column))
+        result.append(full[np.ix_(dofs, dofs)])
     return result
 
 
 @EVERY_CHAIN
-def test_none_is_the_exact_hessian(device, name, closed):
-    """Assembled with analytic second derivatives; frames lag behind, edges are bent, twisted, stretched and compressed."""
+def test_mode_none_is_exact_hessian(device, name, closed):
+    """Analytic second derivatives match at edges that are bent, twisted, stretched and compressed, with time-lagged frames."""
     problem = Problem(name, closed, device, psd="none")
     gauss_newton = Problem(name, closed, device)
     for column, expected in enumerate(exact(problem)):
@@ -59,7 +59,7 @@ def test_none_is_the_exact_hessian(device, name, closed):
 @pytest.mark.slow
 @EVERY_CHAIN
 def test_project_is_positive_semi_definite(device, name, closed):
-    """At 0.6 of the rest length, bent, where the exact Hessian is not; the projected one lies above it, element by element."""
+    """Bent, at 0.6 of the rest length, the exact Hessian is indefinite; the projected one exceeds it, element by element."""
     problem = Problem(name, closed, device, psd="project", scale=0.6)
     for column, hessian in enumerate(exact(problem)):
         size, projected = np.abs(hessian).max(), elastic(problem, column)
@@ -69,7 +69,7 @@ def test_project_is_positive_semi_definite(device, name, closed):
 
 
 def helix(nodes=48, turns=6, closed=False, young=1e7) -> ddg.Scene:
-    """A rod that is curled at rest, on a clamp; closed, a wavy ring that would be straight."""
+    """Build a clamped rod with natural curvature; closed, a wavy ring with straight rest shape."""
     s = np.arange(nodes) / (nodes - 1 + closed)
     a = 2.0 * np.pi * s
     if closed:
@@ -83,8 +83,8 @@ def helix(nodes=48, turns=6, closed=False, young=1e7) -> ddg.Scene:
     return scene
 
 
-def bent(solver, device, psd: str):
-    """A solver on a helix whose inertia pulls it away by 0.2 of its length, and twists it by up to 1 rad."""
+def deflected_helix(solver, device, psd: str):
+    """Return a solver on a clamped helix whose predictor moves the tip by 0.2 and twists by up to 1 rad."""
     s = np.linspace(0.0, 1.0, 16)
     points = np.stack([0.3 * np.cos(2.0 * np.pi * s), 0.3 * np.sin(2.0 * np.pi * s), -0.5 * s], -1)
     scene = ddg.Scene()
@@ -105,17 +105,17 @@ def bent(solver, device, psd: str):
 
 
 def errors(newton, last) -> list[float]:
-    """sqrt(r . H^-1 r), the distance to the solution in the energy norm as Newton sees it, of every iterate."""
-    found = []
+    """Return the error sqrt(r . H^-1 r) of every iterate, an estimate of the distance to the solution in the energy norm."""
+    norms = []
     while not newton.islands.status.numpy()[0]:
         newton.iterate(last)
-        found.append(float(newton.islands.decrement.numpy()[0]) ** 0.5)
+        norms.append(float(newton.islands.decrement.numpy()[0]) ** 0.5)
     assert newton.islands.status.numpy()[0] in (outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING)
-    return found[:-1]
+    return norms[:-1]
 
 
 def order(sizes: list[float]) -> float:
-    """p of e_k+1 = C e_k^p, from the last three errors above rounding."""
+    """Return p of e_k+1 = C e_k^p, from the last three errors above rounding."""
     a, b, c = np.log([e for e in sizes if e > 1e-12][-3:])
     return (c - b) / (b - a)
 
@@ -123,7 +123,10 @@ def order(sizes: list[float]) -> float:
 @pytest.mark.parametrize("solver", [ChainNewton, PcgNewton])
 @pytest.mark.parametrize("psd", ["progressive", pytest.param("none", marks=pytest.mark.slow)])
 def test_exact_newton_converges_quadratically(device, solver, psd):
-    sizes, plain = errors(*bent(solver, device, psd)), errors(*bent(solver, device, "gauss_newton"))
+    sizes, plain = (
+        errors(*deflected_helix(solver, device, psd)),
+        errors(*deflected_helix(solver, device, "gauss_newton")),
+    )
     print(psd, order(sizes), sizes, order(plain), plain)
     assert order(sizes) > 1.8
     assert order(plain) < 1.3
@@ -131,7 +134,7 @@ def test_exact_newton_converges_quadratically(device, solver, psd):
 
 
 def run(scene, device, steps, dt, precision="float64", start=None, **options):
-    """Points after some steps, and the statistics."""
+    """Return the points after some steps, and the statistics."""
     model = scene.build(device, precision)
     integrator, state = ddg.Integrator(model, **options), model.state(points=start)
     for _ in range(steps):
@@ -141,15 +144,15 @@ def run(scene, device, steps, dt, precision="float64", start=None, **options):
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
-def test_fewer_iterations_on_a_curl(device, precision):
-    """A tenth, where Gauss-Newton runs into its limit of 100 and needs shorter steps."""
+def test_progressive_saves_iterations_on_curled_rod(device, precision):
+    """A tenth of the iterations of Gauss-Newton, which reaches its limit of 100 and needs substeps."""
     _, plain = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="gauss_newton")
     assert plain["outcomes"]["max_iterations"] > 0
     for linear in ("sweep", "chain"):
-        _, found = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="progressive", linear=linear)
-        assert found["newton_iterations"]["mean"] < 0.2 * plain["newton_iterations"]["mean"]
-        assert found["newton_iterations"]["max"] < 10
-        assert set(found["outcomes"]) <= CONVERGED and found["retries"] == 0
+        _, statistics = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="progressive", linear=linear)
+        assert statistics["newton_iterations"]["mean"] < 0.2 * plain["newton_iterations"]["mean"]
+        assert statistics["newton_iterations"]["max"] < 10
+        assert set(statistics["outcomes"]) <= CONVERGED and statistics["retries"] == 0
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -158,17 +161,17 @@ def test_every_mode_has_the_same_solution(device, psd, closed):
     """Residuals stop at rtol of the load, which leaves distances far below a thousandth of the radius."""
     scene = helix(24, 1.5, closed, young=1e8)
     linears = ("auto",) if closed else ("sweep", "chain")
-    dt = 0.003 if closed else 0.01  # a ring set free has other branches to fall to
+    dt = 0.003 if closed else 0.01  # longer steps of a released ring may reach other branches
     expected, _ = run(scene, device, 5, dt, psd="gauss_newton", rtol=1e-12)
     assert np.abs(expected - scene.batches[0].points).max() > 2e-3
     for linear in linears:
-        found, statistics = run(scene, device, 5, dt, psd=psd, linear=linear, rtol=1e-12, linear_rtol=1e-12)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+        points, statistics = run(scene, device, 5, dt, psd=psd, linear=linear, rtol=1e-12, linear_rtol=1e-12)
+        np.testing.assert_allclose(points, expected, rtol=0, atol=1e-9)
         assert CONVERGED & set(statistics["outcomes"])
 
 
-def squeezed(closed: bool, share: float) -> tuple[ddg.Scene, np.ndarray]:
-    """A rod and points at a share of its length, bent a little: compression far beyond what buckles it."""
+def compressed_rod(closed: bool, length_ratio: float) -> tuple[ddg.Scene, np.ndarray]:
+    """Return a scene with a rod, and points scaled by `length_ratio` with small noise: compression far beyond buckling."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     s = np.arange(24) / (23 + closed)
     points = np.stack([s, 0.0 * s, 0.0 * s], -1)
@@ -178,24 +181,24 @@ def squeezed(closed: bool, share: float) -> tuple[ddg.Scene, np.ndarray]:
     rod = scene.add_rod(points, section=section, natural="straight", closed=closed)
     if not closed:
         scene.fix(rod, [0, 23])
-    return scene, share * points + 1e-3 * np.random.default_rng(4).normal(size=points.shape)
+    return scene, length_ratio * points + 1e-3 * np.random.default_rng(4).normal(size=points.shape)
 
 
 @pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("share", [0.998, 0.8])
-def test_progressive_holds_where_the_exact_hessian_is_indefinite(device, closed, share):
-    """It needs few shorter steps even where Gauss-Newton is too slow to be of use; `none` says why by name."""
-    (scene, start), dt = squeezed(closed, share), 0.02
-    if share == 0.998:
+@pytest.mark.parametrize("length_ratio", [0.998, 0.8])
+def test_progressive_converges_with_indefinite_hessian(device, closed, length_ratio):
+    """Mode 'progressive' needs few substeps even where Gauss-Newton converges too slowly; mode 'none' fails as 'indefinite'."""
+    (scene, start), dt = compressed_rod(closed, length_ratio), 0.02
+    if length_ratio == 0.998:
         _, plain = run(scene, device, 10, dt, start=start, psd="gauss_newton")
         assert set(plain["outcomes"]) <= CONVERGED
     else:
         with pytest.raises(ddg.SolverError, match="max_iterations"):
             run(scene, device, 10, dt, start=start, rtol=1e-8, psd="gauss_newton")
     for linear in ("auto", "chain"):
-        points, found = run(scene, device, 10, dt, start=start, psd="progressive", linear=linear)
-        assert set(found["outcomes"]) <= CONVERGED | ({"indefinite"} if share < 0.9 else set()), found
-        assert found["retries"] <= 4
+        points, statistics = run(scene, device, 10, dt, start=start, psd="progressive", linear=linear)
+        assert set(statistics["outcomes"]) <= CONVERGED | ({"indefinite"} if length_ratio < 0.9 else set()), statistics
+        assert statistics["retries"] <= 4
         assert np.isfinite(points).all()
         with pytest.raises(ddg.SolverError) as caught:
             run(scene, device, 2, dt, start=start, psd="none", linear=linear, retry_limit=0)

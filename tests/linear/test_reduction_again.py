@@ -1,4 +1,4 @@
-"""Further right-hand sides of what cyclic reduction has eliminated, against dense solves."""
+"""Further right-hand sides by stored factors of cyclic reduction, against dense solves."""
 
 import numpy as np
 import pytest
@@ -12,28 +12,28 @@ COUNTS = (2, 3, 4, 5, 17, 31, 32, 33, 50, 64)
 
 
 @pytest.mark.parametrize("nb", [3, 4])
-def test_further_right_hand_sides_are_dense_solves(device, nb):
-    """Of the first system and of one that takes its place; what is not wanted is left alone."""
+def test_further_right_hand_sides_match_dense_solves(device, nb):
+    """Solve two systems in succession with two right-hand sides each; inactive columns keep their values."""
     rng, columns = np.random.default_rng(3), len(COUNTS)
     reduction = CyclicReduction(nb, max(COUNTS), columns, wp.float64, device, repeated=True)
     count, every = wp.array(COUNTS, dtype=int, device=device), wp.full(columns, 1, dtype=int, device=device)
-    bad, some = wp.zeros(columns, dtype=int, device=device), np.arange(columns) % 5 != 0
+    lost, active = wp.zeros(columns, dtype=int, device=device), np.arange(columns) % 5 != 0
     for _ in range(2):
         bands, matrices = system(nb, COUNTS, rng)
         matrix = arrays.upload(bands, wp.float64, device)
         right = rng.normal(size=(2, nb, max(COUNTS), columns))
-        given = [arrays.upload(values, wp.float64, device) for values in right]
-        found = arrays.upload(np.full(right.shape[1:], 7.0), wp.float64, device)
-        reduction.solve(matrix, given[0], count, every, given[0], bad)
-        reduction.again(given[1], count, wp.array(np.where(some, 1, 2), dtype=int, device=device), 1, found)
-        assert (bad.numpy() == 0).all()
-        first, second = arrays.download(given[0]), arrays.download(found)
+        inputs = [arrays.upload(values, wp.float64, device) for values in right]
+        solution = arrays.upload(np.full(right.shape[1:], 7.0), wp.float64, device)
+        reduction.solve(matrix, inputs[0], count, every, inputs[0], lost)
+        reduction.again(inputs[1], count, wp.array(np.where(active, 1, 2), dtype=int, device=device), 1, solution)
+        assert (lost.numpy() == 0).all()
+        first, second = arrays.download(inputs[0]), arrays.download(solution)
         for column, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
             expected = np.linalg.solve(H, right[0, :, :n, column].T.ravel())
             np.testing.assert_allclose(
                 first[:, :n, column].T.ravel(), expected, rtol=0, atol=1e-11 * abs(expected).max()
             )
-            if not some[column]:
+            if not active[column]:
                 assert (second[:, :, column] == 7.0).all()
                 continue
             expected = np.linalg.solve(H, right[1, :, :n, column].T.ravel())
@@ -43,8 +43,8 @@ def test_further_right_hand_sides_are_dense_solves(device, nb):
             assert (second[:, n:, column] == 7.0).all()
 
 
-def test_in_place_and_by_world(device):
-    """Three chains of each of two worlds, of which the second wants nothing; the solution takes the place of the right-hand side."""
+def test_in_place_solve_skips_inactive_worlds(device):
+    """Overwrite right-hand sides by solutions, for three rods in each of two worlds; the second world is inactive."""
     rng, nb, n = np.random.default_rng(4), 3, 40
     H = np.zeros((3, nb, nb, n, 6))
     H[0] = 10.0 * np.eye(nb)[:, :, None, None]
@@ -53,17 +53,20 @@ def test_in_place_and_by_world(device):
     matrix = arrays.upload(H.reshape(3 * nb**2, n, 6), wp.float64, device)
     count, every = wp.full(6, n, dtype=int, device=device), wp.full(6, 1, dtype=int, device=device)
     right = rng.normal(size=(nb, n, 6))
-    found, bad = (arrays.upload(right, wp.float64, device) for _ in range(2)), wp.zeros(6, dtype=int, device=device)
-    first, second = found
-    reduction.solve(matrix, first, count, every, first, bad)
+    right_sides, lost = (
+        (arrays.upload(right, wp.float64, device) for _ in range(2)),
+        wp.zeros(6, dtype=int, device=device),
+    )
+    first, second = right_sides
+    reduction.solve(matrix, first, count, every, first, lost)
     reduction.again(second, count, wp.array([1, 2], dtype=int, device=device), 3, second)
-    one, other = arrays.download(first), arrays.download(second)
-    np.testing.assert_allclose(other[..., :3], one[..., :3], rtol=1e-12, atol=1e-13)
-    assert (other[..., 3:] == right[..., 3:]).all()
+    first_solution, second_solution = arrays.download(first), arrays.download(second)
+    np.testing.assert_allclose(second_solution[..., :3], first_solution[..., :3], rtol=1e-12, atol=1e-13)
+    assert (second_solution[..., 3:] == right[..., 3:]).all()
 
 
-def test_chains_of_one_block(device):
-    """Of two nodes, which leave no level to reduce."""
+def test_rods_of_two_nodes_match_dense_solve(device):
+    """Rods of two nodes leave no level to reduce."""
     rng, nb = np.random.default_rng(5), 3
     L = rng.normal(size=(2 * nb, 2 * nb))
     H, right = L @ L.T + np.eye(2 * nb), rng.normal(size=(2, 2 * nb))
@@ -71,8 +74,8 @@ def test_chains_of_one_block(device):
     bands[0, :, :, 0, 0], bands[0, :, :, 1, 0], bands[1, :, :, 0, 0] = H[:nb, :nb], H[nb:, nb:], H[:nb, nb:]
     reduction = CyclicReduction(nb, 2, 1, wp.float64, device, repeated=True)
     matrix = arrays.upload(bands.reshape(3 * nb**2, 2, 1), wp.float64, device)
-    count, wanted, bad = (wp.array([value], dtype=int, device=device) for value in (2, 1, 0))
+    count, wanted, lost = (wp.array([value], dtype=int, device=device) for value in (2, 1, 0))
     for again, r in enumerate(right):
-        found = arrays.upload(r.reshape(2, nb).T[..., None], wp.float64, device)
-        reduction.solve(matrix, found, count, wanted, found, bad, again=again > 0)
-        np.testing.assert_allclose(arrays.download(found)[..., 0].T.ravel(), np.linalg.solve(H, r), rtol=1e-10)
+        solution = arrays.upload(r.reshape(2, nb).T[..., None], wp.float64, device)
+        reduction.solve(matrix, solution, count, wanted, solution, lost, again=again > 0)
+        np.testing.assert_allclose(arrays.download(solution)[..., 0].T.ravel(), np.linalg.solve(H, r), rtol=1e-10)

@@ -1,4 +1,4 @@
-"""Tensions as unknowns of direct solvers: the same directions as without, and in float32 as good ones however stiff edges are."""
+"""Mixed axial-force formulation of direct solvers: directions equal the plain ones; float32 errors are independent of EA."""
 
 import numpy as np
 import pytest
@@ -20,16 +20,19 @@ EVERY_SOLVER = pytest.mark.parametrize("solver", list(DIRECT))
 
 
 def rods(name: str, axial: float, supports: str = "many", natural: str = "straight") -> ddg.Scene:
-    """Rough rods with many supports, at their ends, in their middle and along single axes, with one at the "root", or "none"."""
-    given = {"dimension": 3} | KINDS[name]
-    dimension = given.pop("dimension")
+    """Build rough rods.
+
+    `supports`: "many" (ends, middle and single axes), "root" (a clamp each) or "none".
+    """
+    options = {"dimension": 3} | KINDS[name]
+    dimension = options.pop("dimension")
     across = 1.0 if dimension == 3 else 0.0
     random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
     section = ddg.Stiffness(EA=axial, EI1=0.6, GJ=0.5, mass_per_length=0.7, **({"EI2": 0.9} if name == "twist" else {}))
     for nodes in (3, 4, 17, 40):
         points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.2 * random.normal(size=(nodes, 3)), axis=0)
         points[:, 1] *= across
-        rod = scene.add_rod(points, section=section, natural=natural, **given)
+        rod = scene.add_rod(points, section=section, natural=natural, **options)
         if supports != "none":
             scene.clamp(rod, edges=[0])
         if supports == "many" and nodes > 3:
@@ -48,11 +51,11 @@ def directions(
     kept: bool = False,
     solver: str = "sweep",
 ) -> list:
-    """First Newton direction of every group from a rough iterate, (dofs, nodes, rods), its edges, and the nodes of rods.
+    """Return (first Newton direction (dofs, nodes, rods), edges, node counts) of every rod group, from a rough iterate.
 
-    `kept`: whether edges have kept their lengths, from the first node on.
+    `kept`: edges of the iterate have their rest lengths, from the first node on.
     """
-    random, found = np.random.default_rng(11), []
+    random, results = np.random.default_rng(11), []
     model = scene.build(device, "float64")
     for group, state in zip(model.groups, model.state().groups, strict=True):
         newton = DIRECT[solver](model, group, NewtonOptions(psd=psd), linear, split=carried is not None)
@@ -74,18 +77,18 @@ def directions(
         if carried is not None:
             newton.islands.carried.fill_(carried)
         edges = np.diff(arrays.download(newton.x), axis=0)
-        for _ in range(2):  # the second for rods whose matrix compression has made indefinite
+        for _ in range(2):  # a second one for rods with an indefinite matrix under compression
             newton.iterate(state.last)
             if newton.islands.iteration.numpy().all():
                 break
         inside = np.arange(group.nodes)[:, None] < group.host.count
-        found.append((arrays.download(newton.direction).astype(float) * inside, edges, group.host.count))
-    return found
+        results.append((arrays.download(newton.direction).astype(float) * inside, edges, group.host.count))
+    return results
 
 
-def error(found: np.ndarray, exact: np.ndarray) -> float:
-    """The largest of a rod, relative to its largest displacement."""
-    return float((np.abs(found - exact).max((0, 1)) / np.abs(exact).max((0, 1))).max())
+def error(direction: np.ndarray, exact: np.ndarray) -> float:
+    """Return the largest error of a rod, relative to its largest displacement."""
+    return float((np.abs(direction - exact).max((0, 1)) / np.abs(exact).max((0, 1))).max())
 
 
 @EVERY_KIND
@@ -95,44 +98,44 @@ def error(found: np.ndarray, exact: np.ndarray) -> float:
     [
         ("gauss_newton", "sweep"),
         ("gauss_newton", "partitioned"),
-        pytest.param("none", "sweep", marks=pytest.mark.slow),  # which cyclic reduction refuses
+        pytest.param("none", "sweep", marks=pytest.mark.slow),  # refused by cyclic reduction
     ],
 )
-def test_directions_are_those_of_the_whole_matrix(device, name, supports, psd, solver):
-    """H + r^T r / s is the Schur complement of [H r^T; r -s], whatever the share of the stiffness that H carries."""
+def test_directions_match_full_matrix(device, name, supports, psd, solver):
+    """H + r^T r / s is the Schur complement of [H r^T; r -s], for any fraction of axial stiffness kept in H."""
     scene = rods(
         name, 9.0, supports, "shape" if psd == "none" and name != "untwisted" else "straight"
-    )  # the exact Hessian is definite near it
+    )  # near the rest shape the exact Hessian is definite
     exact = directions(scene, device, wp.float64, None, psd)
-    for carried in (1e-3, 1.0, 5.0, 1e3):  # edges have some 9; the last leaves no tension
-        for (found, edges, count), (expected, *_) in zip(
+    for carried in (1e-3, 1.0, 5.0, 1e3):  # axial stiffness is about 9: the last leaves no mixed edge
+        for (mixed, edges, count), (expected, *_) in zip(
             directions(scene, device, wp.float64, carried, psd, solver=solver), exact, strict=True
         ):
-            assert error(found[:-1], expected) < 1e-9
+            assert error(mixed[:-1], expected) < 1e-9
             dim = edges.shape[2]
-            steps = np.diff(np.moveaxis(found[:dim], 0, -1), axis=0)
+            steps = np.diff(np.moveaxis(mixed[:dim], 0, -1), axis=0)
             along = np.sum(edges * steps, -1) / np.linalg.norm(edges, axis=-1)
             inside = np.arange(len(along))[:, None] < count - 1
-            # what edges lengthen by, the last row
-            np.testing.assert_allclose(found[-1, :-1][inside], along[inside], rtol=0, atol=1e-9 * np.abs(steps).max())
+            # lengthening of edges, the last row
+            np.testing.assert_allclose(mixed[-1, :-1][inside], along[inside], rtol=0, atol=1e-9 * np.abs(steps).max())
 
 
 @EVERY_SOLVER
-def test_float32_is_as_good_however_stiff_edges_are(device, solver):
-    """Errors of directions: those of tensions do not grow with EA; without tensions they do, by a hundred for a hundred."""
+def test_float32_error_is_independent_of_axial_stiffness(device, solver):
+    """Errors of mixed directions do not grow with EA; without mixed tensions they grow in proportion."""
     errors = {True: [], False: []}
     for axial in (1e2, 1e4, 1e6, 1e8):
         scene = rods("twist", axial, "root")
         exact = directions(scene, device, wp.float64, None, kept=True)
-        for split, found in errors.items():
-            got = directions(scene, device, wp.float32, 1e2 if split else None, kept=True, solver=solver)
-            found.append(max(error(a[: b.shape[0]], b) for (a, *_), (b, *_) in zip(got, exact, strict=True)))
+        for split, error_list in errors.items():
+            inexact = directions(scene, device, wp.float32, 1e2 if split else None, kept=True, solver=solver)
+            error_list.append(max(error(a[: b.shape[0]], b) for (a, *_), (b, *_) in zip(inexact, exact, strict=True)))
     assert max(errors[True]) < 1e-3
     assert errors[False][-1] > 1e2 * errors[True][-1]
 
 
-def held(nodes: int, axial: float, device) -> PartitionedNewton:
-    """A wavy rod of 1 m by cyclic reduction, with tensions, after one iteration; held at its ends and within, where tensions wait."""
+def mixed_wavy_rod(nodes: int, axial: float, device) -> PartitionedNewton:
+    """Return a mixed solver by cyclic reduction after one iteration, of a wavy rod of 1 m fixed at ends and inner nodes."""
     along = np.linspace(0.0, 1.0, nodes)
     points = np.stack([along, 0.05 * np.sin(20.0 * along), 0.05 * np.cos(14.0 * along)], axis=1)
     scene = ddg.Scene()
@@ -156,7 +159,7 @@ def held(nodes: int, axial: float, device) -> PartitionedNewton:
 
 
 def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
-    """What [H r^T; r -s] makes of the residual in float64, from the same blocks, rows and slacks: (nodes, dofs), lengthening."""
+    """Solve [H r^T, r -s] in float64 from the same blocks, rows and slacks; return (nodes, dofs) and lengthenings."""
     kind, n = newton.group.kind, newton.group.nodes
     nb = kind.block
     blocks = arrays.download(newton.blocks)[..., 0].astype(float).reshape(3, nb, nb, n)
@@ -164,9 +167,9 @@ def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
     fixed = (arrays.download(newton.group.fixed)[:, :1] >> np.arange(nb)) & 1
     slack, H, rows = factor[-1, :-1], np.zeros((n, nb, n, nb)), np.zeros((n - 1, n, nb))
     for k in range(n):
-        for ahead in range(min(3, n - k)):
-            H[k, :, k + ahead] = blocks[ahead, ..., k]
-            H[k + ahead, :, k] = blocks[ahead, ..., k].T
+        for offset in range(min(3, n - k)):
+            H[k, :, k + offset] = blocks[offset, ..., k]
+            H[k + offset, :, k] = blocks[offset, ..., k].T
     first = kind.vertex_strains * kind.window
     for k in range(n - 1):
         rows[k, k, : kind.dim] = -factor[first : first + kind.dim, k]
@@ -174,27 +177,27 @@ def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
     rows *= fixed == 0
     H, rows = H.reshape(n * nb, n * nb), rows.reshape(n - 1, n * nb)
     right = np.concatenate([arrays.download(newton.right)[..., 0].astype(float).T.ravel(), np.zeros(n - 1)])
-    found = np.linalg.solve(np.block([[H, rows.T], [rows, -np.diag(slack)]]), right)
-    return found[: n * nb].reshape(n, nb), slack * found[n * nb :] / np.sqrt(newton.islands.carried.numpy()[0])
+    solution = np.linalg.solve(np.block([[H, rows.T], [rows, -np.diag(slack)]]), right)
+    return solution[: n * nb].reshape(n, nb), slack * solution[n * nb :] / np.sqrt(newton.islands.carried.numpy()[0])
 
 
 @pytest.mark.parametrize("axial", [1e4, 1e6, 1e8, 1e10, 1e12])  # EA L^2 / EI
-def test_cyclic_reduction_is_a_dense_solve(device, axial):
-    """In float32 of 150 nodes, of which one in 15 is held or beside one that is, within a thousandth whatever EA is."""
-    newton = held(150, axial, device)
-    found = arrays.download(newton.direction)[..., 0].T
+def test_cyclic_reduction_matches_dense_solve(device, axial):
+    """Float32 with 150 nodes, one in 15 at or next to a support: within a thousandth at any EA."""
+    newton = mixed_wavy_rod(150, axial, device)
+    direction = arrays.download(newton.direction)[..., 0].T
     expected, longer = dense(newton)
-    np.testing.assert_allclose(found[:, :-1], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
-    np.testing.assert_allclose(found[:-1, -1], longer, rtol=0, atol=1e-3 * np.abs(longer).max())
+    np.testing.assert_allclose(direction[:, :-1], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(direction[:-1, -1], longer, rtol=0, atol=1e-3 * np.abs(longer).max())
 
 
 def hair(nodes: int) -> ddg.Scene:
-    """Four curled hairs of 40 um on roots that are shaken."""
+    """Build four curled hairs of 40 um on shaken roots."""
     return curled.build(strands=4, nodes=nodes)
 
 
 def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **options):
-    """Points after some steps, and the statistics."""
+    """Return the points after some steps, and the statistics."""
     model = scene.build(device, precision)
     integrator, state = ddg.Integrator(model, **options), model.state()
     for _ in range(steps):
@@ -214,25 +217,25 @@ def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **o
     ],
 )
 @EVERY_SOLVER
-def test_hair_moves_as_in_float64(device, nodes, dt, scheme, solver):
+def test_hair_matches_float64(device, nodes, dt, scheme, solver):
     """Within 1e-6 m of float64 at rtol 1e-10, in as many iterations, and without retries."""
     steps = round(0.25 / dt)
     options = {"scheme": scheme, "linear": solver} | ({"energy_bound": None} if scheme == "implicit_midpoint" else {})
-    exact, one = advance(hair(nodes), device, "float64", dt, steps, rtol=1e-10, **options)
-    usual, two = advance(hair(nodes), device, "float64", dt, steps, **options)
-    found, other = advance(hair(nodes), device, "mixed", dt, steps, **options)
-    assert one["linear"] == ["float64"]
-    assert other["linear"] == ["float32 with tensions"]
-    assert np.abs(found - exact).max() < max(1e-6, 2.0 * np.abs(usual - exact).max())
-    assert other["newton_iterations"]["mean"] < 1.1 * two["newton_iterations"]["mean"]
-    assert other["newton_iterations"]["max"] <= 10
-    assert other["retries"] == 0
+    exact, tight = advance(hair(nodes), device, "float64", dt, steps, rtol=1e-10, **options)
+    usual, plain = advance(hair(nodes), device, "float64", dt, steps, **options)
+    points, mixed = advance(hair(nodes), device, "mixed", dt, steps, **options)
+    assert tight["linear"] == ["float64"]
+    assert mixed["linear"] == ["float32 with tensions"]
+    assert np.abs(points - exact).max() < max(1e-6, 2.0 * np.abs(usual - exact).max())
+    assert mixed["newton_iterations"]["mean"] < 1.1 * plain["newton_iterations"]["mean"]
+    assert mixed["newton_iterations"]["max"] <= 10
+    assert mixed["retries"] == 0
 
 
 @pytest.mark.slow
-def test_a_long_cable_moves_as_in_float64(device):
-    """Steel, 10 m of 640 nodes, swings between two clamps by cyclic reduction; float32 alone has no digits for its stretching."""
-    found = {}
+def test_long_cable_matches_float64(device):
+    """A steel cable of 10 m and 640 nodes swings between clamps; plain float32 cannot resolve its stretching."""
+    runs = {}
     for precision in ("float64", "mixed"):
         scene = ddg.Scene(gravity=(0.0, -3.0, -9.81))
         points = np.linspace([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], 640)
@@ -241,8 +244,8 @@ def test_a_long_cable_moves_as_in_float64(device):
             points, section=ddg.Circle(1e-3), material=ddg.Material(young=2e11, poisson=0.3, density=7800.0)
         )
         scene.clamp(rod, edges=[0, 638])
-        found[precision] = advance(scene, device, precision, 1.0 / 240.0, 60, linear="partitioned")
-    (exact, one), (x, two) = found["float64"], found["mixed"]
+        runs[precision] = advance(scene, device, precision, 1.0 / 240.0, 60, linear="partitioned")
+    (exact, one), (x, two) = runs["float64"], runs["mixed"]
     assert two["linear"] == ["float32 with tensions"]
     assert np.abs(exact - points).max() > 0.05
     assert np.abs(x - exact).max() < 1e-6
@@ -251,7 +254,7 @@ def test_a_long_cable_moves_as_in_float64(device):
 
 
 def test_bending_beyond_float32_is_solved_in_float64(device):
-    """Steel of 256 edges over 0.1 s: a node to and fro between its neighbours is stiffer than float32 has digits, too."""
+    """Steel of 256 edges at 0.1 s: bending of a node between its neighbours is too stiff for float32, too."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 257)
     rod = scene.add_rod(
@@ -262,14 +265,14 @@ def test_bending_beyond_float32_is_solved_in_float64(device):
     assert statistics["linear"] == ["float64"]
 
 
-def test_the_report_says_what_steps_take(device, monkeypatch):
-    """Of the scene's analysis: what float32 alone carries, with tensions, and in float64; a soft rod needs nothing of it."""
-    said = "over steps of 0.0166667 s: edges turned, second derivatives"
+def test_report_names_linear_algebra_of_steps(device, monkeypatch):
+    """The report names float32, float32 with tensions or float64 for the steps of the scene's analysis."""
+    prefix = "over steps of 0.0166667 s: edges turned, second derivatives"
     for solver, reduced in (("chain sweep", False), ("cyclic reduction", True)):
-        monkeypatch.setattr(choice, "long_and_few", lambda *given, reduced=reduced: reduced)
+        monkeypatch.setattr(choice, "long_and_few", lambda *_arguments, reduced=reduced: reduced)
         for precision, linear in (("mixed", ", linear algebra in float32 with tensions"), ("float64", "")):
             report = hair(32).build(device, precision).report()
-            assert said + linear + "\n" in report
+            assert prefix + linear + "\n" in report
             assert f"solver: {solver}" in report
     soft = ddg.Scene(analysis=ddg.Dynamics(dt=1.0 / 240.0, duration=1.0))
     rod = soft.add_rod(
