@@ -1,4 +1,4 @@
-"""Bad inputs to contact: its law, what differs between objects, and obstacles."""
+"""Bad inputs to contact: laws, settings of pairs of objects, and obstacles."""
 
 # fmt: off
 import numpy as np
@@ -13,98 +13,100 @@ FLAT = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [2.0, 0.0, -1.0]])
 
 
 def scene() -> ddg.Scene:
-    """Two rods, apart and clamped, called 'rod' and 'odd'."""
+    """Return a scene of two separate clamped rods, 'rod' and 'odd'."""
     made = rods(np.linspace((0.0, 0.5, 0.0), (1.0, 0.5, 0.0), 5))
     made.clamp([0, 1])
     return made
 
 
-def touching(**options) -> ddg.Scene:
-    """The same, in contact."""
+def in_contact(**options) -> ddg.Scene:
+    """Return the two rods with contact."""
     made = scene()
     made.contact(**options)
     return made
 
 
-def over(shape, made: ddg.Scene | None = None, **options) -> ddg.Scene:
-    """The same with an obstacle."""
-    made = made or touching()
+def obstructed(shape, made: ddg.Scene | None = None, **options) -> ddg.Scene:
+    """Return the two rods in contact, with an obstacle."""
+    made = made or in_contact()
     made.add_obstacle(shape, **options)
     return made
 
 
-def stepped(made: ddg.Scene, **options):
-    """A step of it."""
+def step(made: ddg.Scene, **options):
+    """Return the state after a step of a scene."""
     model = built(made)
     return ddg.Integrator(model, **options).step(model.state(), 1e-3)
 
 
-def pushed(made: ddg.Scene, gap):
-    """Its first state with nothing closer than a gap."""
+def separate(made: ddg.Scene, gap):
+    """Resolve overlaps of the initial state to a minimum gap."""
     model = built(made)
     return model.pushed_apart(model.state(), gap)
 
 
-def between(*names, **options):
-    """What differs between two names, in a scene with a floor."""
-    made = over(ddg.Plane((0.0, 0.0, -1.0)), name="floor")
+def build_pair(*names, **options):
+    """Build the two rods over a floor, with contact settings between two names."""
+    made = obstructed(ddg.Plane((0.0, 0.0, -1.0)), name="floor")
     made.contact_between(*names, **options)
     return built(made)
 
 
 for _name, _unit in (("range", "[m]"), ("stiffness", "[N/m]"), ("velocity", "[m/s]")):
-    each("contact", _name, [0.0, -1.0, NAN, INF, "large", (1.0, 2.0)], lambda v, name=_name: touching(**{name: v}),
+    each("contact", _name, [0.0, -1.0, NAN, INF, "large", (1.0, 2.0)], lambda v, name=_name: in_contact(**{name: v}),
          f"contact: {_name}", "positive", _unit)
-each("contact", "friction", [-1.0, NAN, INF, "rough", True, (0.1, 0.2, 0.3)], lambda v: touching(friction=v),
+each("contact", "friction", [-1.0, NAN, INF, "rough", True, (0.1, 0.2, 0.3)], lambda v: in_contact(friction=v),
      "contact: friction", "zero or more", "contact_between")
-each("contact", "apart", [-1.0, NAN, INF, "far"], lambda v: touching(apart=v), "contact: apart", "zero or more [m]")
-each("contact", "lags", [0, -1, 2.5, "two"], lambda v: touching(lags=v), "contact: lags", "whole number")
-each("contact", "law", ["spring", None, 3], lambda v: touching(law=v), "contact: law", "'barrier' or 'penalty'")
-each("contact", "friction law", ["dry", None], lambda v: touching(friction_law=v), "friction_law", "'logistic' or 'polynomial'")
-each("contact", "radius", [0.1, [1.0]], lambda v: touching(radius=v), "contact: radius", "dictionary")
-each("contact", "radius of a name", [0.0, -1.0, NAN, INF, "thick", [1.0, 2.0]], lambda v: touching(radius={"odd": v}),
+each("contact", "apart", [-1.0, NAN, INF, "far"], lambda v: in_contact(apart=v), "contact: apart", "zero or more [m]")
+each("contact", "lags", [0, -1, 2.5, "two"], lambda v: in_contact(lags=v), "contact: lags", "whole number")
+each("contact", "law", ["spring", None, 3], lambda v: in_contact(law=v), "contact: law", "'barrier' or 'penalty'")
+each("contact", "friction law", ["dry", None], lambda v: in_contact(friction_law=v), "friction_law", "'logistic' or 'polynomial'")
+each("contact", "radius", [0.1, [1.0]], lambda v: in_contact(radius=v), "contact: radius", "dictionary")
+each("contact", "radius of a name", [0.0, -1.0, NAN, INF, "thick", [1.0, 2.0]], lambda v: in_contact(radius={"odd": v}),
      "contact: radius of 'odd'", "positive", "[m]")
-each("contact", "objects", [[], 3, ()], lambda v: touching(objects=v), "contact: objects", "names")
-each("contact", "names of objects", ["none", ["rod", "none"]], lambda v: built(touching(objects=v)),
+each("contact", "objects", [[], 3, ()], lambda v: in_contact(objects=v), "contact: objects", "names")
+each("contact", "names of objects", ["none", ["rod", "none"]], lambda v: built(in_contact(objects=v)),
      "contact: objects names", "'odd', 'rod'")
 refuse("contact", {
-    "twice": (lambda: touching().contact(), "has contact already", "contact_between"),
-    "radius of no object": (lambda: built(touching(radius={"none": 0.1})), "radius names 'none'", "'odd', 'rod'"),
-    "radius of what can not touch": (lambda: built(touching(objects="rod", radius={"odd": 0.1})), "radius names 'odd'", "is 'rod'"),
-    "between a name that is not there": (lambda: between("rod", "none", ignore=True), "names 'none'", "'floor', 'odd', 'rod'"),
+    "twice": (lambda: in_contact().contact(), "has contact already", "contact_between"),
+    "radius of no object": (lambda: built(in_contact(radius={"none": 0.1})), "radius names 'none'", "'odd', 'rod'"),
+    "radius of what can not touch": (lambda: built(in_contact(objects="rod", radius={"odd": 0.1})), "radius names 'odd'", "is 'rod'"),
+    "between a name that is not there": (lambda: build_pair("rod", "none", ignore=True), "names 'none'", "'floor', 'odd', 'rod'"),
     "friction by direction of a shell": (lambda: _shell_over_floor((0.1, 0.2, 0.3)), "'shell' and 'floor'", "rods on an obstacle"),
-    "between numbers": (lambda: between(0, 1, ignore=True), "contact_between: one is 0", "text"),
-    "between obstacles": (lambda: between("floor", "floor", friction=0.1), "'floor' and 'floor'", "obstacles never touch"),
-    "between, and nothing": (lambda: between("rod", "floor"), "'rod' and 'floor'", "nothing is different", "ignore=True"),
-    "between, ignored and rough": (lambda: between("rod", "odd", ignore=True, friction=0.1), "'rod' and 'odd'", "no friction"),
-    "between, ignored a little": (lambda: between("rod", "odd", ignore=0.5), "'rod' and 'odd'", "ignore", "True or False"),
+    "between numbers": (lambda: build_pair(0, 1, ignore=True), "contact_between: one is 0", "text"),
+    "between obstacles": (lambda: build_pair("floor", "floor", friction=0.1), "'floor' and 'floor'", "obstacles never touch"),
+    "between, and nothing": (lambda: build_pair("rod", "floor"), "'rod' and 'floor'", "nothing is different", "ignore=True"),
+    "between, ignored and rough": (lambda: build_pair("rod", "odd", ignore=True, friction=0.1), "'rod' and 'odd'", "no friction"),
+    "between, ignored a little": (lambda: build_pair("rod", "odd", ignore=0.5), "'rod' and 'odd'", "ignore", "True or False"),
     "between without contact": (lambda: built(scene(), lambda s: s.contact_between("rod", "odd", ignore=True)), "add scene.contact()"),
-    "obstacles without contact": (lambda: built(over(ddg.Plane(), scene())), "obstacle 0 ('obstacle')", "add scene.contact()"),
+    "obstacles without contact": (lambda: built(obstructed(ddg.Plane(), scene())), "obstacle 0 ('obstacle')", "add scene.contact()"),
     "in a plane": (lambda: built(rods(scene=ddg.Scene(dimension=2)), lambda s: s.contact()), "dimension 3", "dimension=2"),
     "shells of revolution": (lambda: built(dome(DOME), lambda s: s.contact()), "shell of revolution 0 ('dome')", "can not touch"),
-    "overlap": (lambda: stepped(over(ddg.Plane((0.0, 0.0, 1.0)))), "rod 0", "'obstacle'", "overlap by", "move them apart"),
+    "overlap": (lambda: step(obstructed(ddg.Plane((0.0, 0.0, 1.0)))), "rod 0", "'obstacle'", "overlap by", "move them apart"),
 })
-each("contact", "between friction", [-1.0, NAN, INF, "rough"], lambda v: between("rod", "floor", friction=v),
+each("contact", "between friction", [-1.0, NAN, INF, "rough"], lambda v: build_pair("rod", "floor", friction=v),
      "'rod' and 'floor'", "friction")
 each("contact", "friction by direction", [(0.1, 0.2), (0.1, 0.2, NAN), [0.1, (0.2, 0.3)], (0.1, 0.2, "rough"), ()],
-     lambda v: between("rod", "floor", friction=v), "'rod' and 'floor'", "forwards, backwards and across", "three finite numbers")
-each("contact", "friction across", [(0.1, 0.2, -0.3)], lambda v: between("rod", "floor", friction=v),
+     lambda v: build_pair("rod", "floor", friction=v), "'rod' and 'floor'", "forwards, backwards and across", "three finite numbers")
+each("contact", "friction across", [(0.1, 0.2, -0.3)], lambda v: build_pair("rod", "floor", friction=v),
      "'rod' and 'floor'", "friction across is -0.3", "zero or more")
-each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")], lambda v: between(*v, friction=(0.1, 0.2, 0.3)),
+each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")], lambda v: build_pair(*v, friction=(0.1, 0.2, 0.3)),
      "friction forwards, backwards and across", "rods on an obstacle", "one coefficient")
-each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: between("rod", "odd", stiffness=v),
+each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: build_pair("rod", "odd", stiffness=v),
      "'rod' and 'odd'", "stiffness")
-each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: between("rod", "odd", range=v), "'rod' and 'odd'", "range")
-each("contact", "gap to push apart to", [0.0, -1.0, NAN, "far"], lambda v: pushed(touching(), v), "pushed_apart: gap", "positive")
+each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: build_pair("rod", "odd", range=v), "'rod' and 'odd'", "range")
+each("contact", "gap to push apart to", [0.0, -1.0, NAN, "far"], lambda v: separate(in_contact(), v), "pushed_apart: gap", "positive")
 refuse("contact", {
-    "pushed apart too far": (lambda: pushed(touching(), 1e3), "pushed_apart: gap is 1000 m", "may not exceed"),
-    "pushed apart without contact": (lambda: pushed(scene(), None), "pushed_apart", "add scene.contact()"),
-    "pushed apart what is held": (lambda: pushed(over(ddg.Plane((0.0, 0.0, 1.0))), None), "pushed_apart", "'obstacle'", "rounds"),
+    "pushed apart too far": (lambda: separate(in_contact(), 1e3), "pushed_apart: gap is 1000 m", "may not exceed"),
+    "pushed apart without contact": (lambda: separate(scene(), None), "pushed_apart", "add scene.contact()"),
+    "pushed apart what is held": (
+        lambda: separate(obstructed(ddg.Plane((0.0, 0.0, 1.0))), None), "pushed_apart", "'obstacle'", "rounds"),
 })
 
-each("obstacles", "shape", [None, ddg.Plane, "plane", 3], over, "add_obstacle 'obstacle'", "give Plane, Sphere, Capsule, Box or Mesh")
-each("obstacles", "motion", ["up", 3.0, len], lambda v: over(ddg.Plane(), motion=v), "add_obstacle", "Motion")
-each("obstacles", "name", [3, "", None], lambda v: over(ddg.Plane(), name=v), "add_obstacle: name", "text")
+each("obstacles", "shape", [None, ddg.Plane, "plane", 3], obstructed,
+     "add_obstacle 'obstacle'", "give Plane, Sphere, Capsule, Box or Mesh")
+each("obstacles", "motion", ["up", 3.0, len], lambda v: obstructed(ddg.Plane(), motion=v), "add_obstacle", "Motion")
+each("obstacles", "name", [3, "", None], lambda v: obstructed(ddg.Plane(), name=v), "add_obstacle: name", "text")
 each("obstacles", "point", [(0.0, 0.0), NAN, "here", (0.0, 0.0, INF)], ddg.Plane, "Plane: point", "three finite numbers")
 each("obstacles", "normal", [(0.0, 0.0), (0.0, 0.0, NAN)], lambda v: ddg.Plane(normal=v), "Plane: normal", "three finite numbers")
 each("obstacles", "center", [(0.0, 0.0), NAN, None], lambda v: ddg.Sphere(v, 0.1), "Sphere: center", "three finite numbers")
@@ -125,25 +127,25 @@ refuse("obstacles", {
     "a mesh with a hole": (lambda: ddg.Mesh(FLAT * [1.0, 1.0, NAN], [[0, 1, 2]]), "Mesh", "finite"),
     "a mesh of other points": (lambda: ddg.Mesh(FLAT, [[0, 1, 3]]), "Mesh: triangle 0", "vertices are 0 to 2"),
     "a mesh of fractions": (lambda: ddg.Mesh(FLAT, [[0.0, 1.0, 2.0]]), "Mesh", "whole numbers"),
-    "a triangle without area": (lambda: stepped(over(ddg.Mesh(FLAT, [[0, 1, 2]]))), "triangle 0", "'obstacle'", "no area"),
-    "a triangle of two points": (lambda: stepped(over(ddg.Mesh(FLAT, [[0, 1, 1]]))), "triangle 0", "'obstacle'", "no area"),
+    "a triangle without area": (lambda: step(obstructed(ddg.Mesh(FLAT, [[0, 1, 2]]))), "triangle 0", "'obstacle'", "no area"),
+    "a triangle of two points": (lambda: step(obstructed(ddg.Mesh(FLAT, [[0, 1, 1]]))), "triangle 0", "'obstacle'", "no area"),
     "displacements of others": (
-        lambda: over(ddg.Sphere((0.0, 0.0, -1.0), 0.1), motion=ddg.Motion(lambda t: np.zeros((3, 3)))),
+        lambda: obstructed(ddg.Sphere((0.0, 0.0, -1.0), 0.1), motion=ddg.Motion(lambda t: np.zeros((3, 3)))),
         *("add_obstacle 'obstacle'", "3 displacements", "1 points", "one for all"),
     ),
     "a motion that starts elsewhere": (
-        lambda: built(over(ddg.Plane((0.0, 0.0, -1.0)), motion=ddg.Motion(lambda t: (0.0, 0.0, 1.0 + t)))),
+        lambda: built(obstructed(ddg.Plane((0.0, 0.0, -1.0)), motion=ddg.Motion(lambda t: (0.0, 0.0, 1.0 + t)))),
         *("add_obstacle", "t = 0", "supports start where they are"),
     ),
     "a motion that fails": (
-        lambda: stepped(over(ddg.Plane((0.0, 0.0, -1.0)), motion=ddg.Motion(lambda t: (0.0, 0.0, NAN if t else 0.0)))),
+        lambda: step(obstructed(ddg.Plane((0.0, 0.0, -1.0)), motion=ddg.Motion(lambda t: (0.0, 0.0, NAN if t else 0.0)))),
         *("translation", "not finite at t = 0.001"),
     ),
 })
 
 
 def _rough():
-    return built(touching(friction=0.2))
+    return built(in_contact(friction=0.2))
 
 
 refuse("contact", {
@@ -155,14 +157,14 @@ refuse("contact", {
         lambda: ddg.statics.solve(_rough(), start=1.0), "contact: friction", "from 1 to 1", "start other than end",
     ),
     "follows": (lambda: ddg.statics.solve(_rough(), mode="follow"), "contact: ", "paths", "it is 0.2 between", "friction=0"),
-    "factors": (lambda: ddg.statics.solve(built(touching()), solver="direct"), "contact: ", "'direct'", "solver='auto'"),
+    "factors": (lambda: ddg.statics.solve(built(in_contact()), solver="direct"), "contact: ", "'direct'", "solver='auto'"),
     "path": (lambda: ddg.continuation.Continuation(_rough()), "contact: ", "paths", "it is 0.2 between", "friction=0"),
-    "relaxation": (lambda: relax(built(touching())), "contact: ", "relaxation", "statics.solve"),
-    "midpoint": (lambda: stepped(touching(), scheme="implicit_midpoint"), "contact: ", "implicit_euler"),
-    "projective": (lambda: stepped(touching(), solver="projective"), "contact: ", "'newton'"),
+    "relaxation": (lambda: relax(built(in_contact())), "contact: ", "relaxation", "statics.solve"),
+    "midpoint": (lambda: step(in_contact(), scheme="implicit_midpoint"), "contact: ", "implicit_euler"),
+    "projective": (lambda: step(in_contact(), solver="projective"), "contact: ", "'newton'"),
     "asked without": (lambda: (model := built(scene()), model.contacts(model.state())), "contacts: ", "add scene.contact()"),
     "an oblique plane of symmetry": (
-        lambda: stepped(_on_oblique_plane()), "contact: ", "oblique plane", "axis of space"
+        lambda: step(_on_oblique_plane()), "contact: ", "oblique plane", "axis of space"
     ),
 })
 

@@ -1,4 +1,4 @@
-"""Bad inputs to steps whose worlds are told apart: controls, grips, outcomes, resets."""
+"""Bad inputs to steps with different controls per world: controls, grips, outcomes, resets."""
 
 # fmt: off
 import numpy as np
@@ -36,7 +36,7 @@ def _magnetic(dimension: int = 3):
     return built(scene)
 
 
-def _told(made, **controls):
+def _apply(made, **controls):
     return ddg.Integrator(made).step(made.state(), 0.01, ddg.Controls(**controls))
 
 
@@ -62,26 +62,27 @@ def _step(controls):
 
 each("Controls", "controls", [3, {"gravity": (0, 0, 1)}, "up"], _step, "step: controls", "Controls(")
 each("Controls", "of an equilibrium", [3, "up"], lambda v: statics.solve(model(), controls=v), "statics: controls", "Controls(")
-each("Controls", "gravity", [1.0, (0.0, 1.0), "down", NAN, (0.0, 0.0, INF)], lambda v: _told(model(), gravity=v), "Controls: gravity")
-each("Controls", "field", [1.0, (0.0, 1.0), NAN], lambda v: _told(_magnetic(), field=v), "Controls: field")
+each("Controls", "gravity", [1.0, (0.0, 1.0), "down", NAN, (0.0, 0.0, INF)], lambda v: _apply(model(), gravity=v), "Controls: gravity")
+each("Controls", "field", [1.0, (0.0, 1.0), NAN], lambda v: _apply(_magnetic(), field=v), "Controls: field")
 refuse("Controls", {
-    "a field of nothing": (lambda: _told(model(), field=(0.0, 0.0, 1.0)), "field acts on nothing", "scene.magnetize", "magnetic_field"),
-    "a field out of the plane": (lambda: _told(_magnetic(dimension=2), field=(0.0, 1.0, 0.0)), "Controls: field", "0 along y"),
-    "poses without grips": (lambda: _told(model(), poses=np.zeros((0, 6))), "poses of no grip", "Grip"),
-    "poses of one": (lambda: _told(_gripped(), poses=np.zeros((1, 6))), "poses have shape (1, 6)", "(2, 6)", "(2, 2, 6)"),
-    "poses of three worlds": (lambda: _told(_gripped(), poses=np.zeros((3, 2, 6))), "poses have shape (3, 2, 6)", "(2, 2, 6)"),
-    "poses that are not finite": (lambda: _told(_gripped(), poses=BAD), "poses: entry 1 in world 1", "not finite"),
-    "poses out of the plane": (lambda: _told(_gripped(2), poses=OUT), "grip 1", "plane of x and z", "along y"),
-    "poses that turn out of it": (lambda: _told(_gripped(2), poses=SPIN), "grip 1", "rotation about x and z"),
-    "a rim that turns out of it": (lambda: _told(_gripped_dome(), poses=SPIN[1:]), "grip 0", "rotation about x and z"),
-    "forces on few": (lambda: _told(model(), forces=np.zeros((3, 3))), "forces have shape (3, 3)", "(12, 3)"),
-    "forces out of the plane": (lambda: _told(_gripped(2), forces=np.ones((12, 3))), "point 0", "plane of x and z", "0 along y"),
-    "forces around a ring": (lambda: _told(_gripped_dome(), forces=np.ones((6, 3))), "point 0", "plane of x and z", "0 along y"),
-    "forces as words": (lambda: _told(model(), forces="many"), "forces", "no array of numbers"),
-    "moments on nodes": (lambda: _told(model(), moments=np.zeros(12)), "moments have shape (12,)", "(10,)"),
-    "moments without twist": (lambda: _told(_plain(), moments=np.ones(10)), "edge 0 of rod 1 ('odd')", "no twist", "twist=True"),
-    "gravity out of the plane": (lambda: _told(_gripped(2), gravity=(0.0, 1.0, 0.0)), "gravity", "0 along y"),
-    "gravity across the axis": (lambda: _told(_gripped_dome(), gravity=(1.0, 0.0, 0.0)), "gravity", "0 along x and y"),
+    "a field of nothing": (
+        lambda: _apply(model(), field=(0.0, 0.0, 1.0)), "field acts on nothing", "scene.magnetize", "magnetic_field"),
+    "a field out of the plane": (lambda: _apply(_magnetic(dimension=2), field=(0.0, 1.0, 0.0)), "Controls: field", "0 along y"),
+    "poses without grips": (lambda: _apply(model(), poses=np.zeros((0, 6))), "poses of no grip", "Grip"),
+    "poses of one": (lambda: _apply(_gripped(), poses=np.zeros((1, 6))), "poses have shape (1, 6)", "(2, 6)", "(2, 2, 6)"),
+    "poses of three worlds": (lambda: _apply(_gripped(), poses=np.zeros((3, 2, 6))), "poses have shape (3, 2, 6)", "(2, 2, 6)"),
+    "poses that are not finite": (lambda: _apply(_gripped(), poses=BAD), "poses: entry 1 in world 1", "not finite"),
+    "poses out of the plane": (lambda: _apply(_gripped(2), poses=OUT), "grip 1", "plane of x and z", "along y"),
+    "poses that turn out of it": (lambda: _apply(_gripped(2), poses=SPIN), "grip 1", "rotation about x and z"),
+    "a rim that turns out of it": (lambda: _apply(_gripped_dome(), poses=SPIN[1:]), "grip 0", "rotation about x and z"),
+    "forces on few": (lambda: _apply(model(), forces=np.zeros((3, 3))), "forces have shape (3, 3)", "(12, 3)"),
+    "forces out of the plane": (lambda: _apply(_gripped(2), forces=np.ones((12, 3))), "point 0", "plane of x and z", "0 along y"),
+    "forces around a ring": (lambda: _apply(_gripped_dome(), forces=np.ones((6, 3))), "point 0", "plane of x and z", "0 along y"),
+    "forces as words": (lambda: _apply(model(), forces="many"), "forces", "no array of numbers"),
+    "moments on nodes": (lambda: _apply(model(), moments=np.zeros(12)), "moments have shape (12,)", "(10,)"),
+    "moments without twist": (lambda: _apply(_plain(), moments=np.ones(10)), "edge 0 of rod 1 ('odd')", "no twist", "twist=True"),
+    "gravity out of the plane": (lambda: _apply(_gripped(2), gravity=(0.0, 1.0, 0.0)), "gravity", "0 along y"),
+    "gravity across the axis": (lambda: _apply(_gripped_dome(), gravity=(1.0, 0.0, 0.0)), "gravity", "0 along x and y"),
 })
 each("Grip", "pivot", [1.0, (0.0, 1.0), "there", (NAN, 0.0, 0.0)], ddg.Grip, "Grip: pivot", "three finite")
 refuse("Grip", {

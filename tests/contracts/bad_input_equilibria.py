@@ -1,7 +1,7 @@
 """Bad inputs to equilibria: statics, continuation, stability."""
 
 # fmt: off
-from bad_inputs import INF, NAN, built, each, held_rods, line, model, refuse, rods, sheet
+from bad_inputs import INF, NAN, built, clamped, each, line, model, refuse, rods, sheet
 
 import ddg_warp as ddg
 from ddg_warp.solve import continuation, stability, statics
@@ -24,42 +24,42 @@ each("statics", "max_iterations", [0, 1.5], lambda v: statics.solve(model(), max
 each("statics", "max_cuts", [0, "few"], lambda v: statics.solve(model(), max_cuts=v), "max_cuts", "at least 1")
 
 
-def _loose(held: str):
+def _solve_underconstrained(components: str):
     scene = rods()
     scene.clamp(0)
-    if held:
-        scene.fix(1, [0, 2, 4], components=held)
+    if components:
+        scene.fix(1, [0, 2, 4], components=components)
     return statics.solve(built(scene))
 
 
-def _still(change, **options):
+def _solve(change, **options):
     scene = rods()
     scene.clamp(0)
     change(scene)
     return statics.solve(built(scene), **options)
 
 
-def _pushed(amplitude):
+def _force(amplitude):
     return lambda s: (s.clamp(1), s.add_force(1, -1, (0.0, 0.0, 1.0), amplitude))
 
 
 refuse("statics", {
-    "a scene": (lambda: statics.solve(held_rods()), "statics", "Scene", "scene.build()"),
+    "a scene": (lambda: statics.solve(clamped()), "statics", "Scene", "scene.build()"),
     "state of another model": (lambda: statics.solve(model(), model("net").state()), "another model"),
-    "free": (lambda: _loose(""), "rod 1", "along x", "supports", "clamp"),
-    "free along z": (lambda: _loose("xy"), "rod 1", "along z", "supports"),
-    "free along x": (lambda: _loose("yz"), "rod 1", "along x", "supports"),
+    "free": (lambda: _solve_underconstrained(""), "rod 1", "along x", "supports", "clamp"),
+    "free along z": (lambda: _solve_underconstrained("xy"), "rod 1", "along z", "supports"),
+    "free along x": (lambda: _solve_underconstrained("yz"), "rod 1", "along x", "supports"),
     "free sheet": (lambda: statics.solve(built(sheet())), "held along x", "scene.hold"),
     "pcg of rods": (lambda: statics.solve(model(), solver="pcg"), "'pcg'", "solver='direct'"),
     "pcg follows": (lambda: statics.solve(model("net"), solver="pcg", mode="follow"), "'follow'", "solver='direct'"),
-    "amplitude that ends": (lambda: _still(_pushed(lambda t: t if t < 0.5 else NAN), load_steps=4), "amplitude", "t = 0.5"),
+    "amplitude that ends": (lambda: _solve(_force(lambda t: t if t < 0.5 else NAN), load_steps=4), "amplitude", "t = 0.5"),
     "motion that ends": (
-        lambda: _still(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (t if t < 0.5 else NAN, 0.0, 0.0))), load_steps=4),
+        lambda: _solve(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (t if t < 0.5 else NAN, 0.0, 0.0))), load_steps=4),
         *("translation", "not finite", "t = 0.5")),
     "motion that jumps": (
-        lambda: _still(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (0.0, 0.0, 0.0 if t < 0.3 else 1e20))), max_cuts=3),
+        lambda: _solve(lambda s: s.clamp(1, motion=ddg.Motion(lambda t: (0.0, 0.0, 0.0 if t < 0.3 else 1e20))), max_cuts=3),
         *("jumps at t = 0.3", "continuous", "load parameter")),
-    "amplitude of three later": (lambda: _still(_pushed(lambda t: t if t < 0.5 else (t, t, t))), "amplitude", "one number", "t = 1"),
+    "amplitude of three later": (lambda: _solve(_force(lambda t: t if t < 0.5 else (t, t, t))), "amplitude", "one number", "t = 1"),
     "sheet, motion that ends": (
         lambda: statics.solve(_hinged(ddg.Motion(lambda t: (0.0, 0.0, 0.0 if t < 0.5 else NAN)))), "translation", "t = 1"),
 })
@@ -131,12 +131,12 @@ each("stability", "buckling count", [0, 1.5], lambda v: stability.buckling(model
 refuse("stability", {
     "state of another model": (lambda: stability.spectrum(model(), model("net").state()), "another model"),
     "buckling of another": (lambda: stability.buckling(model(), model().state(), model("net").state()), "another model"),
-    "massless": (lambda: stability.spectrum(_bare(), _bare().state()), "mass", "density", "metric='unit'"),
+    "massless": (lambda: stability.spectrum(_massless_model(), _massless_model().state()), "mass", "density", "metric='unit'"),
 })
 BARE = []
 
 
-def _bare():
+def _massless_model():
     if not BARE:
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
         scene.clamp(scene.add_rod(line(), section=ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0)))

@@ -1,4 +1,4 @@
-"""Bad inputs to what reads and writes: recorder, readers of meshes and rods, simulate, and the command line."""
+"""Bad inputs to files: recorder, readers of meshes and rods, simulate, and the command line."""
 
 # fmt: off
 import contextlib
@@ -6,7 +6,7 @@ import io
 import tempfile
 from pathlib import Path
 
-from bad_inputs import DEVICE, INF, NAN, each, held_rods, model, refuse
+from bad_inputs import DEVICE, INF, NAN, clamped, each, model, refuse
 
 import ddg_warp as ddg
 from ddg_warp.io import read
@@ -17,19 +17,19 @@ from ddg_warp.run.simulate import simulate
 
 
 def recorder(**options):
-    """A recorder in a directory that is gone afterwards."""
+    """Return a recorder in a temporary directory."""
     with tempfile.TemporaryDirectory() as directory:
         return ddg.Recorder(options.pop("model", None) or model(), directory, **({"usd": False, "hdf5": False} | options))
 
 
 def record(state):
-    """Record something in a directory that is gone afterwards."""
+    """Record a state in a temporary directory."""
     with tempfile.TemporaryDirectory() as directory, ddg.Recorder(model(), directory, usd=False, hdf5=False) as made:
         made.record(state)
 
 
 each("recorder", "model", [3, "rods"], lambda v: recorder(model=v), "Recorder", "scene.build()")
-refuse("recorder", {"a scene": (lambda: recorder(model=held_rods()), "Recorder", "Scene", "scene.build()")})
+refuse("recorder", {"a scene": (lambda: recorder(model=clamped()), "Recorder", "Scene", "scene.build()")})
 each("recorder", "every", [0, -1, 1.5, "second", None, True], lambda v: recorder(every=v), "every", "whole number")
 each("recorder", "block", [0, -1, 2.5, None], lambda v: recorder(block=v), "block", "whole number")
 each("recorder", "fps", [0.0, -24.0, NAN, "film"], lambda v: recorder(fps=v), "fps", "positive")
@@ -43,7 +43,7 @@ refuse("recorder", {
 
 
 def file(name: str, text: str, reader, **options):
-    """Read a file with this text."""
+    """Read a temporary file with a given text."""
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / name
         path.write_text(text)
@@ -90,8 +90,8 @@ refuse("rods read", {
 
 # --- simulate ---
 def run(**options):
-    """Run held rods, or what `analysis` says."""
-    scene = held_rods()
+    """Simulate clamped rods, by the given `analysis` if any."""
+    scene = clamped()
     scene.analysis = options.pop("analysis", ddg.Dynamics(0.01, 0.02))
     return simulate(scene, device=DEVICE, **({"progress": False} | options))
 
@@ -122,7 +122,7 @@ def build(n: int = 4, label: str = "rod") -> ddg.Scene:
 
 
 def command(*arguments: str, code: str = SCENE) -> None:
-    """Give a command, in a directory with the scene `fall.py`; raises what it says of a mistake."""
+    """Run a command in a temporary directory with the scene `fall.py`; raise its error message."""
     said = io.StringIO()
     with (tempfile.TemporaryDirectory() as directory, contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO())):
         (Path(directory) / "fall.py").write_text(code)

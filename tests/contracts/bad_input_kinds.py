@@ -1,4 +1,4 @@
-"""Values of a wrong kind at public calls: texts and bytes for numbers, numbers for names, what is no array, no model, no state."""
+"""Values of a wrong type at public calls: texts for numbers, numbers for names, no array, no model, no state."""
 
 # fmt: off
 import numpy as np
@@ -8,9 +8,9 @@ from bad_inputs import (
     RUBBER,
     STIFFNESS,
     built,
+    clamped,
     dome,
     each,
-    held_rods,
     integrator,
     line,
     model,
@@ -31,7 +31,7 @@ GRAD = torch.ones(3, dtype=torch.float64, requires_grad=True)
 
 
 class Odd:
-    """Something that has no repr."""
+    """Object without a repr."""
 
     def __repr__(self) -> str:
         raise RuntimeError("no")
@@ -48,7 +48,7 @@ each("kinds: numbers", "error", NUMBERS, lambda v: StepControl(integrator(), v),
 each("kinds: numbers", "thickness", NUMBERS, lambda v: sheet(thickness=v), "shell 'sheet': thickness")
 each("kinds: numbers", "stiffness of a law", NUMBERS, lambda v: ddg.Law(None, stiffness=[1.0, v]), "Law: stiffness")
 each("kinds: numbers", "EA", NUMBERS, lambda v: built(rods(section=ddg.Stiffness(v))), "EA")
-each("kinds: numbers", "mass", NUMBERS, lambda v: held_rods().add_mass(0, -1, v), "mass")
+each("kinds: numbers", "mass", NUMBERS, lambda v: clamped().add_mass(0, -1, v), "mass")
 each("kinds: numbers", "pressure", NUMBERS, lambda v: sheet().add_pressure(0, v), "add_pressure: pressure")
 each("kinds: numbers", "load of a spectrum", NUMBERS, lambda v: stability.spectrum(model(), model().state(), load=v), "spectrum: load")
 each("kinds: numbers", "factor of reactions", NUMBERS, lambda v: inquiry.reactions(model(), model().state(), factor=v), "factor")
@@ -61,7 +61,7 @@ refuse("kinds: numbers", {
 
 # --- arrays ---
 ARRAYS = [GRAD, [GRAD, GRAD], np.ones(3, bool), np.ones(3) * 1j, [["a"]], b"points", {1: 2}, [[1.0], [2.0, 3.0]]]
-for kind, what, action in (
+for kind, words, action in (
     ("points of a rod", "rods 'rod': points", lambda v: ddg.Scene().add_rod(v, section=STIFFNESS)),
     ("director", "rods 'rod': director", lambda v: ddg.Scene().add_rod(line(), section=STIFFNESS, director=v)),
     ("points of a shell", "points", lambda v: ddg.Scene().add_shell(v, [[0, 1, 2]], thickness=0.1, material=RUBBER)),
@@ -70,7 +70,7 @@ for kind, what, action in (
     ("points of a state", "points", lambda v: model().state(points=v)),
     ("spins of a state", "spins", lambda v: model().state(spins=v)),
     ("points of a writhe", "writhe: points", inquiry.writhe),
-    ("force", "add_force: force", lambda v: held_rods().add_force(0, -1, [v, v, v])),
+    ("force", "add_force: force", lambda v: clamped().add_force(0, -1, [v, v, v])),
     ("natural", "natural", lambda v: built(rods(natural=[v, 0.0, 0.0]))),
     ("rest of a meridian", "rest", lambda v: built(dome(rest=(v, v)), lambda s: s.hold_ring(0, 5))),
     ("rest of a shell", "rest", lambda v: sheet(rest=(v, v))),
@@ -80,7 +80,7 @@ for kind, what, action in (
     ("stretch", "first", lambda v: rest_shapes.grown_metric(*meshes.rectangle(1, 1), v)),
 ):
     names = ("a gradient", "tensors of a gradient", "bools", "complex", "texts", "bytes", "a dictionary", "ragged")
-    refuse("kinds: arrays", {f"{kind}: {name}": (lambda v=v, action=action: action(v), what)
+    refuse("kinds: arrays", {f"{kind}: {name}": (lambda v=v, action=action: action(v), words)
                              for name, v in zip(names, ARRAYS, strict=True)})
 refuse("kinds: arrays", {
     "a gradient says what helps": (lambda: ddg.Scene().add_rod(GRAD, section=STIFFNESS), "detach()"),
@@ -109,8 +109,8 @@ each("kinds: names", "other of two", NAMES, lambda v: rods().contact_between("ro
 each("kinds: names", "objects", [[["a"]], [3], 3, [], [b"rod"]],
      lambda v: rods().contact(objects=v), "contact: objects", "list of names")
 each("kinds: names", "radius", [{3: 0.1}, {("a",): 0.1}, [0.1]], lambda v: rods().contact(radius=v), "contact:", "radius")
-each("kinds: names", "precision", [["float64"], {"a": 1}, b"float64", 3], lambda v: held_rods().build("cpu", v), "precision", "mixed")
-each("kinds: names", "device", [[], 0, {"a": 1}, b"cpu"], lambda v: held_rods().build(v), "device")
+each("kinds: names", "precision", [["float64"], {"a": 1}, b"float64", 3], lambda v: clamped().build("cpu", v), "precision", "mixed")
+each("kinds: names", "device", [[], 0, {"a": 1}, b"cpu"], lambda v: clamped().build(v), "device")
 each("kinds: names", "linear", [["sweep"], {"a": 1}, b"sweep"], lambda v: ddg.Integrator(model(), linear=v), "block_jacobi")
 each("kinds: names", "mode", [["follow"], b"follow"], lambda v: statics.solve(model(), mode=v), "mode", "minimise")
 each("kinds: names", "displacement", [["tip"], {"a": 1}, None],
@@ -119,7 +119,7 @@ each("kinds: names", "fields", [[["twist"]], b"twist", 3, None], lambda v: field
 each("kinds: names", "fields of cells", [["twist"]], lambda v: fields.cell_fields(model(), model().state(), v), "cell_fields")
 
 # --- flags, functions, objects ---
-each("kinds: flags", "allow_rounding", ["yes", 1, None, b"1"], lambda v: held_rods().build("cpu", allow_rounding=v), "allow_rounding")
+each("kinds: flags", "allow_rounding", ["yes", 1, None, b"1"], lambda v: clamped().build("cpu", allow_rounding=v), "allow_rounding")
 each("kinds: flags", "dimension", [3.0, "3", b"3", None, [3], 4], lambda v: ddg.Scene(dimension=v), "dimension", "2 or 3")
 each("kinds: flags", "copy", [{"gravity": "down"}, {"dimension": 3.0}, {"callbacks": 3}, {"analysis": None}],
      lambda v: rods().copy(**v), "; ")
@@ -151,7 +151,7 @@ refuse("kinds: flags", {
 QUESTIONS = (inquiry.energies, inquiry.reactions, inquiry.drag, inquiry.stresses, inquiry.triangle_fields, inquiry.total_twist)
 for question in (*QUESTIONS, sag_free.rest_strains, sag_free.least_stiffness):
     refuse("kinds: models", {
-        f"{question.__name__} of a scene": (lambda q=question: q(held_rods(), model().state()), question.__name__, "scene.build()"),
+        f"{question.__name__} of a scene": (lambda q=question: q(clamped(), model().state()), question.__name__, "scene.build()"),
         f"{question.__name__} at points": (lambda q=question: q(model(), line()), question.__name__, "model.state()"),
         f"{question.__name__} at a foreign state": (lambda q=question: q(model(), model("net").state()), question.__name__, "another"),
     })

@@ -1,4 +1,4 @@
-"""Bad inputs to what feeds learning: pickles, ranges and sweeps, episodes, data sets, recordings of cables, environments."""
+"""Bad inputs to learning: pickles, ranges and sweeps, episodes, data sets, cable recordings, environments."""
 
 import functools
 import io
@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from bad_inputs import DEVICE, INF, NAN, STIFFNESS, each, held_rods, line, refuse
+from bad_inputs import DEVICE, INF, NAN, STIFFNESS, clamped, each, line, refuse
 
 import ddg_warp as ddg
 from ddg_warp.learn import plain_pickle
@@ -25,13 +25,13 @@ from ddg_warp.run.cli import main
 
 
 def in_folder(action):
-    """Do something with a folder that is gone afterwards."""
+    """Run an action in a temporary folder."""
     with tempfile.TemporaryDirectory() as directory:
         return action(Path(directory))
 
 
-def pickled(content: bytes, action=plain_pickle.load, name: str = "a.pkl"):
-    """Read a file of these bytes."""
+def read_pickle(content: bytes, action=plain_pickle.load, name: str = "a.pkl"):
+    """Read a temporary file of given bytes."""
 
     def reading(folder):
         (folder / name).write_bytes(content)
@@ -41,8 +41,8 @@ def pickled(content: bytes, action=plain_pickle.load, name: str = "a.pkl"):
 
 
 # --- pickles ---
-def nested(depth: int) -> bytes:
-    """Lists in lists."""
+def nested_lists(depth: int) -> bytes:
+    """Return a pickle of nested lists."""
     return b"\x80\x04" + b"]" * depth + b"a" * (depth - 1) + b"."
 
 
@@ -66,59 +66,63 @@ COPYING = (
 refuse(
     "pickles",
     {
-        "a list that holds itself": (lambda: pickled(b"\x80\x04]q\x00h\x00a."), "a.pkl", "hold themselves"),
-        "a dict that holds itself": (lambda: pickled(b"\x80\x04}q\x00K\x01h\x00s."), "a.pkl", "hold themselves"),
-        "lists nested 3000 times": (lambda: pickled(nested(3000)), "a.pkl", "nested more than 64 times"),
-        "lists nested 20000 times": (lambda: pickled(nested(20_000)), "a.pkl", "nested more than 64 times"),
-        "28 lists that double": (lambda: pickled(DOUBLING), "a.pkl", "unfolds to"),
-        "bytes copied again and again": (lambda: pickled(COPYING), "a.pkl", "unfold to more than"),
-        "bytes of 2^38": (lambda: pickled(b"\x80\x04\x8e" + struct.pack("<Q", 2**38) + b"a."), "a.pkl", "damaged"),
-        "text of 2^38": (lambda: pickled(b"\x80\x04\x8d" + struct.pack("<Q", 2**38) + b"a."), "a.pkl", "damaged"),
-        "bytes of 2^31": (lambda: pickled(b"\x80\x03B" + struct.pack("<I", 2**31) + b"a."), "a.pkl", "damaged"),
-        "frame of 2^60": (lambda: pickled(b"\x80\x04\x95" + struct.pack("<Q", 2**60) + b"N"), "a.pkl", "damaged"),
+        "a list that holds itself": (lambda: read_pickle(b"\x80\x04]q\x00h\x00a."), "a.pkl", "hold themselves"),
+        "a dict that holds itself": (lambda: read_pickle(b"\x80\x04}q\x00K\x01h\x00s."), "a.pkl", "hold themselves"),
+        "lists nested 3000 times": (lambda: read_pickle(nested_lists(3000)), "a.pkl", "nested more than 64 times"),
+        "lists nested 20000 times": (lambda: read_pickle(nested_lists(20_000)), "a.pkl", "nested more than 64 times"),
+        "28 lists that double": (lambda: read_pickle(DOUBLING), "a.pkl", "unfolds to"),
+        "bytes copied again and again": (lambda: read_pickle(COPYING), "a.pkl", "unfold to more than"),
+        "bytes of 2^38": (lambda: read_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 2**38) + b"a."), "a.pkl", "damaged"),
+        "text of 2^38": (lambda: read_pickle(b"\x80\x04\x8d" + struct.pack("<Q", 2**38) + b"a."), "a.pkl", "damaged"),
+        "bytes of 2^31": (lambda: read_pickle(b"\x80\x03B" + struct.pack("<I", 2**31) + b"a."), "a.pkl", "damaged"),
+        "frame of 2^60": (lambda: read_pickle(b"\x80\x04\x95" + struct.pack("<Q", 2**60) + b"N"), "a.pkl", "damaged"),
         "whole number of 2^31 bytes": (
-            lambda: pickled(b"\x80\x02\x8b" + struct.pack("<i", 2**31 - 1) + b"a."),
+            lambda: read_pickle(b"\x80\x02\x8b" + struct.pack("<i", 2**31 - 1) + b"a."),
             "a.pkl",
             "damaged",
         ),
-        "memo that is not there": (lambda: pickled(b"\x80\x02j\xff\xff\xff\x7f."), "a.pkl", "damaged"),
-        "nothing on the stack": (lambda: pickled(b"\x80\x02."), "a.pkl", "damaged"),
-        "two on the stack": (lambda: pickled(b"\x80\x02NN."), "a.pkl", "damaged"),
-        "mark that is not there": (lambda: pickled(b"\x80\x02t."), "a.pkl", "damaged"),
-        "unknown instruction": (lambda: pickled(b"\x80\x02\xff."), "a.pkl", "damaged"),
+        "memo that is not there": (lambda: read_pickle(b"\x80\x02j\xff\xff\xff\x7f."), "a.pkl", "damaged"),
+        "nothing on the stack": (lambda: read_pickle(b"\x80\x02."), "a.pkl", "damaged"),
+        "two on the stack": (lambda: read_pickle(b"\x80\x02NN."), "a.pkl", "damaged"),
+        "mark that is not there": (lambda: read_pickle(b"\x80\x02t."), "a.pkl", "damaged"),
+        "unknown instruction": (lambda: read_pickle(b"\x80\x02\xff."), "a.pkl", "damaged"),
         "bare name of an array": (
-            lambda: pickled(name_of(b"numpy", b"ndarray") + b"."),
+            lambda: read_pickle(name_of(b"numpy", b"ndarray") + b"."),
             "a.pkl",
             "where a value belongs",
         ),
-        "bare name in a list": (lambda: pickled(b"\x80\x02]" + DTYPE + b"a."), "a.pkl", "where a value belongs"),
-        "bare name as a key": (lambda: pickled(b"\x80\x02}" + DTYPE + b"Ns."), "a.pkl", "keys of a dict"),
+        "bare name in a list": (lambda: read_pickle(b"\x80\x02]" + DTYPE + b"a."), "a.pkl", "where a value belongs"),
+        "bare name as a key": (lambda: read_pickle(b"\x80\x02}" + DTYPE + b"Ns."), "a.pkl", "keys of a dict"),
         "28 doubling tuples as a key": (
-            lambda: pickled(b"\x80\x04}" + DOUBLE_TUPLES + b"Ns."),
+            lambda: read_pickle(b"\x80\x04}" + DOUBLE_TUPLES + b"Ns."),
             "a.pkl",
             "keys of a dict",
         ),
-        "28 doubling lists as a type": (lambda: pickled(DTYPE + DOUBLING[2:-1] + b"\x85R."), "a.pkl", "no text"),
+        "28 doubling lists as a type": (lambda: read_pickle(DTYPE + DOUBLING[2:-1] + b"\x85R."), "a.pkl", "no text"),
         "28 doubling lists as an encoding": (
-            lambda: pickled(ENCODE + b"V\n" + DOUBLING[2:-1] + b"\x86R."),
+            lambda: read_pickle(ENCODE + b"V\n" + DOUBLING[2:-1] + b"\x86R."),
             "a.pkl",
             "latin1",
         ),
-        "28 doubling lists outside": (lambda: pickled(DOUBLING[:-1] + b"Q."), "a.pkl", "outside of it"),
-        "28 doubling lists as a name": (lambda: pickled(DOUBLING[:-1] + DOUBLING[2:-1] + b"\x93."), "a.pkl", "no text"),
-        "keys that collide": (lambda: pickled(pickle.dumps({2**61 - 1: 1}, 4)), "a.pkl", "keys of a dict"),
-        "bare type": (lambda: pickled(pickle.dumps(np.dtype("f8"), 2)), "a.pkl", "where a value belongs"),
+        "28 doubling lists outside": (lambda: read_pickle(DOUBLING[:-1] + b"Q."), "a.pkl", "outside of it"),
+        "28 doubling lists as a name": (
+            lambda: read_pickle(DOUBLING[:-1] + DOUBLING[2:-1] + b"\x93."),
+            "a.pkl",
+            "no text",
+        ),
+        "keys that collide": (lambda: read_pickle(pickle.dumps({2**61 - 1: 1}, 4)), "a.pkl", "keys of a dict"),
+        "bare type": (lambda: read_pickle(pickle.dumps(np.dtype("f8"), 2)), "a.pkl", "where a value belongs"),
         "array from an array's type": (
-            lambda: pickled(name_of(b"numpy", b"ndarray") + b"K\x01\x85R."),
+            lambda: read_pickle(name_of(b"numpy", b"ndarray") + b"K\x01\x85R."),
             "a.pkl",
             "not made by calling",
         ),
-        "call of a number": (lambda: pickled(b"\x80\x02K\x01)R."), "a.pkl", "damaged"),
-        "set": (lambda: pickled(pickle.dumps({1, 2}, 4)), "a.pkl", "EMPTY_SET", "nothing of it has run"),
-        "class": (lambda: pickled(pickle.dumps(Path, 4)), "a.pkl", "pathlib", "nothing of it has run"),
-        "name of many lines": (lambda: pickled(b"\x80\x04X\x03\x00\x00\x00a\nbX\x01\x00\x00\x00c\x93."), "a b.c"),
+        "call of a number": (lambda: read_pickle(b"\x80\x02K\x01)R."), "a.pkl", "damaged"),
+        "set": (lambda: read_pickle(pickle.dumps({1, 2}, 4)), "a.pkl", "EMPTY_SET", "nothing of it has run"),
+        "class": (lambda: read_pickle(pickle.dumps(Path, 4)), "a.pkl", "pathlib", "nothing of it has run"),
+        "name of many lines": (lambda: read_pickle(b"\x80\x04X\x03\x00\x00\x00a\nbX\x01\x00\x00\x00c\x93."), "a b.c"),
         "array larger than its bytes": (
-            lambda: pickled(pickle.dumps(np.zeros(4), 2).replace(b"K\x04\x85", b"K\x7f\x85")),
+            lambda: read_pickle(pickle.dumps(np.zeros(4), 2).replace(b"K\x04\x85", b"K\x7f\x85")),
             "a.pkl",
             "damaged",
         ),
@@ -206,22 +210,22 @@ refuse(
 
 
 # --- sweeps ---
-def thrown(directory, load: float, n: int = 3, *, label: str = "rod") -> None:
-    """A run of which nothing is ever made."""
+def unreached(directory, load: float, n: int = 3, *, label: str = "rod") -> None:
+    """Raise: a refused sweep runs no sample."""
     raise AssertionError("a sample has run")
 
 
 LOADS = {"load": 1.0}
 
 
-def swept(what=thrown, ranges=LOADS, samples=2, files: dict | None = None, **options):
-    """Sweep in a folder that is gone afterwards, and may hold files by name before."""
+def run_sweep(run=unreached, ranges=LOADS, samples=2, files: dict | None = None, **options):
+    """Sweep in a temporary folder, with files by name in it beforehand."""
 
     def sweeping(folder):
         for name, text in (files or {}).items():
             (folder / name).write_text(text)
         out = options.pop("out", folder)
-        return sweep(what, ranges, samples, out=out, progress=False, **options)
+        return sweep(run, ranges, samples, out=out, progress=False, **options)
 
     return in_folder(sweeping)
 
@@ -237,23 +241,23 @@ def build(n: int = 4, radius: float = 0.01, thick: bool = False, label: str = "r
 
 
 @functools.cache
-def fall() -> str:
-    """The file of a scene, kept until the process ends."""
+def scene_file() -> str:
+    """Return the path of a scene file that exists until the process ends."""
     folder = tempfile.TemporaryDirectory()
-    fall.folder = folder
+    scene_file.folder = folder
     (Path(folder.name) / "falling_rod.py").write_text(FALL)
     return f"{folder.name}/falling_rod.py"
 
 
-each("sweeps", "what", [3, None, b"cable", ["cable"], 1.5], swept, "sweep", "name of a scene")
-each("sweeps", "ranges", [None, 3, [("load", 1.0)], "load=1:2"], lambda v: swept(ranges=v), "ranges", "dict")
-each("sweeps", "samples", [0, 2.5, "3", True, None], lambda v: swept(samples=v), "samples")
-each("sweeps", "seed", [-1, 0.5, None, "0"], lambda v: swept(seed=v), "seed")
+each("sweeps", "what", [3, None, b"cable", ["cable"], 1.5], run_sweep, "sweep", "name of a scene")
+each("sweeps", "ranges", [None, 3, [("load", 1.0)], "load=1:2"], lambda v: run_sweep(ranges=v), "ranges", "dict")
+each("sweeps", "samples", [0, 2.5, "3", True, None], lambda v: run_sweep(samples=v), "samples")
+each("sweeps", "seed", [-1, 0.5, None, "0"], lambda v: run_sweep(seed=v), "seed")
 each(
     "sweeps",
     "whole number of a function",
     [5.5, "x", True, Uniform(1, 5)],
-    lambda v: swept(ranges={"load": 1.0, "n": v}),
+    lambda v: run_sweep(ranges={"load": 1.0, "n": v}),
     "ranges: n",
     "whole number",
 )
@@ -261,20 +265,27 @@ each(
     "sweeps",
     "number of a function",
     ["x", True, Choice([0.5, "1"])],
-    lambda v: swept(ranges={"load": v}),
+    lambda v: run_sweep(ranges={"load": v}),
     "ranges: load",
     "number",
 )
-each("sweeps", "workers", [0, 1.5, "2", True], lambda v: swept(workers=v), "workers")
-each("sweeps", "gpus", [-1.0, "1", NAN, True, None], lambda v: swept(gpus=v), "gpus")
-each("sweeps", "out", [None, 3, b"out", "", "a\0b"], lambda v: swept(out=v), "out", "pathlib.Path")
-each("sweeps", "ray", ["yes", 1, None], lambda v: swept(ray=v), "ray", "True or False")
-each("sweeps", "options", [3, "dt=0.1", [("dt", 0.1)]], lambda v: swept(fall(), {}, options=v), "options", "dict")
+each("sweeps", "workers", [0, 1.5, "2", True], lambda v: run_sweep(workers=v), "workers")
+each("sweeps", "gpus", [-1.0, "1", NAN, True, None], lambda v: run_sweep(gpus=v), "gpus")
+each("sweeps", "out", [None, 3, b"out", "", "a\0b"], lambda v: run_sweep(out=v), "out", "pathlib.Path")
+each("sweeps", "ray", ["yes", 1, None], lambda v: run_sweep(ray=v), "ray", "True or False")
+each(
+    "sweeps",
+    "options",
+    [3, "dt=0.1", [("dt", 0.1)]],
+    lambda v: run_sweep(scene_file(), {}, options=v),
+    "options",
+    "dict",
+)
 each(
     "sweeps",
     "options: dt",
     ["0.1", 0.0, -1.0, NAN, True],
-    lambda v: swept(fall(), {}, options={"dt": v}),
+    lambda v: run_sweep(scene_file(), {}, options={"dt": v}),
     "options: dt",
     "positive",
 )
@@ -282,7 +293,7 @@ each(
     "sweeps",
     "options: fields",
     ["velocities", 3, None, [3]],
-    lambda v: swept(fall(), {}, options={"fields": v}),
+    lambda v: run_sweep(scene_file(), {}, options={"fields": v}),
     "fields",
     "list of names",
 )
@@ -290,7 +301,7 @@ each(
     "sweeps",
     "fractions",
     [(0.8, 0.2), "all", (1.0, 1.0, -1.0), 3, (NAN, 0.5, 0.5)],
-    lambda v: swept(fractions=v),
+    lambda v: run_sweep(fractions=v),
     "fractions",
     "train",
 )
@@ -298,7 +309,7 @@ each(
     "sweeps",
     "whole number n",
     [5.5, "x", 5.0, True, None, Choice([5, "x"]), Choice([4, 5.5]), Uniform(1, 5), [4, 5]],
-    lambda v: swept(fall(), {"n": v}),
+    lambda v: run_sweep(scene_file(), {"n": v}),
     "ranges: n",
     "whole number",
 )
@@ -306,7 +317,7 @@ each(
     "sweeps",
     "number radius",
     ["0.1", True, Choice([0.1, "thick"]), None],
-    lambda v: swept(fall(), {"radius": v}),
+    lambda v: run_sweep(scene_file(), {"radius": v}),
     "ranges: radius",
     "number",
 )
@@ -314,7 +325,7 @@ each(
     "sweeps",
     "truth value thick",
     [1, "yes", 0.5, Uniform(0.0, 1.0)],
-    lambda v: swept(fall(), {"thick": v}),
+    lambda v: run_sweep(scene_file(), {"thick": v}),
     "ranges: thick",
     "True or False",
 )
@@ -322,7 +333,7 @@ each(
     "sweeps",
     "text label",
     [1, True, Choice(["a", 2]), LogUniform(1.0, 2.0)],
-    lambda v: swept(fall(), {"label": v}),
+    lambda v: run_sweep(scene_file(), {"label": v}),
     "ranges: label",
     "text",
 )
@@ -330,7 +341,7 @@ each(
     "sweeps",
     "duration",
     ["long", True, Choice([1.0, "2"])],
-    lambda v: swept(fall(), {"duration": v}),
+    lambda v: run_sweep(scene_file(), {"duration": v}),
     "ranges: duration",
     "number",
 )
@@ -338,54 +349,54 @@ each(
     "sweeps",
     "damaged sweep.json",
     ['{"what": "a\x01"}', "[]", "3", "{}", '{"samples": "2"}', "[" * 100_000, "\x00"],
-    lambda v: swept(files={"sweep.json": v}),
+    lambda v: run_sweep(files={"sweep.json": v}),
     "sweep.json is damaged",
 )
 each(
     "sweeps",
     "damaged index",
     ['{"seed": "\x01"}', "[]", "{}", '{"fractions": [1, 0, 0], "seed": 0, "episodes": [3]}', "[" * 100_000],
-    lambda v: swept(files={"index.json": v}),
+    lambda v: run_sweep(files={"index.json": v}),
     "index.json is damaged",
 )
 refuse(
     "sweeps",
     {
-        "a parameter that is not": (lambda: swept(ranges={"load": 1.0, "m": 2.0}), "no parameter 'm'"),
-        "a parameter without value": (lambda: swept(ranges={"n": 2}), "load has neither a range nor a default"),
-        "a function without directory": (lambda: swept(lambda: None, {}), "takes no directory"),
+        "a parameter that is not": (lambda: run_sweep(ranges={"load": 1.0, "m": 2.0}), "no parameter 'm'"),
+        "a parameter without value": (lambda: run_sweep(ranges={"n": 2}), "load has neither a range nor a default"),
+        "a function without directory": (lambda: run_sweep(lambda: None, {}), "takes no directory"),
         "dt of options and ranges": (
-            lambda: swept(fall(), {"dt": Uniform(0.1, 0.2)}, options={"dt": 0.1}),
+            lambda: run_sweep(scene_file(), {"dt": Uniform(0.1, 0.2)}, options={"dt": 0.1}),
             "dt is given by options and by ranges",
         ),
-        "options of a function": (lambda: swept(options={"dt": 0.1}), "options", "function"),
+        "options of a function": (lambda: run_sweep(options={"dt": 0.1}), "options", "function"),
         "unknown option": (
-            lambda: swept(fall(), {}, options={"step": 0.1, 3: 1}),
+            lambda: run_sweep(scene_file(), {}, options={"step": 0.1, 3: 1}),
             "options",
             "step",
             "there are device",
         ),
-        "a scene that is not": (lambda: swept("nowhere.py", {}), "no scene file"),
+        "a scene that is not": (lambda: run_sweep("nowhere.py", {}), "no scene file"),
         "a folder that is a file": (
-            lambda: in_folder(lambda f: [(f / "a").write_text(""), swept(out=f / "a")]),
+            lambda: in_folder(lambda f: [(f / "a").write_text(""), run_sweep(out=f / "a")]),
             "/a is a file",
             "another folder",
         ),
         "a folder below a file": (
-            lambda: in_folder(lambda f: [(f / "a").write_text(""), swept(out=f / "a" / "b")]),
+            lambda: in_folder(lambda f: [(f / "a").write_text(""), run_sweep(out=f / "a" / "b")]),
             "is a file",
             "another folder",
         ),
-        "gpus without Ray": (lambda: swept(gpus=1.0), "gpus", "ray=True"),
+        "gpus without Ray": (lambda: run_sweep(gpus=1.0), "gpus", "ray=True"),
     },
 )
 
 
-def commanded(*arguments: str) -> None:
-    """Give a command of sweeps of `falling_rod.py`; raises what it says of a mistake."""
+def run_command(*arguments: str) -> None:
+    """Run a sweep command of `falling_rod.py`; raise its error message."""
     said = io.StringIO()
     with tempfile.TemporaryDirectory() as directory, redirect_stderr(said), redirect_stdout(io.StringIO()):
-        result = main(["sweep", fall(), "--device", "cpu", "--out", f"{directory}/out", *arguments])
+        result = main(["sweep", scene_file(), "--device", "cpu", "--out", f"{directory}/out", *arguments])
     if result == 2:
         raise InputError(said.getvalue())
     raise AssertionError(f"exit code {result}")
@@ -394,7 +405,7 @@ def commanded(*arguments: str) -> None:
 refuse(
     "command of sweeps",
     {
-        " ".join(line): (functools.partial(commanded, *line), *words)
+        " ".join(line): (functools.partial(run_command, *line), *words)
         for line, *words in [
             (("--range", "n=5,x"), "n is a whole number", "'x'"),
             (("--range", "n=5.5"), "n is a whole number", "5.5"),
@@ -428,8 +439,8 @@ refuse(
 
 
 # --- episodes ---
-def writing(action, **options):
-    """Do something with a writer of a folder that is gone afterwards."""
+def with_writer(action, **options):
+    """Run an action with an episode writer in a temporary folder."""
 
     def opened(folder):
         with EpisodeWriter(folder, **options) as writer:
@@ -438,7 +449,7 @@ def writing(action, **options):
     return in_folder(opened)
 
 
-def entered(writer, name="a", **entry) -> None:
+def open_episode(writer, name="a", **entry) -> None:
     with writer.episode(name, **entry):
         raise AssertionError("the block was entered")
 
@@ -448,7 +459,7 @@ each(
     "episodes",
     "name",
     ["a" * 300, "", "../a", "a/b", "a b", ".a", None, 3, b"a", "a\n"],
-    lambda v: writing(lambda w: w.add(v, **FAILED)),
+    lambda v: with_writer(lambda w: w.add(v, **FAILED)),
     "episode",
     "letters",
 )
@@ -456,7 +467,7 @@ each(
     "episodes",
     "name of a block",
     ["a" * 300, "..", None],
-    lambda v: writing(lambda w: entered(w, v)),
+    lambda v: with_writer(lambda w: open_episode(w, v)),
     "episode",
     "letters",
 )
@@ -464,36 +475,38 @@ each(
     "episodes",
     "parameters",
     [3, [("a", 1)], "a", {"a": object}, {"a": NAN}, {1: 2}, {"a": {1, 2}}, {"a": b"b"}],
-    lambda v: writing(lambda w: w.add("a", parameters=v, **FAILED)),
+    lambda v: with_writer(lambda w: w.add("a", parameters=v, **FAILED)),
     "episode 'a': parameters",
 )
 each(
     "episodes",
     "parameters of a block",
     [3, {"a": object}],
-    lambda v: writing(lambda w: entered(w, parameters=v)),
+    lambda v: with_writer(lambda w: open_episode(w, parameters=v)),
     "episode 'a': parameters",
 )
 each(
     "episodes",
     "seed",
     [-1, 0.5, "0", True],
-    lambda v: writing(lambda w: w.add("a", seed=v, **FAILED)),
+    lambda v: with_writer(lambda w: w.add("a", seed=v, **FAILED)),
     "episode 'a': seed",
 )
 each(
     "episodes",
     "seconds",
     [-1.0, NAN, "long", None],
-    lambda v: writing(lambda w: w.add("a", seconds=v, **FAILED)),
+    lambda v: with_writer(lambda w: w.add("a", seconds=v, **FAILED)),
     "episode 'a': seconds",
 )
-each("episodes", "outcome", ["", None, 3], lambda v: writing(lambda w: w.add("a", outcome=v)), "episode 'a': outcome")
+each(
+    "episodes", "outcome", ["", None, 3], lambda v: with_writer(lambda w: w.add("a", outcome=v)), "episode 'a': outcome"
+)
 each(
     "episodes",
     "trajectory",
     [3, b"a", "", ["a"]],
-    lambda v: writing(lambda w: w.add("a", v)),
+    lambda v: with_writer(lambda w: w.add("a", v)),
     "episode 'a': trajectory",
 )
 each(
@@ -505,7 +518,7 @@ each(
     "pathlib.Path",
 )
 each("episodes", "folder to read", [None, 3, b"a", ""], Episodes, "Episodes: directory", "pathlib.Path")
-each("episodes", "writer's seed", [-1, 0.5, "0", True], lambda v: writing(id, seed=v), "seed")
+each("episodes", "writer's seed", [-1, 0.5, "0", True], lambda v: with_writer(id, seed=v), "seed")
 each(
     "episodes",
     "fractions",
@@ -516,12 +529,12 @@ each(
 )
 
 
-def listed(action=len, before=lambda folder: None, **entry):
-    """Read a folder whose index has one episode."""
+def read_index(action=len, before=lambda folder: None, **entry):
+    """Read a folder with an index of one episode."""
 
     def reading(folder):
-        own = {"name": "a", "split": "train", "frames": 3, "file": "a.h5"} | entry
-        (folder / "index.json").write_text(json.dumps({"fractions": [1, 0, 0], "seed": 0, "episodes": [own]}))
+        record = {"name": "a", "split": "train", "frames": 3, "file": "a.h5"} | entry
+        (folder / "index.json").write_text(json.dumps({"fractions": [1, 0, 0], "seed": 0, "episodes": [record]}))
         before(folder)
         return action(Episodes(folder))
 
@@ -543,29 +556,31 @@ for key, values in {
     "parameters": [[1], "a"],
     "color": ["red"],
 }.items():
-    each("index of episodes", key, values, lambda v, key=key: listed(**{key: v}), "index.json is damaged")
+    each("index of episodes", key, values, lambda v, key=key: read_index(**{key: v}), "index.json is damaged")
 refuse(
     "index of episodes",
     {
-        "file that leads out": (lambda: listed(first, file="../a.h5"), "leads out of", "outside=True"),
-        "file elsewhere": (lambda: listed(first, file="/etc/a.h5"), "leads out of", "/etc/a.h5", "outside=True"),
+        "file that leads out": (lambda: read_index(first, file="../a.h5"), "leads out of", "outside=True"),
+        "file elsewhere": (lambda: read_index(first, file="/etc/a.h5"), "leads out of", "/etc/a.h5", "outside=True"),
         "link elsewhere": (
-            lambda: listed(first, lambda folder: (folder / "a.h5").symlink_to("/etc/hosts")),
+            lambda: read_index(first, lambda folder: (folder / "a.h5").symlink_to("/etc/hosts")),
             "leads out of",
             "/etc/hosts",
         ),
-        "episode that is not": (lambda: listed(lambda e: e["b"]), "no episode 'b'"),
-        "episode by number": (lambda: listed(lambda e: e[0]), "no episode 0", "name"),
-        "episode by list": (lambda: listed(lambda e: e[["a"]]), "no episode ['a']", "name"),
-        "path of a name": (lambda: listed(lambda e: e.path("a")), "'a' is no episode"),
+        "episode that is not": (lambda: read_index(lambda e: e["b"]), "no episode 'b'"),
+        "episode by number": (lambda: read_index(lambda e: e[0]), "no episode 0", "name"),
+        "episode by list": (lambda: read_index(lambda e: e[["a"]]), "no episode ['a']", "name"),
+        "path of a name": (lambda: read_index(lambda e: e.path("a")), "'a' is no episode"),
         "path of nothing recorded": (
-            lambda: listed(lambda e: e.path(Episode("b", "train"))),
+            lambda: read_index(lambda e: e.path(Episode("b", "train"))),
             "nothing was recorded of episode 'b'",
         ),
-        "split": (lambda: listed(lambda e: e.select("all")), "split"),
-        "failed": (lambda: listed(lambda e: e.select(failed="yes")), "failed", "True or False"),
+        "split": (lambda: read_index(lambda e: e.select("all")), "split"),
+        "failed": (lambda: read_index(lambda e: e.select(failed="yes")), "failed", "True or False"),
         "a link as trajectory": (
-            lambda: in_folder(lambda f: [(f / "l").symlink_to("/etc/hosts"), writing(lambda w: w.add("a", f / "l"))]),
+            lambda: in_folder(
+                lambda f: [(f / "l").symlink_to("/etc/hosts"), with_writer(lambda w: w.add("a", f / "l"))]
+            ),
             "is a link",
         ),
     },
@@ -578,7 +593,7 @@ CABLE = Recording("rope", np.arange(4) * 0.01, MARKERS.transpose(0, 2, 1), (0, 1
 
 
 def cable(**options):
-    return pickled(pickle.dumps(MARKERS), lambda path: read(path, **options))
+    return read_pickle(pickle.dumps(MARKERS), lambda path: read(path, **options))
 
 
 each(
@@ -659,13 +674,13 @@ each(
         np.zeros((0, 3, 7)),
         np.full((2, 3, 7), INF),
     ],
-    lambda v: pickled(pickle.dumps(v), read),
+    lambda v: read_pickle(pickle.dumps(v), read),
     "a.pkl",
 )
 
 
-def linked(folder):
-    """A clone with a link that leads out of it."""
+def linked_folder(folder):
+    """Return a copied folder with a symbolic link to a file outside."""
     (folder / "clone").mkdir()
     (folder / "away.pkl").write_bytes(pickle.dumps(MARKERS))
     (folder / "clone" / "a.pkl").symlink_to(folder / "away.pkl")
@@ -676,17 +691,25 @@ refuse(
     "recordings of cables",
     {
         "list with a link out": (
-            lambda: in_folder(lambda f: recordings(root=linked(f))),
+            lambda: in_folder(lambda f: recordings(root=linked_folder(f))),
             "leads out of",
             "outside=True",
         ),
-        "a link out": (lambda: in_folder(lambda f: read("a.pkl", root=linked(f))), "leads out of", "outside=True"),
+        "a link out": (
+            lambda: in_folder(lambda f: read("a.pkl", root=linked_folder(f))),
+            "leads out of",
+            "outside=True",
+        ),
         "a path out": (
-            lambda: in_folder(lambda f: read("../away.pkl", root=linked(f))),
+            lambda: in_folder(lambda f: read("../away.pkl", root=linked_folder(f))),
             "leads out of",
             "outside=True",
         ),
-        "a folder out": (lambda: in_folder(lambda f: recordings("..", root=linked(f))), "leads out of", "outside=True"),
+        "a folder out": (
+            lambda: in_folder(lambda f: recordings("..", root=linked_folder(f))),
+            "leads out of",
+            "outside=True",
+        ),
         "outside as a text": (
             lambda: in_folder(lambda f: recordings(root=f, outside="yes")),
             "outside",
@@ -712,11 +735,11 @@ if find_spec("torch"):
         scene.clamp(0, motion=ddg.Grip())
         return Simulator(scene.build(DEVICE, "float64"), 0.01)
 
-    def nothing(now):
-        return now.poses[:, 0]
+    def nothing(step):
+        return step.poses[:, 0]
 
-    def rates(now):
-        return now.poses[:, 0, 0]
+    def rates(step):
+        return step.poses[:, 0, 0]
 
     def environment(rates_=GripRates(axes="x"), worlds=2, **options) -> Environment:  # noqa: B008
         usual = {"observe": nothing, "reward": rates, "steps": 3} | options
@@ -724,23 +747,23 @@ if find_spec("torch"):
 
     @functools.cache
     def good() -> tuple:
-        """An environment of two worlds that draws two goals, its generators, and episodes that have begun."""
-        own = environment(draw=lambda random: random.random(2))
-        return own, own.generators(0), own.begin(own.generators(0))
+        """Return an environment of two worlds with two drawn goals, its generators, and begun episodes."""
+        valid = environment(draw=lambda random: random.random(2))
+        return valid, valid.generators(0), valid.begin(valid.generators(0))
 
     def acted(actions):
-        own, _, now = good()
-        return own.step(now, actions)
+        valid, _, episodes = good()
+        return valid.step(episodes, actions)
 
     def begun(generators=None, *more):
-        own, usual, _ = good()
-        return own.begin(usual if generators is None else generators, *more)
+        valid, usual, _ = good()
+        return valid.begin(usual if generators is None else generators, *more)
 
     def seeded(seed):
         return good()[0].generators(seed)
 
     class Growing:
-        """Draws one number more each time."""
+        """Draw that returns one more number each time."""
 
         def __init__(self):
             self.count = 0
@@ -762,7 +785,7 @@ if find_spec("torch"):
         "environments",
         "observed",
         [3, None, torch.zeros(2), torch.zeros(3, 1)],
-        lambda v: environment(observe=lambda now: v),
+        lambda v: environment(observe=lambda step: v),
         "observe",
     )
     refuse(
@@ -776,7 +799,7 @@ if find_spec("torch"):
         },
     )
     each("environments", "start", [3, "rest"], lambda v: environment(start=v), "start is no WorldState")
-    each("environments", "simulator", [3, "s", held_rods()], lambda v: environment(simulator=v), "is no simulator")
+    each("environments", "simulator", [3, "s", clamped()], lambda v: environment(simulator=v), "is no simulator")
     each("environments", "seed", [-1, 0.5, "0", [1, 2], None, True], seeded, "seed")
     each("environments", "generators", [3, "ab", [1, 2]], begun, "generators")
     each(
@@ -858,7 +881,7 @@ if find_spec("torch"):
                 "outside=True",
             ),
             "an index that leads out": (
-                lambda: listed(lambda e: windows(e.directory), file="../a.h5"),
+                lambda: read_index(lambda e: windows(e.directory), file="../a.h5"),
                 "leads out of",
                 "outside=True",
             ),

@@ -4,7 +4,7 @@
 import dataclasses
 
 import numpy as np
-from bad_inputs import INF, NAN, STIFFNESS, built, each, held_rods, line, refuse, rods
+from bad_inputs import INF, NAN, STIFFNESS, built, clamped, each, line, refuse, rods
 
 import ddg_warp as ddg
 
@@ -12,7 +12,7 @@ AREA = dataclasses.replace(STIFFNESS, area=1e-4)
 
 
 def magnets(magnetisation=1e4, edges=None, scene=None, **options) -> ddg.Scene:
-    """`rods` with sections that have an area, of which rod 1 is magnetised."""
+    """Return `rods` with sections of known area; rod 1 is magnetised."""
     scene = scene or rods(section=AREA, **options)
     scene.magnetize(1, magnetisation, edges)
     return scene
@@ -32,8 +32,8 @@ refuse("magnets", {
         *("rod 1", "across the plane", "give 0"),
     ),
     "nothing acts": (lambda: built(magnets()), "nothing acts on rod 1", "magnetic_field", "add_dipoles"),
-    "field alone": (lambda: built(held_rods(), lambda s: s.magnetic_field((0.0, 0.0, 1.0))), "nothing is magnetised", "magnetize"),
-    "dipoles alone": (lambda: built(held_rods(), lambda s: s.add_dipoles()), "nothing is magnetised", "magnetize"),
+    "field alone": (lambda: built(clamped(), lambda s: s.magnetic_field((0.0, 0.0, 1.0))), "nothing is magnetised", "magnetize"),
+    "dipoles alone": (lambda: built(clamped(), lambda s: s.add_dipoles()), "nothing is magnetised", "magnetize"),
     "dipole without magnetisation": (lambda: built(magnets(), lambda s: s.add_dipoles([0, 1])), "rod 0", "not magnetised"),
     "dipoles out of reach": (lambda: built(magnets(), lambda s: s.add_dipoles(cutoff=1e-3)), "add_dipoles", "cutoff", "larger"),
     "dipoles of no rod": (lambda: magnets().add_dipoles([7]), "rod 7", "does not exist"),

@@ -1,4 +1,4 @@
-"""Options that no call takes, attributes that nothing has, and what would have no effect."""
+"""Unknown options, unknown attributes, and options without effect."""
 
 # fmt: off
 from dataclasses import replace
@@ -55,28 +55,28 @@ refuse("options: unknown", {
 # --- unknown attributes ---
 
 
-def assigned(made, name: str):
+def assign(made, name: str):
     """Set an attribute."""
     setattr(made, name, 1.0)
 
 
 refuse("options: attributes", {
-    "scene.gravty": (lambda: assigned(rods(), "gravty"), "Scene has no attribute 'gravty'", "did you mean 'gravity'"),
-    "scene.mass_dampin": (lambda: assigned(rods(), "mass_dampin"), "did you mean 'mass_damping'"),
-    "scene.foo": (lambda: assigned(rods(), "foo"), "Scene has no attribute 'foo'", "gravity", "callbacks"),
+    "scene.gravty": (lambda: assign(rods(), "gravty"), "Scene has no attribute 'gravty'", "did you mean 'gravity'"),
+    "scene.mass_dampin": (lambda: assign(rods(), "mass_dampin"), "did you mean 'mass_damping'"),
+    "scene.foo": (lambda: assign(rods(), "foo"), "Scene has no attribute 'foo'", "gravity", "callbacks"),
     "scene.copy(gravty)": (lambda: rods().copy(gravty=(0, 0, 0)), "Scene has no attribute 'gravty'", "did you mean 'gravity'"),
-    "state.tme": (lambda: assigned(model().state(), "tme"), "State has no attribute 'tme'", "did you mean 'time'"),
-    "state.velocity": (lambda: assigned(model().state(), "velocity"), "State has no attribute 'velocity'", "did you mean 'velocities'"),
-    "integrator.retry_limt": (lambda: assigned(integrator(), "retry_limt"), "did you mean 'retry_limit'"),
-    "model.gravity": (lambda: assigned(model(), "gravty"), "Model has no attribute 'gravty'"),
-    "continuation.optoins": (lambda: assigned(continuation.Continuation(model()), "optoins"), "did you mean 'options'"),
+    "state.tme": (lambda: assign(model().state(), "tme"), "State has no attribute 'tme'", "did you mean 'time'"),
+    "state.velocity": (lambda: assign(model().state(), "velocity"), "State has no attribute 'velocity'", "did you mean 'velocities'"),
+    "integrator.retry_limt": (lambda: assign(integrator(), "retry_limt"), "did you mean 'retry_limit'"),
+    "model.gravity": (lambda: assign(model(), "gravty"), "Model has no attribute 'gravty'"),
+    "continuation.optoins": (lambda: assign(continuation.Continuation(model()), "optoins"), "did you mean 'options'"),
 })
 
 # --- no effect ---
 
 
 def smooth(**options) -> ddg.Scene:
-    """Two rods apart in contact without friction."""
+    """Return two separate rods with frictionless contact."""
     scene = rods(line() + [0.0, 0.5, 0.0])
     scene.contact(**options)
     return scene
@@ -93,31 +93,31 @@ refuse("options: no effect", {
 
 
 # --- laws ---
-def wrong(part: int):
-    """The quadratic law with twice one of its derivatives, or its energy."""
+def inconsistent_law(index: int):
+    """Return the quadratic law, the energy or one derivative doubled."""
 
     @cache
     def laws(real, n):
         functions, values = list(quadratic.laws(real, n)), wp.types.vector(2 * n, real)
-        strains, right = wp.types.vector(n, real), functions[part]
+        strains, right = wp.types.vector(n, real), functions[index]
 
         @wp.func
         def twice(e: strains, p: values):
             return real(2.0) * right(e, p)
 
-        functions[part] = twice
+        functions[index] = twice
         return tuple(functions)
 
     return replace(quadratic, name="mine", laws=laws)
 
 
-def bent(part: int):
-    """Build a rod with such a law."""
-    return built(rods(laws={"rod_bend_twist": ddg.Law(wrong(part), stiffness=[1.0, 1.0, 1.0])}))
+def build_with_law(index: int):
+    """Build a rod with an inconsistent law."""
+    return built(rods(laws={"rod_bend_twist": ddg.Law(inconsistent_law(index), stiffness=[1.0, 1.0, 1.0])}))
 
 
 refuse("options: laws", {
-    "slope": (lambda: bent(1), "rod 1 ('odd')", "rod_bend_twist", "slope of the law 'mine'", "derivative of its energy"),
-    "energy": (lambda: bent(0), "rod 1 ('odd')", "slope of the law 'mine'", "derivative of its energy"),
-    "curvature": (lambda: bent(2), "rod 1 ('odd')", "curvature of the law 'mine'", "derivative of its slope"),
+    "slope": (lambda: build_with_law(1), "rod 1 ('odd')", "rod_bend_twist", "slope of the law 'mine'", "derivative of its energy"),
+    "energy": (lambda: build_with_law(0), "rod 1 ('odd')", "slope of the law 'mine'", "derivative of its energy"),
+    "curvature": (lambda: build_with_law(2), "rod 1 ('odd')", "curvature of the law 'mine'", "derivative of its slope"),
 })

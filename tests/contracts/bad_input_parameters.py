@@ -1,10 +1,10 @@
-"""Bad inputs to what changes parameters, and to steps and roll-outs from torch."""
+"""Bad inputs to parameter changes, and to steps and roll-outs from torch."""
 
 # fmt: off
 from functools import cache
 
 import numpy as np
-from bad_inputs import INF, NAN, each, held_rods, integrator, model, refuse
+from bad_inputs import INF, NAN, clamped, each, integrator, model, refuse
 
 import ddg_warp as ddg
 
@@ -24,45 +24,45 @@ for kind in ("rods", "net"):
 
 @cache
 def simulator():
-    """A simulator of two rods, one of them gripped, made once."""
+    """Return a simulator of two rods, one gripped, made once."""
     from ddg_warp.torch import Simulator
 
-    scene = held_rods()
+    scene = clamped()
     scene.clamp(1, -1, motion=ddg.Grip())
     return Simulator(scene.build("cpu", "float64"), 0.01)
 
 
 @cache
-def begun():
-    """Its first state, of two worlds."""
+def initial_state():
+    """Return the initial state of two worlds."""
     return simulator().initial_state(2)
 
 
 def step(parameters=None, controls=None):
-    """A step of it."""
-    return simulator().step(begun(), parameters, controls)
+    """Return the state after a step."""
+    return simulator().step(initial_state(), parameters, controls)
 
 
-def roll(controls=None, **options):
-    """A roll-out of it."""
-    return simulator().rollout(begun(), None, controls, **({"steps": 2} | options))
+def rollout(controls=None, **options):
+    """Return a roll-out."""
+    return simulator().rollout(initial_state(), None, controls, **({"steps": 2} | options))
 
 
-def made(**options):
-    """Another simulator of the same model."""
+def new_simulator(**options):
+    """Return another simulator of the same model."""
     from ddg_warp.torch import Simulator
 
     return Simulator(**({"model": simulator().model, "dt": 0.01} | options))
 
 
 NAME = "rod_stretch.stiffness"
-each("simulator", "model", [None, 3, "rods"], lambda v: made(model=v), "Simulator")
-each("simulator", "dt", [0.0, -1.0, NAN, INF, None, "0.01", b"0.01", True, [0.01], 1e300, 1e-300], lambda v: made(dt=v), "dt")
-each("simulator", "scheme", ["rk4", None, 3], lambda v: made(scheme=v), "scheme")
-each("simulator", "failures", ["raise", "flag"], lambda v: made(failures=v), "failures")
-each("simulator", "check_every", [1], lambda v: made(check_every=v), "check_every")
-each("simulator", "foo", [1], lambda v: made(foo=v), "Simulator", "foo")
-each("simulator", "rtol", [-1.0, NAN, "small", None], lambda v: made(rtol=v), "rtol")
+each("simulator", "model", [None, 3, "rods"], lambda v: new_simulator(model=v), "Simulator")
+each("simulator", "dt", [0.0, -1.0, NAN, INF, None, "0.01", b"0.01", True, [0.01], 1e300, 1e-300], lambda v: new_simulator(dt=v), "dt")
+each("simulator", "scheme", ["rk4", None, 3], lambda v: new_simulator(scheme=v), "scheme")
+each("simulator", "failures", ["raise", "flag"], lambda v: new_simulator(failures=v), "failures")
+each("simulator", "check_every", [1], lambda v: new_simulator(check_every=v), "check_every")
+each("simulator", "foo", [1], lambda v: new_simulator(foo=v), "Simulator", "foo")
+each("simulator", "rtol", [-1.0, NAN, "small", None], lambda v: new_simulator(rtol=v), "rtol")
 each("simulator", "parameters",
      [3, "stiff", [NAME], {3: 1.0}, {None: 1.0}, {"rod_stretch": 1.0}, {"no.thing": 1.0}, {b"a.b": 1.0}, {"rod_stretch.no": 1.0}],
      step, "parameters")
@@ -82,26 +82,26 @@ each("simulator", "positions", [np.full((12, 3), NAN), "there"], lambda v: simul
 each("simulator", "positions", [np.zeros((11, 3)), np.zeros((3, 12, 2)), 3.0], lambda v: simulator().initial_state(positions=v),
      "points have shape", "(12, 3)")
 each("simulator", "world_state", [None, 3, "start"], lambda v: simulator().world_state(v), "world_state")
-each("simulator", "batch of an equilibrium", [3, 0, "two"], lambda v: simulator().equilibrium(state=begun(), batch=v), "batch")
+each("simulator", "batch of an equilibrium", [3, 0, "two"], lambda v: simulator().equilibrium(state=initial_state(), batch=v), "batch")
 each("simulator", "options of an equilibrium", [{"foo": 1}, {"load_stps": 2}], lambda v: simulator().equilibrium(batch=2, **v),
      "Simulator.equilibrium")
-each("rollout", "steps", [0, -1, 1.5, None, "ten", True], lambda v: roll(steps=v), "steps")
-each("rollout", "save", [0, -1, 1.5, None, 3], lambda v: roll(save=v), "save")
-each("rollout", "checkpoint_every", [0, -1, 1.5, "all"], lambda v: roll(checkpoint_every=v), "checkpoint_every")
-each("rollout", "memory", [0.0, -1.0, NAN, "all", 10.0], lambda v: roll(memory=v), "memory")
+each("rollout", "steps", [0, -1, 1.5, None, "ten", True], lambda v: rollout(steps=v), "steps")
+each("rollout", "save", [0, -1, 1.5, None, 3], lambda v: rollout(save=v), "save")
+each("rollout", "checkpoint_every", [0, -1, 1.5, "all"], lambda v: rollout(checkpoint_every=v), "checkpoint_every")
+each("rollout", "memory", [0.0, -1.0, NAN, "all", 10.0], lambda v: rollout(memory=v), "memory")
 refuse("rollout", {
-    "controls that are a number": (lambda: roll(lambda number: 3), "controls", "dictionary"),
-    "controls of no such name": (lambda: roll(lambda number: {"force": 1.0}), "controls", "'force'"),
+    "controls that are a number": (lambda: rollout(lambda number: 3), "controls", "dictionary"),
+    "controls of no such name": (lambda: rollout(lambda number: {"force": 1.0}), "controls", "'force'"),
 })
-each("rollout", "outcomes", [3], lambda v: made().outcomes(), "outcomes")
+each("rollout", "outcomes", [3], lambda v: new_simulator().outcomes(), "outcomes")
 each("parameter", "name", [None, 3, "stiffness", "rod_stretch.no"], lambda v: simulator().parameter(v), "parameters")
 each("parameter", "batch", [0, -1, 1.5, "two"], lambda v: simulator().parameter(NAME, v), "batch")
 for kind in ("RodParameters", "ShellParameters"):
-    def module(*given, kind=kind, **named):
-        """A module of parameters of a simulator."""
-        import ddg_warp.torch as own
+    def module(*arguments, kind=kind, **named):
+        """Return a module of parameters of a simulator."""
+        import ddg_warp.torch as torch_package
 
-        return getattr(own, kind)(*given, **named)
+        return getattr(torch_package, kind)(*arguments, **named)
 
     each(kind, "simulator", [None, 3, model, "rods"], module, kind, "Simulator(model, dt)")
     each(kind, "names", [None, 3, "bending", (), (3,), ("bending", "bending"), {"bending"}, ("no",)],

@@ -1,8 +1,8 @@
-"""Bad inputs to models: integrators, steps, states, inquiries, parameters, rest shapes."""
+"""Bad inputs to models: integrators, steps, states, queries, parameters, rest shapes."""
 
 # fmt: off
 import numpy as np
-from bad_inputs import INF, NAN, RING, STIFFNESS, built, each, held_rods, integrator, line, model, refuse, rods
+from bad_inputs import INF, NAN, RING, STIFFNESS, built, clamped, each, integrator, line, model, refuse, rods
 
 import ddg_warp as ddg
 from ddg_warp.ask import inquiry
@@ -106,19 +106,19 @@ refuse("step", {
     "none": (lambda: integrator().step(None, 0.01), "step: the state is None", "model.state()"),
     "points": (lambda: _step(model().state().points()), "step", "model.state()"),
     "state of another model": (lambda: _step(model("net").state()), "another model", "model.state()"),
-    "motion that ends": (lambda: _run(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN)), "translation", "not finite", "t = 0.01"),
-    "motion that fails": (lambda: _run(lambda t: (0.0, 0.0, 0.0 / (0.01 - t))), "translation", "ZeroDivision", "t = 0.01"),
-    "motion of two later": (lambda: _run(lambda t: (0.0,) * (3 if t < 0.005 else 2)), "translation", "(0.0, 0.0)", "t = 0.01"),
-    "each of others later": (lambda: _run(lambda t: np.zeros((1 if t < 0.005 else 2, 3))), "translation", "(2, 3)", "t = 0.01"),
-    "angle that ends": (lambda: _run(None, lambda t: 0.0 if t < 0.005 else INF), "angle", "not finite", "t = 0.01"),
+    "motion that ends": (lambda: _moving(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN)), "translation", "not finite", "t = 0.01"),
+    "motion that fails": (lambda: _moving(lambda t: (0.0, 0.0, 0.0 / (0.01 - t))), "translation", "ZeroDivision", "t = 0.01"),
+    "motion of two later": (lambda: _moving(lambda t: (0.0,) * (3 if t < 0.005 else 2)), "translation", "(0.0, 0.0)", "t = 0.01"),
+    "each of others later": (lambda: _moving(lambda t: np.zeros((1 if t < 0.005 else 2, 3))), "translation", "(2, 3)", "t = 0.01"),
+    "angle that ends": (lambda: _moving(None, lambda t: 0.0 if t < 0.005 else INF), "angle", "not finite", "t = 0.01"),
     "amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN), "amplitude", "not finite", "t = 0.01"),
-    "net, motion that ends": (lambda: _run(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN), net=True), "translation", "t = 0.01"),
+    "net, motion that ends": (lambda: _moving(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN), net=True), "translation", "t = 0.01"),
     "net, amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN, net=True), "amplitude", "t = 0.01"),
-    "flow that ends": (lambda: _flows(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN)), "flow", "not finite", "t = 0.01"),
-    "net, flow of two later": (lambda: _flows(lambda t: (0.0,) * (3 if t < 0.005 else 2), True), "flow", "(0.0, 0.0)", "t = 0.01"),
-    "out of the plane": (lambda: _planar(lambda t: (0.0, t, 0.0)), "translation", "along y", "t = 0.01"),
-    "motion that jumps": (lambda: _run(_jump), "jumps at t = 0.005", "continuous"),
-    "net, motion that jumps": (lambda: _run(_jump, net=True), "jumps at t = 0.005", "continuous"),
+    "flow that ends": (lambda: _in_flow(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN)), "flow", "not finite", "t = 0.01"),
+    "net, flow of two later": (lambda: _in_flow(lambda t: (0.0,) * (3 if t < 0.005 else 2), True), "flow", "(0.0, 0.0)", "t = 0.01"),
+    "out of the plane": (lambda: _step_planar(lambda t: (0.0, t, 0.0)), "translation", "along y", "t = 0.01"),
+    "motion that jumps": (lambda: _moving(_jump), "jumps at t = 0.005", "continuous"),
+    "net, motion that jumps": (lambda: _moving(_jump, net=True), "jumps at t = 0.005", "continuous"),
 })
 
 
@@ -126,54 +126,54 @@ def _jump(t):
     return (0.0, 0.0, 0.0 if t < 0.005 else 1e20)
 
 
-def _stepped(scene):
+def _step_scene(scene):
     made = built(scene)
     return ddg.Integrator(made).step(made.state(), 0.01)
 
 
-def _flows(flow, net=False):
+def _in_flow(flow, net=False):
     scene = rods(scene=ddg.Scene(flow=flow))
     scene.drag(tangential=1.0, normal=1.0)
     if net:
         scene.join([(0, 0), (1, 0)])
-    return _stepped(scene)
+    return _step_scene(scene)
 
 
-def _run(translation=None, angle=None, net=False):
+def _moving(translation=None, angle=None, net=False):
     functions = {"translation": translation, "angle": angle}
     scene = rods()
     scene.clamp(0)
     scene.fix(1, [0], motion=ddg.Motion(**{name: f for name, f in functions.items() if f}))
     if net:
         scene.join([(1, 4), (scene.add_rod(line() + [1.0, 0.0, 0.0], section=STIFFNESS), 0)], rigid=False)
-    return _stepped(scene)
+    return _step_scene(scene)
 
 
 def _loaded(amplitude, net=False):
-    scene = held_rods()
+    scene = clamped()
     scene.add_force(1, -1, (0.0, 0.0, 1.0), amplitude)
     if net:
         scene.join([(0, 0), (1, 0)])
-    return _stepped(scene)
+    return _step_scene(scene)
 
 
-def _planar(translation):
+def _step_planar(translation):
     scene = rods(scene=ddg.Scene(dimension=2))
     scene.clamp([0, 1], motion=ddg.Motion(translation))
-    return _stepped(scene)
+    return _step_scene(scene)
 
 
 # --- states; `rods` have 12 points and 10 edges ---
 POINTS = np.zeros((12, 3))
 BAD = np.where(np.arange(36).reshape(12, 3) == 25, NAN, 0.0)
-for what in ("points", "velocities"):
+for field in ("points", "velocities"):
 
-    def make(v, what=what):
-        return model().state(**{what: v})
+    def make(v, field=field):
+        return model().state(**{field: v})
 
-    each("state", what, [POINTS[1:], np.zeros((2, 12, 3)), 0.0], make, what, "(12, 3)")
-    each("state", what, [BAD], make, what, "node 8", "not finite")
-    each("state", what, ["rest", [[0.0], [0.0, 1.0]]], make, what, "numbers")
+    each("state", field, [POINTS[1:], np.zeros((2, 12, 3)), 0.0], make, field, "(12, 3)")
+    each("state", field, [BAD], make, field, "node 8", "not finite")
+    each("state", field, ["rest", [[0.0], [0.0, 1.0]]], make, field, "numbers")
 each("state", "spins", [np.zeros(7), 0.0], lambda v: model().state(spins=v), "spins", "(10,)")
 each("state", "spins", [np.full(10, NAN)], lambda v: model().state(spins=v), "spins", "edge 0", "not finite")
 each("state", "spins", ["fast"], lambda v: model().state(spins=v), "spins", "numbers")

@@ -1,4 +1,4 @@
-"""Bad inputs to readers of files that others wrote: curves, meshes, and what both are handed."""
+"""Bad inputs to readers of foreign files: curves, meshes, and their common arguments."""
 
 import struct
 import tempfile
@@ -21,7 +21,7 @@ from ddg_warp.io.usd_prims import ColorBy
 
 
 def file(name: str, content: str | bytes, reader, *arguments, **options):
-    """Read a file of this content, in a folder that is gone afterwards."""
+    """Read a temporary file of a given content."""
     with tempfile.TemporaryDirectory() as directory, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path = Path(directory) / name
@@ -31,7 +31,7 @@ def file(name: str, content: str | bytes, reader, *arguments, **options):
 
 # --- paths ---
 NO_PATHS = [None, 3, b"a.usda", "", "a\0b", ["a.usda"], 1.5]
-for what, reader in {
+for kind_of_file, reader in {
     "a file": existing,
     "curves": read,
     "curves of USD": read_curves,
@@ -39,12 +39,12 @@ for what, reader in {
     "DisMech": read_text,
     "USD": validate,
 }.items():
-    each("paths", what, NO_PATHS, reader, "the file to read", "pathlib.Path")
+    each("paths", kind_of_file, NO_PATHS, reader, "the file to read", "pathlib.Path")
 refuse(
     "paths",
     {
-        f"{what} of 300 letters": (lambda reader=reader, end=end: reader("a" * 300 + end), "no such file")
-        for what, reader, end in [
+        f"{kind_of_file} of 300 letters": (lambda reader=reader, end=end: reader("a" * 300 + end), "no such file")
+        for kind_of_file, reader, end in [
             ("curves", read, ".usda"),
             ("text", read, ".txt"),
             ("mesh", read_mesh, ".obj"),
@@ -71,7 +71,7 @@ POINTS = "[(0,0,0), (1,0,0), (2,0,0), (3,1,0), (4,0,0)]"
 def prim(
     counts="[5]", points=POINTS, kind="linear", basis="bspline", wrap="nonperiodic", more="", type_="BasisCurves"
 ) -> str:
-    """A prim /c of curves."""
+    """Return a prim /c of curves, as text."""
     return (
         f'def {type_} "c"\n{{\nuniform token type = "{kind}"\nuniform token basis = "{basis}"\nuniform token wrap = "{wrap}"\n'
         f"int[] curveVertexCounts = {counts}\npoint3f[] points = {points}\n{more}\n}}\n"
@@ -82,7 +82,7 @@ def curves(body: str, unit="1", **options):
     return file("a.usda", HEAD.format(unit) + body, read_curves, **options)
 
 
-def moved(operation: str, value: str, kind: str = "float3") -> str:
+def transformed(operation: str, value: str, kind: str = "float3") -> str:
     return f'{kind} xformOp:{operation} = {value}\nuniform token[] xformOpOrder = ["xformOp:{operation}"]'
 
 
@@ -108,7 +108,7 @@ each(
     "USD",
     "scale",
     ["(0,0,0)", "(1,0,1)", "(nan,1,1)", "(inf,1,1)"],
-    lambda v: curves(prim(more=moved("scale", v))),
+    lambda v: curves(prim(more=transformed("scale", v))),
     "/c",
     "transforms scale volumes",
 )
@@ -116,7 +116,7 @@ each(
     "USD",
     "scale of a mesh",
     ["(0,0,0)", "(1,1,0)", "(nan,1,1)"],
-    lambda v: mesh(more=moved("scale", v)),
+    lambda v: mesh(more=transformed("scale", v)),
     "/m",
     "transforms scale volumes",
 )
@@ -124,7 +124,7 @@ each(
     "USD",
     "translation",
     ["(nan,0,0)", "(inf,0,0)"],
-    lambda v: curves(prim(more=moved("translate", v, "double3"))),
+    lambda v: curves(prim(more=transformed("translate", v, "double3"))),
     "/c",
     "transforms",
 )
@@ -400,8 +400,8 @@ refuse(
 
 
 # --- HDF5 of plain arrays ---
-def plain(**arrays):
-    """Read an HDF5 file of such arrays."""
+def read_hdf5(**arrays):
+    """Read an HDF5 file of given arrays."""
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "a.h5"
         with h5py.File(path, "w") as written:
@@ -415,14 +415,14 @@ each(
     "plain HDF5",
     "counts",
     [[3], [5], [2, 3], [-1, 5], [1, 3], [3.5, 0.5], [NAN], [], [[2], [2], [2]]],
-    lambda v: plain(points=LINE, counts=v),
+    lambda v: read_hdf5(points=LINE, counts=v),
     "a.h5",
 )
 each(
     "plain HDF5",
     "closed",
     [[True, False], [[True]], 0.5],
-    lambda v: plain(points=LINE, counts=[4], closed=v),
+    lambda v: read_hdf5(points=LINE, counts=[4], closed=v),
     "a.h5",
     "closed",
 )
@@ -430,7 +430,7 @@ each(
     "plain HDF5",
     "radius",
     [[0.1, 0.1], 0.0, -0.1, NAN, [0.1, 0.0, 0.1, 0.1]],
-    lambda v: plain(points=LINE, counts=[4], radius=v),
+    lambda v: read_hdf5(points=LINE, counts=[4], radius=v),
     "a.h5",
     "radi",
 )
@@ -438,7 +438,7 @@ each(
     "plain HDF5",
     "points",
     [LINE[:, :2].tolist(), (LINE * NAN).tolist(), 3.0, "line", [0.0, 1.0, 2.0]],
-    lambda v: plain(points=v, counts=[4]),
+    lambda v: read_hdf5(points=v, counts=[4]),
     "a.h5",
 )
 each(
@@ -452,7 +452,7 @@ each(
     "plain HDF5",
     "text as",
     ["closed", "radius", "counts"],
-    lambda v: plain(points=LINE, **{"counts": [4], v: "no"}),
+    lambda v: read_hdf5(points=LINE, **{"counts": [4], v: "no"}),
     "a.h5",
 )
 

@@ -1,4 +1,4 @@
-"""Bad inputs to recordings: what a recorder is given, files that are damaged or of others, directories, runs to resume."""
+"""Bad inputs to recordings: recorder arguments, damaged or foreign files, directories, resumed runs."""
 
 import contextlib
 import io
@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from bad_input_files import FALL, SCENE, command, run
-from bad_inputs import DEVICE, INF, NAN, each, held_rods, line, model, refuse
+from bad_inputs import DEVICE, INF, NAN, clamped, each, line, model, refuse
 
 import ddg_warp as ddg
 from ddg_warp.io import CurveSet, journal
@@ -28,7 +28,7 @@ TRAJECTORY, LOCK = "trajectory.h5", "run.lock"
 
 
 def folder(action):
-    """Do something in a directory that is gone afterwards."""
+    """Run an action in a temporary directory."""
     with tempfile.TemporaryDirectory() as directory:
         return action(Path(directory))
 
@@ -40,17 +40,17 @@ def recorder(**options):
 
 @cache
 def states():
-    """Three states of the model, one after the other."""
+    """Return three successive states of the model."""
     integrator, state = ddg.Integrator(model()), model().state()
-    found = [state.copy()]
+    copies = [state.copy()]
     for _ in range(2):
         state = integrator.step(state, 0.01)
-        found.append(state.copy())
-    return found
+        copies.append(state.copy())
+    return copies
 
 
 def record(*observed, order=(0, 1, 2), **options):
-    """Record states and what was observed of them."""
+    """Record states with observed values."""
 
     def act(directory):
         with ddg.Recorder(model(), directory, **{"usd": False, "hdf5": False} | options) as made:
@@ -62,7 +62,7 @@ def record(*observed, order=(0, 1, 2), **options):
 
 @cache
 def recorded() -> bytes:
-    """A trajectory.h5 of three frames, with velocities and a series."""
+    """Return the bytes of a trajectory.h5 of three frames, with velocities and a series."""
 
     def act(directory):
         with ddg.Recorder(model(), directory, usd=False, velocities=True, block=2, attributes={"id": [1, 2]}) as made:
@@ -73,8 +73,8 @@ def recorded() -> bytes:
     return folder(act)
 
 
-def laid(action, content: bytes | None = None, name: str = TRAJECTORY):
-    """Do something in a directory with that trajectory, or other content."""
+def with_trajectory(action, content: bytes | None = None, name: str = TRAJECTORY):
+    """Run an action in a directory with the recorded trajectory, or other content."""
 
     def act(directory):
         (directory / name).write_bytes(recorded() if content is None else content)
@@ -83,28 +83,28 @@ def laid(action, content: bytes | None = None, name: str = TRAJECTORY):
     return folder(act)
 
 
-def resume(first: int = 2, observed=None, given=None, **options):
-    """Go on with it, from one of the states."""
+def resume(first: int = 2, observed=None, other_model=None, **options):
+    """Resume the recorded trajectory from one of the states."""
 
     def act(directory):
-        with ddg.Recorder(given or model(), directory, usd=False, resume=True, **options) as made:
+        with ddg.Recorder(other_model or model(), directory, usd=False, resume=True, **options) as made:
             made.record(states()[first], {"tip": 0.0} if observed is None else observed)
 
-    return laid(act)
+    return with_trajectory(act)
 
 
 def resume_other():
-    other = model().state(states()[2].points() + 1e-6)
-    other.time = states()[2].time
+    state = model().state(states()[2].points() + 1e-6)
+    state.time = states()[2].time
 
     def act(directory):
         with ddg.Recorder(model(), directory, usd=False, resume=True) as made:
-            made.record(other, {"tip": 0.0})
+            made.record(state, {"tip": 0.0})
 
-    return laid(act)
+    return with_trajectory(act)
 
 
-# --- what a recorder is given ---
+# --- arguments of a recorder ---
 for option in ("usd", "hdf5", "tube", "resume", "force", "velocities", "directors", "contacts"):
     each("recorder", option, ["yes", 1, None], lambda v, o=option: recorder(**{o: v}), option, "True or False")
 each("recorder", "directory", [None, 3, b"out", "a\0b"], lambda v: ddg.Recorder(model(), v), "directory", "path")
@@ -162,7 +162,7 @@ refuse(
     {"provenance that holds itself": (lambda: recorder(provenance={"x": loop}), "provenance 'x'", "cannot be stored")},
 )
 
-# --- what is recorded ---
+# --- recorded states and observed values ---
 each("observed", "kind", [3, "tip", [1.0], [("tip", 1.0)]], record, "observed", "by name")
 each(
     "observed",
@@ -180,12 +180,12 @@ each(
     "observed 'tip'",
     "one finite number",
 )
-for given in ({"tip": 1.0, "b": 1.0}, {}, {"b": 1.0}, None):
+for second in ({"tip": 1.0, "b": 1.0}, {}, {"b": 1.0}, None):
     refuse(
         "observed",
         {
-            f"names that change to {given}": (
-                lambda given=given: record({"tip": 1.0}, given),
+            f"names that change to {second}": (
+                lambda second=second: record({"tip": 1.0}, second),
                 "observed",
                 "before ['tip']",
                 "same names",
@@ -224,19 +224,27 @@ refuse(
         "more numbers": (lambda: resume(fields=["twist"]), "no twist", "leave twist out"),
         "another time": (lambda: resume(time="frame"), "time='state'", "not 'frame'"),
         "other attributes": (lambda: resume(attributes={"id": [2, 1]}), "other attributes"),
-        "another model": (lambda: resume(given=model("net")), "parameters", "its own scene"),
-        "more worlds": (lambda: resume(given=model("rods", 2)), "shape", "as many worlds"),
-        "a shell": (lambda: resume(given=model("hinge")), "rods", "its own scene"),
+        "another model": (lambda: resume(other_model=model("net")), "parameters", "its own scene"),
+        "more worlds": (lambda: resume(other_model=model("rods", 2)), "shape", "as many worlds"),
+        "a shell": (lambda: resume(other_model=model("hinge")), "rods", "its own scene"),
         "no trajectory": (lambda: folder(lambda d: ddg.Recorder(model(), d, resume=True)), TRAJECTORY, "no such file"),
-        "an empty file": (lambda: laid(lambda d: ddg.Recorder(model(), d, resume=True), b""), "cut short or damaged"),
-        "a run": (lambda: laid(lambda d: ddg.Recorder(model(), d)), "3 frames up to 0.02 s", "--force", "--resume"),
+        "an empty file": (
+            lambda: with_trajectory(lambda d: ddg.Recorder(model(), d, resume=True), b""),
+            "cut short or damaged",
+        ),
+        "a run": (
+            lambda: with_trajectory(lambda d: ddg.Recorder(model(), d)),
+            "3 frames up to 0.02 s",
+            "--force",
+            "--resume",
+        ),
     },
 )
 
 
 # --- directories ---
-def link(name: str, action):
-    """Do something in a directory in which a name is a link to a file beside it."""
+def with_link(name: str, action):
+    """Run an action in a directory with a symbolic link `name` to a file outside."""
 
     def act(directory):
         (directory / "run").mkdir()
@@ -254,27 +262,27 @@ def recorder_at(directory, **options):
     return ddg.Recorder(model(), directory, hdf5=False, usd=False, **options)
 
 
-def at_a_file(action):
-    return laid(lambda d: action(d / "file"), b"", "file")
+def with_file_as_directory(action):
+    return with_trajectory(lambda d: action(d / "file"), b"", "file")
 
 
 refuse(
     "directories",
     {
-        "a lock that is a link": (lambda: link(LOCK, RunDirectory), LOCK, "is a link", "remove it"),
+        "a lock that is a link": (lambda: with_link(LOCK, RunDirectory), LOCK, "is a link", "remove it"),
         "a lock that is a directory": (
             lambda: folder(lambda d: ((d / LOCK).mkdir(), RunDirectory(d))),
             LOCK,
             "is a directory",
         ),
         "a trajectory that is a link": (
-            lambda: link(TRAJECTORY, lambda d: ddg.Recorder(model(), d, usd=False, resume=True)),
+            lambda: with_link(TRAJECTORY, lambda d: ddg.Recorder(model(), d, usd=False, resume=True)),
             "is a link to",
             "not written through",
         ),
-        "a file": (lambda: at_a_file(RunDirectory), "file is a file", "give another one"),
+        "a file": (lambda: with_file_as_directory(RunDirectory), "file is a file", "give another one"),
         "below a file": (
-            lambda: at_a_file(lambda p: RunDirectory(p / "a" / "b")),
+            lambda: with_file_as_directory(lambda p: RunDirectory(p / "a" / "b")),
             "file is a file",
             "give another one",
         ),
@@ -298,19 +306,19 @@ refuse(
 
 
 # --- files that are damaged, or no recordings ---
-def damaged(change, read=lambda path: TrajectoryReader(path).close()):
-    """Read the trajectory after a change to it."""
+def read_changed(change, read=lambda path: TrajectoryReader(path).close()):
+    """Read the trajectory after a change of the file."""
 
     def act(directory):
         with h5py.File(directory / TRAJECTORY, "r+") as file:
             change(file)
         return read(directory / TRAJECTORY)
 
-    return laid(act)
+    return with_trajectory(act)
 
 
-def put(name: str, *values, **options):
-    """A change: another dataset in the place of one."""
+def replace_dataset(name: str, *values, **options):
+    """Return a change that replaces, creates or deletes a dataset."""
 
     def change(file):
         if name in file:
@@ -323,20 +331,20 @@ def put(name: str, *values, **options):
     return change
 
 
-def flipped(name: str, read, chunk: int = 0):
-    """Read the trajectory after a byte of a dataset has changed."""
+def read_flipped(name: str, read, chunk: int = 0):
+    """Read the trajectory after a bit flip in a dataset."""
 
     def act(directory):
         path = directory / TRAJECTORY
         with h5py.File(path) as file:
-            own = file[name].id
-            place = own.get_chunk_info(chunk).byte_offset if file[name].chunks else own.get_offset()
+            dataset = file[name].id
+            offset = dataset.get_chunk_info(chunk).byte_offset if file[name].chunks else dataset.get_offset()
         content = bytearray(path.read_bytes())
-        content[place + 6] ^= 16
+        content[offset + 6] ^= 16
         path.write_bytes(content)
         return read(path)
 
-    return laid(act)
+    return with_trajectory(act)
 
 
 def frames(field: str):
@@ -357,49 +365,60 @@ refuse(
     "damaged recordings",
     {
         "a byte of points": (
-            lambda: flipped("trajectory/points", frames("points")),
+            lambda: read_flipped("trajectory/points", frames("points")),
             "points is damaged",
             "frames 0 to 1",
             "2 to 2 can be read",
         ),
         "a byte of the last points": (
-            lambda: flipped("trajectory/points", frames("points"), 1),
+            lambda: read_flipped("trajectory/points", frames("points"), 1),
             "points is damaged",
             "frames 2 to 2",
             "0 to 1 can be read",
         ),
         "a byte of velocities": (
-            lambda: flipped("trajectory/velocities", frames("velocities")),
+            lambda: read_flipped("trajectory/velocities", frames("velocities")),
             "velocities is damaged",
             "frames 0 to 1",
         ),
-        "a byte of times": (lambda: flipped("trajectory/time", opened), "time is damaged", "frames 0 to 1"),
-        "a byte of a series": (lambda: flipped("trajectory/series/tip", opened), "tip is damaged", "frames 0 to 1"),
-        "a byte of the radius": (lambda: flipped("model/curves/radius", opened), "/model is damaged", "checksum"),
-        "a byte of an attribute": (lambda: flipped("model/attributes/id", opened), "/model is damaged", "checksum"),
+        "a byte of times": (lambda: read_flipped("trajectory/time", opened), "time is damaged", "frames 0 to 1"),
+        "a byte of a series": (
+            lambda: read_flipped("trajectory/series/tip", opened),
+            "tip is damaged",
+            "frames 0 to 1",
+        ),
+        "a byte of the radius": (lambda: read_flipped("model/curves/radius", opened), "/model is damaged", "checksum"),
+        "a byte of an attribute": (
+            lambda: read_flipped("model/attributes/id", opened),
+            "/model is damaged",
+            "checksum",
+        ),
         "a byte of the checkpoint": (
-            lambda: flipped("checkpoint/b/0/x", checkpoint),
+            lambda: read_flipped("checkpoint/b/0/x", checkpoint),
             "/checkpoint/b is damaged",
             "checksum",
         ),
-        "no model": (lambda: damaged(put("model")), "cut short or damaged"),
-        "no points": (lambda: damaged(put("trajectory/points")), "cut short or damaged"),
-        "no times": (lambda: damaged(put("trajectory/time")), "cut short or damaged"),
-        "no trajectory": (lambda: damaged(put("trajectory")), "no group /trajectory"),
-        "no checkpoint": (lambda: damaged(put("checkpoint"), checkpoint), "before its first block"),
+        "no model": (lambda: read_changed(replace_dataset("model")), "cut short or damaged"),
+        "no points": (lambda: read_changed(replace_dataset("trajectory/points")), "cut short or damaged"),
+        "no times": (lambda: read_changed(replace_dataset("trajectory/time")), "cut short or damaged"),
+        "no trajectory": (lambda: read_changed(replace_dataset("trajectory")), "no group /trajectory"),
+        "no checkpoint": (lambda: read_changed(replace_dataset("checkpoint"), checkpoint), "before its first block"),
         "times that are a group": (
-            lambda: damaged(lambda f: (put("trajectory/time")(f), f.create_group("trajectory/time"))),
+            lambda: read_changed(lambda f: (replace_dataset("trajectory/time")(f), f.create_group("trajectory/time"))),
             "time is a group",
         ),
-        "times that are nothing": (lambda: damaged(put("trajectory/time", h5py.Empty("f8"))), "time is empty"),
+        "times that are nothing": (
+            lambda: read_changed(replace_dataset("trajectory/time", h5py.Empty("f8"))),
+            "time is empty",
+        ),
         "endless times": (
-            lambda: damaged(put("trajectory/time", shape=(10**14,), dtype="f8", chunks=(64,))),
+            lambda: read_changed(replace_dataset("trajectory/time", shape=(10**14,), dtype="f8", chunks=(64,))),
             "more than the file can hold",
         ),
-        "text": (lambda: laid(lambda d: opened(d / TRAJECTORY), b"time, x, y, z\n"), "cut short or damaged"),
-        "a frame too many": (lambda: laid(lambda d: read_frame(d, 3)), "no frame 3; it has 3"),
-        "a frame too few": (lambda: laid(lambda d: read_frame(d, -4)), "no frame -4; it has 3"),
-        "frames by name": (lambda: laid(lambda d: read_frame(d, "last")), "choose frames by a number"),
+        "text": (lambda: with_trajectory(lambda d: opened(d / TRAJECTORY), b"time, x, y, z\n"), "cut short or damaged"),
+        "a frame too many": (lambda: with_trajectory(lambda d: read_frame(d, 3)), "no frame 3; it has 3"),
+        "a frame too few": (lambda: with_trajectory(lambda d: read_frame(d, -4)), "no frame -4; it has 3"),
+        "frames by name": (lambda: with_trajectory(lambda d: read_frame(d, "last")), "choose frames by a number"),
     },
 )
 
@@ -409,8 +428,8 @@ def read_frame(directory, frame):
         return reader.points[frame]
 
 
-def grid(*chosen, **datasets):
-    """Read rods from an HDF5 file with these datasets."""
+def read_datasets(*chosen, **datasets):
+    """Read rods from an HDF5 file of given datasets."""
 
     def act(directory):
         with h5py.File(directory / "a.h5", "w") as file:
@@ -426,45 +445,46 @@ def grid(*chosen, **datasets):
 
 for number in (3, -4, "last", 1.5, None, True):
     refuse(
-        "rods of HDF5", {f"frame {number!r}": (lambda v=number: laid(lambda d: read_rods(d / TRAJECTORY, v)), "frame")}
+        "rods of HDF5",
+        {f"frame {number!r}": (lambda v=number: with_trajectory(lambda d: read_rods(d / TRAJECTORY, v)), "frame")},
     )
     refuse(
         "rods of HDF5",
-        {f"world {number!r}": (lambda v=number: laid(lambda d: read_rods(d / TRAJECTORY, 0, v)), "world")},
+        {f"world {number!r}": (lambda v=number: with_trajectory(lambda d: read_rods(d / TRAJECTORY, 0, v)), "world")},
     )
 refuse(
     "rods of HDF5",
     {
-        "frame of a file without": (lambda: grid(99, points=POINTS), "a.h5", "leave out frame = 99"),
-        "world of a file without": (lambda: grid(0, 2, points=POINTS), "a.h5", "world = 2"),
+        "frame of a file without": (lambda: read_datasets(99, points=POINTS), "a.h5", "leave out frame = 99"),
+        "world of a file without": (lambda: read_datasets(0, 2, points=POINTS), "a.h5", "world = 2"),
     },
 )
 POINTS = np.arange(24.0).reshape(2, 4, 3)
 refuse(
     "rods of HDF5",
     {
-        "nothing": (lambda: grid(points=h5py.Empty("f8")), "a.h5", "points is empty"),
+        "nothing": (lambda: read_datasets(points=h5py.Empty("f8")), "a.h5", "points is empty"),
         "endless": (
-            lambda: grid(points={"shape": (10**12, 4, 3), "dtype": "f8", "chunks": (1, 4, 3)}),
+            lambda: read_datasets(points={"shape": (10**12, 4, 3), "dtype": "f8", "chunks": (1, 4, 3)}),
             "a.h5",
             "more than the file can hold",
         ),
         "endless counts": (
-            lambda: grid(points=POINTS, counts={"shape": (10**12,), "dtype": "i8", "chunks": (64,)}),
+            lambda: read_datasets(points=POINTS, counts={"shape": (10**12,), "dtype": "i8", "chunks": (64,)}),
             "a.h5",
             "more than the file can hold",
         ),
-        "letters": (lambda: grid(points=np.array([b"a", b"b"])), "a.h5"),
-        "no counts": (lambda: grid(points=POINTS[0]), "a.h5", "add the points per rod"),
-        "radius of another length": (lambda: grid(points=POINTS, radius=[1.0, 2.0, 3.0]), "a.h5"),
+        "letters": (lambda: read_datasets(points=np.array([b"a", b"b"])), "a.h5"),
+        "no counts": (lambda: read_datasets(points=POINTS[0]), "a.h5", "add the points per rod"),
+        "radius of another length": (lambda: read_datasets(points=POINTS, radius=[1.0, 2.0, 3.0]), "a.h5"),
         "points of another file": (
-            lambda: grid(points=h5py.ExternalLink("b.h5", "points")),
+            lambda: read_datasets(points=h5py.ExternalLink("b.h5", "points")),
             "a.h5",
             "points is a link to b.h5",
             "outside=True",
         ),
         "storage elsewhere": (
-            lambda: grid(points={"shape": (2, 4, 3), "dtype": "f8", "external": [("/etc/hostname", 0, 192)]}),
+            lambda: read_datasets(points={"shape": (2, 4, 3), "dtype": "f8", "external": [("/etc/hostname", 0, 192)]}),
             "a.h5",
             "/etc/hostname",
             "outside=True",
@@ -474,8 +494,8 @@ refuse(
 
 
 # --- journals ---
-def foreign(action, newer: bool = False):
-    """Do something beside a journal of another version of the file."""
+def with_foreign_journal(action, newer: bool = False):
+    """Run an action in a directory with a journal of another version of the file."""
 
     def act(directory):
         path = directory / TRAJECTORY
@@ -497,7 +517,7 @@ def foreign(action, newer: bool = False):
             path.write_bytes(path.read_bytes()[:-4096])
         return action(directory)
 
-    return laid(act)
+    return with_trajectory(act)
 
 
 journal_words = (TRAJECTORY + ".journal", "belongs to another", "remove it")
@@ -505,17 +525,20 @@ refuse(
     "journals",
     {
         "of an older version": (
-            lambda: foreign(lambda d: ddg.Recorder(model(), d, usd=False, resume=True), True),
+            lambda: with_foreign_journal(lambda d: ddg.Recorder(model(), d, usd=False, resume=True), True),
             *journal_words,
         ),
-        "of a longer file": (lambda: foreign(lambda d: transaction(d / TRAJECTORY).__enter__()), *journal_words),
+        "of a longer file": (
+            lambda: with_foreign_journal(lambda d: transaction(d / TRAJECTORY).__enter__()),
+            *journal_words,
+        ),
     },
 )
 
 
 # --- writers ---
 def writer(action, **options):
-    """Do something with a writer of USD."""
+    """Run an action with a USD writer."""
     curves = CurveSet(line(5), np.array([5]), np.array([False]), np.full(5, 0.1), "/rod")
 
     def act(directory):
@@ -537,7 +560,7 @@ each(
     "exported",
     "fps",
     [0.0, -1.0, NAN, "film"],
-    lambda v: laid(lambda d: export_usd(d / TRAJECTORY, d / "a.usda", fps=v)),
+    lambda v: with_trajectory(lambda d: export_usd(d / TRAJECTORY, d / "a.usda", fps=v)),
     "fps",
     "positive",
 )
@@ -545,14 +568,14 @@ each(
     "exported",
     "revolve",
     [1, 2, -3, 2.5, "8"],
-    lambda v: laid(lambda d: export_usd(d / TRAJECTORY, d / "a.usda", revolve=v)),
+    lambda v: with_trajectory(lambda d: export_usd(d / TRAJECTORY, d / "a.usda", revolve=v)),
     "revolve",
 )
 each(
     "exported",
     "tube",
     ["yes", 1],
-    lambda v: laid(lambda d: export_usd(d / TRAJECTORY, d / "a.usda", tube=v)),
+    lambda v: with_trajectory(lambda d: export_usd(d / TRAJECTORY, d / "a.usda", tube=v)),
     "tube",
     "True or False",
 )
@@ -560,7 +583,7 @@ each(
     "exported",
     "place",
     ["/proc/x.usda", "/proc/x/y.usda", "a" * 300 + ".usda"],
-    lambda v: laid(lambda d: export_usd(d / TRAJECTORY, v)),
+    lambda v: with_trajectory(lambda d: export_usd(d / TRAJECTORY, v)),
     ".usda: ",
     "give",
 )
@@ -614,61 +637,66 @@ refuse(
         ),
         "steps without end": (lambda: run(dt=1e-300), "take longer steps"),
         "nowhere to resume": (lambda: run(resume="nowhere"), "no run to resume in nowhere"),
-        "a recorder's run": (lambda: laid(lambda d: run(resume=d)), "is not of `simulate`", "Recorder(resume=True)"),
-        "out in a file": (lambda: at_a_file(lambda p: run(out=p)), "file is a file"),
+        "a recorder's run": (
+            lambda: with_trajectory(lambda d: run(resume=d)),
+            "is not of `simulate`",
+            "Recorder(resume=True)",
+        ),
+        "out in a file": (lambda: with_file_as_directory(lambda p: run(out=p)), "file is a file"),
         "an unknown field": (lambda: folder(lambda d: run(out=d, fields=["tension"])), "fields", "axial_force"),
     },
 )
 
 
 @cache
-def simulated() -> bytes:
-    """The trajectory.h5 of two steps of 0.01 s."""
+def simulated_trajectory() -> bytes:
+    """Return the bytes of a trajectory.h5 of two steps of 0.01 s."""
     return folder(lambda d: (run(out=d, usd=False, fields=["velocities"]), (d / TRAJECTORY).read_bytes())[1])
 
 
-def again(**options):
-    """Go on with it."""
-    return laid(lambda d: run(resume=d, usd=False, **options), simulated())
+def resume_run(**options):
+    """Resume the simulated run."""
+    return with_trajectory(lambda d: run(resume=d, usd=False, **options), simulated_trajectory())
 
 
-each("resumed runs", "dt", [0.02, 0.005], lambda v: again(dt=v), "has dt = 0.01")
-each("resumed runs", "worlds", [2, 3], lambda v: again(worlds=v), "has worlds = 1")
-each("resumed runs", "precision", ["mixed", "float32"], lambda v: again(precision=v), "has precision = float64")
+each("resumed runs", "dt", [0.02, 0.005], lambda v: resume_run(dt=v), "has dt = 0.01")
+each("resumed runs", "worlds", [2, 3], lambda v: resume_run(worlds=v), "has worlds = 1")
+each("resumed runs", "precision", ["mixed", "float32"], lambda v: resume_run(precision=v), "has precision = float64")
 each(
     "resumed runs",
     "fields",
     [["directors"], ["velocities", "twist"]],
-    lambda v: again(fields=v),
+    lambda v: resume_run(fields=v),
     "has fields = velocities",
 )
-each("resumed runs", "duration", [0.01], lambda v: again(duration=v), "recorded up to 0.02 s", "longer one")
+each("resumed runs", "duration", [0.01], lambda v: resume_run(duration=v), "recorded up to 0.02 s", "longer one")
 refuse(
     "resumed runs",
     {
         "another scene": (
-            lambda: laid(
-                lambda d: simulate(longer(), device=DEVICE, progress=False, resume=d, duration=0.04), simulated()
+            lambda: with_trajectory(
+                lambda d: simulate(longer_scene(), device=DEVICE, progress=False, resume=d, duration=0.04),
+                simulated_trajectory(),
             ),
             "snapshot",
         ),
-        "by force": (lambda: again(force=True), "replaces nothing"),
-        "elsewhere": (lambda: again(out="elsewhere"), "goes on in its directory"),
-        "a static scene": (lambda: again(analysis=ddg.Statics()), "static"),
+        "by force": (lambda: resume_run(force=True), "replaces nothing"),
+        "elsewhere": (lambda: resume_run(out="elsewhere"), "goes on in its directory"),
+        "a static scene": (lambda: resume_run(analysis=ddg.Statics()), "static"),
     },
 )
 
 
-def longer():
-    scene = held_rods()
+def longer_scene():
+    scene = clamped()
     scene.add_rod(line(9), section=ddg.Circle(0.01), material=ddg.Material(1e6))
     scene.analysis = ddg.Dynamics(0.01, 0.02)
     return scene
 
 
 # --- command line ---
-def told(words: str, directory: Path) -> tuple[int, str]:
-    """Exit code of a command, and what it says of a mistake."""
+def run_command(words: str, directory: Path) -> tuple[int, str]:
+    """Return the exit code and the error message of a command."""
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
         code = main([word.replace("DIR", str(directory)) for word in words.split()])
@@ -676,21 +704,21 @@ def told(words: str, directory: Path) -> tuple[int, str]:
 
 
 @cache
-def started() -> tempfile.TemporaryDirectory:
-    """A directory with a scene, its run of two steps and a file."""
+def started_run() -> tempfile.TemporaryDirectory:
+    """Return a directory with a scene, a run of two steps and a file."""
     made = tempfile.TemporaryDirectory()
     (Path(made.name) / "fall.py").write_text(SCENE)
     (Path(made.name) / "file").write_text("")
-    assert told(START, Path(made.name)) == (0, "")
+    assert run_command(START, Path(made.name)) == (0, "")
     return made
 
 
-def shell(words: str):
-    """A command in a copy of that directory, which is a mistake."""
+def fail_command(words: str):
+    """Run a wrong command in a copy of the directory; raise its error message."""
 
     def act(directory):
-        shutil.copytree(started().name, directory, dirs_exist_ok=True)
-        code, said = told(words, directory)
+        shutil.copytree(started_run().name, directory, dirs_exist_ok=True)
+        code, said = run_command(words, directory)
         if code != 2:
             raise AssertionError(f"exit code {code}")
         raise InputError(said)
@@ -703,32 +731,36 @@ GO_ON = "run DIR/fall.py --device cpu --resume DIR/out"
 refuse(
     "commands with files",
     {
-        "out is a file": (lambda: shell("run DIR/fall.py --device cpu --out DIR/file"), "file is a file", "--out DIR"),
-        "out below a file": (lambda: shell("run DIR/fall.py --device cpu --out DIR/file/a"), "file is a file"),
+        "out is a file": (
+            lambda: fail_command("run DIR/fall.py --device cpu --out DIR/file"),
+            "file is a file",
+            "--out DIR",
+        ),
+        "out below a file": (lambda: fail_command("run DIR/fall.py --device cpu --out DIR/file/a"), "file is a file"),
         "out of the system": (
-            lambda: shell("run DIR/fall.py --device cpu --out /proc/x"),
+            lambda: fail_command("run DIR/fall.py --device cpu --out /proc/x"),
             "/proc/x",
             "give another place",
         ),
-        "a run is there": (lambda: shell(START), "holds 3 frames", "--force"),
-        "summary below a file": (lambda: shell(f"{START} --force --json DIR/file/a.json"), "file/a.json"),
-        "a shorter duration": (lambda: shell(f"{GO_ON} --duration 0.01"), "recorded up to 0.02 s", "longer"),
-        "part of a step": (lambda: shell(f"{GO_ON} --duration 0.035"), "no whole number of steps"),
-        "another dt": (lambda: shell(f"{GO_ON} --dt 0.02"), "has dt = 0.01", "without --dt"),
-        "another precision": (lambda: shell(f"{GO_ON} --precision float32"), "has precision = float64"),
-        "more worlds": (lambda: shell(f"{GO_ON} --worlds 2"), "has worlds = 1"),
-        "other nodes": (lambda: shell(f"{GO_ON} --n 9"), "has n = 4"),
-        "other fields": (lambda: shell(f"{GO_ON} --duration 0.03 --fields velocities"), "has fields = none"),
+        "a run is there": (lambda: fail_command(START), "holds 3 frames", "--force"),
+        "summary below a file": (lambda: fail_command(f"{START} --force --json DIR/file/a.json"), "file/a.json"),
+        "a shorter duration": (lambda: fail_command(f"{GO_ON} --duration 0.01"), "recorded up to 0.02 s", "longer"),
+        "part of a step": (lambda: fail_command(f"{GO_ON} --duration 0.035"), "no whole number of steps"),
+        "another dt": (lambda: fail_command(f"{GO_ON} --dt 0.02"), "has dt = 0.01", "without --dt"),
+        "another precision": (lambda: fail_command(f"{GO_ON} --precision float32"), "has precision = float64"),
+        "more worlds": (lambda: fail_command(f"{GO_ON} --worlds 2"), "has worlds = 1"),
+        "other nodes": (lambda: fail_command(f"{GO_ON} --n 9"), "has n = 4"),
+        "other fields": (lambda: fail_command(f"{GO_ON} --duration 0.03 --fields velocities"), "has fields = none"),
         "another scene": (
-            lambda: shell("run cantilever --device cpu --resume DIR/out"),
+            lambda: fail_command("run cantilever --device cpu --resume DIR/out"),
             "a run of 'fall', not of 'cantilever'",
         ),
-        "force and resume": (lambda: shell(f"{GO_ON} --force"), "--resume goes on", "--force replaces"),
+        "force and resume": (lambda: fail_command(f"{GO_ON} --force"), "--resume goes on", "--force replaces"),
         "steps without end": (lambda: command(*FALL, "--dt", "1e-300"), "take longer steps"),
-        "export below a file": (lambda: shell("export DIR/out --to DIR/file/a.usda"), "file/a.usda"),
-        "export to the system": (lambda: shell("export DIR/out --to /proc/x.usda"), "/proc/x.usda: "),
-        "export to a directory": (lambda: shell("export DIR/out --to DIR"), "must end in .usdc or .usda"),
-        "export as text": (lambda: shell("export DIR/out --to DIR/a.txt"), "must end in .usdc or .usda"),
-        "two sides": (lambda: shell("export DIR/out --revolve 2"), "3 sides at least"),
+        "export below a file": (lambda: fail_command("export DIR/out --to DIR/file/a.usda"), "file/a.usda"),
+        "export to the system": (lambda: fail_command("export DIR/out --to /proc/x.usda"), "/proc/x.usda: "),
+        "export to a directory": (lambda: fail_command("export DIR/out --to DIR"), "must end in .usdc or .usda"),
+        "export as text": (lambda: fail_command("export DIR/out --to DIR/a.txt"), "must end in .usdc or .usda"),
+        "two sides": (lambda: fail_command("export DIR/out --revolve 2"), "3 sides at least"),
     },
 )

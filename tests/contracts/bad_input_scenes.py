@@ -57,7 +57,7 @@ refuse("analysis", {
     "trace watch": (lambda: ddg.Trace(watch={"tip": 3}), "watch", "Displacement.of"),
 })
 
-# --- rods; those of every kind are compiled by the same code, so that a twisted one in space stands for all ---
+# --- rods; all kinds are compiled by the same code: a twisted rod in space represents them ---
 ROD = {
     "zero-length edge": ({"points": line(n3=(0.5, 0.0, 0.0))}, "rod 1", "'odd'", "edge 2", "no length", "remove"),
     "edge of rounding": ({"points": line(n3=(0.5 + 1e-16, 0.0, 0.0))}, "rod 1", "edge 2", "one point", "remove"),
@@ -124,20 +124,20 @@ refuse("rods", {"none": (lambda: built(ddg.Scene(), lambda s: s.add_rods(np.zero
 
 # --- sections and materials ---
 SECTION = {"EA": 1e3, "EI1": 1.0, "EI2": 1.0, "GJ": 1.0, "mass_per_length": 1.0}
-for what in ("EA", "EI1", "EI2", "GJ"):
+for field in ("EA", "EI1", "EI2", "GJ"):
 
-    def stiff(v, what=what):
-        return built(rods(section=ddg.Stiffness(**(SECTION | {what: v}))))
+    def stiff(v, field=field):
+        return built(rods(section=ddg.Stiffness(**(SECTION | {field: v}))))
 
-    each("sections", what, [-1.0, NAN, INF, [1.0, 1.0, -1.0, 1.0]], stiff, "rod 1", "'odd'", what, "finite and not negative")
-    each("sections", what, [0.0], stiff, "rod 1", "'odd'", what, "is zero", "bend=False")
-    each("sections", what, ["stiff", [1.0, 2.0, 3.0]], stiff, "rod 1", "'odd'", what, "broadcast", "4 edges")
-for what in ("mass_per_length", "rotary_inertia", "radius", "viscosity"):
+    each("sections", field, [-1.0, NAN, INF, [1.0, 1.0, -1.0, 1.0]], stiff, "rod 1", "'odd'", field, "finite and not negative")
+    each("sections", field, [0.0], stiff, "rod 1", "'odd'", field, "is zero", "bend=False")
+    each("sections", field, ["stiff", [1.0, 2.0, 3.0]], stiff, "rod 1", "'odd'", field, "broadcast", "4 edges")
+for field in ("mass_per_length", "rotary_inertia", "radius", "viscosity"):
 
-    def inert(v, what=what):
-        return built(rods(section=ddg.Stiffness(**(SECTION | {what: v}))))
+    def inert(v, field=field):
+        return built(rods(section=ddg.Stiffness(**(SECTION | {field: v}))))
 
-    each("sections", what, [-1.0, NAN, np.ones(7), "heavy"], inert, "rod 1", "'odd'", what)
+    each("sections", field, [-1.0, NAN, np.ones(7), "heavy"], inert, "rod 1", "'odd'", field)
 each("materials", "young", [-1.0, 0.0, NAN, "soft", None], ddg.Material, "young", "positive")
 each("materials", "poisson", [-1.0, 0.51, NAN, "half"], lambda v: ddg.Material(1.0, v), "poisson", "0.5")
 each("materials", "density", [-1.0, INF, "light"], lambda v: ddg.Material(1.0, 0.3, v), "density", "not negative")

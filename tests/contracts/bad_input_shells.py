@@ -23,7 +23,7 @@ def shell(points=SQUARE, triangles=TWO, **options):
     return built(scene)
 
 
-def _moved(vertex, value):
+def _square_with(vertex, value):
     points = SQUARE.copy()
     points[vertex] = value
     return points
@@ -32,7 +32,7 @@ def _moved(vertex, value):
 refuse("shells", {
     "points of two": (lambda: shell(SQUARE[:, :2]), "'odd'", "(4, 2)", "(P, 3)"),
     "points of letters": (lambda: shell([["a", "b", "c"]] * 4), "'odd'", "points", "numbers"),
-    "points not finite": (lambda: shell(_moved(2, NAN)), "'odd'", "vertex 2", "non-finite"),
+    "points not finite": (lambda: shell(_square_with(2, NAN)), "'odd'", "vertex 2", "non-finite"),
     "quadrilaterals": (lambda: shell(triangles=[[0, 1, 2, 3]]), "'odd'", "(1, 4)", "(T, 3)"),
     "triangles of fractions": (lambda: shell(triangles=[[0.0, 1.0, 2.5]]), "'odd'", "float64", "whole"),
     "no triangles": (lambda: shell(triangles=np.zeros((0, 3), int)), "'odd'", "(0, 3)", "one at least"),
@@ -40,13 +40,13 @@ refuse("shells", {
     "vertex that is not": (lambda: shell(triangles=[[0, 1, 2], [0, 2, 4]]), "'odd'", "triangle 1", "0 to 3"),
     "vertex before the first": (lambda: shell(triangles=[[0, 1, 2], [0, 2, -1]]), "'odd'", "triangle 1", "0 to 3"),
     "vertex twice": (lambda: shell(triangles=[[0, 1, 2], [0, 2, 2]]), "'odd'", "triangle 1", "twice"),
-    "degenerate": (lambda: shell(_moved(1, (0.5, 0.5, 0.0))), "'odd'", "triangle 0", "on a line"),
+    "degenerate": (lambda: shell(_square_with(1, (0.5, 0.5, 0.0))), "'odd'", "triangle 0", "on a line"),
     "unused vertex": (lambda: shell(triangles=[[0, 1, 2]]), "'odd'", "vertex 3", "no triangle"),
     "turned neighbour": (lambda: shell(triangles=[[0, 1, 2], [2, 0, 3]]), "'odd'", "triangles 0 and 1", "direction"),
     "three at an edge": (
         lambda: shell(np.vstack([SQUARE, [[0.5, 0.5, 1.0]]]), [[0, 1, 2], [0, 2, 3], [0, 2, 4]]), "'odd'", "3 triangles"),
     "back to back": (lambda: shell(triangles=[[0, 1, 2], [0, 2, 3], [0, 3, 2]]), "'odd'"),
-    "folded back": (lambda: shell(_moved(3, (1.0, 0.1, 0.0))), "'odd'", "fold back", "move a vertex"),
+    "folded back": (lambda: shell(_square_with(3, (1.0, 0.1, 0.0))), "'odd'", "fold back", "move a vertex"),
     "no material": (lambda: shell(material=None), "'odd'", "material", "Material(...)"),
     "bending unknown": (lambda: shell(bending="stiff"), "'odd'", "'stiff'", "'midedge_dof'", "'hinge'"),
     "bending false": (lambda: shell(bending=False), "'odd'", "bending", "'hinge'"),
@@ -57,7 +57,7 @@ refuse("shells", {
     "rest a number": (lambda: shell(rest=5), "'odd'", "rest", "two arrays"),
     "rest of wrong shape": (lambda: shell(rest=(np.ones((3, 3)), np.zeros((2, 3)))), "'odd'", "(3, 3)", "(2, 3)"),
     "rest without area": (lambda: shell(rest=(np.ones((2, 3)), np.zeros((2, 3)))), "'odd'", "triangle 0", "no area"),
-    "isometric and curved": (lambda: shell(_moved(2, (1.0, 1.0, 0.5)), bending="isometric"), "flat rest shape", "hinge"),
+    "isometric and curved": (lambda: shell(_square_with(2, (1.0, 1.0, 0.5)), bending="isometric"), "flat rest shape", "hinge"),
     "isometric and clamped": (
         lambda: built(sheet(bending="isometric"), lambda s: s.clamp_boundary(0, [0, 1])), "isometric", "no clamped"),
     "in the plane": (lambda: built(sheet(scene=ddg.Scene(dimension=2))), "dimension 3"),
@@ -123,8 +123,8 @@ refuse("shells", {name: (lambda a=add: built(sheet(), a), *words) for name, (add
 
 
 # --- joints and attachments ---
-def both() -> ddg.Scene:
-    """The rods, and the sheet."""
+def rods_and_sheet() -> ddg.Scene:
+    """Return a scene with the rods and the sheet."""
     return sheet(scene=rods())
 
 
@@ -142,15 +142,15 @@ refuse("joints", {
     "rigid no": (lambda: rods().join([(0, 0), (1, 0)], rigid="no"), "rigid", "True or False"),
     "apart": (lambda: built(rods(), lambda s: s.join([(0, 0), (1, -1)])), "joint 0", "apart at rest"),
     "rigid without twist": (lambda: built(rods(twist=False), lambda s: s.join([(0, 0), (1, 0)])), "rod 1", "rigid=False"),
-    "attach no rod": (lambda: both().attach(2, [0], 0, [0]), "rod 2", "2 rods"),
-    "attach rods": (lambda: both().attach([0, 1], [0], 0, [0]), "attach: rod", "one whole number"),
-    "attach no node": (lambda: both().attach(1, [5], 0, [0]), "node 5", "rod 1"),
-    "attach no shell": (lambda: both().attach(1, [0], 1, [0]), "shell 1", "1 shells"),
-    "attach no vertex": (lambda: both().attach(1, [0], 0, [16]), "vertex 16", "16 vertices"),
-    "attach others": (lambda: both().attach(1, [0, 1], 0, [0]), "2 nodes", "1 vertices", "as many"),
-    "attach nothing": (lambda: both().attach(1, [], 0, []), "nothing is chosen"),
-    "attach spin": (lambda: both().attach(1, [0], 0, [0], spin="stuck"), "attach: spin", "'stuck'", "'glued' or 'free'"),
-    "attach apart": (lambda: built(both(), lambda s: s.attach(1, [0], 0, [5])), "node 0 of rod 1", "vertex 5", "apart"),
+    "attach no rod": (lambda: rods_and_sheet().attach(2, [0], 0, [0]), "rod 2", "2 rods"),
+    "attach rods": (lambda: rods_and_sheet().attach([0, 1], [0], 0, [0]), "attach: rod", "one whole number"),
+    "attach no node": (lambda: rods_and_sheet().attach(1, [5], 0, [0]), "node 5", "rod 1"),
+    "attach no shell": (lambda: rods_and_sheet().attach(1, [0], 1, [0]), "shell 1", "1 shells"),
+    "attach no vertex": (lambda: rods_and_sheet().attach(1, [0], 0, [16]), "vertex 16", "16 vertices"),
+    "attach others": (lambda: rods_and_sheet().attach(1, [0, 1], 0, [0]), "2 nodes", "1 vertices", "as many"),
+    "attach nothing": (lambda: rods_and_sheet().attach(1, [], 0, []), "nothing is chosen"),
+    "attach spin": (lambda: rods_and_sheet().attach(1, [0], 0, [0], spin="stuck"), "attach: spin", "'stuck'", "'glued' or 'free'"),
+    "attach apart": (lambda: built(rods_and_sheet(), lambda s: s.attach(1, [0], 0, [5])), "node 0 of rod 1", "vertex 5", "apart"),
 })
 
 # --- meridians ---
@@ -159,17 +159,17 @@ each("meridians", "points", [np.zeros((5, 3)), np.zeros((2, 2)), "round", [[0.0,
 each("meridians", "thickness", [0.0, -1.0, NAN, [0.1, 0.1], "thin"], lambda v: dome(thickness=v), "'dome'", "thickness")
 
 
-def _bent(node, value):
+def _dome_with(node, value):
     points = DOME.copy()
     points[node] = value
     return points
 
 
 refuse("meridians", {
-    "not finite": (lambda: dome(_bent(2, NAN)), "'dome'", "node 2", "non-finite"),
-    "negative radius": (lambda: dome(_bent(2, (-0.1, 1.0))), "'dome'", "node 2", "negative radius"),
-    "on the axis": (lambda: dome(_bent(2, (0.0, 0.5))), "'dome'", "node 2", "on the axis"),
-    "no length": (lambda: dome(_bent(3, DOME[2])), "'dome'", "edge 2", "no length"),
+    "not finite": (lambda: dome(_dome_with(2, NAN)), "'dome'", "node 2", "non-finite"),
+    "negative radius": (lambda: dome(_dome_with(2, (-0.1, 1.0))), "'dome'", "node 2", "negative radius"),
+    "on the axis": (lambda: dome(_dome_with(2, (0.0, 0.5))), "'dome'", "node 2", "on the axis"),
+    "no length": (lambda: dome(_dome_with(3, DOME[2])), "'dome'", "edge 2", "no length"),
     "material": (lambda: dome(material=1e7), "'dome'", "material"),
     "rest unknown": (lambda: built(dome(rest="round")), "'round'", "'flat'"),
     "rest shape": (lambda: built(dome(rest=(np.ones((3, 2)), np.zeros((6, 2))))), "'dome'", "rest"),

@@ -1,4 +1,4 @@
-"""Bad sizes: numbers whose products overflow or underflow, steps and ranges far from what is simulated, starts without room."""
+"""Bad sizes: products that overflow or underflow, steps and ranges far from the scale, overlapping starts."""
 
 # fmt: off
 import numpy as np
@@ -7,9 +7,9 @@ from bad_inputs import (
     DOME,
     RUBBER,
     built,
+    clamped,
     dome,
     each,
-    held_rods,
     integrator,
     line,
     model,
@@ -69,10 +69,10 @@ each("sizes: sections", "natural curvature", [1e200, 1e-200],
      lambda v: built(rods(natural=(v, 0.0, 0.0))), "rod 1 ('odd')", "natural", *OUTSIDE)
 
 # --- loads, drag, magnets, scenes ---
-sizes("sizes: loads", "force", lambda v: held_rods().add_force(0, -1, (0.0, v, 0.0)), words=("add_force: force", *OUTSIDE))
-sizes("sizes: loads", "moment", lambda v: held_rods().add_twisting_moment(0, -1, v), words=("moment", *OUTSIDE))
-sizes("sizes: loads", "couple", lambda v: held_rods().add_couple(0, -1, (0.0, v, 0.0)), words=("couple", *OUTSIDE))
-sizes("sizes: loads", "mass", lambda v: held_rods().add_mass(0, -1, v), words=("mass", *OUTSIDE))
+sizes("sizes: loads", "force", lambda v: clamped().add_force(0, -1, (0.0, v, 0.0)), words=("add_force: force", *OUTSIDE))
+sizes("sizes: loads", "moment", lambda v: clamped().add_twisting_moment(0, -1, v), words=("moment", *OUTSIDE))
+sizes("sizes: loads", "couple", lambda v: clamped().add_couple(0, -1, (0.0, v, 0.0)), words=("couple", *OUTSIDE))
+sizes("sizes: loads", "mass", lambda v: clamped().add_mass(0, -1, v), words=("mass", *OUTSIDE))
 sizes("sizes: loads", "pressure", lambda v: sheet().add_pressure(0, v), words=("pressure", *OUTSIDE))
 sizes("sizes: loads", "gravity", lambda v: ddg.Scene(gravity=(0.0, 0.0, v)), words=("gravity", *OUTSIDE))
 sizes("sizes: loads", "mass_damping", lambda v: ddg.Scene(mass_damping=v), words=("mass_damping", *OUTSIDE))
@@ -81,7 +81,7 @@ sizes("sizes: loads", "drag of nodes", lambda v: rods().drag(0, nodes=v), words=
 sizes("sizes: loads", "viscosity of a fluid", ddg.Viscous, words=("Viscous: viscosity", *OUTSIDE))
 sizes("sizes: loads", "radius in a fluid", lambda v: ddg.Viscous(1.0, radius=v), words=("Viscous: radius", *OUTSIDE))
 sizes("sizes: loads", "field", lambda v: rods().magnetic_field((0.0, 0.0, v)), words=("magnetic_field: value", *OUTSIDE))
-sizes("sizes: loads", "amplitude", lambda v: held_rods().add_force(0, -1, (0.0, 0.0, 1.0), lambda t: v), (1e300, 1e100),
+sizes("sizes: loads", "amplitude", lambda v: clamped().add_force(0, -1, (0.0, 0.0, 1.0), lambda t: v), (1e300, 1e100),
       ("amplitude", "too large", "correct the function"))
 sizes("sizes: loads", "translation", lambda v: ddg.Motion(lambda t: (0.0, v, 0.0)), (1e300, 1e100), ("translation", "too large"))
 
@@ -112,8 +112,8 @@ sizes("sizes: equilibria", "load of a spectrum", lambda v: stability.spectrum(mo
 
 
 # --- contact ---
-def crossed(gap: float = 0.02, radius: float = 0.01, **options) -> ddg.Scene:
-    """Two rods across each other, a gap apart, 'low' and 'high'; the first is clamped."""
+def crossed_rods(gap: float = 0.02, radius: float = 0.01, **options) -> ddg.Scene:
+    """Return two crossed rods a gap apart, 'low' and 'high'; the first is clamped."""
     scene = ddg.Scene()
     for name, axis, z in (("low", 0, 0.0), ("high", 1, 2.0 * radius + gap)):
         points = np.zeros((5, 3))
@@ -124,8 +124,8 @@ def crossed(gap: float = 0.02, radius: float = 0.01, **options) -> ddg.Scene:
     return scene
 
 
-def stepped(scene: ddg.Scene, steps: int = 1):
-    """Some steps of a scene."""
+def step(scene: ddg.Scene, steps: int = 1):
+    """Return the state after some steps of a scene."""
     made = scene.build(DEVICE, "float64")
     state, steps_of = made.state(), ddg.Integrator(made, retry_limit=2)
     for _ in range(steps):
@@ -133,13 +133,13 @@ def stepped(scene: ddg.Scene, steps: int = 1):
     return state
 
 
-def driven(held: str = "rods", law: str = "barrier") -> ddg.Scene:
-    """All is held, and a motion drives it through what is held, too."""
-    scene = crossed(law=law)
+def driven_through(obstacle: str = "rods", law: str = "barrier") -> ddg.Scene:
+    """Return fully constrained rods with a prescribed motion through each other, or an obstacle through them."""
+    scene = crossed_rods(law=law)
     scene.clamp(0, slice(None))
     down = ddg.Motion(lambda t: (0.0, 0.0, -2.0 * t))
-    scene.clamp(1, slice(None), motion=down if held == "rods" else None)
-    if held == "plane":
+    scene.clamp(1, slice(None), motion=down if obstacle == "rods" else None)
+    if obstacle == "plane":
         scene.add_obstacle(ddg.Plane((0.0, 0.0, -0.02)), motion=ddg.Motion(lambda t: (0.0, 0.0, 4.0 * t)), name="floor")
     return scene
 
@@ -152,30 +152,30 @@ for name in ("range", "stiffness", "velocity"):
     sizes("sizes: contact", name, rub, words=(f"contact: {name}", *OUTSIDE))
 sizes("sizes: contact", "radius", lambda v: rods().contact(radius={"odd": v}), words=("contact: radius of 'odd'", *OUTSIDE))
 sizes("sizes: contact", "apart", lambda v: rods().contact(apart=v), words=("contact: apart", *OUTSIDE))
-each("sizes: contact", "range beyond the scene", [1e60, 1e10, 1e3], lambda v: built(crossed(range=v)),
+each("sizes: contact", "range beyond the scene", [1e60, 1e10, 1e3], lambda v: built(crossed_rods(range=v)),
      "range between 'high' and 'high'", "far beyond the size of the scene", "half of the smallest radius")
-each("sizes: contact", "range that is lost", [1e-60, 1e-20, 1e-14], lambda v: built(crossed(range=v)),
+each("sizes: contact", "range that is lost", [1e-60, 1e-20, 1e-14], lambda v: built(crossed_rods(range=v)),
      "range between 'high' and 'high'", "lost in positions")
-each("sizes: contact", "gap that is too small", [1e-8, 1e-12, 1e-15], lambda v: stepped(crossed(v)),
+each("sizes: contact", "gap that is too small", [1e-8, 1e-12, 1e-15], lambda v: step(crossed_rods(v)),
      "edge", "of rod 0", "of rod 1", "too close for a barrier", "pushed_apart")
-each("sizes: contact", "gap that is too small for an equilibrium", [1e-12], lambda v: statics.solve(built(crossed(v))),
+each("sizes: contact", "gap that is too small for an equilibrium", [1e-12], lambda v: statics.solve(built(crossed_rods(v))),
      "of rod 0", "of rod 1", "too close for a barrier", "pushed_apart")
 refuse("sizes: steps", {"dt of too many digits": (lambda: integrator().step(model().state(), 10**5000), "dt is", "positive")})
 refuse("sizes: contact", {
-    "no gap": (lambda: stepped(crossed(0.0)), "of rod 0", "of rod 1", "touch at the start", "pushed_apart"),
+    "no gap": (lambda: step(crossed_rods(0.0)), "of rod 0", "of rod 1", "touch at the start", "pushed_apart"),
     "no radius": (lambda: built(rods(section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, radius=0.0), name="thin"),
                                 lambda s: s.contact()), "rod 1 ('thin')", "radius", "positive"),
-    "held through held": (lambda: stepped(driven(), 2), "both held", "motion of support 2 (clamp)", "change that motion"),
-    "held through held, penalty": (lambda: stepped(driven(law="penalty"), 4), "both held", "motion of support 2 (clamp)"),
-    "a plane through what is held": (lambda: stepped(driven("plane"), 2), "both held", "motion of obstacle 'floor'"),
-    "held through held in an equilibrium": (lambda: statics.solve(built(driven()), max_cuts=1),
+    "held through held": (lambda: step(driven_through(), 2), "both held", "motion of support 2 (clamp)", "change that motion"),
+    "held through held, penalty": (lambda: step(driven_through(law="penalty"), 4), "both held", "motion of support 2 (clamp)"),
+    "a plane through what is held": (lambda: step(driven_through("plane"), 2), "both held", "motion of obstacle 'floor'"),
+    "held through held in an equilibrium": (lambda: statics.solve(built(driven_through()), max_cuts=1),
                                             "in_the_way", "both held", "support 2 (clamp)"),
 })
 
 
 # --- float32 ---
-def small(length: float, shell: bool = False) -> ddg.Scene:
-    """A rod or a sheet of a size."""
+def scaled(length: float, shell: bool = False) -> ddg.Scene:
+    """Return a rod or a sheet of a given size."""
     scene = ddg.Scene()
     if shell:
         scene.add_shell(meshes.rectangle(2, 2)[0] * length, meshes.rectangle(2, 2)[1], thickness=0.01 * length, material=RUBBER)
@@ -185,9 +185,9 @@ def small(length: float, shell: bool = False) -> ddg.Scene:
     return scene
 
 
-each("sizes: float32", "rod", [1e-12, 1e-11, 1e11], lambda v: small(v).build(DEVICE, "float32"),
+each("sizes: float32", "rod", [1e-12, 1e-11, 1e11], lambda v: scaled(v).build(DEVICE, "float32"),
      "float32", "stiffness", "mixed", "units")
-each("sizes: float32", "sheet", [1e-12, 1e-11, 1e13], lambda v: small(v, True).build(DEVICE, "float32"), "float32", "shell", "mixed")
+each("sizes: float32", "sheet", [1e-12, 1e-11, 1e13], lambda v: scaled(v, True).build(DEVICE, "float32"), "float32", "shell", "mixed")
 refuse("sizes: float32", {
     "stiffness": (lambda: rods(section=ddg.Stiffness(EA=1.0, EI1=1e-44, GJ=1.0)).build(DEVICE, "float32"),
                   "float32", "1e-44", "mixed"),

@@ -1,4 +1,7 @@
-"""Bad inputs as data: what is done, and words that the refusal holds. `python tests/contracts/bad_inputs.py` counts them."""
+"""Bad inputs as data: actions, and words of their refusals.
+
+`python tests/contracts/bad_inputs.py` counts them.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ TUBE = np.column_stack([np.ones(6), np.linspace(0.0, 1.0, 6)])
 
 @dataclass(frozen=True)
 class Case:
-    """Something that must be refused: `action()` raises, and the message holds the words."""
+    """Action that must be refused: `action()` raises an error with the words in its message."""
 
     group: str
     name: str
@@ -53,7 +56,7 @@ def each(group: str, name: str, values, action, *words: str) -> None:
 
 
 def line(nodes: int = 5, **moved) -> np.ndarray:
-    """A straight rod along x; `n3=(1, 2, 3)` moves node 3."""
+    """Return a straight rod along x; `n3=(1, 2, 3)` moves node 3."""
     points = np.zeros((nodes, 3))
     points[:, 0] = np.linspace(0.0, 1.0, nodes)
     for name, value in moved.items():
@@ -62,7 +65,7 @@ def line(nodes: int = 5, **moved) -> np.ndarray:
 
 
 def rods(points=None, scene: ddg.Scene | None = None, **options) -> ddg.Scene:
-    """A good rod 0 of 7 nodes, and rod 1, called 'odd', of 5 unless given otherwise."""
+    """Add a valid rod 0 of 7 nodes, and rod 1, 'odd', by default of 5."""
     scene = scene or ddg.Scene()
     scene.add_rod(line(7), section=STIFFNESS)
     scene.add_rod(line() if points is None else points, **({"section": STIFFNESS, "name": "odd"} | options))
@@ -70,7 +73,7 @@ def rods(points=None, scene: ddg.Scene | None = None, **options) -> ddg.Scene:
 
 
 def sheet(cells: int = 3, scene: ddg.Scene | None = None, **options) -> ddg.Scene:
-    """A square sheet, shell 0, of (cells + 1)^2 vertices: (i, j) is i + (cells + 1) j."""
+    """Add a square sheet, shell 0, of (cells + 1)^2 vertices: (i, j) is i + (cells + 1) j."""
     scene = scene or ddg.Scene()
     settings = {"thickness": 0.01, "material": RUBBER, "name": "sheet"} | options
     scene.add_shell(*meshes.rectangle(cells, cells), **settings)
@@ -78,14 +81,14 @@ def sheet(cells: int = 3, scene: ddg.Scene | None = None, **options) -> ddg.Scen
 
 
 def dome(points=DOME, **options) -> ddg.Scene:
-    """A shell of revolution, 0, of 6 nodes, the first at the pole."""
+    """Return a scene with a shell of revolution of 6 nodes, the first at the pole."""
     scene = ddg.Scene()
     scene.add_axisymmetric_shell(points, **({"thickness": 0.01, "material": RUBBER, "name": "dome"} | options))
     return scene
 
 
-def held_rods() -> ddg.Scene:
-    """`rods` with both clamped at their first edge."""
+def clamped() -> ddg.Scene:
+    """Return `rods`, each clamped at the first edge."""
     scene = rods()
     scene.clamp([0, 1])
     return scene
@@ -93,11 +96,11 @@ def held_rods() -> ddg.Scene:
 
 @cache
 def model(kind: str = "rods", worlds: int = 1):
-    """A good model, made once: of "rods", "sheet" (held, with hinges) or "net" (two rods joined)."""
+    """Return a valid model, built once: rods, rods joined (`net`), or a clamped sheet of a bending model."""
     if kind == "rods":
-        scene = held_rods()
+        scene = clamped()
     elif kind == "net":
-        scene = held_rods()
+        scene = clamped()
         scene.join([(0, 0), (1, 0)])
     else:
         scene = sheet(2, bending=kind)
@@ -107,26 +110,26 @@ def model(kind: str = "rods", worlds: int = 1):
 
 @cache
 def integrator(kind: str = "rods"):
-    """An integrator of a good model, made once."""
+    """Return an integrator of a valid model, made once."""
     return ddg.Integrator(model(kind))
 
 
 def built(scene: ddg.Scene, *changes: Callable[[ddg.Scene], object]):
-    """Do something to a scene, and build it."""
+    """Apply changes to a scene, and build the model."""
     for change in changes:
         change(scene)
     return scene.build(DEVICE, "float64")
 
 
 def is_bare(error: Exception) -> bool:
-    """Return True of an error of Python's, NumPy's or another library's, which names no object."""
+    """Return True if an error of Python, NumPy or another library names no object."""
     raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
     packaged = type(error).__module__.startswith("ddg_warp") or Path(ddg.__file__).parent in raised_in.parents
     return not (isinstance(error, ValueError | SolverError) and packaged)
 
 
 def verdict(case: Case) -> str:
-    """Return what became of a case: "refused", "silent", "bare", or "unclear" where words are missing."""
+    """Return the outcome of a case: "refused", "silent", "bare", or "unclear" where words are missing."""
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -139,16 +142,16 @@ def verdict(case: Case) -> str:
 
 
 def counts() -> Counter:
-    """Number of cases by group, of all modules."""
+    """Return the number of cases by group, of all modules."""
     for path in sorted(Path(__file__).parent.glob("bad_input_*.py")):
         import_module(path.stem)
     return Counter(case.group for case in import_module("bad_inputs").CASES)
 
 
 if __name__ == "__main__":
-    found, cases = counts(), import_module("bad_inputs").CASES
-    print("\n".join(f"{number:4}  {group}" for group, number in found.items()))
-    print(f"{sum(found.values()):4}  in all")
+    by_group, cases = counts(), import_module("bad_inputs").CASES
+    print("\n".join(f"{number:4}  {group}" for group, number in by_group.items()))
+    print(f"{sum(by_group.values()):4}  in all")
     verdicts = {str(case): verdict(case) for case in cases}
     for name, said in verdicts.items():
         if said != "refused":

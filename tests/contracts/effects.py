@@ -1,7 +1,7 @@
-"""Arguments of public calls as data: for each one a value that changes what is observed, or that is refused.
+"""Arguments of public calls as data: for each one a value that changes the observation, or that is refused.
 
-A `Call` runs with keyword arguments and returns what is observed; its rows are argument -> changed value. `test_effect` runs every
-argument that a signature lists, so that a new argument needs a row.
+A `Call` runs with keyword arguments and returns an observation; its rows are argument -> changed value. `test_effect` runs every
+argument of a signature, so that a new argument needs a row.
 """
 
 from __future__ import annotations
@@ -21,16 +21,18 @@ from ddg_warp.run.simulate import simulate
 DEVICE, DT = "cpu", 1e-2
 RUBBER = ddg.Material(1e6, 0.3, 1000.0)
 MAGNET = ddg.Stiffness(EA=1e3, EI1=0.1, GJ=0.1, mass_per_length=0.1, rotary_inertia=1e-3, radius=0.01, area=1e-4)
-NOTHING = object()  # in place of an argument: it is left out
+NOTHING = object()  # value of an omitted argument
 
 
 @dataclass(frozen=True)
 class Change:
-    """A changed value of an argument, beside which other arguments have other values, before and after.
+    """Changed value of an argument, with values of other arguments before and after the change.
 
     Attributes:
-        value: of the argument; beside: others, both times; before: of the argument itself before the change.
-        refused: whether the call with `value` has to be refused, and not to be observed.
+        `value`: changed value of the argument.
+        `beside`: other arguments, equal before and after.
+        `before`: value of the argument before the change.
+        `refused`: the call with `value` must be refused.
     """
 
     value: object
@@ -41,11 +43,13 @@ class Change:
 
 @dataclass(frozen=True)
 class Call:
-    """A public call: `run(**arguments)` returns what is observed.
+    """Public call: `run(**arguments)` returns an observation.
 
     Attributes:
-        of: whose signature lists the arguments; kinds: dataclasses whose fields it takes, too.
-        base: arguments that it is given; subjects: those that are no options, but what it is about.
+        of: callable with the signature.
+        kinds: dataclasses with fields accepted as arguments, too.
+        base: default arguments.
+        subjects: arguments that are no options.
         rows: argument -> changed value, or `Change`.
     """
 
@@ -69,10 +73,10 @@ CALLS: dict[str, Call] = {}
 
 
 def observed(call: Call, arguments: dict):
-    """What a call shows, to be compared; a refusal shows its message."""
-    given = {name: value for name, value in arguments.items() if value is not NOTHING}
+    """Return the observation of a call in comparable form; a refusal yields the message."""
+    named = {name: value for name, value in arguments.items() if value is not NOTHING}
     try:
-        return "seen", _comparable(call.run(**given))
+        return "seen", _comparable(call.run(**named))
     except (ValueError, SolverError) as error:
         return "refused", str(error)
 
@@ -81,13 +85,13 @@ def _comparable(value):
     if isinstance(value, np.ndarray):
         return value.shape, value.tolist()
     if isinstance(value, dict):
-        return {str(name): _comparable(part) for name, part in value.items()}
-    return [_comparable(part) for part in value] if isinstance(value, list | tuple) else value
+        return {str(name): _comparable(item) for name, item in value.items()}
+    return [_comparable(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-# --- what is looked at ---
-def at_state(state) -> list:
-    """What a state shows."""
+# --- observations ---
+def observe_state(state) -> list:
+    """Return the observable quantities of a state."""
     model = state.model
     names = [] if model.surfaces is None else model.surfaces.names.tolist()
     reactions = [(reaction.force, reaction.moment) for reaction in model.reactions(state)]
@@ -102,13 +106,13 @@ def at_state(state) -> list:
     ]
 
 
-def stepped(scene: ddg.Scene, steps: int = 1, **options) -> list:
-    """What a scene shows after some steps."""
+def observe_steps(scene: ddg.Scene, steps: int = 1, **options) -> list:
+    """Return the observation of a scene after some steps."""
     model = scene.build(DEVICE, "float64")
     integrator, state = ddg.Integrator(model, **options), model.state()
     for _ in range(steps):
         state = integrator.step(state, DT)
-    return [*at_state(state), state.obstacle_points()]
+    return [*observe_state(state), state.obstacle_points()]
 
 
 def scene_call(
@@ -116,22 +120,22 @@ def scene_call(
 ) -> None:
     """Add a method of `Scene`, called between `before(scene)` and `after(scene)`."""
 
-    def run(**given):
+    def run(**named):
         scene = ddg.Scene()
         before(scene)
-        getattr(scene, name)(**given)
+        getattr(scene, name)(**named)
         if after is not None:
             after(scene)
-        return stepped(scene, steps)
+        return observe_steps(scene, steps)
 
     CALLS[name] = Call(getattr(ddg.Scene, name), run, base, rows)
 
 
 # --- rods ---
-def line(nodes: int = 6, at: float = 0.0) -> np.ndarray:
-    """A straight rod along x, at a place along y."""
+def line(nodes: int = 6, y: float = 0.0) -> np.ndarray:
+    """Return a straight rod along x, at a given y."""
     points = np.zeros((nodes, 3))
-    points[:, 0], points[:, 1] = np.linspace(0.0, 0.5, nodes), at
+    points[:, 0], points[:, 1] = np.linspace(0.0, 0.5, nodes), y
     return points
 
 
@@ -158,7 +162,7 @@ scene_call("add_rod", BASE, ROD | {"director": Change((0.0, 1.0, 0.3), {"section
 
 
 def _wrapped(change):
-    """A row of `add_rod` as one of `add_rods`."""
+    """Return a row of `add_rod` as a row of `add_rods`."""
     if isinstance(change, Change) and "points" in change.beside:
         return Change(change.value, change.beside | {"points": [change.beside["points"]]})
     return change
@@ -168,28 +172,30 @@ scene_call("add_rods", BASE | {"points": [ARC]}, {name: _wrapped(change) for nam
     "points": [ARC, ARC + [0.0, 1.0, 0.0]]}, lambda s: None, lambda s: s.clamp(0))  # fmt: skip
 
 
-def two(scene: ddg.Scene) -> None:
-    """Two curved rods with sections that are not round."""
+def two_rods(scene: ddg.Scene) -> None:
+    """Add two curved rods with rectangular sections."""
     scene.add_rods([ARC, ARC + [0.0, 0.5, 0.0]], section=ddg.Rectangle(0.03, 0.02), material=RUBBER)
 
 
-def held(scene: ddg.Scene) -> None:
-    """The same, clamped."""
-    two(scene)
+def two_clamped_rods(scene: ddg.Scene) -> None:
+    """Add two curved rods, clamped."""
+    two_rods(scene)
     scene.clamp([0, 1])
 
 
 LIFT = ddg.Motion(lambda t: (0.0, 0.0, t), lambda t: t)
-scene_call("clamp", {"rods": 0}, {"rods": [0, 1], "edges": [1], "motion": LIFT}, two)
+scene_call("clamp", {"rods": 0}, {"rods": [0, 1], "edges": [1], "motion": LIFT}, two_rods)
 scene_call("clamp_end", {"rods": 0}, {
     "rods": [0, 1], "end": "last", "motion": LIFT, "components": "yz", "tangent": (1.0, 0.1, 0.0), "director": (0.0, 1.0, 0.5)},
-    two)  # fmt: skip
-scene_call("fix", {"rods": 0, "nodes": [0]}, {"rods": [0, 1], "nodes": [1], "components": "xy", "motion": LIFT}, two)
+    two_rods)  # fmt: skip
+scene_call(
+    "fix", {"rods": 0, "nodes": [0]}, {"rods": [0, 1], "nodes": [1], "components": "xy", "motion": LIFT}, two_rods
+)
 scene_call(
     "fix_twist",
     {"rods": 0, "edges": [2]},
     {"rods": [0, 1], "edges": [3], "motion": ddg.Motion(angle=lambda t: 9.0 * t)},
-    held,
+    two_clamped_rods,
 )
 
 
@@ -198,15 +204,22 @@ def _half(t: float) -> float:
 
 
 LOADS = {"rods": [0, 1], "amplitude": _half}
-scene_call("add_force", {"rods": 0, "node": -1, "force": (0, 0, 1)}, LOADS | {"node": 3, "force": (0, 1, 0)}, held)
-scene_call("add_twisting_moment", {"rods": 0, "edge": -1, "moment": 0.1}, LOADS | {"edge": 2, "moment": 0.2}, held)
 scene_call(
-    "add_couple", {"rods": 0, "edge": -1, "couple": (0, 0.1, 0)}, LOADS | {"edge": 2, "couple": (0, 0, 0.1)}, held
+    "add_force", {"rods": 0, "node": -1, "force": (0, 0, 1)}, LOADS | {"node": 3, "force": (0, 1, 0)}, two_clamped_rods
 )
-scene_call("add_mass", {"rods": 0, "node": -1, "mass": 0.1}, {"rods": [0, 1], "node": 3, "mass": 0.2}, held)
+scene_call(
+    "add_twisting_moment", {"rods": 0, "edge": -1, "moment": 0.1}, LOADS | {"edge": 2, "moment": 0.2}, two_clamped_rods
+)
+scene_call(
+    "add_couple",
+    {"rods": 0, "edge": -1, "couple": (0, 0.1, 0)},
+    LOADS | {"edge": 2, "couple": (0, 0, 0.1)},
+    two_clamped_rods,
+)
+scene_call("add_mass", {"rods": 0, "node": -1, "mass": 0.1}, {"rods": [0, 1], "node": 3, "mass": 0.2}, two_clamped_rods)
 scene_call("drag", {"rods": 0, "tangential": 1.0, "normal": 2.0}, {
     "rods": [0, 1], "law": Change(ddg.Viscous(1.0), {"tangential": NOTHING, "normal": NOTHING}, ddg.Viscous(2.0)),
-    "tangential": 2.0, "normal": 1.0, "rotational": 1.0, "nodes": 1.0}, held,
+    "tangential": 2.0, "normal": 1.0, "rotational": 1.0, "nodes": 1.0}, two_clamped_rods,
     lambda s: s.add_twisting_moment(0, -1, 0.1))  # fmt: skip
 scene_call("join", {"members": [(0, -1), (1, 0)]}, {"members": [(0, 0), (1, 0)], "rigid": False},
            lambda s: (s.add_rods([ARC, ARC[[-1]] + ARC], section=ddg.Circle(0.02), material=RUBBER),
@@ -215,91 +228,91 @@ CALLS["join"].rows["members"] = [(0, 0), (2, 0)]
 
 
 # --- sections, materials, laws, drag ---
-def of_section(section, material=RUBBER, **scene) -> list:
-    """What a rod of a section shows after some steps under a twisting moment and in a fluid."""
+def observe_section(section, material=RUBBER, **scene) -> list:
+    """Observe a rod of a section under a twisting moment."""
     made = ddg.Scene(**scene)
     made.add_rod(ARC, section=section, material=None if isinstance(section, ddg.Stiffness) else material)
     made.clamp(0)
     made.add_twisting_moment(0, -1, 0.05)
-    return stepped(made)
+    return observe_steps(made)
 
 
 def section_call(kind: type, base: dict, rows: dict) -> None:
     """Add a section."""
-    CALLS[kind.__name__] = Call(kind, lambda **given: of_section(kind(**given)), base, rows)
+    CALLS[kind.__name__] = Call(kind, lambda **named: observe_section(kind(**named)), base, rows)
 
 
 section_call(ddg.Circle, {"radius": 0.02}, {"radius": 0.03})
 section_call(ddg.Ellipse, {"a": 0.02, "b": 0.03}, {"a": 0.025, "b": 0.025})
 section_call(ddg.Rectangle, {"width": 0.02, "height": 0.03}, {"width": 0.025, "height": 0.025})
 section_call(ddg.Ribbon, {"width": 0.1, "thickness": 0.01}, {"width": 0.12, "thickness": 0.012, "law": "sano_wada"})
-CALLS["Material"] = Call(ddg.Material, lambda **given: of_section(ddg.Circle(0.02), ddg.Material(**given)), {"young": 1e6}, {
+CALLS["Material"] = Call(ddg.Material, lambda **named: observe_section(ddg.Circle(0.02), ddg.Material(**named)), {"young": 1e6}, {
     "young": 2e6, "poisson": 0.3, "density": 500.0, "viscosity": 0.1})  # fmt: skip
 WIRE = {"EA": 1e3, "EI1": 0.1, "GJ": 0.1, "mass_per_length": 0.1, "rotary_inertia": 1e-3, "radius": 0.01, "area": 1e-4}
 
 
-def of_stiffness(**given) -> list:
-    """What a magnetised rod of a stiffness shows in a viscous fluid."""
+def observe_stiffness(**named) -> list:
+    """Observe a magnetised rod of a stiffness in a viscous fluid."""
     scene = ddg.Scene()
-    scene.add_rod(ARC, section=ddg.Stiffness(**given))
+    scene.add_rod(ARC, section=ddg.Stiffness(**named))
     scene.clamp(0)
     scene.magnetize(0, 1e5)
     scene.magnetic_field((0.0, 0.0, 1e-2))
     scene.drag(0, ddg.Viscous(1.0))
     scene.add_twisting_moment(0, -1, 0.05)
-    return stepped(scene)
+    return observe_steps(scene)
 
 
-CALLS["Stiffness"] = Call(ddg.Stiffness, of_stiffness, WIRE, {name: 2.0 * value for name, value in WIRE.items()} | {
+CALLS["Stiffness"] = Call(ddg.Stiffness, observe_stiffness, WIRE, {name: 2.0 * value for name, value in WIRE.items()} | {
     "EI2": 0.2, "viscosity": 0.1})  # fmt: skip
 
 
-def in_fluid(law) -> list:
-    """What a falling rod shows with a law of drag."""
+def observe_drag(law) -> list:
+    """Observe a falling rod with a drag law."""
     scene = ddg.Scene()
     scene.add_rod(ARC, section=ddg.Circle(0.02), material=RUBBER)
     scene.drag(0, law)
-    return stepped(scene)
+    return observe_steps(scene)
 
 
-CALLS["Viscous"] = Call(ddg.Viscous, lambda **given: in_fluid(ddg.Viscous(**given)), {"viscosity": 1.0}, {
+CALLS["Viscous"] = Call(ddg.Viscous, lambda **named: observe_drag(ddg.Viscous(**named)), {"viscosity": 1.0}, {
     "viscosity": 2.0, "theory": Change("gray_hancock", {"scale": 2.0}), "scale": 2.0, "radius": 0.01})  # fmt: skip
 GRANULAR = {"lateral": 10.0, "friction": 5.0}
-CALLS["Granular"] = Call(ddg.Granular, lambda **given: in_fluid(ddg.Granular(**given)), GRANULAR, {
+CALLS["Granular"] = Call(ddg.Granular, lambda **named: observe_drag(ddg.Granular(**named)), GRANULAR, {
     "lateral": 20.0, "friction": 6.0, "leading": 1.0, "angle": 0.5, "speed": 1e-1})  # fmt: skip
 
 
-def with_law(density, stiffness=10.0) -> list:
-    """What a rod shows with a law of stretching."""
+def observe_law(density, stiffness=10.0) -> list:
+    """Observe a rod with a stretching law."""
     scene = ddg.Scene()
     scene.add_rod(
         ARC, section=ddg.Circle(0.02), material=RUBBER, laws={"rod_stretch": ddg.Law(density, stiffness=stiffness)}
     )
     scene.clamp(0)
-    return stepped(scene)
+    return observe_steps(scene)
 
 
-CALLS["Law"] = Call(ddg.Law, with_law, {"density": quadratic}, {"density": Change(3.0, refused=True)})
+CALLS["Law"] = Call(ddg.Law, observe_law, {"density": quadratic}, {"density": Change(3.0, refused=True)})
 
 
 # --- motions ---
-def moved(motion, controls=None) -> list:
-    """What a rod shows whose clamp moves."""
+def observe_motion(motion, controls=None) -> list:
+    """Observe rods with a moving clamp."""
     scene = ddg.Scene()
-    two(scene)
+    two_rods(scene)
     scene.clamp(0, motion=motion)
     model = scene.build(DEVICE, "float64")
     state, integrator = model.state(), ddg.Integrator(model)
     for _ in range(2):
         state = integrator.step(state, DT, controls)
-    return at_state(state)
+    return observe_state(state)
 
 
 TURN = {"angle": lambda t: 9.0 * t}
-CALLS["Motion"] = Call(ddg.Motion, lambda **given: moved(ddg.Motion(**given)), TURN, {
+CALLS["Motion"] = Call(ddg.Motion, lambda **named: observe_motion(ddg.Motion(**named)), TURN, {
     "translation": lambda t: (t, 0, 0), "angle": lambda t: t, "axis": (1, 0, 0), "pivot": (0, 1, 0)})  # fmt: skip
 POSE = ddg.Controls(poses=[[0.1, 0.0, 0.0, 0.0, 0.1, 0.0]])
-CALLS["Grip"] = Call(ddg.Grip, lambda **given: moved(ddg.Grip(**given), POSE), {}, {"pivot": (0, 0, 1)})
+CALLS["Grip"] = Call(ddg.Grip, lambda **named: observe_motion(ddg.Grip(**named), POSE), {}, {"pivot": (0, 0, 1)})
 
 
 # --- shells ---
@@ -309,18 +322,18 @@ TUBE = np.column_stack([np.linspace(1.0, 1.5, 5), np.linspace(0.0, 1.0, 5)])
 
 
 def sheet(scene: ddg.Scene) -> None:
-    """A sheet of 9 vertices; (i, j) is i + 3 j."""
+    """Add a sheet of 9 vertices; (i, j) is i + 3 j."""
     scene.add_shell(**SHEET, thickness=0.05, material=RUBBER)
 
 
-def clamped(scene: ddg.Scene) -> None:
-    """The same, clamped along x."""
+def clamped_sheet(scene: ddg.Scene) -> None:
+    """Add a sheet clamped along x."""
     sheet(scene)
     scene.clamp_boundary(0, [0, 1, 2])
 
 
-def tilted(scene: ddg.Scene) -> None:
-    """Two sheets, one over the other."""
+def two_sheets(scene: ddg.Scene) -> None:
+    """Add two sheets, one above the other."""
     sheet(scene)
     scene.add_shell(SHEET["points"] + [0, 0, 0.3], SHEET["triangles"], thickness=0.05, material=RUBBER)
 
@@ -334,36 +347,36 @@ scene_call(
     "hold",
     {"shell": 0, "vertices": [0, 1, 2]},
     {"shell": 1, "vertices": [0, 2], "components": "z", "motion": LIFT},
-    tilted,
+    two_sheets,
 )
 scene_call("clamp_boundary", {"shell": 0, "vertices": [0, 1, 2]}, {
-    "shell": 1, "vertices": [0, 1], "components": "z", "motion": LIFT}, tilted)  # fmt: skip
+    "shell": 1, "vertices": [0, 1], "components": "z", "motion": LIFT}, two_sheets)  # fmt: skip
 scene_call("symmetry", {"shell": 0, "vertices": [0, 1, 2], "axis": "y"}, {
     "shell": 1, "vertices": [0, 1], "axis": Change("y", {"vertices": [0, 3, 6]}, "x", refused=True),
-    "motion": ddg.Motion(lambda t: (0, t, 0))}, tilted)  # fmt: skip
+    "motion": ddg.Motion(lambda t: (0, t, 0))}, two_sheets)  # fmt: skip
 VERTEX_LOADS = {"shell": 1, "amplitude": _half}
 
 
-def clamped_twice(scene: ddg.Scene) -> None:
-    """Two sheets, both clamped along x."""
-    tilted(scene)
+def two_clamped_sheets(scene: ddg.Scene) -> None:
+    """Add two sheets, both clamped along x."""
+    two_sheets(scene)
     for shell in (0, 1):
         scene.clamp_boundary(shell, [0, 1, 2])
 
 
 scene_call("add_vertex_force", {"shell": 0, "vertices": [7], "force": (0, 0, 1)}, VERTEX_LOADS | {
-    "vertices": [8], "force": (0, 1, 0)}, clamped_twice)  # fmt: skip
+    "vertices": [8], "force": (0, 1, 0)}, two_clamped_sheets)  # fmt: skip
 scene_call("add_edge_force", {"shell": 0, "path": [6, 7], "force": (0, 0, 1)}, VERTEX_LOADS | {
-    "path": [7, 8], "force": (0, 1, 0)}, clamped_twice)  # fmt: skip
+    "path": [7, 8], "force": (0, 1, 0)}, two_clamped_sheets)  # fmt: skip
 scene_call("add_edge_couple", {"shell": 0, "path": [6, 7], "couple": 1.0}, VERTEX_LOADS | {
-    "path": [7, 8], "couple": 2.0}, clamped_twice)  # fmt: skip
+    "path": [7, 8], "couple": 2.0}, two_clamped_sheets)  # fmt: skip
 scene_call("add_pressure", {"shell": 0, "pressure": 10.0}, VERTEX_LOADS | {
-    "pressure": 20.0, "triangles": [0, 1], "dead": Change(True, {"pressure": 1e3})}, clamped_twice, steps=2)  # fmt: skip
+    "pressure": 20.0, "triangles": [0, 1], "dead": Change(True, {"pressure": 1e3})}, two_clamped_sheets, steps=2)  # fmt: skip
 
 
 def stiffened(scene: ddg.Scene) -> None:
-    """Two sheets, and two rods along their edges, one on the first, one on the second sheet's place."""
-    clamped_twice(scene)
+    """Add two clamped sheets, and rods along their edges: two on the first, one on the second."""
+    two_clamped_sheets(scene)
     for height in (0.0, 0.3, 0.0):
         points = SHEET["points"][[6, 7, 8]] + [0, 0, height]
         scene.add_rod(points, section=ddg.Circle(0.02), material=RUBBER)
@@ -375,21 +388,21 @@ scene_call("attach", {"rod": 0, "nodes": [0, 1, 2], "shell": 0, "vertices": [6, 
 
 
 # --- shells of revolution ---
-def tube(scene: ddg.Scene) -> None:
-    """Two shells of revolution with rims."""
+def two_tubes(scene: ddg.Scene) -> None:
+    """Add two shells of revolution with rims."""
     for shift in (0.0, 3.0):
         scene.add_axisymmetric_shell(TUBE + [0, shift], thickness=0.05, material=RUBBER)
 
 
-def held_tube(scene: ddg.Scene) -> None:
-    """The same, clamped at their last rims."""
-    tube(scene)
+def two_clamped_tubes(scene: ddg.Scene) -> None:
+    """Add two shells of revolution, clamped at their last rims."""
+    two_tubes(scene)
     for shell in (0, 1):
         scene.clamp_ring(shell, "last")
 
 
-def domes(scene: ddg.Scene) -> None:
-    """Two with poles at both ends, held at their middles."""
+def two_domes(scene: ddg.Scene) -> None:
+    """Add two closed shells of revolution with a pole at each end, fixed at the equator."""
     for shift in (0.0, 3.0):
         ball = np.column_stack([np.sin(np.linspace(0, np.pi, 7)), shift - np.cos(np.linspace(0, np.pi, 7))])
         ball[[0, -1], 0] = 0.0
@@ -401,53 +414,55 @@ scene_call("add_axisymmetric_shell", {"points": DOME, "thickness": 0.05, "materi
     "points": DOME * 1.1, "thickness": 0.06, "material": ddg.Material(2e6, 0.3), "rest": "flat", "name": "odd"},
     lambda s: None, lambda s: s.hold_ring(0, [4]))  # fmt: skip
 SIDE = ddg.Motion(lambda t: (t, 0, 0))
-scene_call("hold_ring", {"shell": 0, "nodes": [0]}, {"shell": 1, "nodes": [1], "components": "z", "motion": SIDE}, tube)
+scene_call(
+    "hold_ring", {"shell": 0, "nodes": [0]}, {"shell": 1, "nodes": [1], "components": "z", "motion": SIDE}, two_tubes
+)
 scene_call("clamp_ring", {"shell": 0, "end": "first"}, {
-    "shell": 1, "end": "last", "components": "z", "tangent": (0.1, 1.0), "motion": SIDE}, tube)  # fmt: skip
-scene_call("symmetry_ring", {"shell": 0, "end": "first"}, {"shell": 1, "end": "last"}, tube)
+    "shell": 1, "end": "last", "components": "z", "tangent": (0.1, 1.0), "motion": SIDE}, two_tubes)  # fmt: skip
+scene_call("symmetry_ring", {"shell": 0, "end": "first"}, {"shell": 1, "end": "last"}, two_tubes)
 scene_call(
     "add_ring_force",
     {"shell": 0, "nodes": [0], "force": (1, 0)},
     VERTEX_LOADS | {"nodes": [1], "force": (0, 1)},
-    held_tube,
+    two_clamped_tubes,
 )
-scene_call("add_pole_force", {"shell": 0, "force": 1.0}, VERTEX_LOADS | {"force": 2.0, "end": "last"}, domes)
+scene_call("add_pole_force", {"shell": 0, "force": 1.0}, VERTEX_LOADS | {"force": 2.0, "end": "last"}, two_domes)
 scene_call("add_axisymmetric_pressure", {"shell": 0, "pressure": 10.0}, VERTEX_LOADS | {
-    "pressure": 20.0, "edges": [0], "dead": Change(True, {"pressure": 1e4})}, held_tube, steps=2)  # fmt: skip
+    "pressure": 20.0, "edges": [0], "dead": Change(True, {"pressure": 1e4})}, two_clamped_tubes, steps=2)  # fmt: skip
 
 
 # --- magnets ---
-def wires(scene: ddg.Scene) -> None:
-    """Two rods that can be magnetised, clamped."""
+def magnets(scene: ddg.Scene) -> None:
+    """Add two magnetisable rods, clamped."""
     scene.add_rods([line(4), line(4, 0.1)], section=MAGNET)
     scene.clamp([0, 1])
 
 
-scene_call("magnetize", {"rods": 0, "magnetisation": 1e5}, {"rods": 1, "magnetisation": 2e5, "edges": [1]}, wires,
+scene_call("magnetize", {"rods": 0, "magnetisation": 1e5}, {"rods": 1, "magnetisation": 2e5, "edges": [1]}, magnets,
            lambda s: s.magnetic_field((0, 0, 0.01)))  # fmt: skip
 scene_call("magnetic_field", {"value": (0, 0, 0.01)}, {
     "value": (0, 0, 0.02), "gradient": np.diag([1e-2, 1e-2, -2e-2]),
-    "origin": Change((1, 0, 0), {"gradient": np.diag([1e-2, 1e-2, -2e-2])})}, wires, lambda s: s.magnetize([0, 1], 1e5))  # fmt: skip
-scene_call("add_dipoles", {}, {"rods": [0], "cutoff": 0.12}, lambda s: (wires(s), s.magnetize([0, 1], 1e6)))
+    "origin": Change((1, 0, 0), {"gradient": np.diag([1e-2, 1e-2, -2e-2])})}, magnets, lambda s: s.magnetize([0, 1], 1e5))  # fmt: skip
+scene_call("add_dipoles", {}, {"rods": [0], "cutoff": 0.12}, lambda s: (magnets(s), s.magnetize([0, 1], 1e6)))
 
 
 # --- contact ---
-def apart(scene: ddg.Scene) -> None:
-    """A rod above another, 'low', across it, which falls onto it, and a third that touches neither."""
+def crossed_rods(scene: ddg.Scene) -> None:
+    """Add a clamped rod 'low' and a rod 'high' that falls onto the clamped one."""
     low, high = line(5), line(5)[:, [1, 0, 2]] + [0.25, -0.25, 0.021]
     scene.add_rod(low, section=ddg.Circle(0.01), material=RUBBER, name="low")
     scene.add_rod(high, section=ddg.Circle(0.01), material=RUBBER, name="high")
     scene.clamp([0])
 
 
-def touching(scene: ddg.Scene, **options) -> None:
-    """The same in contact."""
-    apart(scene)
+def crossed_rods_in_contact(scene: ddg.Scene, **options) -> None:
+    """Add two crossed rods in contact."""
+    crossed_rods(scene)
     scene.contact(**({"range": 5e-3, "friction": 0.5} | options))
 
 
-def slide(scene: ddg.Scene) -> None:
-    """What pushes the upper rod sideways."""
+def add_lateral_forces(scene: ddg.Scene) -> None:
+    """Add lateral forces on the upper rod."""
     for node in (0, -1):
         scene.add_force(1, node, (0.2, 0.1, -0.2))
 
@@ -455,54 +470,54 @@ def slide(scene: ddg.Scene) -> None:
 RUB = {"range": 5e-3, "friction": 0.5}
 scene_call("contact", RUB, {
     "law": "penalty", "range": 6e-3, "stiffness": 10.0, "friction": 0.1, "friction_law": "polynomial", "velocity": 1e-2, "lags": 2,
-    "rolling": True, "radius": {"low": 0.0095}, "objects": "low"}, apart, slide, steps=2)  # fmt: skip
+    "rolling": True, "radius": {"low": 0.0095}, "objects": "low"}, crossed_rods, add_lateral_forces, steps=2)  # fmt: skip
 
 
-def coiled(**given) -> list:
-    """What a rod shows whose ends touch each other, if they are far enough apart along it to be a pair."""
+def observe_coil(**named) -> list:
+    """Observe a coil with both ends in contact, if the arc length between them exceeds the exclusion distance."""
     scene = ddg.Scene()
-    turns = np.linspace(0.0, 2.0 * np.pi, 13)
-    points = 0.2 * np.column_stack([np.sin(turns), np.cos(turns), 0.02 * turns])
+    angle = np.linspace(0.0, 2.0 * np.pi, 13)
+    points = 0.2 * np.column_stack([np.sin(angle), np.cos(angle), 0.02 * angle])
     scene.add_rod(points, section=ddg.Circle(0.01), material=RUBBER, name="coil")
-    scene.contact(range=1e-2, **given)
-    return stepped(scene, 1)
+    scene.contact(range=1e-2, **named)
+    return observe_steps(scene, 1)
 
 
-CALLS["contact of a coil"] = Call(ddg.Scene.contact, coiled, {}, {"apart": 5.0})
+CALLS["contact of a coil"] = Call(ddg.Scene.contact, observe_coil, {}, {"apart": 5.0})
 
 scene_call("contact_between", {"one": "low", "other": "high", "friction": 0.3}, {
     "one": "high", "other": "low", "ignore": Change(True, {"friction": NOTHING, "stiffness": 10.0}, False, refused=True),
-    "friction": 0.1, "stiffness": 10.0, "range": 6e-3}, touching, slide, steps=2)  # fmt: skip
+    "friction": 0.1, "stiffness": 10.0, "range": 6e-3}, crossed_rods_in_contact, add_lateral_forces, steps=2)  # fmt: skip
 CALLS["contact_between"].rows["ignore"] = Change(True, {"friction": NOTHING}, refused=False)
 FLOOR = ddg.Plane((0.0, 0.0, -0.0105))
 
 
-def on_floor(shape, motion=None, name: str = "floor") -> list:
-    """What a rod shows that falls onto an obstacle that `contact_between` names 'floor'."""
+def observe_floor(shape, motion=None, name: str = "floor") -> list:
+    """Observe a rod that falls onto an obstacle; `contact_between` names it 'floor'."""
     scene = ddg.Scene()
     scene.add_rod(line(5), section=ddg.Circle(0.01), material=RUBBER, name="low")
     scene.contact(range=5e-3)
     scene.contact_between("low", "floor", stiffness=50.0)
     scene.add_obstacle(shape, motion=motion, name=name)
-    return stepped(scene)
+    return observe_steps(scene)
 
 
-CALLS["add_obstacle"] = Call(ddg.Scene.add_obstacle, on_floor, {"shape": FLOOR}, {
+CALLS["add_obstacle"] = Call(ddg.Scene.add_obstacle, observe_floor, {"shape": FLOOR}, {
     "shape": ddg.Sphere((0.25, 0.0, -0.1), 0.085), "motion": ddg.Motion(lambda t: (0, 0, -t)),
     "name": Change("odd", refused=True)})  # fmt: skip
-CALLS["Plane"] = Call(ddg.Plane, lambda **given: on_floor(ddg.Plane(**given)), {"point": (0, 0, -0.0105)}, {
+CALLS["Plane"] = Call(ddg.Plane, lambda **named: observe_floor(ddg.Plane(**named)), {"point": (0, 0, -0.0105)}, {
     "point": (0, 0, -0.011), "normal": (0.0, 0.01, 1.0)})  # fmt: skip
-CALLS["Sphere"] = Call(ddg.Sphere, lambda **given: on_floor(ddg.Sphere(**given)), {"center": (0.25, 0, -0.1), "radius": 0.0895}, {
+CALLS["Sphere"] = Call(ddg.Sphere, lambda **named: observe_floor(ddg.Sphere(**named)), {"center": (0.25, 0, -0.1), "radius": 0.0895}, {
     "center": (0.2, 0, -0.1), "radius": 0.0885})  # fmt: skip
 BAR = {"start": (0.25, -0.2, -0.0205), "end": (0.25, 0.2, -0.0205), "radius": 0.01}
-CALLS["Capsule"] = Call(ddg.Capsule, lambda **given: on_floor(ddg.Capsule(**given)), BAR, {
+CALLS["Capsule"] = Call(ddg.Capsule, lambda **named: observe_floor(ddg.Capsule(**named)), BAR, {
     "start": (0.2, -0.2, -0.0205), "end": (0.2, 0.2, -0.0205), "radius": 0.0095})  # fmt: skip
 CUBE = {"center": (0.25, 0, -0.1105), "half": (0.1, 0.1, 0.1)}
-CALLS["Box"] = Call(ddg.Box, lambda **given: on_floor(ddg.Box(**given)), CUBE, {
+CALLS["Box"] = Call(ddg.Box, lambda **named: observe_floor(ddg.Box(**named)), CUBE, {
     "center": (0.25, 0, -0.111), "half": (0.2, 0.1, 0.1), "rotation": np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1.0]]),
     "radius": Change(2e-4)})  # fmt: skip
 TABLE = {"points": [[-1, -1, -0.0105], [1, -1, -0.0105], [0, 2, -0.0105], [3, 3, -0.0105]], "cells": [[0, 1, 2]]}
-CALLS["Mesh"] = Call(ddg.Mesh, lambda **given: on_floor(ddg.Mesh(**given)), TABLE, {
+CALLS["Mesh"] = Call(ddg.Mesh, lambda **named: observe_floor(ddg.Mesh(**named)), TABLE, {
     "points": [[-1, -1, -0.011], [1, -1, -0.011], [0, 2, -0.011], [3, 3, -0.011]], "cells": [[1, 3, 2]], "radius": 2e-4})  # fmt: skip
 
 
@@ -510,23 +525,23 @@ CALLS["Mesh"] = Call(ddg.Mesh, lambda **given: on_floor(ddg.Mesh(**given)), TABL
 CALLED: list = []
 
 
-def of_scene(late: bool = False, **given) -> list:
-    """What a scene shows whose rod drags, with how often a callback was called; `late`: its support starts elsewhere."""
+def observe_scene(moved_support: bool = False, **named) -> list:
+    """Observe a rod with drag and the number of callback calls; `moved_support`: the support starts elsewhere."""
     CALLED.clear()
-    scene = ddg.Scene(**given)
+    scene = ddg.Scene(**named)
     scene.add_rod(line(), section=ddg.Rectangle(0.03, 0.02), material=RUBBER)
-    scene.clamp(0, motion=ddg.Motion(lambda t: (0.0, 0.0, 1.0)) if late else None)
+    scene.clamp(0, motion=ddg.Motion(lambda t: (0.0, 0.0, 1.0)) if moved_support else None)
     scene.drag(0, tangential=1.0, normal=1.0)
-    return [*stepped(scene), len(CALLED), scene.build(DEVICE).precision]
+    return [*observe_steps(scene), len(CALLED), scene.build(DEVICE).precision]
 
 
-CALLS["Scene"] = Call(ddg.Scene, of_scene, {}, {
+CALLS["Scene"] = Call(ddg.Scene, observe_scene, {}, {
     "gravity": (0, 0, -1), "dimension": 2, "analysis": ddg.Dynamics(precision="mixed"), "mass_damping": 1.0, "flow": (1, 0, 0),
-    "initial": Change(lambda model: model.state(), {"late": True}), "callbacks": [CALLED.append]})  # fmt: skip
+    "initial": Change(lambda model: model.state(), {"moved_support": True}), "callbacks": [CALLED.append]})  # fmt: skip
 
 
-def built(device=DEVICE, precision=None, worlds=1, allow_rounding=False) -> list:
-    """What a model shows of a rod so stiff that float32 loses it."""
+def observe_build(device=DEVICE, precision=None, worlds=1, allow_rounding=False) -> list:
+    """Observe a model of a rod too stiff for float32."""
     scene = ddg.Scene()
     scene.add_rod(line(40), section=ddg.Circle(1e-5), material=ddg.Material(1e11))
     scene.clamp(0)
@@ -535,13 +550,13 @@ def built(device=DEVICE, precision=None, worlds=1, allow_rounding=False) -> list
     return [state.points(), model.precision, model.worlds]
 
 
-CALLS["build"] = Call(ddg.Scene.build, built, {}, {
+CALLS["build"] = Call(ddg.Scene.build, observe_build, {}, {
     "device": Change("cuda:99", refused=True), "precision": "mixed", "worlds": 2,
     "allow_rounding": Change(True, {"precision": "float32"})})  # fmt: skip
 
 
-def simulated(analysis, **options) -> list:
-    """What a run shows of a clamped rod under a force, by an analysis."""
+def analyse(analysis, **options) -> list:
+    """Observe an analysis of a clamped rod under a force."""
     scene = ddg.Scene(analysis=analysis)
     scene.add_rod(line(), section=ddg.Circle(0.02), material=RUBBER)
     scene.clamp(0)
@@ -550,26 +565,26 @@ def simulated(analysis, **options) -> list:
     path = (
         [] if result.path is None else [result.path.load, [list(point.values.items()) for point in result.path.points]]
     )
-    return [*at_state(result.state), result.model.precision, result.state.time, str(result.failure), path]
+    return [*observe_state(result.state), result.model.precision, result.state.time, str(result.failure), path]
 
 
-CALLS["Dynamics"] = Call(ddg.Dynamics, lambda **given: simulated(ddg.Dynamics(**given)), {"dt": 0.01, "duration": 0.02}, {
+CALLS["Dynamics"] = Call(ddg.Dynamics, lambda **named: analyse(ddg.Dynamics(**named)), {"dt": 0.01, "duration": 0.02}, {
     "dt": 0.02, "duration": 0.03, "scheme": "implicit_midpoint", "rtol": 1e-1, "precision": "mixed",
     "outliers": Change(0.1, refused=True)})  # fmt: skip
-CALLS["Statics"] = Call(ddg.Statics, lambda **given: simulated(ddg.Statics(**given)), {}, {"load_steps": 2})
+CALLS["Statics"] = Call(ddg.Statics, lambda **named: analyse(ddg.Statics(**named)), {}, {"load_steps": 2})
 TIP = {"tip": ddg.Displacement.of(5, "z")}
-CALLS["Trace"] = Call(ddg.Trace, lambda **given: simulated(ddg.Trace(**given)), {"stop": ddg.Stop(steps=2)}, {
+CALLS["Trace"] = Call(ddg.Trace, lambda **named: analyse(ddg.Trace(**named)), {"stop": ddg.Stop(steps=2)}, {
     "watch": TIP, "stop": ddg.Stop(steps=1), "step": 0.01, "max_step": 0.01, "load_scale": 3.0})  # fmt: skip
 
 
-def stopped(**given) -> list:
-    """What a path shows that ends by some bound."""
-    return simulated(ddg.Trace(watch=TIP, stop=ddg.Stop(**given), step=0.1, max_step=0.1))
+def observe_stop(**named) -> list:
+    """Observe a path with a stop criterion."""
+    return analyse(ddg.Trace(watch=TIP, stop=ddg.Stop(**named), step=0.1, max_step=0.1))
 
 
-CALLS["Stop"] = Call(ddg.Stop, stopped, {"steps": 3}, {
+CALLS["Stop"] = Call(ddg.Stop, observe_stop, {"steps": 3}, {
     "steps": 2, "load": (-1.0, 0.01), "displacement": ("tip", -1e-3, 1e-3)})  # fmt: skip
-CALLS["Displacement"] = Call(ddg.Displacement, lambda terms: simulated(ddg.Trace(watch={"tip": ddg.Displacement(terms)}, stop=ddg.Stop(
+CALLS["Displacement"] = Call(ddg.Displacement, lambda terms: analyse(ddg.Trace(watch={"tip": ddg.Displacement(terms)}, stop=ddg.Stop(
     steps=1))), {"terms": ((5, "z", 1.0),)}, {"terms": ((5, "z", -1.0), (4, "y", 1.0))})  # fmt: skip
-CALLS["Displacement.of"] = Call(ddg.Displacement.of, lambda **given: simulated(ddg.Trace(watch={"tip": ddg.Displacement.of(
-    **given)}, stop=ddg.Stop(steps=1))), {"row": 5, "axis": "z"}, {"row": 4, "axis": "y", "weight": 2.0})  # fmt: skip
+CALLS["Displacement.of"] = Call(ddg.Displacement.of, lambda **named: analyse(ddg.Trace(watch={"tip": ddg.Displacement.of(
+    **named)}, stop=ddg.Stop(steps=1))), {"row": 5, "axis": "z"}, {"row": 4, "axis": "y", "weight": 2.0})  # fmt: skip

@@ -1,9 +1,9 @@
-"""Arguments of integrators, equilibria, paths, questions and states; see `effects`."""
+"""Arguments of integrators, equilibria, paths, queries and states; see `effects`."""
 
 from functools import cache
 
 import numpy as np
-from effects import ARC, CALLS, DEVICE, DT, MAGNET, RUBBER, SHEET, Call, Change, at_state, line
+from effects import ARC, CALLS, DEVICE, DT, MAGNET, RUBBER, SHEET, Call, Change, line, observe_state
 
 import ddg_warp as ddg
 from ddg_warp.ask import inquiry
@@ -16,7 +16,7 @@ from ddg_warp.solve.step_control import StepControl
 
 @cache
 def model(kind: str = "arc", worlds: int = 1):
-    """A small model, built once."""
+    """Return a small model, built once."""
     scene = ddg.Scene(mass_damping=0.1)
     if kind == "sheet":
         scene.add_shell(**SHEET, thickness=0.05, material=RUBBER, bending="hinge")
@@ -24,7 +24,7 @@ def model(kind: str = "arc", worlds: int = 1):
     elif kind == "dof sheet":
         scene.add_shell(**SHEET, thickness=0.05, material=RUBBER)
         scene.clamp_boundary(0, [0, 1, 2])
-    elif kind == "ring":  # which PCG solves
+    elif kind == "ring":  # solved by PCG
         angle = 2.0 * np.pi * np.arange(8) / 8
         scene.add_rod(
             np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]),
@@ -71,8 +71,10 @@ def model(kind: str = "arc", worlds: int = 1):
 ODD = ARC + 0.3 * np.random.default_rng(0).standard_normal(ARC.shape) * (np.arange(6) > 1)[:, None]  # far from rest
 
 
-def integrated(kind: str = "arc", dt: float = 0.05, steps: int = 2, spins: float = 0.0, points=None, **options) -> list:
-    """What some steps show: the state, the counts, and after how many steps they end."""
+def observe_integrator(
+    kind: str = "arc", dt: float = 0.05, steps: int = 2, spins: float = 0.0, points=None, **options
+) -> list:
+    """Observe some steps: state, statistics, number of completed steps and outcome."""
     made = model(kind)
     integrator = ddg.Integrator(made, **options)
     state = made.state(points, spins=np.full(made.order.edges_count, spins) if spins else None)
@@ -84,11 +86,11 @@ def integrated(kind: str = "arc", dt: float = 0.05, steps: int = 2, spins: float
             ended = error.outcome
             break
         done += 1
-    return [*at_state(state), integrator.statistics(), done, ended, integrator.outcomes().tolist()]
+    return [*observe_state(state), integrator.statistics(), done, ended, integrator.outcomes().tolist()]
 
 
 FAILS = {"max_iterations": 1, "retry_limit": 1, "rtol": 1e-12}
-CALLS["Integrator"] = Call(ddg.Integrator, integrated, {}, {
+CALLS["Integrator"] = Call(ddg.Integrator, observe_integrator, {}, {
     "scheme": "implicit_midpoint", "solver": "projective", "linear": "chain", "retry_limit": Change(0, {"max_iterations": 2}, 20),
     "energy_bound": Change(1e-9, {"scheme": "implicit_midpoint"}), "check_every": Change(2, FAILS), "failures": Change("flag", FAILS),
     "gyroscopic": Change(False, {"kind": "falling", "spins": 500.0}), "rtol": 1e-2, "floor_factor": Change(1e9, {"rtol": 1e-14}),
@@ -98,106 +100,111 @@ CALLS["Integrator"] = Call(ddg.Integrator, integrated, {}, {
     subjects=("model",), kinds=(NewtonOptions,))  # fmt: skip
 
 
-def controlled(**given) -> list:
-    """What a step under controls shows of a magnetised rod that is gripped."""
+def observe_controls(**named) -> list:
+    """Observe a step of a gripped, magnetised rod under controls."""
     made = model("held")
-    return at_state(ddg.Integrator(made).step(made.state(), DT, ddg.Controls(**given)))
+    return observe_state(ddg.Integrator(made).step(made.state(), DT, ddg.Controls(**named)))
 
 
-CALLS["Controls"] = Call(ddg.Controls, controlled, {}, {
+CALLS["Controls"] = Call(ddg.Controls, observe_controls, {}, {
     "poses": [[0.1, 0, 0, 0, 0.1, 0]], "forces": np.full((6, 3), 0.1), "moments": np.full(5, 0.1), "gravity": (1, 0, 0),
     "field": (0, 0.1, 0)})  # fmt: skip
 
 
-def advanced(**given) -> list:
-    """What steps of their own length show."""
+def observe_adaptive_steps(**named) -> list:
+    """Observe adaptive steps."""
     made = model("falling")
-    steps = StepControl(ddg.Integrator(made), **given)
+    steps = StepControl(ddg.Integrator(made), **named)
     state = steps.advance(made.state(), 0.1)
-    return [*at_state(state), sorted(steps.lengths.items()), steps.estimate]
+    return [*observe_state(state), sorted(steps.lengths.items()), steps.estimate]
 
 
 CALLS["StepControl"] = Call(
-    StepControl, advanced, {"error": 0.2, "halvings": 3}, {"error": 10.0, "halvings": 2}, ("integrator",)
+    StepControl, observe_adaptive_steps, {"error": 0.2, "halvings": 3}, {"error": 10.0, "halvings": 2}, ("integrator",)
 )
 
 
 # --- states and questions ---
-def begun(kind: str = "arc", **given) -> list:
-    """What a first state shows, and a step from it."""
+def observe_initial_state(kind: str = "arc", **named) -> list:
+    """Observe an initial state, and a step from it."""
     made = model(kind)
-    state = made.state(**given)
-    return [*at_state(state), at_state(ddg.Integrator(made).step(state, DT))]
+    state = made.state(**named)
+    return [*observe_state(state), observe_state(ddg.Integrator(made).step(state, DT))]
 
 
-CALLS["model.state"] = Call(ddg.Model.state, begun, {}, {
+CALLS["model.state"] = Call(ddg.Model.state, observe_initial_state, {}, {
     "points": ARC + [0, 0.1, 0] * ARC, "velocities": np.full((6, 3), 0.1), "spins": np.full(5, 0.1),
     "angles": np.linspace(0, 1, 5)})  # fmt: skip
 
 
-def reacting(**given) -> list:
-    """Reactions."""
-    return [(found.force, found.moment, found.point) for found in inquiry.reactions(model(), model().state(), **given)]
+def observe_reactions(**named) -> list:
+    """Observe reactions."""
+    return [
+        (reaction.force, reaction.moment, reaction.point)
+        for reaction in inquiry.reactions(model(), model().state(), **named)
+    ]
 
 
-CALLS["reactions"] = Call(inquiry.reactions, reacting, {}, {"point": (1, 0, 0), "factor": 2.0}, ("model", "state"))
+CALLS["reactions"] = Call(
+    inquiry.reactions, observe_reactions, {}, {"point": (1, 0, 0), "factor": 2.0}, ("model", "state")
+)
 
 
-def pushed(**given) -> list:
-    """What is pushed apart."""
-    state, far = model("touching").pushed_apart(model("touching").state(), **given)
-    return [state.points(), far]
+def observe_overlap_resolution(**named) -> list:
+    """Observe an overlap resolution."""
+    state, distance = model("touching").pushed_apart(model("touching").state(), **named)
+    return [state.points(), distance]
 
 
-CALLS["pushed_apart"] = Call(ddg.Model.pushed_apart, pushed, {}, {"gap": 2e-3}, ("state",))
+CALLS["pushed_apart"] = Call(ddg.Model.pushed_apart, observe_overlap_resolution, {}, {"gap": 2e-3}, ("state",))
 
 
-def with_rest(kind: str = "dof sheet", **given) -> list:
-    """What a sheet of another rest shape shows, in a model of its own."""
+def observe_rest_shape(kind: str = "dof sheet", **named) -> list:
+    """Observe a sheet with a changed rest shape, in a separate model."""
     made = model(kind).scene.build(DEVICE, "float64")
-    made.set_rest(0, **given)
-    return at_state(ddg.Integrator(made).step(made.state(), DT))
+    made.set_rest(0, **named)
+    return observe_state(ddg.Integrator(made).step(made.state(), DT))
 
 
 STRETCHED = SHEET["points"] * 1.05
 METRIC = np.tile([0.3, 0.0, 0.3], (8, 1))
-CALLS["set_rest"] = Call(ddg.Model.set_rest, with_rest, {"points": SHEET["points"]}, {
+CALLS["set_rest"] = Call(ddg.Model.set_rest, observe_rest_shape, {"points": SHEET["points"]}, {
     "points": STRETCHED, "metric": METRIC, "curvature": np.full((8, 3), 0.1),
     "angle": Change(np.full(16, 0.1), {"kind": "sheet"})}, ("shell",))  # fmt: skip
 
 
-def with_parameter(**given) -> list:
-    """What a rod shows with another parameter, in a model of its own."""
+def observe_parameter(**named) -> list:
+    """Observe a rod with a changed parameter, in a separate model."""
     made = model().scene.build(DEVICE, "float64")
-    made.set_parameter(**given)
-    return at_state(ddg.Integrator(made).step(made.state(), DT))
+    made.set_parameter(**named)
+    return observe_state(ddg.Integrator(made).step(made.state(), DT))
 
 
-CALLS["set_parameter"] = Call(ddg.Model.set_parameter, with_parameter, {
+CALLS["set_parameter"] = Call(ddg.Model.set_parameter, observe_parameter, {
     "term": "rod_bend_twist", "parameter": "stiffness_1", "values": 0.2}, {
     "term": Change("rod_stretch", {"parameter": "measure"}, "rod_bend_twist"), "parameter": "stiffness_2", "values": 0.3})  # fmt: skip
 
 
 # --- equilibria ---
-def solved(kind: str = "arc", way=None, controls=None, cuts: bool = False, **given) -> list:
-    """What an equilibrium shows, with how it was found."""
-    made, ways = model(kind), []
+def observe_equilibrium(kind: str = "arc", way=None, controls=None, cuts: bool = False, **named) -> list:
+    """Observe an equilibrium, its outcome and iterations."""
+    made, history = model(kind), []
     if way is not None:
-        given["way"] = ways
-    if given.get("state") == "moved":
-        given["state"] = made.state(points=made.state().points() * [1.0, 1.0, -1.0])
-    if given.get("rest"):
+        named["way"] = history
+    if named.get("state") == "moved":
+        named["state"] = made.state(points=made.state().points() * [1.0, 1.0, -1.0])
+    if named.get("rest"):
         made = made.scene.build(DEVICE, "float64")
-    options = {name: given.pop(name) for name in [each.name for each in _fields()] if name in given}
+    options = {name: named.pop(name) for name in [each.name for each in _fields()] if name in named}
     solver = statics.Equilibrium(made, StaticsOptions(**options))
-    state = given.pop("state", None) or made.state()
-    found = solver.load(state, controls=controls, **given)
+    state = named.pop("state", None) or made.state()
+    result = solver.load(state, controls=controls, **named)
     return [
-        *at_state(found),
-        str(found.outcome),
-        str(found.stable),
+        *observe_state(result),
+        str(result.outcome),
+        str(result.stable),
         solver.iterations,
-        len(ways),
+        len(history),
         solver.pcg_iterations,
     ]
 
@@ -209,7 +216,7 @@ def _fields():
 
 
 PUSH = ddg.Controls(forces=np.full((6, 3), 0.1))
-CALLS["statics.solve"] = Call(statics.solve, solved, {}, {
+CALLS["statics.solve"] = Call(statics.solve, observe_equilibrium, {}, {
     "state": Change("moved", {"kind": "arch", "end": 0.01}), "controls": PUSH, "load_steps": 2,
     "start": Change(0.5, {"load_steps": 2}), "end": 0.5, "way": [],
     "rest": Change({0: {"angle": np.full(16, 0.1)}}, {"kind": "sheet"}), "rtol": 1e-2, "floor_factor": Change(1e12, {"rtol": 1e-30}),
@@ -218,93 +225,95 @@ CALLS["statics.solve"] = Call(statics.solve, solved, {}, {
     subjects=("model",), kinds=(StaticsOptions,))  # fmt: skip
 
 
-def spectrum(kind: str = "arc", **given) -> list:
-    """Eigenvalues of a column that a force which follows nothing presses."""
+def observe_spectrum(kind: str = "arc", **named) -> list:
+    """Observe the eigenvalues at the initial state of a model."""
     made = model(kind)
-    found = stability.spectrum(made, made.state(), **given)
-    return [found.eigenvalues, found.negative]
+    modes = stability.spectrum(made, made.state(), **named)
+    return [modes.eigenvalues, modes.negative]
 
 
-CALLS["spectrum"] = Call(stability.spectrum, spectrum, {}, {
+CALLS["spectrum"] = Call(stability.spectrum, observe_spectrum, {}, {
     "count": 2, "metric": "unit", "load": Change(2.0, {"kind": "couple"})}, ("model", "state", "tangent"))  # fmt: skip
 
 
 @cache
 def at_load(load: float):
-    """The column at a load parameter."""
+    """Return the column at a load parameter."""
     return model("column"), statics.solve(model("column"), end=load, mode="follow")
 
 
-def buckling(free: float = 0.0, loaded: float = 0.1, count: int = 1) -> list:
-    """Buckling factors between two loads."""
+def observe_buckling(free: float = 0.0, loaded: float = 0.1, count: int = 1) -> list:
+    """Observe buckling factors between two loads."""
     return [stability.buckling(model("column"), at_load(free)[1], at_load(loaded)[1], count)]
 
 
-CALLS["buckling"] = Call(stability.buckling, buckling, {}, {"free": 0.01, "loaded": 0.2, "count": 2}, ("model",))
+CALLS["buckling"] = Call(
+    stability.buckling, observe_buckling, {}, {"free": 0.01, "loaded": 0.2, "count": 2}, ("model",)
+)
 CALLS["critical"] = Call(stability.critical, stability.critical, {
     "equilibrium_at": at_load, "low": 0.0, "high": 1.0, "tolerance": 1e-2}, {
     "equilibrium_at": lambda load: at_load(2.0 * load), "low": 0.05, "high": 1.2, "tolerance": 1e-6})  # fmt: skip
 
 
 # --- paths ---
-def traced(kind: str = "arch", tip: int = 4, trace=None, **given) -> list:
-    """What a path shows."""
+def observe_path(kind: str = "arch", tip: int = 4, trace=None, **named) -> list:
+    """Observe a path."""
     made = model(kind)
-    watch = given.pop("watch", {"tip": ddg.Displacement.of(tip, "z")})
-    followed = continuation.Continuation(made, watch, **given)
+    watch = named.pop("watch", {"tip": ddg.Displacement.of(tip, "z")})
+    followed = continuation.Continuation(made, watch, **named)
     path = followed.trace(**({"stop": ddg.Stop(steps=3)} | (trace or {})))
     return [path.load, path.arclength, path.negative, path.kinds, [list(point.values.items()) for point in path.points], path.outcome,
             [point.iterations for point in path.points]]  # fmt: skip
 
 
-CALLS["Continuation"] = Call(continuation.Continuation, traced, {}, {
+CALLS["Continuation"] = Call(continuation.Continuation, observe_path, {}, {
     "watch": {"side": ddg.Displacement.of(3, "x")}, "step": 0.01, "max_step": 0.021, "min_step": Change(0.5, refused=True),
     "load_scale": 0.3, "iterations": 2, "max_iterations": Change(1, {"min_step": 1e-2}, refused=True), "rotation_cap": 1e-2,
     "tolerance": Change(0.1, {"trace": {"stop": ddg.Stop(steps=40, limit_points=1)}, "max_step": 0.3}), "rtol": 1e-2,
     "floor_factor": Change(1e12, {"rtol": 1e-30})}, ("model",), (ContinuationOptions,))  # fmt: skip
 
 
-def follow(**given) -> list:
-    """What a path shows by the arguments of `trace`."""
+def observe_trace(**named) -> list:
+    """Observe a path by the arguments of `trace`."""
     made = model("arch")
-    if given.get("state"):
-        given["state"] = made.state(points=made.state().points() * [1.0, 1.0, -1.0])
-    return traced(trace=given)
+    if named.get("state"):
+        named["state"] = made.state(points=made.state().points() * [1.0, 1.0, -1.0])
+    return observe_path(trace=named)
 
 
-CALLS["trace"] = Call(continuation.Continuation.trace, follow, {"stop": ddg.Stop(steps=3)}, {
+CALLS["trace"] = Call(continuation.Continuation.trace, observe_trace, {"stop": ddg.Stop(steps=3)}, {
     "state": True, "start": 0.01, "direction": -1, "stop": ddg.Stop(steps=2)})  # fmt: skip
-CALLS["Stop at limit points"] = Call(ddg.Stop, lambda **given: traced(trace={"stop": ddg.Stop(**given)}, max_step=0.3), {"steps": 30}, {
-    "limit_points": 1})  # fmt: skip
+CALLS["Stop at limit points"] = Call(ddg.Stop, lambda **named: observe_path(trace={"stop": ddg.Stop(**named)}, max_step=0.3), {
+    "steps": 30}, {"limit_points": 1})  # fmt: skip
 
 
-def driven(displacement="tip", values=(-0.01,), state=None, start=0.0, max_cuts=10) -> list:
-    """What a path under control shows."""
+def observe_control(displacement="tip", values=(-0.01,), state=None, start=0.0, max_cuts=10) -> list:
+    """Observe a path under displacement control."""
     made = model("arch")
     watch = {"tip": ddg.Displacement.of(4, "z"), "side": ddg.Displacement.of(3, "z")}
     begin = made.state(points=made.state().points() * [1.0, 1.0, -1.0]) if state else None
-    found = continuation.Continuation(made, watch).control(displacement, values, begin, start=start, max_cuts=max_cuts)
-    return [found.load, found.points[-1].state.points(), [point.iterations for point in found.points]]
+    path = continuation.Continuation(made, watch).control(displacement, values, begin, start=start, max_cuts=max_cuts)
+    return [path.load, path.points[-1].state.points(), [point.iterations for point in path.points]]
 
 
-CALLS["control"] = Call(continuation.Continuation.control, driven, {}, {
+CALLS["control"] = Call(continuation.Continuation.control, observe_control, {}, {
     "displacement": "side", "values": (-0.02,), "state": Change(True, {"values": (-0.21,), "max_cuts": 0}), "start": 0.01,
     "max_cuts": Change(0, {"values": (-0.25,)}, refused=True)})  # fmt: skip
 
 
 @cache
-def branched():
-    """A path of the column through its first bifurcation."""
+def bifurcated_path():
+    """Return a path of the column through the first bifurcation."""
     followed = continuation.Continuation(model("column"), max_step=0.3)
     return followed, followed.trace(stop=ddg.Stop(load=(-1.0, 1.0))).bifurcations[0]
 
 
-def switched(**given) -> list:
-    """What a branch shows."""
-    followed, fork = branched()
-    path = followed.switch(fork, **({"stop": ddg.Stop(steps=2)} | given))
+def observe_branch(**named) -> list:
+    """Observe a branch."""
+    followed, fork = bifurcated_path()
+    path = followed.switch(fork, **({"stop": ddg.Stop(steps=2)} | named))
     return [path.load, path.points[-1].state.points()]
 
 
-CALLS["switch"] = Call(continuation.Continuation.switch, switched, {}, {
+CALLS["switch"] = Call(continuation.Continuation.switch, observe_branch, {}, {
     "side": -1, "step": 0.05, "stop": ddg.Stop(steps=1)}, ("bifurcation",))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Every kind of object that a scene may hold, small: how it is added, held and loaded, and what it has."""
+"""Small examples of every kind of object: how to add, support and load each, and its features."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,12 +18,12 @@ def rubber(viscosity: float = 0.0) -> ddg.Material:
 
 @dataclass
 class Added:
-    """What an object's `add` put into a scene, and how questions take hold of it.
+    """Indices and operations of an added object.
 
     Attributes:
         rods, shells, rings: indices.
-        hold: (scene, motion) -> None: supports that leave no rigid motion and only move by `motion`.
-        load: (scene, size, amplitude) -> None: a force of some size along -z, away from the supports.
+        hold: (scene, motion) -> None: supports that leave no rigid-body mode and only move by `motion`.
+        load: (scene, size, amplitude) -> None: a force of magnitude `size` along -z, away from the supports.
     """
 
     hold: Callable
@@ -35,7 +35,7 @@ class Added:
 
 @dataclass(frozen=True)
 class Object:
-    """A kind of object; `turns` says whether its supports may turn as a rigid body about `axis`."""
+    """Kind of object; `turns`: supports may rotate rigidly about `axis`."""
 
     add: Callable
     dimension: int = 3
@@ -43,7 +43,7 @@ class Object:
     turns: bool = True
 
     def scene(self, viscosity: float = 0.0, motion=None, held: bool = True, **options) -> tuple[ddg.Scene, Added]:
-        """A scene with this object alone, held."""
+        """Return a scene with this object alone, supported if `held`."""
         scene = ddg.Scene(**({"dimension": self.dimension} | options))
         added = self.add(scene, rubber(viscosity))
         if held:
@@ -52,7 +52,7 @@ class Object:
 
 
 def arc(n: int = 8, lift: float = 0.0) -> np.ndarray:
-    """A flat arc of a circle in the plane of x and z, or rising out of it."""
+    """Return an arc of a circle in the plane of x and z, or rising out of it."""
     s = np.linspace(0.0, 0.5, n + 1)
     return np.stack([np.sin(s), lift * s, 1.0 - np.cos(s)], -1)
 
@@ -67,8 +67,8 @@ def _force_on_rod(rod: int, node: int):
 
 def _rod(points=None, clamp: str = "edge", **options):
     def add(scene, material) -> Added:
-        given = {"section": RECTANGLE} | options
-        rod = scene.add_rod(arc(lift=0.3) if points is None else points, material=material, **given)
+        settings = {"section": RECTANGLE} | options
+        rod = scene.add_rod(arc(lift=0.3) if points is None else points, material=material, **settings)
 
         def hold(scene, motion=None):
             if clamp == "edge":
@@ -84,7 +84,7 @@ def _rod(points=None, clamp: str = "edge", **options):
 
 
 def _magnetised(scene, material) -> Added:
-    """Along its tangent, in a field across the plane of the other loads that is none at the start."""
+    """Add a rod with tangential magnetisation, in a field normal to the plane of other loads, zero at the start."""
     added = _rod()(scene, material)
     scene.magnetize(added.rods, 2e4)
     scene.magnetic_field(lambda t: (0.0, 2e-3 * t**4, 0.0))
@@ -102,14 +102,14 @@ def _ring(scene, material) -> Added:
 
 def _joined(rigid: bool, **options):
     def add(scene, material) -> Added:
-        given = {"section": RECTANGLE, "material": material} | options
-        first = scene.add_rod(line(0.0 * X, 0.5 * X, 4), **given)
-        second = scene.add_rod(line(0.5 * X, X, 4), **given)
+        settings = {"section": RECTANGLE, "material": material} | options
+        first = scene.add_rod(line(0.0 * X, 0.5 * X, 4), **settings)
+        second = scene.add_rod(line(0.5 * X, X, 4), **settings)
         scene.join([(first, -1), (second, 0)], rigid=rigid)
 
         def hold(scene, motion=None):
             scene.clamp(first, edges=[0], motion=motion)
-            if not rigid:  # a hinge alone would let the second rod swing
+            if not rigid:  # a hinge alone leaves the second rod a mechanism
                 scene.clamp(second, edges=[-1], motion=motion)
 
         return Added(hold, _force_on_rod(second, 1), rods=[first, second])
@@ -123,12 +123,12 @@ def _sheet(bending: str, membrane: str = "flat"):
         shell = scene.add_shell(
             points, triangles, thickness=0.01, material=material, bending=bending, membrane=membrane
         )
-        return _of_sheet(scene, shell, points)
+        return _added_sheet(scene, shell, points)
 
     return add
 
 
-def _of_sheet(scene, shell: int, points: np.ndarray) -> Added:
+def _added_sheet(scene, shell: int, points: np.ndarray) -> Added:
     low = points[:, 0].min()
     column = np.unique(points[:, 0])[1]
     clamped = np.flatnonzero(points[:, 0] <= low + 1e-9)
@@ -136,9 +136,7 @@ def _of_sheet(scene, shell: int, points: np.ndarray) -> Added:
     tip = np.flatnonzero(points[:, 0] >= points[:, 0].max() - 1e-9)
 
     def hold(scene, motion=None):
-        if (
-            scene.shells[shell].bending == "isometric"
-        ):  # has no normals at its boundary to clamp: two columns of vertices
+        if scene.shells[shell].bending == "isometric":  # no boundary normals to clamp: fix two columns of vertices
             scene.hold(shell, np.concatenate([clamped, inside]), motion=motion)
         else:
             scene.clamp_boundary(shell, clamped, motion=motion)
@@ -152,11 +150,11 @@ def _of_sheet(scene, shell: int, points: np.ndarray) -> Added:
 def _stiffened(scene, material) -> Added:
     points, triangles = meshes.rectangle(4, 3, (0.8, 0.5), "alternating")
     shell = scene.add_shell(points, triangles, thickness=0.01, material=material)
-    added = _of_sheet(scene, shell, points)
+    added = _added_sheet(scene, shell, points)
     edge = np.flatnonzero(points[:, 1] <= points[:, 1].min() + 1e-9)
     edge = edge[np.argsort(points[edge, 0])]
     rod = scene.add_rod(points[edge], section=ddg.Rectangle(0.02, 0.01), material=material, director=Z)
-    scene.attach(rod, range(len(edge)), shell, edge)  # glued, so that what holds the sheet holds the rod's spin
+    scene.attach(rod, range(len(edge)), shell, edge)  # coupled, so that supports of the sheet fix the rod's twist
     return Added(added.hold, added.load, rods=[rod], shells=[shell])
 
 
@@ -173,61 +171,61 @@ def _dome(scene, material) -> Added:
 
 def _mixed(*adders):
     def add(scene, material) -> Added:
-        parts = [adder(scene, material) for adder in adders]
+        added = [adder(scene, material) for adder in adders]
 
         def hold(scene, motion=None):
-            for part in parts:
-                part.hold(scene, motion)
+            for item in added:
+                item.hold(scene, motion)
 
         def load(scene, size, amplitude=None):
-            for part in parts:
-                part.load(scene, size, amplitude)
+            for item in added:
+                item.load(scene, size, amplitude)
 
-        several = {name: [i for part in parts for i in getattr(part, name)] for name in ("rods", "shells", "rings")}
+        several = {name: [i for item in added for i in getattr(item, name)] for name in ("rods", "shells", "rings")}
         return Added(hold, load, **several)
 
     return add
 
 
-RANGE = 1e-3  # of contact [m]
+RANGE = 1e-3  # activation distance of contact [m]
 
 
-def _between_balls(adder, at: tuple, thick: float, friction=0.2):
-    """What `adder` adds, with a ball above and one below a point of it, a little more than the range of contact away."""
+def _between_balls(adder, point: tuple, thick: float, friction=0.2):
+    """Return an adder with a ball above and one below a point of the object, slightly beyond the activation distance."""
 
     def add(scene, material) -> Added:
         added = adder(scene, material)
-        apart = 0.05 + thick + 1.02 * RANGE
+        offset = 0.05 + thick + 1.02 * RANGE
         for side in (-1.0, 1.0):
-            scene.add_obstacle(ddg.Sphere(tuple(np.array(at) + [0.0, 0.0, side * apart]), 0.05), name="ball")
+            scene.add_obstacle(ddg.Sphere(tuple(np.array(point) + [0.0, 0.0, side * offset]), 0.05), name="ball")
         scene.contact(range=RANGE)
-        for part in (*scene.batches, *scene.shells):
-            scene.contact_between(part.name, "ball", friction=friction)
+        for item in (*scene.batches, *scene.shells):
+            scene.contact_between(item.name, "ball", friction=friction)
         return added
 
     return add
 
 
-def over_floor(scene, gap: float, motion=None, **options) -> float:
-    """Put a floor below everything, of which the parts pass through each other; its height [m]."""
-    low = [batch.points[..., 2].min() - np.max(batch.section.radius) for batch in scene.batches]
-    low += [shell.points[:, 2].min() - 0.5 * np.max(shell.thickness) for shell in scene.shells]
-    height = min(low, default=0.0) - gap
+def add_floor(scene, gap: float, motion=None, **options) -> float:
+    """Add a floor below all objects, which ignore each other; return its height [m]."""
+    heights = [batch.points[..., 2].min() - np.max(batch.section.radius) for batch in scene.batches]
+    heights += [shell.points[:, 2].min() - 0.5 * np.max(shell.thickness) for shell in scene.shells]
+    height = min(heights, default=0.0) - gap
     scene.add_obstacle(ddg.Plane((0.0, 0.0, height)), motion=motion, name="floor")
     scene.contact(range=RANGE, friction=0.2, **options)
-    pass_each_other(scene)
+    ignore_pairs_of_objects(scene)
     return height
 
 
-def pass_each_other(scene) -> None:
-    """Let rods and shells pass through each other."""
-    names = sorted({part.name for part in (*scene.batches, *scene.shells)})
+def ignore_pairs_of_objects(scene) -> None:
+    """Ignore contact between all rods and shells."""
+    names = sorted({item.name for item in (*scene.batches, *scene.shells)})
     for i, one in enumerate(names):
-        for other in names[i:]:
-            scene.contact_between(one, other, ignore=True)
+        for two in names[i:]:
+            scene.contact_between(one, two, ignore=True)
 
 
-UP = (0.0, 1.0, 0.0)  # the axis that turns within the plane of x and z
+UP = (0.0, 1.0, 0.0)  # axis of rotations within the plane of x and z
 HANGING = line(0.0 * X, -0.5 * Z, 6)
 
 OBJECTS = {

@@ -1,4 +1,4 @@
-"""The table of contracts: every object against every question. Each cell works, or is refused by a sentence that says why.
+"""Table of contracts, every object against every question: each cell works, or is refused with a reason.
 
 python tests/contracts/table.py [--device cuda:0]     # prints the table with its counts
 """
@@ -38,7 +38,7 @@ RODS_IN_CONTACT = ("rod in contact", "rods in contact, joined")
 IN_CONTACT = (*RODS_IN_CONTACT, "shell in contact")
 SHELLS = (*(name for name in OBJECTS if name.startswith("shell,")), "shell in contact")
 
-# What is refused: question -> objects -> words of the message.
+# Refused cells: question -> objects -> words of the message.
 REFUSED = {
     "total twist": {
         **dict.fromkeys(
@@ -87,12 +87,12 @@ REFUSED["continuation"] |= dict.fromkeys(
 REFUSED["path onto a ball"] = REFUSED["rests"] | {"rod without bending": REFUSED["continuation"]["rod without bending"]}
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
 REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))
-# questions that several worlds are refused, and the objects that are refused before
+# questions refused for several worlds, and objects with an earlier refusal
 ALONE = {"continuation": {}, "path onto a ball": REFUSED["rests"]}
 
 
 def answer(name: str, question: str, variant: Variant) -> str:
-    """The sentence by which a cell is refused, empty where it works; anything else is raised."""
+    """Return the refusal of a cell, empty if the cell works; other errors are raised."""
     try:
         with np.errstate(over="raise", invalid="raise", divide="raise"), redirect_stdout(io.StringIO()):
             QUESTIONS[question](OBJECTS[name], variant)
@@ -102,7 +102,7 @@ def answer(name: str, question: str, variant: Variant) -> str:
 
 
 def expected(name: str, question: str, variant: Variant) -> tuple[str, ...]:
-    """Words of the sentence by which a cell is refused; none where it works."""
+    """Return words of the expected refusal of a cell; none where the cell works."""
     if variant.worlds > 1 and name not in ALONE.get(question, OBJECTS):
         return ("one world",)
     return REFUSED.get(question, {}).get(name, ())
@@ -145,7 +145,7 @@ def main() -> int:
 
 
 def cells():
-    """Every cell of the table: object, question, worlds, precision."""
+    """Return all cells of the table: object, question, worlds, precision."""
     return [(name, question, *variant) for name, question, variant in itertools.product(OBJECTS, QUESTIONS, VARIANTS)]
 
 

@@ -1,6 +1,6 @@
-"""Bad input is refused with an error that names the object, its index and the remedy, and nothing is built from it.
+"""Bad input is refused with an error that names the object, its index and the remedy; nothing is built.
 
-The list is data, in `bad_inputs` and what it names: 0 crashes, 0 errors of Python's or NumPy's own, 0 silent results.
+The cases are data, in `bad_inputs` and its modules: 0 crashes, 0 errors of Python or NumPy, 0 silent results.
 """
 
 import numpy as np
@@ -10,12 +10,12 @@ from bad_inputs import CASES, NAN, RING, RUBBER, STIFFNESS, built, counts, dome,
 import ddg_warp as ddg
 from ddg_warp.errors import SolverError
 
-COUNTS = counts()  # which brings all cases in
+COUNTS = counts()  # imports the modules of all cases
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_refused(case):
+def test_case_is_refused(case):
     with np.errstate(all="ignore"), pytest.raises((ValueError, SolverError)) as caught:
         case.action()
     assert not is_bare(caught.value)
@@ -23,15 +23,15 @@ def test_refused(case):
     assert not missing, f"{missing} not in: {caught.value}"
 
 
-def test_there_are_as_many_as_promised():
-    """At least 1,900, and no two alike."""
+def test_cases_are_many_and_different():
+    """There are at least 1,900 cases, all different."""
     assert sum(COUNTS.values()) == len(CASES) >= 1900
     assert len({str(case) for case in CASES}) == len(CASES)
     assert all(case.words for case in CASES)
 
 
-def test_the_good_ones_build():
-    """Otherwise all would be refused for another reason."""
+def test_valid_inputs_build():
+    """The valid objects build, so that refusals have no other reason."""
     assert model().curves.counts.tolist() == [7, 5]
     assert built(dome(), lambda s: s.hold_ring(0, 5)).points_count == 6
     assert built(sheet(), lambda s: s.hold(0, [0])).points_count == 16
@@ -40,8 +40,8 @@ def test_the_good_ones_build():
     ddg.Circle(np.array([0.1, 0.2]))
 
 
-def test_what_is_refused_leaves_no_trace():
-    """A scene is as it was before a call that it refused."""
+def test_refused_calls_leave_the_scene_unchanged():
+    """A refused call leaves the scene unchanged."""
     scene = rods(RING, closed=True)
     for action in (
         lambda: scene.add_rod(line(), section=3.0),
@@ -54,8 +54,8 @@ def test_what_is_refused_leaves_no_trace():
     assert (scene.rod_count, scene.loads, scene.supports, scene.shells) == (2, [], [], [])
 
 
-def test_a_parameter_that_is_refused_stays(device):
-    """All or nothing, in groups and nets."""
+def test_refused_parameters_stay_unchanged(device):
+    """Refused parameters stay unchanged in rod groups and coupled systems."""
     for kind, term in (("rods", "rod_stretch"), ("net", "rod_stretch"), ("hinge", "shell_hinge")):
         made = model(kind)
         before = {name: values.copy() for name, values in made.parameters().items()}
@@ -80,16 +80,16 @@ def test_a_parameter_that_is_refused_stays(device):
     ],
     ids=repr,
 )
-def test_selections_of_every_form(chosen):
-    """Edges 0 and 3 of the four of a rod, however they are named, are the same clamp."""
+def test_selections_of_all_forms_agree(chosen):
+    """Edges 0 and 3 of four make the same clamp in every form of selection."""
     scene = rods()
     scene.clamp(np.array([False, True]), chosen)
     assert [edge % 4 for edge in scene.supports[0].edges] == [0, 3]
     assert scene.supports[0].rods.tolist() == [1]
 
 
-def test_masks_of_vertices():
-    """A mask, its indices and a slice hold the same vertices of a shell and of a meridian."""
+def test_masks_indices_and_slices_agree():
+    """A mask, its indices and a slice select the same vertices of a shell and of a meridian."""
     scene = sheet()
     for chosen in (scene.shells[0].points[:, 0] == 0.0, np.arange(0, 16, 4), slice(0, 16, 4)):
         scene.hold(0, chosen)
@@ -100,8 +100,8 @@ def test_masks_of_vertices():
     assert meridian.ring_supports[0].nodes.tolist() == [4, 5]
 
 
-def test_rods_count_as_scalars_of_numpy():
-    """What `np.flatnonzero` and the like return goes in as it is."""
+def test_numpy_integers_are_valid_indices():
+    """NumPy integers, as of `np.flatnonzero`, are valid indices of rods and nodes."""
     scene = rods()
     scene.add_force(np.int64(1), np.int64(4), np.array([0.0, 0.0, 1.0]))
     scene.join([(np.int64(0), np.int32(0)), (1, 0)])

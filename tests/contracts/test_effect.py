@@ -1,4 +1,4 @@
-"""Every argument of a public call has an effect that something shows, or is refused; the table is in `effects`.
+"""Every argument of a public call has an observable effect, or is refused; the table is in `effects`.
 
 All rows take 25 s of one core.
 """
@@ -24,52 +24,64 @@ ROWS = [
     for call in CALLS
     for argument in CALLS[call].rows
 ]
-UNLISTED = {"copy"}  # takes the attributes of a scene, as `Scene` does
+UNLISTED = {"copy"}  # same arguments as `Scene`
 
 
 def change_of(call: str, argument: str) -> Change:
-    """The change of an argument of a call."""
+    """Return the change of an argument of a call."""
     row = CALLS[call].rows[argument]
     return row if isinstance(row, Change) else Change(row)
 
 
 @cache
-def untouched(call: str):
-    """What a call shows with the arguments of its base."""
+def base_observation(call: str):
+    """Return the observation of a call with base arguments."""
     return observed(CALLS[call], CALLS[call].base)
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("call", "argument"), ROWS, ids=str)
-def test_effect(call, argument):
+def test_argument_has_an_effect(call, argument):
     change, made = change_of(call, argument), CALLS[call]
     before = made.base | change.beside | ({} if change.before is None else {argument: change.before})
     with np.errstate(all="ignore"):
-        alone = not change.beside and change.before is None
-        first = untouched(call) if alone else observed(made, before)
+        is_base = not change.beside and change.before is None
+        first = base_observation(call) if is_base else observed(made, before)
         second = observed(made, before | {argument: change.value})
     assert first != second
     assert (second[0] == "refused") == change.refused, second[1] if second[0] == "refused" else "it is not refused"
 
 
 def test_every_argument_has_a_row():
-    """Of each call that is in the table, every argument of its signature and of the options that it takes."""
+    """Every argument and option of each call in the table is listed."""
     wanted, listed = defaultdict(set), defaultdict(set)
     for call in CALLS.values():
         wanted[call.of] |= set(call.arguments)
         listed[call.of] |= set(call.rows)
-    missing = {of.__qualname__: sorted(wanted[of] - listed[of]) for of in wanted if wanted[of] - listed[of]}
-    unknown = {of.__qualname__: sorted(listed[of] - wanted[of]) for of in listed if listed[of] - wanted[of]}
+    missing = {
+        function.__qualname__: sorted(wanted[function] - listed[function])
+        for function in wanted
+        if wanted[function] - listed[function]
+    }
+    unknown = {
+        function.__qualname__: sorted(listed[function] - wanted[function])
+        for function in listed
+        if listed[function] - wanted[function]
+    }
     assert not missing
     assert not unknown
 
 
-def test_every_call_of_a_scene_is_in_the_table():
-    """And every class that a user makes: sections, materials, motions, obstacles, drag, analyses."""
-    found = {call.of for call in CALLS.values()}
-    methods = {name: of for name, of in inspect.getmembers(ddg.Scene, inspect.isfunction) if not name.startswith("_")}
+def test_every_public_call_is_in_the_table():
+    """Every public class is listed, too: sections, materials, motions, obstacles, drag, analyses."""
+    listed = {call.of for call in CALLS.values()}
+    methods = {
+        name: function
+        for name, function in inspect.getmembers(ddg.Scene, inspect.isfunction)
+        if not name.startswith("_")
+    }
     kinds = {name: getattr(ddg, name) for name in ddg.__all__ if inspect.isclass(getattr(ddg, name))}
-    others = {
+    untested = {
         "Check",
         "Model",
         "Recorder",
@@ -78,5 +90,5 @@ def test_every_call_of_a_scene_is_in_the_table():
         "SolverError",
         "State",
     }  # made by no user, or tested elsewhere
-    assert not [name for name, of in methods.items() if of not in found and name not in UNLISTED]
-    assert not [name for name, of in kinds.items() if of not in found and name not in others]
+    assert not [name for name, function in methods.items() if function not in listed and name not in UNLISTED]
+    assert not [name for name, function in kinds.items() if function not in listed and name not in untested]

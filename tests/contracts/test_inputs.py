@@ -1,4 +1,4 @@
-"""What a user hands in is taken as it is meant, on every kind of object: selections, motions, loads, models that stay as built."""
+"""Interpretation of user input on every kind of object: selections, motions, loads, models unchanged after build."""
 
 import inspect
 import os
@@ -35,44 +35,44 @@ def sheet(cells=(4, 4), size=(1.0, 1.0), bending="midedge_dof", gravity=(0.0, 0.
     return scene
 
 
-def side(scene: ddg.Scene, axis: int, at: float) -> np.ndarray:
-    """Mask of the vertices of shell 0 on a side."""
-    return np.abs(scene.shells[0].points[:, axis] - at) < 1e-9
+def side(scene: ddg.Scene, axis: int, coordinate: float) -> np.ndarray:
+    """Return the mask of vertices of shell 0 on a side."""
+    return np.abs(scene.shells[0].points[:, axis] - coordinate) < 1e-9
 
 
 # --- loads along edges ---
-def applied(scene: ddg.Scene) -> np.ndarray:
-    """Forces of all vertex loads of a scene on its vertices (P, 3)."""
+def vertex_forces(scene: ddg.Scene) -> np.ndarray:
+    """Return the sum of vertex loads of a scene by vertex (P, 3)."""
     force = np.zeros_like(scene.shells[0].points)
     for load in scene.shell_loads:
         np.add.at(force, load.vertices, load.force)
     return force
 
 
-def test_an_edge_force_is_that_per_length_of_edges():
-    """1 N/m on a side of 1 m is 1 N, halves at its ends, whatever the order of the vertices; on all sides it is 4 N."""
+def test_edge_force_is_per_length():
+    """1 N/m on a side of 1 m is 1 N, halved at the ends, for any order of vertices; on all sides it is 4 N."""
     expected = np.where(side(sheet(), 1, 0.0), 0.25, 0.0)
     expected[[0, 4]] = 0.125
     for chosen in ([0, 1, 2, 3, 4], [3, 0, 4, 1, 2], side(sheet(), 1, 0.0), [[0, 1], [2, 1], [2, 3], [4, 3]]):
         scene = sheet()
         scene.add_edge_force(0, chosen, (0.0, 0.0, 1.0))
-        np.testing.assert_allclose(applied(scene)[:, 2], expected, atol=1e-15)
+        np.testing.assert_allclose(vertex_forces(scene)[:, 2], expected, atol=1e-15)
     scene = sheet()
     scene.add_edge_force(0, scene.shells[0].surface.boundary_vertices, (0.0, 0.0, 1.0))
-    assert applied(scene)[:, 2].sum() == pytest.approx(4.0)
-    assert applied(scene)[12, 2] == 0.0  # the middle
+    assert vertex_forces(scene)[:, 2].sum() == pytest.approx(4.0)
+    assert vertex_forces(scene)[12, 2] == 0.0  # the middle
 
 
-def test_an_edge_force_inside_takes_edges():
-    """A line through the middle, by its mesh edges: 2 N/m on 1 m."""
+def test_edge_force_on_inner_edges():
+    """Mesh edges through the middle carry 2 N/m on 1 m."""
     scene = sheet()
     line = np.arange(10, 15)
     scene.add_edge_force(0, np.column_stack([line[:-1], line[1:]]), (0.0, 2.0, 0.0))
-    np.testing.assert_allclose(applied(scene)[line, 1], [0.25, 0.5, 0.5, 0.5, 0.25])
+    np.testing.assert_allclose(vertex_forces(scene)[line, 1], [0.25, 0.5, 0.5, 0.5, 0.25])
 
 
 def strip(turn: float, bending: str, n: int = 32, **options) -> ddg.Scene:
-    """A strip of 1 m, clamped at x = 0, with the couple at x = 1 that bends it by `turn` [rad] into an arc."""
+    """Return a strip of 1 m clamped at x = 0, with a couple at x = 1 that bends it into an arc of angle `turn` [rad]."""
     scene = sheet((n, 2), (1.0, 0.1), bending)
     scene.clamp_boundary(0, side(scene, 0, 0.0))
     moment = RUBBER.young * 0.01**3 / 12.0 * turn  # per length: E h^3 / 12 kappa, of nu = 0
@@ -81,7 +81,7 @@ def strip(turn: float, bending: str, n: int = 32, **options) -> ddg.Scene:
 
 
 @pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "midedge_boundary"])
-def test_an_edge_couple_bends_a_strip_into_an_arc(device, bending):
+def test_edge_couple_bends_strip_into_arc(device, bending):
     """M = E h^3 / 12 kappa, kappa L = pi: the tip is at L (sin pi, cos pi - 1) / pi, convex above; the error falls with n^2."""
     errors = []
     for n in (16, 32):
@@ -94,12 +94,12 @@ def test_an_edge_couple_bends_a_strip_into_an_arc(device, bending):
     assert errors[0] / errors[1] > 2.5
     (reaction,) = model.reactions(state, point=(0.0, 0.0, 0.0))
     np.testing.assert_allclose(reaction.force, 0.0, atol=1e-6)
-    moment = 0.1 * RUBBER.young * 0.01**3 / 12.0 * np.pi  # about +y, the way the edge at x = 1 runs
+    moment = 0.1 * RUBBER.young * 0.01**3 / 12.0 * np.pi  # about +y, the direction of the edge at x = 1
     np.testing.assert_allclose(reaction.moment, (0.0, -moment, 0.0), atol=1e-3 * moment)
 
 
-def test_derivative_of_edge_couples(device):
-    """load_stiffness is minus the central difference of the loads, on any shape."""
+def test_load_stiffness_of_edge_couples_matches_differences(device):
+    """`load_stiffness` is minus the central difference of the loads, on any shape."""
     model = strip(0.5, "midedge_dof", 4).build(device, "float64")
     tangent, random = Tangent(model), np.random.default_rng(0)
     q = tangent.dofs(model.state()) + 0.02 * random.normal(size=tangent.size)
@@ -109,33 +109,33 @@ def test_derivative_of_edge_couples(device):
 
 
 @pytest.mark.slow
-def test_edge_couples_are_the_same_on_the_device(device):
-    """Conjugate gradients, which take the loads from the device, and factors find the same arc; in 3 worlds alike."""
+def test_edge_couples_agree_between_pcg_and_factors(device):
+    """PCG, with loads from the device, and direct factors find the same arc; 3 worlds agree."""
     scene = strip(0.6, "midedge_dof", 8)
     one = statics.solve(scene.build(device, "float64"), solver="direct").points()
     three = statics.solve(scene.build(device, "float64", worlds=3), solver="pcg").points()
-    for found in three:
-        np.testing.assert_allclose(found, one, atol=1e-7)
+    for points in three:
+        np.testing.assert_allclose(points, one, atol=1e-7)
 
 
 @pytest.mark.parametrize(
     "precision", ["float64", *(pytest.param(precision, marks=pytest.mark.slow) for precision in ("mixed", "float32"))]
 )
-def test_edge_couples_move_what_they_act_on(device, precision):
-    """A free square, h rho a^2 = 10 kg: a couple about one side gives it M = I w' about its middle and no momentum."""
+def test_edge_couple_adds_angular_momentum_only(device, precision):
+    """A couple on a side of a free square, h rho a^2 = 10 kg, gives M = I w' about the middle and no momentum."""
     scene = sheet((2, 2))
     scene.add_edge_couple(0, side(scene, 0, 1.0), 2e-5, amplitude=lambda t: 1.0)
     model = scene.build(device, precision)
     state = ddg.Integrator(model).step(model.state(), 1e-3)
     v, x = state.velocities(), state.points()
-    (part,) = Tangent(model).parts
-    mass = part.mass.reshape(-1, 3)[: len(x), :1]
+    (block,) = Tangent(model).parts
+    mass = block.mass.reshape(-1, 3)[: len(x), :1]
     np.testing.assert_allclose((mass * v).sum(0), 0.0, atol=1e-11)
     spin = np.cross(x - [0.5, 0.5, 0.0], mass * v).sum(0)
     np.testing.assert_allclose(spin, (0.0, 2e-5 * 1e-3, 0.0), rtol=0.05, atol=1e-11)
 
 
-def test_edge_couples_need_an_angle_that_is_free(device):
+def test_edge_couples_need_free_boundary_angles(device):
     for bending in ("midedge", "hinge", "isometric"):
         with pytest.raises(ddg.SceneError, match="no angle with bending"):
             sheet(bending=bending).add_edge_couple(0, [0, 1], 1.0)
@@ -153,15 +153,15 @@ def shift(t: float) -> np.ndarray:
     return np.array([0.02 * t, -0.05 * t, 0.1 * t])
 
 
-def alone(motion) -> ddg.Scene:
+def uncoupled_rods(motion) -> ddg.Scene:
     scene = ddg.Scene(gravity=(0.0, 0.0, -1.0))
     rods = scene.add_rods([straight(), straight() + [0.0, 1.0, 0.0]], section=STEEL)
     scene.fix(rods, [0, 1, -1], motion=motion)
     return scene
 
 
-def joined(motion) -> ddg.Scene:
-    scene = alone(motion)
+def coupled_rods(motion) -> ddg.Scene:
+    scene = uncoupled_rods(motion)
     scene.join([(0, 4), (scene.add_rod(straight() + [0.5, 0.0, 0.0], section=STEEL), 0)])
     return scene
 
@@ -187,8 +187,8 @@ def revolved(motion) -> ddg.Scene:
 
 
 KINDS = {
-    "rods": (alone, 6),
-    "joined": (joined, 6),
+    "rods": (uncoupled_rods, 6),
+    "joined": (coupled_rods, 6),
     "planar": (planar, 3),
     "shell": (shell, 10),
     "revolved": (revolved, 2),
@@ -197,37 +197,37 @@ KINDS = {
 
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("kind", KINDS)
-def test_one_displacement_for_all_is_the_same_for_each(device, kind, worlds):
-    """A rigid motion, and the same given node by node: the same steps to the last bit, and the same equilibrium."""
-    make, held = KINDS[kind]
-    out = [1.0, 0.0 if kind in ("planar", "revolved") else 1.0, 1.0]
-    rigid = make(ddg.Motion(translation=lambda t: out * shift(t)))
-    each = make(ddg.Motion(translation=lambda t: np.tile(out * shift(t), (held, 1))))
-    found = []
-    for scene in (rigid, each):
+def test_common_displacement_equals_displacements_per_node(device, kind, worlds):
+    """A rigid displacement and the same one per node: bitwise equal steps and equilibrium."""
+    make, count = KINDS[kind]
+    scale = [1.0, 0.0 if kind in ("planar", "revolved") else 1.0, 1.0]
+    rigid = make(ddg.Motion(translation=lambda t: scale * shift(t)))
+    single = make(ddg.Motion(translation=lambda t: np.tile(scale * shift(t), (count, 1))))
+    results = []
+    for scene in (rigid, single):
         model = scene.build(device, "float64", worlds=worlds)
         integrator, state = ddg.Integrator(model), model.state()
         for _ in range(2):
             state = integrator.step(state, 0.01)
-        found.append([state.points(), *([statics.solve(model).points()] if worlds == 1 else [])])
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
+        results.append([state.points(), *([statics.solve(model).points()] if worlds == 1 else [])])
+    for common, per_node in zip(*results, strict=True):
+        np.testing.assert_array_equal(common, per_node)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_node_goes_its_own_way(device, kind):
-    """Node i of those held is displaced by i a t along z: in dynamics and in statics, in the order given, rod after rod."""
-    make, held = KINDS[kind]
-    scene = make(ddg.Motion(translation=lambda t: 1e-3 * t * np.outer(np.arange(held), [0.0, 0.0, 1.0])))
+def test_displacements_per_node_apply_in_order(device, kind):
+    """Supported node i is displaced by i a t along z, in dynamics and statics, in the given order, rod by rod."""
+    make, count = KINDS[kind]
+    scene = make(ddg.Motion(translation=lambda t: 1e-3 * t * np.outer(np.arange(count), [0.0, 0.0, 1.0])))
     model = scene.build(device, "float64")
     rest = model.state().points()
     for state, t in ((ddg.Integrator(model).step(model.state(), 0.1), 0.1), (statics.solve(model), 1.0)):
-        moved = (state.points() - rest)[held_points(scene), 2]
-        np.testing.assert_allclose(moved, 1e-3 * t * np.arange(held), atol=1e-14)
+        moved = (state.points() - rest)[supported_points(scene), 2]
+        np.testing.assert_allclose(moved, 1e-3 * t * np.arange(count), atol=1e-14)
 
 
-def held_points(scene: ddg.Scene) -> np.ndarray:
-    """Rows of the points that the first support of a scene holds, in its order."""
+def supported_points(scene: ddg.Scene) -> np.ndarray:
+    """Return the point indices of the first support of a scene, in its order."""
     if scene.shell_supports:
         return scene.shell_supports[0].vertices
     if scene.ring_supports:
@@ -238,8 +238,8 @@ def held_points(scene: ddg.Scene) -> np.ndarray:
 
 # --- models stay as they were built ---
 def test_edits_after_build_do_not_reach_the_model(device):
-    """A model steps the same whatever happens to its scene, and arrays of a scene are read-only."""
-    scene = joined(None)
+    """Later changes of the scene do not change the model; arrays of a scene are read-only."""
+    scene = coupled_rods(None)
     model = scene.build(device, "float64")
     before = ddg.Integrator(model).step(model.state(), 0.01).points()
     scene.gravity, scene.mass_damping = (5.0, 0.0, 0.0), 3.0
@@ -254,8 +254,8 @@ def test_edits_after_build_do_not_reach_the_model(device):
             array[0] = 0
 
 
-def test_arrays_of_the_user_are_copied(device):
-    """What is changed after it was handed in stays as it was handed in."""
+def test_input_arrays_are_copied(device):
+    """Arrays changed after the call do not change the scene."""
     points, stiffness, natural = straight(), np.full(8, 1e3), np.zeros(7)
     scene = ddg.Scene()
     scene.add_rod(points, section=ddg.Stiffness(EA=stiffness, EI1=1.0, GJ=1.0), natural=(natural, 0.0, 0.0))
@@ -265,9 +265,9 @@ def test_arrays_of_the_user_are_copied(device):
     np.testing.assert_array_equal(scene.build(device, "float64").state().points(), straight())
 
 
-# --- meshes and masses that are likely not meant ---
-def test_pieces_are_warned_of_and_welded(tmp_path):
-    """Two squares side by side, each with vertices of its own: two pieces, until read with a tolerance; a slit is no piece."""
+# --- meshes and masses that are probably unintended ---
+def test_disconnected_meshes_warn_and_weld(tmp_path):
+    """Two squares with separate vertices are two pieces until read with a tolerance; a slit mesh is one piece."""
     quads = "".join(f"v {x} {y} 0\n" for s in (0, 1) for x, y in ((s, 0), (s + 1, 0), (s + 1, 1), (s, 1 + 1e-9)))
     (tmp_path / "two.obj").write_text(quads + "f 1 2 3 4\nf 5 6 7 8\n")
     points, triangles, name = read_mesh(tmp_path / "two.obj")
@@ -277,15 +277,13 @@ def test_pieces_are_warned_of_and_welded(tmp_path):
     points, triangles, _ = read_mesh(tmp_path / "two.obj", weld=1e-6)
     assert (len(points), len(triangles)) == (6, 4)
     for mesh in ((points, triangles), meshes.annulus(2, 8, 1.0, 2.0, slit=True), meshes.weld(*meshes.sphere(1), 1e-9)):
-        shell = scene.add_shell(
-            *mesh, thickness=0.01, material=RUBBER
-        )  # a warning would be an error, see `filterwarnings`
+        shell = scene.add_shell(*mesh, thickness=0.01, material=RUBBER)  # warnings are errors, see `filterwarnings`
         assert scene.shells[shell].surface.pieces == 1
 
 
 @pytest.mark.filterwarnings("error")
-def test_gravity_on_what_has_no_mass_is_warned_of(device):
-    """A rod without mass does not sag: said by name in statics, and not where there is no gravity, or a point mass."""
+def test_gravity_without_mass_warns(device):
+    """A rod without mass under gravity warns by name in statics; not without gravity or with a point mass."""
     bare = ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0)
 
     def solve(mass: float = 0.0, **options):
@@ -302,7 +300,7 @@ def test_gravity_on_what_has_no_mass_is_warned_of(device):
 
 
 def test_curved_membranes_take_a_new_rest_shape(device):
-    """A sheet with curved sides that grows by a tenth is a tenth larger, all of it: no term is left with its old rest shape."""
+    """A sheet with curved sides grown by a tenth is a tenth larger: every term takes the new rest shape."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_shell(*meshes.rectangle(2, 2), thickness=0.05, material=RUBBER, membrane="curved")
     scene.hold(0, [0])
@@ -314,9 +312,9 @@ def test_curved_membranes_take_a_new_rest_shape(device):
     np.testing.assert_allclose(statics.solve(model).points(), 1.1 * points, atol=1e-8)
 
 
-# --- what is found ---
-def test_public_names_are_known():
-    """dir, completion and type checkers know what `import ddg_warp` offers, each from where it is loaded."""
+# --- public names ---
+def test_public_names_are_listed():
+    """`dir`, completion and type checkers list the names of `ddg_warp`, each from its module."""
     source = Path(ddg.__file__).read_text()
     checked = re.findall(r"^    from ddg_warp(?:\.(\S+))? import (.+)$", source, re.MULTILINE)
     homes = {name.strip(): home for home, names in checked for name in names.split(",")}
@@ -329,8 +327,8 @@ def test_public_names_are_known():
         _ = ddg.Rod
 
 
-def test_signatures_say_what_they_take():
-    """`add_rod` shows the arguments of `add_rods`, and a scene takes keywords only, none of them its own lists."""
+def test_signatures_list_arguments():
+    """`add_rod` shows the arguments of `add_rods`; a scene takes keywords only, none of them its internal lists."""
     one, several = (inspect.signature(getattr(ddg.Scene, name)) for name in ("add_rod", "add_rods"))
     assert one.parameters == several.parameters
     assert list(inspect.signature(ddg.Scene).parameters) == [
@@ -340,11 +338,11 @@ def test_signatures_say_what_they_take():
     assert typing.get_type_hints(ddg.Scene.add_rod)["return"] is int
 
 
-def test_objects_say_what_they_are(device):
-    """A few lines each, with the counts that matter."""
+def test_repr_names_object_and_counts(device):
+    """A few lines each, with the main counts."""
     from ddg_warp.run.simulate import Result
 
-    scene = joined(None)
+    scene = coupled_rods(None)
     scene.add_force(0, 3, (0.0, 0.0, 1.0))
     model = scene.build(device, "float64", worlds=2)
     state = model.state()
@@ -354,8 +352,8 @@ def test_objects_say_what_they_are(device):
         (state, "State", "t = 0 s", "2 worlds of 27 points"),
         (Result(scene, model, state, [0.0, 0.5], {"tip": [0.0, 1.0]}), "Result", "2 states", "0 to 0.5", "tip"),
     ]
-    for thing, *words in texts:
-        text = repr(thing)
+    for item, *words in texts:
+        text = repr(item)
         assert all(word in text for word in words), text
         assert len(text) < 400
 
@@ -377,7 +375,7 @@ ddg.Integrator(model).step(model.state(), 0.01)
 
 @pytest.mark.parametrize("verbose", ["", pytest.param("1", marks=pytest.mark.slow)])
 def test_scripts_print_no_module_loads(verbose):
-    """Importing loads nothing heavy; a run prints nothing of Warp's, or with DDG_WARP_VERBOSE=1 what it always did."""
+    """Importing loads nothing heavy; a run prints Warp's messages only with DDG_WARP_VERBOSE=1."""
     environment = os.environ | {"DDG_WARP_VERBOSE": verbose}
     done = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -387,7 +385,7 @@ def test_scripts_print_no_module_loads(verbose):
 
 # --- symmetry planes across any direction ---
 def quarter(turn: float = 0.0, bending: str = "midedge_dof", axes: bool = False, gravity: float = 1.0) -> ddg.Scene:
-    """A quarter of a square plate on supported sides under its weight, turned by an angle about z, on two symmetry planes."""
+    """Return a quarter of a square plate, rotated about z, with two symmetry planes, supported sides and gravity."""
     rotation = ddg.Motion().rotation(turn)
     points, triangles = meshes.rectangle(4, 4)
     scene = ddg.Scene(gravity=(0.0, 0.0, -gravity))
@@ -403,9 +401,9 @@ TURN = np.pi / 6.0
 
 
 @pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "hinge"])
-def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
-    """Statics by factors and by conjugate gradients, and steps of both schemes: turned by 30 degrees, all is turned, nothing else."""
-    found = []
+def test_oblique_symmetry_is_rotated_axis_aligned_symmetry(device, bending):
+    """Rotated by 30 degrees, statics by both solvers and steps of both schemes are rotated, and otherwise equal."""
+    results = []
     for turn, axes in ((0.0, True), (TURN, False)):
         back = ddg.Motion().rotation(turn)
         model = quarter(turn, bending, axes).build(device, "float64")
@@ -415,26 +413,26 @@ def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
             for _ in range(5):
                 state = integrator.step(state, 0.01)
             points.append(state.points())
-        found.append([x @ back for x in points])
-    for aligned, oblique in zip(*found, strict=True):
+        results.append([x @ back for x in points])
+    for aligned, oblique in zip(*results, strict=True):
         np.testing.assert_allclose(oblique, aligned, atol=1e-7)
-    assert found[0][0][0, 2] < -1e-3  # the middle sags
+    assert results[0][0][0, 2] < -1e-3  # the middle sags
 
 
 @pytest.mark.slow
-def test_oblique_symmetry_in_worlds_precisions_and_paths(device):
-    """Three worlds are alike; mixed and float32 agree within their rounding; frequencies and the end of a path are as aligned."""
+def test_oblique_symmetry_agrees_across_worlds_precisions_and_paths(device):
+    """Worlds agree exactly, precisions within rounding; frequencies and path ends equal the aligned ones."""
     from ddg_warp.solve.continuation import Continuation
     from ddg_warp.solve.stability import spectrum
 
-    found = []
+    results = []
     for turn, axes in ((0.0, True), (TURN, False)):
         model = quarter(turn, axes=axes).build(device, "float64")
         state = statics.solve(model)
         watch = {"middle": ddg.Displacement.of(0, "z")}
         path = Continuation(model, watch).trace(stop=ddg.Stop(load=(-1.0, 0.5))).values("middle")
-        found.append([*spectrum(model, state, 3).frequencies, path[-1]])
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+        results.append([*spectrum(model, state, 3).frequencies, path[-1]])
+    np.testing.assert_allclose(results[1], results[0], rtol=1e-6)
     reference = ddg.Integrator(model).step(model.state(), 0.02).points()
     for precision, tolerance in (("mixed", 1e-6), ("float32", 1e-4)):
         worlds = quarter(TURN).build(device, precision, worlds=3)
@@ -443,8 +441,8 @@ def test_oblique_symmetry_in_worlds_precisions_and_paths(device):
         np.testing.assert_allclose(points[0], reference, atol=tolerance)
 
 
-def test_points_stay_on_oblique_planes_and_reactions_are_across_them(device):
-    """A sheet swings freely along its planes; what each plane bears points along its normal, and all bear the weight."""
+def test_oblique_planes_keep_points_and_normal_reactions(device):
+    """Sheet points stay on the oblique planes; reactions are normal to the planes and carry the weight."""
     scene = quarter(TURN)
     model = scene.build(device, "float64")
     first, second, sides = model.reactions(statics.solve(model))
@@ -458,8 +456,8 @@ def test_points_stay_on_oblique_planes_and_reactions_are_across_them(device):
         np.testing.assert_allclose(offset, 0.0, atol=1e-12)
 
 
-def test_a_wedge_sags_like_the_disc_it_is_of(device):
-    """A sixth of a disc of six equal sectors, between planes 60 degrees apart that meet on the axis: the disc itself."""
+def test_wedge_between_symmetry_planes_matches_disc(device):
+    """A sixth of a disc between symmetry planes 60 degrees apart that meet on the axis equals the disc."""
     points, triangles = meshes.disc(4)
     scenes = []
     for sector in (False, True):
@@ -478,11 +476,11 @@ def test_a_wedge_sags_like_the_disc_it_is_of(device):
             scene.hold(0, [1], "y")
         scene.hold(0, np.abs(np.linalg.norm(x, axis=1) - 1.0) < 1e-9, "z")
         scenes.append((scene, used))
-    whole, part = (statics.solve(scene.build(device, "float64")).points() for scene, _ in scenes)
-    np.testing.assert_allclose(part, whole[scenes[1][1]], atol=1e-7)
+    disc, wedge = (statics.solve(scene.build(device, "float64")).points() for scene, _ in scenes)
+    np.testing.assert_allclose(wedge, disc[scenes[1][1]], atol=1e-7)
 
 
-def test_a_moved_vertex_is_on_no_oblique_plane(device):
+def test_moved_vertex_on_oblique_plane_is_refused(device):
     scene = quarter(TURN)
     scene.hold(0, [0], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
     with pytest.raises(ddg.SceneError, match=r"\(0, 0, 0\) m is on a symmetry plane across .* and moved by a support"):
