@@ -1,4 +1,4 @@
-"""A model and its states without Warp: what recorder and writers ask of the real ones, and nothing else."""
+"""Model and states without Warp, with the minimal interface of recorder and writers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SAIL, BALL = meshes.rectangle(4, 2), meshes.sphere(0)
 
 
 def curves() -> Curves:
-    """Two open rods of 5 points and a closed one of 6, in two batches."""
+    """Return two open rods of 5 points and a closed one of 6, in two batches."""
     counts = np.array([5, 5, 6])
     return Curves(
         counts=counts,
@@ -25,7 +25,7 @@ def curves() -> Curves:
 
 
 def rest_points() -> np.ndarray:
-    """Positions [m], shape (16, 3): lines along x and a circle in the plane z = 1."""
+    """Return positions [m], shape (16, 3): lines along x and a circle in the plane z = 1."""
     line = np.linspace(0.0, 1.0, 5)
     angle = 2.0 * np.pi * np.arange(6) / 6
     rods = [np.stack([line, np.full(5, y), np.zeros(5)], axis=1) for y in (0.0, 0.5)]
@@ -33,7 +33,7 @@ def rest_points() -> np.ndarray:
 
 
 def surfaces() -> Surfaces:
-    """A sail of 4 x 2 cells, held by the ring at its first vertex, and a ball; their other points follow those of the rods."""
+    """Return a sail of 4 x 2 cells, fixed to the ring at its first vertex, and a ball; their other points follow the rods'."""
     (_, sail), (_, ball) = SAIL, BALL
     return Surfaces(
         triangles=np.concatenate([np.where(sail == 0, 15, 15 + sail), 30 + ball]),
@@ -44,13 +44,13 @@ def surfaces() -> Surfaces:
 
 
 def surface_points() -> np.ndarray:
-    """Positions of the points that only the surfaces have [m], shape (26, 3)."""
+    """Return the positions of surface points without rod points [m], shape (26, 3)."""
     return np.concatenate([SAIL[0][1:] + [0.5, -1.0, 1.0], BALL[0] + [0.0, 0.0, 3.0]])
 
 
 @dataclass
 class State:
-    """Points that a pseudo-random map moves, so that a wrong restart shows."""
+    """Points advanced by a pseudo-random map: a wrong restart shows."""
 
     time: float
     q: np.ndarray
@@ -74,7 +74,7 @@ class State:
 
 @dataclass
 class Model:
-    """A model of `worlds` copies."""
+    """Model of `worlds` copies."""
 
     curves: Curves = field(default_factory=curves)
     surfaces: Surfaces | None = None
@@ -97,5 +97,5 @@ class Model:
 
 
 def step(state: State, dt: float = 0.01) -> State:
-    """The next state; the map is chaotic enough that only a bitwise equal state continues alike."""
+    """Return the next state; the map is chaotic: only bitwise equal states evolve equally."""
     return State(state.time + dt, np.sin(3.0 * state.q + state.time), state.model)

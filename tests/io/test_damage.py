@@ -1,4 +1,4 @@
-"""Disks that fill up and files that are cut short: one named error, nothing that was complete is lost, no crash."""
+"""Full disks and truncated files: one named error, no loss of complete data, no crash."""
 
 import os
 import subprocess
@@ -40,8 +40,8 @@ for size in map(int, sys.argv[2:]):
 SIZES = (0, 1000, 20_000, 40_000, 80_000, 150_000, 250_000, 400_000)
 
 
-def child(code: str, *arguments) -> subprocess.CompletedProcess:
-    """Runs code in a process of its own, so that a crash, also one at its exit, is seen."""
+def run_in_process(code: str, *arguments) -> subprocess.CompletedProcess:
+    """Run code in a separate process, so that crashes, also at exit, are seen."""
     root = Path(__file__).resolve().parents[2]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(Path(__file__).parent)])}
     return subprocess.run(
@@ -49,9 +49,9 @@ def child(code: str, *arguments) -> subprocess.CompletedProcess:
     )
 
 
-def test_a_full_disk_costs_no_complete_block(tmp_path):
-    """Files that may not grow beyond a size, as on a full disk: the error says so, frames and scene up to a block are there."""
-    run = child(FULL, tmp_path, *SIZES)
+def test_full_disk_loses_no_complete_block(tmp_path):
+    """Files limited in size, as on a full disk: the error reports it; frames and scene up to a block are complete."""
+    run = run_in_process(FULL, tmp_path, *SIZES)
     assert (run.returncode, run.stderr) == (0, "")
     assert len(run.stdout.splitlines()) == len(SIZES)
     frames = []
@@ -76,7 +76,7 @@ def test_a_full_disk_costs_no_complete_block(tmp_path):
 
 @pytest.fixture
 def run(tmp_path) -> Path:
-    """A directory with a run of ten frames."""
+    """Return a directory with a run of ten frames."""
     model = Model(surfaces=surfaces())
     with Recorder(model, tmp_path / "run", block=BLOCK) as recorder:
         state = model.state()
@@ -95,7 +95,7 @@ def exported(path: Path) -> None:
     export_usd(path, path.with_name("export.usdc"))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.99])
+@pytest.mark.parametrize("fraction", [0.0, 0.03, 0.5, 0.99])
 @pytest.mark.parametrize(
     ("name", "read_it", "error"),
     [
@@ -106,28 +106,28 @@ def exported(path: Path) -> None:
         (SCENE, lambda path: read_mesh(path, "/World/sail"), MeshError),
     ],
 )
-def test_a_file_cut_short_is_named(run, name, read_it, error, share):
-    """What copying that was broken off leaves: the file, what is wrong with it, and what to do."""
+def test_truncated_files_are_refused_by_name(run, name, read_it, error, fraction):
+    """A truncated copy is refused with the file, the fault and the remedy."""
     path = run / name
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    path.write_bytes(path.read_bytes()[: int(fraction * path.stat().st_size)])
     with pytest.raises(error, match=rf"{path}.*cut short or damaged.*(export it again|record the run anew)") as caught:
         read_it(path)
     assert "\n" not in str(caught.value)
 
 
-def test_damage_inside_is_named(run):
-    """Bytes overwritten at random: what is read is either whole or refused by name; nothing else escapes."""
+def test_random_damage_is_refused_by_name(run):
+    """Random bytes are overwritten: data read are complete or refused by name, without other errors."""
     path, refused = run / TRAJECTORY, 0
     content = path.read_bytes()
     for seed in range(30):
         random = np.random.default_rng(seed)
         damaged = bytearray(content)
-        for place in random.integers(0, len(content), 20):
-            damaged[place] = random.integers(256)
+        for offset in random.integers(0, len(content), 20):
+            damaged[offset] = random.integers(256)
         path.write_bytes(damaged)
         for read_it in (read, exported, resumed):
             try:
-                with np.errstate(over="ignore", invalid="ignore"):  # numbers may have become any others
+                with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers may have any value
                     read_it(path)
             except (TrajectoryError, CurveError) as error:
                 assert str(path) in str(error)
@@ -136,51 +136,51 @@ def test_damage_inside_is_named(run):
     assert refused > 10
 
 
-def all_of(path: Path) -> dict:
-    """Everything that a reader has of a trajectory, but its provenance, as bytes or text."""
+def all_data(path: Path) -> dict:
+    """Return all data of a trajectory but the provenance, as text."""
     with TrajectoryReader(path) as reader:
-        found = {
+        data = {
             "time": reader.time,
             "points": reader.points[:],
             **reader.series,
             **reader.parameters,
             **reader.checkpoint(),
         }
-        found |= {"counts": reader.curves.counts, "radius": reader.curves.radius, "names": reader.curves.names}
-        found |= {"triangles": reader.surfaces.triangles, "run": np.array(sorted(reader.run_counts()))}
-    return {name: str(value.tolist()) for name, value in found.items()}
+        data |= {"counts": reader.curves.counts, "radius": reader.curves.radius, "names": reader.curves.names}
+        data |= {"triangles": reader.surfaces.triangles, "run": np.array(sorted(reader.run_counts()))}
+    return {name: str(value.tolist()) for name, value in data.items()}
 
 
-def test_no_flipped_bit_is_read_as_a_number(run):
-    """Anywhere in the file: what is read is what was written, or refused by name."""
-    path, told = run / TRAJECTORY, 0
-    content, written = path.read_bytes(), all_of(path)
+def test_no_flipped_bit_changes_data(run):
+    """A bit flip anywhere in the file: data read equal the data written, or are refused by name."""
+    path, refused = run / TRAJECTORY, 0
+    content, written = path.read_bytes(), all_data(path)
     random = np.random.default_rng(1)
-    for place in random.choice(len(content), 60, replace=False):
+    for offset in random.choice(len(content), 60, replace=False):
         damaged = bytearray(content)
-        damaged[place] ^= 1 << random.integers(8)
+        damaged[offset] ^= 1 << random.integers(8)
         path.write_bytes(damaged)
         try:
-            assert all_of(path) == written
+            assert all_data(path) == written
         except (TrajectoryError, CurveError) as error:
             assert str(path) in str(error)
-            told += 1
-    assert told > 20
+            refused += 1
+    assert refused > 20
 
 
-def test_a_run_without_a_block_is_started_again(tmp_path):
-    """Killed before its first block: it cannot be resumed, says so, and is no run that a new one would destroy."""
+def test_run_without_a_block_is_restarted(tmp_path):
+    """A run killed before the first block cannot be resumed, and a new run may replace it."""
     model = Model()
     recorder = Recorder(model, tmp_path, usd=False)
     recorder.record(model.state())
-    recorder._abandon()  # as a kill does, that writes nothing
+    recorder._abandon()  # like a kill: nothing is written
     with pytest.raises(TrajectoryError, match="ended before its first block was written; start it again"):
         Recorder(model, tmp_path, usd=False, resume=True)
     Recorder(model, tmp_path, usd=False).close()
 
 
-def test_a_run_is_not_replaced_unasked(run):
-    """The message names both ways out; with the one the frames are gone, with neither they are untouched."""
+def test_runs_are_replaced_only_by_force(run):
+    """The message names both remedies; `force` deletes the frames, otherwise they stay."""
     before = (run / TRAJECTORY).read_bytes()
     with pytest.raises(FileExistsError, match=r"10 frames up to 0.09 s: force \(--force\).*another directory"):
         Recorder(Model(), run)
@@ -190,8 +190,8 @@ def test_a_run_is_not_replaced_unasked(run):
         assert len(reader) == 0
 
 
-def test_one_recorder_a_directory(tmp_path):
-    """The second is told of the process of the first; a lock that a killed process left behind holds nobody up."""
+def test_directories_are_locked_by_one_recorder(tmp_path):
+    """The second recorder is refused with the process of the first; a lock left by a killed process is ignored."""
     (tmp_path / LOCK).write_text("1")
     with Recorder(Model(), tmp_path, usd=False):
         for options in ({"force": True}, {"resume": True}):
@@ -201,7 +201,7 @@ def test_one_recorder_a_directory(tmp_path):
     Recorder(Model(), tmp_path, usd=False).close()
 
 
-def test_mistakes_in_recording_are_named(tmp_path):
+def test_recording_errors_are_named(tmp_path):
     model = Model()
     for option, value in {"every": 0, "block": -1, "fps": 0.0}.items():
         with pytest.raises(ValueError, match=f"{option} (is|=) {value}"):
@@ -214,8 +214,8 @@ def test_mistakes_in_recording_are_named(tmp_path):
         recorder.record(step(model.state()))
 
 
-def journalled(path: Path, monkeypatch, value: float) -> Path:
-    """A complete journal beside a file, as left by a process killed before it was carried out; the time of frame 0 becomes `value`."""
+def with_pending_journal(path: Path, monkeypatch, value: float) -> Path:
+    """Leave a complete journal next to a file, as a killed process does; it sets the time of frame 0 to `value`."""
     with monkeypatch.context() as patch:
         patch.setattr("ddg_warp.io.journal.recover", lambda path: None)
         with transaction(path) as file:
@@ -228,20 +228,20 @@ def first_time(path: Path) -> float:
         return reader.time[0]
 
 
-@pytest.mark.parametrize("other", ["another run", "an older copy", "a newer version"])
-def test_a_journal_of_another_file_is_not_applied(run, tmp_path, monkeypatch, other):
-    """Readers pass it over, writers refuse it by name; neither touches file or journal."""
+@pytest.mark.parametrize("kind", ["another run", "an older copy", "a newer version"])
+def test_foreign_journals_are_not_applied(run, tmp_path, monkeypatch, kind):
+    """Readers ignore the foreign journal, writers refuse it by name; file and journal stay."""
     path = run / TRAJECTORY
     whole = path.read_bytes()
-    if other == "an older copy":
+    if kind == "an older copy":
         with transaction(path) as file:
             file.attrs["note"] = "newer"
-    log = journalled(path, monkeypatch, -1.0)
-    if other == "another run":
+    log = with_pending_journal(path, monkeypatch, -1.0)
+    if kind == "another run":
         with Recorder(Model(surfaces=surfaces()), tmp_path / "b", usd=False) as recorder:
             recorder.record(recorder._model.state())
         whole = (tmp_path / "b" / TRAJECTORY).read_bytes()
-    elif other == "a newer version":
+    elif kind == "a newer version":
         content = log.read_bytes()
         for _ in range(2):
             with transaction(path) as file:
@@ -250,16 +250,16 @@ def test_a_journal_of_another_file_is_not_applied(run, tmp_path, monkeypatch, ot
         log.write_bytes(content)
     path.write_bytes(whole)
     kept = log.read_bytes()
-    assert first_time(path) == (-1.0 if other == "a newer version" else 0.0)
+    assert first_time(path) == (-1.0 if kind == "a newer version" else 0.0)
     with pytest.raises(TrajectoryError, match=r"trajectory.h5.journal belongs to another file, or to another version"):
         resumed(path)
     assert (path.read_bytes(), log.read_bytes()) == (whole, kept)
 
 
-def test_a_journal_goes_with_its_file(run, tmp_path, monkeypatch):
-    """File and journal copied together, and a file into which a part of the journal has gone already."""
+def test_copied_journals_apply_to_copied_files(run, tmp_path, monkeypatch):
+    """A journal copied with the file applies, also to a partly updated file."""
     path = run / TRAJECTORY
-    log = journalled(path, monkeypatch, -1.0)
+    log = with_pending_journal(path, monkeypatch, -1.0)
     (tmp_path / "copy").mkdir()
     copy = tmp_path / "copy" / TRAJECTORY
     version, pages = journal._read_journal(log)
@@ -276,16 +276,16 @@ def test_a_journal_goes_with_its_file(run, tmp_path, monkeypatch):
         assert first_time(copy) == -1.0
 
 
-def test_a_flipped_byte_in_a_block_is_told(run):
-    """Of every field the frames concerned are named, and the others can be read."""
+def test_flipped_bytes_name_damaged_frames(run):
+    """The damaged frames of a field are named, and the other frames can be read."""
     path = run / TRAJECTORY
     with h5py.File(path) as file:
         chunks = file["trajectory/points"].id
-        places = [chunks.get_chunk_info(k).byte_offset for k in range(chunks.get_num_chunks())]
+        offsets = [chunks.get_chunk_info(k).byte_offset for k in range(chunks.get_num_chunks())]
     content = path.read_bytes()
-    for block, place in enumerate(places):
+    for block, offset in enumerate(offsets):
         damaged = bytearray(content)
-        damaged[place + 100] ^= 1
+        damaged[offset + 100] ^= 1
         path.write_bytes(damaged)
         with TrajectoryReader(path) as reader:
             with pytest.raises(TrajectoryError, match=rf"{path}: /trajectory/points is damaged.*can be read") as caught:
@@ -295,9 +295,9 @@ def test_a_flipped_byte_in_a_block_is_told(run):
             for frame in set(range(10)) - set(range(first, last + 1)):
                 reader.points[frame]
     with h5py.File(path) as file:
-        (place,) = (file["trajectory/time"].id.get_chunk_info(k).byte_offset for k in range(1, 2))
+        (offset,) = (file["trajectory/time"].id.get_chunk_info(k).byte_offset for k in range(1, 2))
     damaged = bytearray(content)
-    damaged[place + 3] ^= 1
+    damaged[offset + 3] ^= 1
     path.write_bytes(damaged)
     with pytest.raises(
         TrajectoryError, match=r"/trajectory/time is damaged: the checksum of frames 4 to 7.*0 to 3, 8 to 9 can"
@@ -306,22 +306,22 @@ def test_a_flipped_byte_in_a_block_is_told(run):
 
 
 @pytest.mark.parametrize("name", ["model/curves/radius", "model/parameters/density", "checkpoint/a/0/q"])
-def test_a_flipped_byte_elsewhere_is_told(run, name):
-    """In what the run is made of, and in the state that it goes on from."""
+def test_flipped_bytes_of_model_and_checkpoint_are_named(run, name):
+    """Damage of model data, or of the checkpoint, is named."""
     path = run / TRAJECTORY
     with h5py.File(path) as file:
         assert file["checkpoint"].attrs["current"] == "a"
-        place = file[name].id.get_offset()
+        offset = file[name].id.get_offset()
     with open(path, "r+b") as file:
-        file.seek(place + 6)
+        file.seek(offset + 6)
         value = file.read(1)
-        file.seek(place + 6)
+        file.seek(offset + 6)
         file.write(bytes([value[0] ^ 1]))
     with pytest.raises(TrajectoryError, match=rf"{path}: /(model|checkpoint/a) is damaged: its checksum"):
         resumed(path)
 
 
-def test_frames_are_chosen_as_of_an_array(run):
+def test_frames_are_indexed_as_an_array(run):
     with TrajectoryReader(run / TRAJECTORY) as reader:
         assert len(list(reader.points)) == 10
         for frame in (10, -11):
@@ -331,8 +331,8 @@ def test_frames_are_chosen_as_of_an_array(run):
             reader.points["first"]
 
 
-def elsewhere(path: Path, kind: str) -> None:
-    """A file whose points are in another one."""
+def write_external_points(path: Path, kind: str) -> None:
+    """Write a file with points stored in another file."""
     with h5py.File(path.with_name("other.h5"), "w") as file:
         file["points"] = np.arange(18.0).reshape(2, 3, 3)
     with h5py.File(path, "w") as file:
@@ -348,10 +348,10 @@ def elsewhere(path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["an external link", "external storage", "a virtual dataset"])
-def test_data_of_outside_are_not_read(tmp_path, monkeypatch, kind):
-    """Unless it is asked for by name."""
+def test_external_data_are_not_read(tmp_path, monkeypatch, kind):
+    """Data of other files need `outside=True`."""
     monkeypatch.chdir(tmp_path)
-    elsewhere(tmp_path / "a.h5", kind)
+    write_external_points(tmp_path / "a.h5", kind)
     with pytest.raises(TrajectoryError, match=r"a.h5: .*points.*(other.h5|raw): data of other files are not read"):
         read(tmp_path / "a.h5")
     (rods,) = read_rods(tmp_path / "a.h5", outside=True)

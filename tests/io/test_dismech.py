@@ -16,18 +16,18 @@ def rods(tmp_path, text):
 NODES = "*Nodes\n0,0,0\n1, 0, 0\n2.0e+00 0 0\n3, 0, 0\n"
 
 
-def test_nodes_counted_from_one(tmp_path):
+def test_node_numbers_may_start_at_one(tmp_path):
     curves = rods(tmp_path, NODES + "*Edges\n1,2\n2, 3\n3,4\n*elStretchRod\n1, 2\n*elBendRod\n1, 1, 2, 2, 3\n")
     assert list(curves.counts) == [4] and not curves.closed[0] and curves.radius is None
     np.testing.assert_array_equal(curves.points[:, 0], [0, 1, 2, 3])
 
 
-def test_nodes_counted_from_zero(tmp_path):
+def test_node_numbers_may_start_at_zero(tmp_path):
     curves = rods(tmp_path, NODES + "*rodEdges\n0,1\n1,2\n2,3\n")
     np.testing.assert_array_equal(curves.points[:, 0], [0, 1, 2, 3])
 
 
-def test_edges_in_any_order_and_direction(tmp_path):
+def test_edges_may_have_any_order_and_direction(tmp_path):
     curves = rods(tmp_path, "% comment\n" + NODES + "5,0,0\n6,0,0\n\n*Edges # two rods\n4,3\n6,5\n1,3\n2,4\n")
     assert list(curves.counts) == [4, 2]
     np.testing.assert_array_equal(curves.points[:, 0], [0, 2, 3, 1, 5, 6])
@@ -68,12 +68,12 @@ def test_bad_files_are_named(tmp_path, text, message):
         rods(tmp_path, text)
 
 
-def test_comments_in_any_encoding(tmp_path):
+def test_comments_may_have_any_encoding(tmp_path):
     path = tmp_path / "rods.txt"
     path.write_bytes(("% Länge 1 m, Höhe µ\n" + NODES + "*Edges\n1,2\n2,3\n3,4\n").encode("latin-1"))
     assert list(read_rods(path).counts) == [4]
 
 
-def test_missing_file(tmp_path):
+def test_missing_files_are_named(tmp_path):
     with pytest.raises(MissingFileError, match="no such file"):
         read_rods(tmp_path / "none.txt")

@@ -1,4 +1,4 @@
-"""trajectory.h5: round trips, the view for ParaView, and that kill -9 costs no complete block."""
+"""trajectory.h5: round trips, the view for ParaView, and no loss of complete blocks by kill -9."""
 
 import json
 import os
@@ -34,14 +34,14 @@ def observed(state):
 
 
 def recorded(directory, count, **options):
-    """Records `count` frames without the scene."""
+    """Record `count` frames without the scene."""
     with Recorder(MODEL, directory, usd=False, block=BLOCK, **options) as recorder:
         for state in states(count):
             recorder.record(state, observed(state))
     return directory / TRAJECTORY
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_recorded_data_read_back(tmp_path):
     fields = {"velocities": True, "directors": True}
     path = recorded(tmp_path, 11, **fields, provenance={"scene": "stand_in", "parameters": {"n": 5}})
     expected = list(states(11))
@@ -96,7 +96,7 @@ def test_vtk_view_has_no_copies(tmp_path):
 
 
 def test_vtk_reads_the_view(tmp_path):
-    """With VTK itself, where it is installed."""
+    """Read the view with VTK itself, if installed."""
     vtk = pytest.importorskip("vtk")
     path = recorded(tmp_path, 2 * BLOCK + 1, velocities=True)
     reader = vtk.vtkHDFReader()
@@ -122,11 +122,11 @@ def test_resumed_equals_straight(tmp_path):
         while recorder_frames(recorder) < 13:
             recorder.record(state, observed(state))
             state = step(state)
-    with TrajectoryReader(straight) as one, TrajectoryReader(tmp_path / "resumed" / TRAJECTORY) as other:
-        assert one.points[:].tobytes() == other.points[:].tobytes()
-        assert one.time.tobytes() == other.time.tobytes()
-        assert one.series["energy"].tobytes() == other.series["energy"].tobytes()
-        assert one.checkpoint()["0/q"].tobytes() == other.checkpoint()["0/q"].tobytes()
+    with TrajectoryReader(straight) as uninterrupted, TrajectoryReader(tmp_path / "resumed" / TRAJECTORY) as resumed:
+        assert uninterrupted.points[:].tobytes() == resumed.points[:].tobytes()
+        assert uninterrupted.time.tobytes() == resumed.time.tobytes()
+        assert uninterrupted.series["energy"].tobytes() == resumed.series["energy"].tobytes()
+        assert uninterrupted.checkpoint()["0/q"].tobytes() == resumed.checkpoint()["0/q"].tobytes()
 
 
 def recorder_frames(recorder):
@@ -134,7 +134,7 @@ def recorder_frames(recorder):
     return recorder._trajectory.frame_count
 
 
-def test_every_counts_on_after_a_resume(tmp_path):
+def test_every_continues_counting_after_resume(tmp_path):
     with Recorder(MODEL, tmp_path, usd=False, every=3) as recorder:
         for state in states(8):
             recorder.record(state)  # records steps 0, 3, 6
@@ -148,7 +148,7 @@ def test_every_counts_on_after_a_resume(tmp_path):
         np.testing.assert_allclose(reader.time, [0.0, 0.03, 0.06, 0.09], rtol=1e-12)
 
 
-def test_resume_cuts_what_is_past_the_checkpoint(tmp_path):
+def test_resume_drops_frames_past_the_checkpoint(tmp_path):
     path = recorded(tmp_path, 8)
     with transaction(path) as file:
         checkpoint = file["checkpoint"]
@@ -161,10 +161,10 @@ def test_resume_cuts_what_is_past_the_checkpoint(tmp_path):
 
 def test_resume_refuses_other_rods(tmp_path):
     path = recorded(tmp_path, 4)
-    other = Model()
-    other.curves.counts[:2] = [4, 6]
+    model = Model()
+    model.curves.counts[:2] = [4, 6]
     with pytest.raises(TrajectoryError, match="other rods"):
-        TrajectoryWriter.resume(path, other)
+        TrajectoryWriter.resume(path, model)
 
 
 def test_resumed_scene_shows_all_frames(tmp_path):
@@ -183,7 +183,7 @@ def test_resumed_scene_shows_all_frames(tmp_path):
         assert UsdGeom.PointBased(prim).GetPointsAttr().GetNumTimeSamples() == 7
 
 
-def test_an_exception_leaves_the_old_content(tmp_path):
+def test_exceptions_leave_the_old_content(tmp_path):
     path = recorded(tmp_path, 4)
     before = path.read_bytes()
     with pytest.raises(RuntimeError), transaction(path) as file:
@@ -192,8 +192,8 @@ def test_an_exception_leaves_the_old_content(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_a_complete_journal_counts_as_written(tmp_path, monkeypatch):
-    """As if the process had been killed between the journal and the file."""
+def test_complete_journals_count_as_written(tmp_path, monkeypatch):
+    """A process killed between journal and file update loses nothing."""
     path = recorded(tmp_path, 4)
     old = path.read_bytes()
     with monkeypatch.context() as patch:
@@ -205,7 +205,7 @@ def test_a_complete_journal_counts_as_written(tmp_path, monkeypatch):
         assert file["trajectory/time"][0] == 99.0
     log = path.with_name(path.name + ".journal")
     content = log.read_bytes()
-    log.write_bytes(content[:-1])  # a journal cut short counts for nothing
+    log.write_bytes(content[:-1])  # truncated journals are ignored
     with open_to_read(path) as file:
         assert file["trajectory/time"][0] == 0.0
     log.write_bytes(content)
@@ -216,8 +216,8 @@ def test_a_complete_journal_counts_as_written(tmp_path, monkeypatch):
         assert file["trajectory/time"][0] == 99.0
 
 
-def test_checkpoints_alternate_outside_of_the_journal(tmp_path, monkeypatch):
-    """The journal holds only metadata, however large the checkpoint; the old one stays as it was until the flip."""
+def test_checkpoints_alternate_outside_the_journal(tmp_path, monkeypatch):
+    """The journal holds only metadata, for checkpoints of any size; the old checkpoint stays until the switch."""
     journals = []
     monkeypatch.setattr(
         "ddg_warp.io.journal._write_journal",
@@ -256,7 +256,7 @@ with Recorder(model, directory, block=4, resume=resume) as recorder:
 
 
 def killed_run(directory: Path, resume: bool, seconds: float) -> None:
-    """Starts a recording in another process and kills it some time after its first frame."""
+    """Start a recording in another process, and kill that process some time after the first frame."""
     root = Path(__file__).resolve().parents[2]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(Path(__file__).parent)])}
     command = [sys.executable, "-c", CHILD, str(directory), str(resume)]
@@ -266,8 +266,8 @@ def killed_run(directory: Path, resume: bool, seconds: float) -> None:
         child.send_signal(signal.SIGKILL)
 
 
-def test_kill_costs_no_complete_block(tmp_path):
-    """Kills a recording at random times, resumes it, and compares all frames with the exact ones."""
+def test_kill_loses_no_complete_block(tmp_path):
+    """Kill a recording at random times, resume it, and compare all frames with the exact ones."""
     from ddg_warp.io.usd import validate
 
     rng = np.random.default_rng(int(os.environ.get("KILL_SEED", "1")))
@@ -283,13 +283,13 @@ def test_kill_costs_no_complete_block(tmp_path):
             np.testing.assert_array_equal(reader.points[:], [state.q for state in expected])
             np.testing.assert_array_equal(reader.series["tip"], [state.q.flat[0] for state in expected])
             np.testing.assert_array_equal(reader.checkpoint()["0/q"], expected[-1].q)
-        with h5py.File(tmp_path / TRAJECTORY) as file:  # without help of ours
+        with h5py.File(tmp_path / TRAJECTORY) as file:  # with h5py alone
             assert len(file["VTKHDF/Points"]) % 16 == 0
         if (tmp_path / SCENE).exists():
             assert validate(tmp_path / SCENE) == []
 
 
-def test_rods_from_files(tmp_path):
+def test_rods_are_read_from_files(tmp_path):
     path = recorded(tmp_path, 5)
     strands, ring = read(path)
     assert (strands.path, ring.path) == ("strand", "ring")

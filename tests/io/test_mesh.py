@@ -1,4 +1,4 @@
-"""Meshes: OBJ and USD files are read in metres, seen from outside; surfaces are recorded beside rods and read back."""
+"""Meshes: OBJ and USD files are read in metres with outward normals; surfaces are recorded with rods and read back."""
 
 import h5py
 import matplotlib.image
@@ -45,7 +45,7 @@ def volume(points, triangles):
 
 
 @pytest.mark.parametrize("form", FACES)
-def test_obj_forms_are_read_alike(tmp_path, form):
+def test_obj_face_forms_are_equivalent(tmp_path, form):
     (tmp_path / "a.obj").write_text(PYRAMID + FACES[form])
     points, triangles, name = read_mesh(tmp_path / "a.obj")
     assert name == "tent"
@@ -55,7 +55,7 @@ def test_obj_forms_are_read_alike(tmp_path, form):
     assert Surface(points, triangles).euler_characteristic == 2
 
 
-def test_obj_negative_indices_count_from_where_they_stand(tmp_path):
+def test_obj_negative_indices_count_from_their_line(tmp_path):
     (tmp_path / "two.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\nv 1 0 1\nv 0 1 1\nf -3 -2 -1\n")
     _, triangles, name = read_mesh(tmp_path / "two.obj")
     assert triangles.tolist() == [[0, 1, 2], [3, 4, 5]]
@@ -93,7 +93,7 @@ def test_bad_obj_files_are_named(tmp_path, text, message):
         read_mesh(tmp_path / "a.obj")
 
 
-def test_vertices_of_no_face_are_dropped_with_a_word(tmp_path):
+def test_unused_vertices_are_dropped_with_a_warning(tmp_path):
     (tmp_path / "a.obj").write_text(
         "v 9 9 9\n" + PYRAMID.replace("# a pyr", "v 8 8 8\n#") + "v 5 5 5\nf 3 4 7\nf 4 5 7\n"
     )
@@ -106,7 +106,7 @@ def test_vertices_of_no_face_are_dropped_with_a_word(tmp_path):
     assert len(Surface(points, triangles).points) == 4
 
 
-def test_the_refusal_of_unused_vertices_names_what_drops_them():
+def test_refusal_of_unused_vertices_names_the_remedy():
     points, triangles = meshes.rectangle(1, 1)
     more = np.concatenate([[[9.0, 9.0, 9.0]], points])
     with pytest.raises(
@@ -118,12 +118,12 @@ def test_the_refusal_of_unused_vertices_names_what_drops_them():
     np.testing.assert_array_equal(renumbered, triangles)
 
 
-def test_libraries_of_materials_are_never_opened(tmp_path):
+def test_material_libraries_are_never_opened(tmp_path):
     (tmp_path / "a.obj").write_text("mtllib /dev/full ../../nowhere.mtl\n" + PYRAMID + FACES["v"])
     assert len(read_mesh(tmp_path / "a.obj")[0]) == 5
 
 
-def test_other_files_are_refused(tmp_path):
+def test_other_file_types_are_refused(tmp_path):
     with pytest.raises(MissingFileError, match="no such file"):
         read_mesh(tmp_path / "none.obj")
     (tmp_path / "a.stl").write_text("solid")
@@ -135,7 +135,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 def stage_with_mesh(path, points, triangles, prim="/Model/Ball"):
-    """An open stage with one mesh, z up and in metres."""
+    """Return an open stage with one mesh, z up and in metres."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -155,7 +155,7 @@ def saved(stage, prim=None):
     return read_mesh(stage.GetRootLayer().realPath, prim)
 
 
-def test_usd_units_up_axis_and_transforms(tmp_path):
+def test_usd_units_up_axis_and_transforms_apply(tmp_path):
     stage, mesh = stage_with_mesh(tmp_path / "a.usda", [[0, 0, 0], [1, 0, 0], [0, 2, 0]], [[0, 1, 2]])
     mesh.AddTranslateOp().Set(Gf.Vec3d(0, 0, 10))
     mesh.AddScaleOp().Set(Gf.Vec3f(3.0))
@@ -172,17 +172,17 @@ def test_usd_units_up_axis_and_transforms(tmp_path):
 @pytest.mark.parametrize("mirror", [False, True])
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_usd_meshes_face_outwards(tmp_path, left, mirror, up):
-    """Whatever the handedness and the transform, a ball encloses a positive volume."""
+    """For any handedness and transform a ball encloses a positive volume."""
     points, triangles = meshes.sphere(1)
     stage, mesh = stage_with_mesh(tmp_path / "a.usdc", points, triangles[:, [2, 1, 0]] if left else triangles)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y if up == "y" else UsdGeom.Tokens.z)
     mesh.CreateOrientationAttr(UsdGeom.Tokens.leftHanded if left else UsdGeom.Tokens.rightHanded)
     mesh.AddScaleOp().Set(Gf.Vec3f(1.0, -2.0 if mirror else 2.0, 1.0))
-    found, faces, _ = saved(stage)
-    assert volume(found, faces) == pytest.approx(2.0 * volume(points, triangles), rel=1e-6)
+    vertices, faces, _ = saved(stage)
+    assert volume(vertices, faces) == pytest.approx(2.0 * volume(points, triangles), rel=1e-6)
 
 
-def test_usd_polygons_holes_and_first_sample(tmp_path):
+def test_usd_holes_are_dropped_at_the_first_sample(tmp_path):
     stage, mesh = stage_with_mesh(
         tmp_path / "a.usda", [(k % 4, k // 4, 0) for k in range(8)], [(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7)]
     )
@@ -196,7 +196,7 @@ def test_usd_polygons_holes_and_first_sample(tmp_path):
     assert (points[:, 2] == 7.0).all()
 
 
-def test_usd_files_with_several_meshes_or_bad_ones(tmp_path):
+def test_usd_files_with_several_or_bad_meshes_are_refused(tmp_path):
     points, triangles = meshes.sphere(0)
     stage, mesh = stage_with_mesh(tmp_path / "a.usda", points, triangles)
     add_mesh(stage, "/Model/Box/Lid", points + 5.0, triangles)
@@ -228,7 +228,7 @@ def shell_model(**options) -> Model:
 
 
 def shell_frames(count=3):
-    """(time [s], points [m]) of frames in which all moves, without folding the ball."""
+    """Return (time [s], points [m]) of frames in which all points move, without folding the ball."""
     points = shell_model().state().q
     return [(0.1 * k, points * (1.0 + 0.1 * k) + [0.0, 0.0, k]) for k in range(count)]
 
@@ -242,12 +242,12 @@ def test_written_surfaces_read_back(tmp_path):
     assert validate(path) == []
     last = shell_frames()[-1][1]
     stage = Usd.Stage.Open(str(path))
-    for name, part in zip(("sail", "ball"), surfaces().parts(), strict=True):
-        rows = np.unique(surfaces().triangles[part])
-        points, triangles, found = read_mesh(path, f"/World/{name}")
-        assert found == name
+    for name, range_ in zip(("sail", "ball"), surfaces().parts(), strict=True):
+        rows = np.unique(surfaces().triangles[range_])
+        points, triangles, read_name = read_mesh(path, f"/World/{name}")
+        assert read_name == name
         np.testing.assert_allclose(points, shell_frames()[0][1][rows], atol=1e-6)
-        assert np.array_equal(rows[triangles], surfaces().triangles[part])
+        assert np.array_equal(rows[triangles], surfaces().triangles[range_])
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}"))
         assert mesh.GetSubdivisionSchemeAttr().Get() == "none" and mesh.GetDoubleSidedAttr().Get()
         assert mesh.GetPointsAttr().GetTimeSamples() == [0.0, 1.0, 2.0]
@@ -259,38 +259,38 @@ def test_written_surfaces_read_back(tmp_path):
         np.testing.assert_allclose(mesh.GetNormalsAttr().Get(2.0), expected, atol=1e-6)
         primvars = UsdGeom.PrimvarsAPI(mesh)
         np.testing.assert_allclose(primvars.GetPrimvar("height").Get(2.0), last[rows, 2], rtol=1e-6)
-        np.testing.assert_allclose(primvars.GetPrimvar("thickness").Get(), surfaces().thickness[part][:1], rtol=1e-6)
+        np.testing.assert_allclose(primvars.GetPrimvar("thickness").Get(), surfaces().thickness[range_][:1], rtol=1e-6)
         assert len(primvars.GetPrimvar("displayColor").Get()) == 1
     ring = UsdGeom.BasisCurves(stage.GetPrimAtPath("/World/ring"))
     np.testing.assert_allclose(ring.GetPointsAttr().Get(2.0), last[10:16], rtol=1e-6)
 
 
-@pytest.mark.parametrize("at", ["points", "triangles"])
-def test_surfaces_are_colored_by_a_scalar(tmp_path, at):
-    """Below the range the lowest color, above the highest; raw values beside; rods without the scalar keep their color."""
+@pytest.mark.parametrize("location", ["points", "triangles"])
+def test_surfaces_are_colored_by_a_scalar(tmp_path, location):
+    """Colors are clamped to the range; raw values are kept, and rods without the scalar keep their color."""
     path, shapes = tmp_path / "scene.usda", Shapes.of(curves(), surfaces())
     triangles, (_, points) = surfaces().triangles, shell_frames(1)[0]
-    height = points[:, 2] if at == "points" else points[triangles, 2].mean(axis=1)
+    height = points[:, 2] if location == "points" else points[triangles, 2].mean(axis=1)
     with CurvesWriter(path, shapes, color_by=("height", 1.5, 3.0)) as writer:
-        writer.write(0.0, points, **{"scalars" if at == "points" else "triangle_scalars": {"height": height}})
+        writer.write(0.0, points, **{"scalars" if location == "points" else "triangle_scalars": {"height": height}})
     assert validate(path) == []
     stage = Usd.Stage.Open(str(path))
-    part = surfaces().parts()[1]
-    mine = height[np.unique(triangles[part])] if at == "points" else height[part]
+    ball = surfaces().parts()[1]
+    ball_height = height[np.unique(triangles[ball])] if location == "points" else height[ball]
     primvars = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/ball"))
     raw, color = primvars.GetPrimvar("height"), primvars.GetPrimvar("displayColor")
-    np.testing.assert_allclose(raw.Get(0.0), mine, rtol=1e-6)
-    assert raw.GetInterpolation() == color.GetInterpolation() == ("vertex" if at == "points" else "uniform")
+    np.testing.assert_allclose(raw.Get(0.0), ball_height, rtol=1e-6)
+    assert raw.GetInterpolation() == color.GetInterpolation() == ("vertex" if location == "points" else "uniform")
     assert color.Get() is None
     shown = np.array(color.Get(0.0))
     np.testing.assert_allclose(
-        shown[mine >= 3.0], np.tile([0xD1, 0x49, 0x5B], (np.sum(mine >= 3.0), 1)) / 255.0, rtol=1e-6
+        shown[ball_height >= 3.0], np.tile([0xD1, 0x49, 0x5B], (np.sum(ball_height >= 3.0), 1)) / 255.0, rtol=1e-6
     )
-    assert 0 < np.sum(mine >= 3.0) < len(mine) and len(np.unique(shown, axis=0)) > 2
+    assert 0 < np.sum(ball_height >= 3.0) < len(ball_height) and len(np.unique(shown, axis=0)) > 2
     low = np.array(UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/sail")).GetPrimvar("displayColor").Get(0.0))
     np.testing.assert_allclose(low, np.tile([0xC9, 0xD6, 0xE8], (len(low), 1)) / 255.0, rtol=1e-6)
     rods = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/ring")).GetPrimvar("displayColor")
-    assert rods.GetInterpolation() == ("vertex" if at == "points" else "constant")
+    assert rods.GetInterpolation() == ("vertex" if location == "points" else "constant")
 
 
 def test_validate_finds_bad_meshes(tmp_path):
@@ -309,8 +309,8 @@ def test_validate_finds_bad_meshes(tmp_path):
     assert "/World/sail: corner 0 has the index -3" in problems
 
 
-def test_a_collapsed_surface_is_written(tmp_path):
-    """A state in which all vertices of a surface meet is no error of the writer."""
+def test_collapsed_surfaces_are_written(tmp_path):
+    """A surface collapsed to a point is written without error."""
     points = shell_frames(1)[0][1]
     points[16:30] = points[15]
     with CurvesWriter(tmp_path / "scene.usda", Shapes.of(curves(), surfaces())) as writer:
@@ -371,7 +371,7 @@ def test_vtk_view_shows_rods_and_triangles(tmp_path, worlds):
 
 
 def test_vtk_reads_the_triangles(tmp_path):
-    """With VTK itself, where it is installed: the area of the triangles at each step."""
+    """Read the triangle areas of each step with VTK itself, if installed."""
     vtk = pytest.importorskip("vtk")
     model = shell_model()
     states = [model.state(), step(model.state())]
@@ -385,13 +385,13 @@ def test_vtk_reads_the_triangles(tmp_path):
         reader.Update()
         shown = reader.GetOutput()
         assert (shown.GetNumberOfLines(), shown.GetNumberOfPolys()) == (3, 36)
-        found = sum(shown.GetCell(3 + t).ComputeArea() for t in range(36))
+        area = sum(shown.GetCell(3 + t).ComputeArea() for t in range(36))
         a, b, c = np.moveaxis(state.q[surfaces().triangles], 1, 0)
-        assert found == pytest.approx(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum(), rel=1e-12)
+        assert area == pytest.approx(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum(), rel=1e-12)
 
 
-def test_surfaces_alone(tmp_path):
-    """A model without rods."""
+def test_surfaces_without_rods_read_back(tmp_path):
+    """A model without rods is recorded and read back."""
     points, triangles = meshes.sphere(1)
     ball = Surfaces(triangles, np.array([0]), np.array(["ball"]), np.full(len(triangles), 1e-3))
     model = Model(curves=NO_RODS, surfaces=ball)
@@ -399,8 +399,8 @@ def test_surfaces_alone(tmp_path):
         for time in (0.0, 0.1):
             recorder.record(State(time, points + time, model))
     assert validate(tmp_path / SCENE) == []
-    found, faces, _ = read_mesh(tmp_path / SCENE)
-    np.testing.assert_allclose(found, points, atol=1e-6)
+    vertices, faces, _ = read_mesh(tmp_path / SCENE)
+    np.testing.assert_allclose(vertices, points, atol=1e-6)
     assert np.array_equal(faces, triangles)
     with TrajectoryReader(tmp_path / TRAJECTORY) as reader:
         np.testing.assert_array_equal(reader.points[1], points + 0.1)
@@ -413,13 +413,13 @@ def test_resume_refuses_other_surfaces(tmp_path):
         writer.append(model.state())
     with TrajectoryWriter.resume(tmp_path / "t.h5", model) as writer:
         assert writer.frame_count == 1
-    for other in (None, Surfaces(**{**vars(surfaces()), "triangles": surfaces().triangles[:, ::-1]})):
+    for changed in (None, Surfaces(**{**vars(surfaces()), "triangles": surfaces().triangles[:, ::-1]})):
         with pytest.raises(TrajectoryError, match="other surfaces than the model"):
-            TrajectoryWriter.resume(tmp_path / "t.h5", Model(surfaces=other))
+            TrajectoryWriter.resume(tmp_path / "t.h5", Model(surfaces=changed))
 
 
-def colored(path):
-    """RGB of the pixels that are not grey, and how much of the rectangle around them they fill."""
+def colored_pixels(path):
+    """Return the RGB of colored pixels, and the fraction of the bounding rectangle filled."""
     image = matplotlib.image.imread(path)[..., :3]
     mask = np.ptp(image, axis=2) > 0.05
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -427,13 +427,13 @@ def colored(path):
 
 
 def test_pictures_show_surfaces(tmp_path):
-    """A disc in its plane fills pi/4 of the square around it; a ball has as many shades as it has directions."""
+    """A disc in the image plane fills pi/4 of a square; a ball has many shades."""
     points, triangles = meshes.disc(12)
-    part = Surfaces(triangles, np.array([0]), np.array(["disc"]), np.full(len(triangles), 1e-3))
-    rods_picture(Model(curves=NO_RODS, surfaces=part), {0.0: points}, tmp_path / "disc.png")
-    _, filled = colored(tmp_path / "disc.png")
+    disc = Surfaces(triangles, np.array([0]), np.array(["disc"]), np.full(len(triangles), 1e-3))
+    rods_picture(Model(curves=NO_RODS, surfaces=disc), {0.0: points}, tmp_path / "disc.png")
+    _, filled = colored_pixels(tmp_path / "disc.png")
     assert filled == pytest.approx(np.pi / 4.0, rel=0.01)
     model = shell_model(worlds=2)
     rods_picture(model, {0.0: model.state().points()}, tmp_path / "both.png")
-    shades, _ = colored(tmp_path / "both.png")
+    shades, _ = colored_pixels(tmp_path / "both.png")
     assert len(np.unique(shades, axis=0)) > 10

@@ -1,4 +1,4 @@
-"""Obstacles and contact in recordings: where they stand, what is read back, resumed and exported."""
+"""Obstacles and contact in recordings: positions, and data read back, resumed and exported."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ HEAD = meshes.sphere(1, 0.03)
 
 
 def scene(motion=MOTION, contact: bool = True) -> ddg.Scene:
-    """A rod that falls onto a floor, and obstacles of every kind beside it."""
+    """Return a rod that falls onto a floor, and obstacles of every kind away from it."""
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=DT, duration=6 * DT))
     x = np.linspace(-0.05, 0.05, 9)
     material = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -34,13 +34,13 @@ def scene(motion=MOTION, contact: bool = True) -> ddg.Scene:
 
 
 def volume(points, cells) -> float:
-    """Enclosed by triangles that are seen counter-clockwise from outside [m^3]."""
+    """Return the volume enclosed by triangles with outward normals [m^3]."""
     a, b, c = np.moveaxis((points - points.mean(0))[cells], 1, 0)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def run(device, folder, steps: int, worlds: int = 1, resume: bool = False, **options):
-    """States of a recorded run."""
+    """Record a run; return its model and states."""
     model = scene().build(device=device, worlds=worlds)
     integrator, state = ddg.Integrator(model), model.state()
     with ddg.Recorder(model, folder, block=2, resume=resume, **options) as recorder:
@@ -56,7 +56,7 @@ def run(device, folder, steps: int, worlds: int = 1, resume: bool = False, **opt
     return model, states
 
 
-def test_surfaces_have_the_volumes_of_the_bodies(device):
+def test_surfaces_enclose_the_volumes_of_obstacles(device):
     obstacles = scene().build(device=device).obstacles
     assert obstacles.names.tolist() == ["floor", "ball", "capsule", "box", "head"]
     expected = {
@@ -69,7 +69,7 @@ def test_surfaces_have_the_volumes_of_the_bodies(device):
         points, cells = obstacles.points(k), obstacles.cells(k)
         if name in expected:
             np.testing.assert_allclose(volume(points, cells), expected[name], rtol=0.012)
-        else:  # seen from outside, and larger than what is over it
+        else:  # outward normals, and larger than the objects above
             corners = points[cells]
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             assert (normal[:, 2] > 0.0).all()
@@ -89,9 +89,9 @@ def test_surfaces_move_with_the_obstacles(device):
         obstacles.points(box, nodes[1, obstacles.rows(box)]), MOTION.place(3 * DT, obstacles.points(box)), atol=1e-12
     )
     ends = nodes[0, obstacles.rows(capsule)]
-    shown, way = obstacles.points(capsule, ends), ends[1] - ends[0]
-    along = np.clip((shown - ends[0]) @ way / (way @ way), 0.0, 1.0)
-    np.testing.assert_allclose(np.linalg.norm(shown - ends[0] - along[:, None] * way, axis=1), 0.02, rtol=1e-9)
+    shown, axis = obstacles.points(capsule, ends), ends[1] - ends[0]
+    along = np.clip((shown - ends[0]) @ axis / (axis @ axis), 0.0, 1.0)
+    np.testing.assert_allclose(np.linalg.norm(shown - ends[0] - along[:, None] * axis, axis=1), 0.02, rtol=1e-9)
 
 
 @pytest.mark.parametrize("worlds", [1, 2])
@@ -101,17 +101,17 @@ def test_recorded_obstacles_and_contacts_read_back(device, tmp_path, worlds):
         assert len(reader) == len(reader.contacts) == 7
         for frame, state in enumerate(states):
             np.testing.assert_array_equal(reader.obstacle_points[frame], state.obstacle_points())
-            found, expected = reader.contacts[frame], model.contacts(state)
+            pairs, expected = reader.contacts[frame], model.contacts(state)
             for name in ("world", "objects", "point", "gap", "force", "friction"):
-                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-            assert found.names == expected.names
+                np.testing.assert_array_equal(getattr(pairs, name), getattr(expected, name), err_msg=name)
+            assert pairs.names == expected.names
         assert len(reader.contacts[-1]) >= 9 * worlds
         with pytest.raises(IndexError):
             reader.contacts[7]
         for name in ("rest", "counts", "triangles", "spans"):
             np.testing.assert_array_equal(getattr(reader.obstacles, name), getattr(model.obstacles, name))
         shown = standing(reader, {0: 0.0, 6: 0.06})
-        assert len(shown[0.0][1]) > len(shown[0.06][1])  # what is still is shown once
+        assert len(shown[0.0][1]) > len(shown[0.06][1])  # static obstacles are stored once
     assert validate(tmp_path / "scene.usdc") == []
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
     still, moved = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr() for name in ("head", "box"))
@@ -129,18 +129,18 @@ def test_recorded_obstacles_and_contacts_read_back(device, tmp_path, worlds):
     assert widths[forces.argmax()] == widths.max() > 0.0
 
 
-def test_a_resumed_run_is_the_run_that_went_on(device, tmp_path):
+def test_resumed_run_equals_uninterrupted_run(device, tmp_path):
     run(device, tmp_path / "straight", 6, contacts=True)
     run(device, tmp_path / "parts", 3, contacts=True)
     run(device, tmp_path / "parts", 6, resume=True)
     with (
-        TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as one,
-        TrajectoryReader(tmp_path / "parts" / "trajectory.h5") as other,
+        TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as uninterrupted,
+        TrajectoryReader(tmp_path / "parts" / "trajectory.h5") as resumed,
     ):
-        np.testing.assert_array_equal(one.points[:], other.points[:])
-        np.testing.assert_array_equal(one.obstacle_points[:], other.obstacle_points[:])
+        np.testing.assert_array_equal(uninterrupted.points[:], resumed.points[:])
+        np.testing.assert_array_equal(uninterrupted.obstacle_points[:], resumed.obstacle_points[:])
         for frame in range(7):
-            np.testing.assert_array_equal(one.contacts[frame].force, other.contacts[frame].force)
+            np.testing.assert_array_equal(uninterrupted.contacts[frame].force, resumed.contacts[frame].force)
     assert validate(tmp_path / "parts" / "scene.usdc") == []
     assert main(["export", str(tmp_path / "parts"), "--to", str(tmp_path / "out.usda")]) == 0
     assert validate(tmp_path / "out.usda") == []
@@ -152,12 +152,12 @@ def test_a_resumed_run_is_the_run_that_went_on(device, tmp_path):
 
 def test_other_obstacles_are_refused(device, tmp_path):
     run(device, tmp_path, 2)
-    other = scene(motion=None).build(device=device)
+    model = scene(motion=None).build(device=device)
     with pytest.raises(TrajectoryError, match="other obstacles than the model; resume with its own scene"):
-        ddg.Recorder(other, tmp_path, resume=True)
+        ddg.Recorder(model, tmp_path, resume=True)
 
 
-def test_contacts_of_no_contact_are_refused(device, tmp_path):
+def test_recording_contacts_without_contact_is_refused(device, tmp_path):
     model = scene(contact=False).build(device=device)
     with pytest.raises(ValueError, match=r"the model has no contact; add scene\.contact"):
         ddg.Recorder(model, tmp_path, contacts=True)

@@ -1,4 +1,4 @@
-"""Polygons of files as triangles: they cover what the polygon does, from whichever corner it begins, or are refused by number."""
+"""Triangulation of polygons in files: exact cover from any first corner, or refusal by face number."""
 
 import numpy as np
 import pytest
@@ -17,33 +17,33 @@ SPIRAL = [(0, 0), (4, 0), (4, 4), (1, 4), (1, 2), (2, 2), (2, 3), (3, 3), (3, 1)
 KEYHOLE = [(0, 0), (3, 0), (3, 3), (0, 3), (0, 0), (1, 1), (1, 2), (2, 2), (2, 1), (1, 1)]  # a square hole, by a bridge
 
 
-def placed(corners, turned: bool = True) -> np.ndarray:
-    """Corners of a plane in space, askew."""
+def in_space(corners, inclined: bool = True) -> np.ndarray:
+    """Return the corners of a plane polygon in an inclined plane in space."""
     flat = np.column_stack([np.array(corners, float), np.zeros(len(corners))])
     axes = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
-    return flat @ axes * np.linalg.det(axes) + [1.0, -2.0, 3.0] if turned else flat
+    return flat @ axes * np.linalg.det(axes) + [1.0, -2.0, 3.0] if inclined else flat
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e5])
 @pytest.mark.parametrize(
     "corners", [L_SHAPE, ARROW, COMB, MIDDLES, SPIRAL, KEYHOLE], ids="L arrow comb middles spiral hole".split()
 )
-def test_ears_cover_the_polygon(corners, scale):
-    """Triangles turn as the polygon does, and their areas sum up to its own, sum (x_i y_{i+1} - x_{i+1} y_i) / 2."""
+def test_triangles_cover_the_polygon(corners, scale):
+    """Triangles have the polygon's orientation, and their areas sum to sum (x_i y_{i+1} - x_{i+1} y_i) / 2."""
     x, y = np.array(corners, float).T
     area = 0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
     for first in range(len(corners)):
-        points = scale * placed(corners[first:] + corners[:first])
-        found, fault = polygons.triangulate(points)
-        assert fault == "" and found.shape == (len(corners) - 2, 3)
-        vectors = polygons.area_vectors(points[found])
+        points = scale * in_space(corners[first:] + corners[:first])
+        triangles, fault = polygons.triangulate(points)
+        assert fault == "" and triangles.shape == (len(corners) - 2, 3)
+        vectors = polygons.area_vectors(points[triangles])
         normal = polygons.area_vectors(points)
         assert (vectors @ normal > 0.0).all()
         assert np.linalg.norm(vectors, axis=1).sum() == pytest.approx(area * scale**2, rel=1e-9)
 
 
 @pytest.mark.parametrize("corners", [L_SHAPE, ARROW, SPIRAL], ids=["L", "arrow", "spiral"])
-def test_obj_files_hold_the_area_of_their_polygons(tmp_path, corners):
+def test_triangles_of_obj_files_keep_polygon_areas(tmp_path, corners):
     for first in range(len(corners)):
         lines = [f"v {x} {y} 0" for x, y in corners[first:] + corners[:first]]
         path = tmp_path / "one.obj"
@@ -54,7 +54,7 @@ def test_obj_files_hold_the_area_of_their_polygons(tmp_path, corners):
         assert face_areas(Surface(points, triangles)).sum() == pytest.approx(area)
 
 
-def test_convex_faces_stay_fans_in_their_order():
+def test_convex_faces_become_fans_in_order():
     points = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0.5, 0), (3, 0, 0), (1.5, 3, 0.0)])
     triangles, face = triangulated(points, np.array([4, 3, 4]), np.array([0, 1, 2, 3, 1, 4, 2, 1, 5, 4, 6]), "a")
     assert face.tolist() == [0, 0, 1, 2, 2]
@@ -73,7 +73,7 @@ def test_convex_faces_stay_fans_in_their_order():
         ([(0, 0, 0), (1, 1, 0), (1, 0, 0), (0, 1, 0)], "has no area"),
     ],
 )
-def test_faces_that_can_not_be_are_refused_by_number(tmp_path, corners, fault):
+def test_invalid_faces_are_refused_by_number(tmp_path, corners, fault):
     good = "v 0 0 9\nv 1 0 9\nv 0 1 9\n"
     lines = "\n".join(f"v {x} {y} {z}" for x, y, z in corners)
     path = tmp_path / "bad.obj"

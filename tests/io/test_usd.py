@@ -1,4 +1,4 @@
-"""USD: what programs write is read in metres with z up; what is written is valid and reads back."""
+"""USD: foreign files are read in metres with z up; written files are valid and read back."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ POINTS = [(0, 0, 0), (0, 1, 0), (0, 2, 0), (5, 0, 0), (5, 0, 1)]
 
 
 def stage_with_curves(path, points=POINTS, counts=(3, 2), kind="linear", wrap="nonperiodic"):
-    """An open stage with /Curves; y up and centimetres unless changed."""
+    """Return an open stage with /Curves; y up and centimetres by default."""
     stage = Usd.Stage.CreateNew(str(path))
     prim = UsdGeom.BasisCurves.Define(stage, "/Curves")
     prim.CreateTypeAttr(kind)
@@ -27,26 +27,26 @@ def stage_with_curves(path, points=POINTS, counts=(3, 2), kind="linear", wrap="n
     return stage, prim
 
 
-def only(stage):
-    """The one set of curves of a stage, read from its file."""
+def read_only_curves(stage):
+    """Save a stage and read back the only set of curves."""
     stage.Save()
-    (found,) = read_curves(stage.GetRootLayer().realPath)
-    return found
+    (curves_read,) = read_curves(stage.GetRootLayer().realPath)
+    return curves_read
 
 
-def test_units_and_up_axis(tmp_path):
+def test_units_and_up_axis_apply(tmp_path):
     stage, _ = stage_with_curves(tmp_path / "a.usda")  # USD's fallbacks: y up, centimetres
-    found = only(stage)
-    np.testing.assert_allclose(found.points[:3], [[0, 0, 0], [0, 0, 0.01], [0, 0, 0.02]], atol=1e-9)
-    np.testing.assert_allclose(found.points[4], [0.05, -0.01, 0.0], atol=1e-9)
-    assert found.path == "/Curves" and list(found.counts) == [3, 2] and not found.closed.any()
-    assert found.radius is None
+    read_back = read_only_curves(stage)
+    np.testing.assert_allclose(read_back.points[:3], [[0, 0, 0], [0, 0, 0.01], [0, 0, 0.02]], atol=1e-9)
+    np.testing.assert_allclose(read_back.points[4], [0.05, -0.01, 0.0], atol=1e-9)
+    assert read_back.path == "/Curves" and list(read_back.counts) == [3, 2] and not read_back.closed.any()
+    assert read_back.radius is None
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    np.testing.assert_array_equal(only(stage).points, POINTS)
+    np.testing.assert_array_equal(read_only_curves(stage).points, POINTS)
 
 
-def test_nested_transforms_and_scaled_widths(tmp_path):
+def test_nested_transforms_scale_widths(tmp_path):
     stage = Usd.Stage.CreateNew(str(tmp_path / "a.usdc"))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -60,9 +60,9 @@ def test_nested_transforms_and_scaled_widths(tmp_path):
     prim.CreatePointsAttr([Gf.Vec3f(0, 0, 0), Gf.Vec3f(1, 0, 0)])
     prim.CreateWidthsAttr([0.1])
     prim.SetWidthsInterpolation("constant")
-    found = only(stage)
-    np.testing.assert_allclose(found.points, [[0, 0, 10], [0, 2, 10]], atol=1e-12)
-    np.testing.assert_allclose(found.radius, 0.1, rtol=1e-6)  # half of a width of 0.1, twice as large
+    read_back = read_only_curves(stage)
+    np.testing.assert_allclose(read_back.points, [[0, 0, 10], [0, 2, 10]], atol=1e-12)
+    np.testing.assert_allclose(read_back.radius, 0.1, rtol=1e-6)  # half of a width of 0.1, twice as large
 
 
 @pytest.mark.parametrize(
@@ -78,22 +78,22 @@ def test_widths_are_diameters(tmp_path, interpolation, widths, radii):
     stage, prim = stage_with_curves(tmp_path / "a.usda")
     prim.CreateWidthsAttr([float(width) for width in widths])
     prim.SetWidthsInterpolation(interpolation)
-    np.testing.assert_allclose(only(stage).radius, 0.01 * np.array(radii), rtol=1e-6)
+    np.testing.assert_allclose(read_only_curves(stage).radius, 0.01 * np.array(radii), rtol=1e-6)
 
 
 def test_periodic_curves_are_closed(tmp_path):
     stage, _ = stage_with_curves(tmp_path / "a.usda", POINTS[:4], [4], wrap="periodic")
-    assert only(stage).closed.all()
+    assert read_only_curves(stage).closed.all()
 
 
-def test_first_sample_without_a_default(tmp_path):
+def test_first_sample_replaces_a_missing_default(tmp_path):
     stage, prim = stage_with_curves(tmp_path / "a.usda", POINTS[:2], [2])
     prim.GetPointsAttr().Clear()
     for time in (7.0, 9.0):
         prim.GetPointsAttr().Set([Gf.Vec3f(time, 0, 0), Gf.Vec3f(time, 1, 0)], time)
     prim.AddTranslateOp().GetAttr().Set(Gf.Vec3d(100, 0, 0), 7.0)
     prim.GetPrim().GetAttribute("xformOp:translate").Set(Gf.Vec3d(500, 0, 0), 0.0)
-    np.testing.assert_allclose(only(stage).points[0], [1.07, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(read_only_curves(stage).points[0], [1.07, 0, 0], rtol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore:.*shorter than its cubic:ddg_warp.errors.SceneWarning")
@@ -112,9 +112,9 @@ def test_cubic_curves_become_polylines_through_knots(tmp_path, basis, wrap, x):
     stage, prim = stage_with_curves(tmp_path / "a.usda", [(k, 0, 0) for k in (0, 1, 3, 6, 10)], [5], "cubic", wrap)
     prim.CreateBasisAttr(basis)
     prim.CreateWidthsAttr([1.0] * 5)
-    found = only(stage)
-    np.testing.assert_allclose(100 * found.points[:, 0], x, rtol=1e-6, atol=1e-7)
-    assert found.radius.shape == (len(x),)
+    read_back = read_only_curves(stage)
+    np.testing.assert_allclose(100 * read_back.points[:, 0], x, rtol=1e-6, atol=1e-7)
+    assert read_back.radius.shape == (len(x),)
 
 
 CIRCLE = 4.0 / 3.0 * np.tan(np.pi / 8)  # of a Bezier quarter circle, within 3e-4
@@ -132,29 +132,29 @@ AROUND = [(np.cos(a), np.sin(a), 0.0) for a in TURNS]
     ],
 )
 def test_lengths_of_cubic_curves_converge(tmp_path, basis, wrap, points, length):
-    """With the square of the number of points; lengths of splines are those that SciPy has of them."""
+    """The error falls with the square of the number of samples; reference lengths of splines are from SciPy."""
     stage, prim = stage_with_curves(tmp_path / "a.usda", points, [len(points)], "cubic", wrap)
     prim.CreateBasisAttr(basis)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.Save()
     path = stage.GetRootLayer().realPath
 
-    def measured(samples: int) -> float:
-        (found,) = read_curves(path, samples=samples)
-        around = np.concatenate([found.points, found.points[:1]]) if wrap == "periodic" else found.points
+    def length_of(samples: int) -> float:
+        (polyline,) = read_curves(path, samples=samples)
+        around = np.concatenate([polyline.points, polyline.points[:1]]) if wrap == "periodic" else polyline.points
         return np.linalg.norm(np.diff(around, axis=0), axis=1).sum()
 
-    exact = measured(500)
+    exact = length_of(500)
     assert exact == pytest.approx(length, rel=5e-4)
-    errors = [exact - measured(samples) for samples in (8, 16)]
+    errors = [exact - length_of(samples) for samples in (8, 16)]
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.02)
     with pytest.warns(
         SceneWarning, match=rf"/Curves: the polyline of curve 0 .* shorter than its cubic {basis}; .*samples="
     ):
-        measured(1)
+        length_of(1)
 
 
-def test_samples_lie_between_knots_with_their_widths(tmp_path):
+def test_samples_interpolate_positions_and_widths(tmp_path):
     stage, prim = stage_with_curves(tmp_path / "a.usda", [(3 * k, 0, 0) for k in range(6)], [6], "cubic", "pinned")
     prim.CreateBasisAttr("bspline")
     prim.CreateWidthsAttr([2.0, 4.0, 6.0, 8.0, 10.0, 12.0])
@@ -163,21 +163,23 @@ def test_samples_lie_between_knots_with_their_widths(tmp_path):
     for kind in ("vertex", "varying"):
         prim.SetWidthsInterpolation(kind)
         stage.Save()
-        (found,) = read_curves(stage.GetRootLayer().realPath, samples=3)
-        assert found.counts.tolist() == [16]
-        along = [abs(x) for x in found.points @ [1.0, 0.0, 0.0]]
-        np.testing.assert_allclose(along, np.arange(16.0), atol=1e-6)  # the phantom points keep a straight line even
-        np.testing.assert_allclose(found.radius, np.linspace(1.0, 6.0, 16), rtol=1e-6)
+        (polyline,) = read_curves(stage.GetRootLayer().realPath, samples=3)
+        assert polyline.counts.tolist() == [16]
+        along = [abs(x) for x in polyline.points @ [1.0, 0.0, 0.0]]
+        np.testing.assert_allclose(
+            along, np.arange(16.0), atol=1e-6
+        )  # phantom points keep the spacing on a straight line
+        np.testing.assert_allclose(polyline.radius, np.linspace(1.0, 6.0, 16), rtol=1e-6)
 
 
-def test_bezier_knots_and_varying_widths(tmp_path):
+def test_bezier_knots_take_varying_widths(tmp_path):
     stage, prim = stage_with_curves(tmp_path / "a.usda", [(k, 0, 0) for k in range(7)], [7], "cubic")
     prim.CreateBasisAttr("bezier")
     prim.CreateWidthsAttr([2.0, 4.0, 6.0])
     prim.SetWidthsInterpolation("varying")
-    found = only(stage)
-    np.testing.assert_allclose(100 * found.points[:, 0], [0, 3, 6], rtol=1e-6)
-    np.testing.assert_allclose(100 * found.radius, [1, 2, 3], rtol=1e-6)
+    read_back = read_only_curves(stage)
+    np.testing.assert_allclose(100 * read_back.points[:, 0], [0, 3, 6], rtol=1e-6)
+    np.testing.assert_allclose(100 * read_back.radius, [1, 2, 3], rtol=1e-6)
 
 
 def test_bad_files_are_named(tmp_path):
@@ -188,7 +190,7 @@ def test_bad_files_are_named(tmp_path):
         read_curves(tmp_path / "text.usda")
     stage = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
     with pytest.raises(CurveError, match="no BasisCurves"):
-        only(stage)
+        read_only_curves(stage)
     with pytest.raises(CurveError, match="no prim /Nowhere"):
         read_curves(GROOM, "/Nowhere")
 
@@ -205,14 +207,14 @@ def test_bad_files_are_named(tmp_path):
 def test_bad_curves_are_named(tmp_path, changes, message):
     stage, _ = stage_with_curves(tmp_path / "a.usda", **changes)
     with pytest.raises(CurveError, match=message):
-        only(stage)
+        read_only_curves(stage)
 
 
 def test_bad_widths_are_named(tmp_path):
     stage, prim = stage_with_curves(tmp_path / "a.usda")
     prim.CreateWidthsAttr([1.0, 2.0, 3.0])
     with pytest.raises(CurveError, match="/Curves: there are 3 widths, but `vertex` interpolation takes 5"):
-        only(stage)
+        read_only_curves(stage)
     for widths, curve in (
         ([1.0, 0.0, 1.0, 1.0, 1.0], 0),
         ([1.0, 1.0, 1.0, 0.0, 0.0], 1),
@@ -220,28 +222,28 @@ def test_bad_widths_are_named(tmp_path):
     ):
         prim.GetWidthsAttr().Set(widths)
         with pytest.raises(CurveError, match=rf"curve {curve} has a radius of -?0\.\d+ m.* taper to 0 at the ends"):
-            only(stage)
+            read_only_curves(stage)
     prim.CreateWrapAttr("periodic")
     prim.GetCurveVertexCountsAttr().Set([5])
     prim.GetWidthsAttr().Set([1.0, 1.0, 1.0, 1.0, 0.0])
     with pytest.raises(CurveError, match=r"curve 0 has a radius of 0\.0 m"):
-        only(stage)
+        read_only_curves(stage)
 
 
-def test_widths_taper_to_0_at_tips(tmp_path):
-    """As those of most grooms do; a linear taper gives edges the mean of their ends."""
+def test_radii_may_vanish_at_tips(tmp_path):
+    """Grooms mostly taper; a linear taper gives edges the mean of their end radii."""
     stage, prim = stage_with_curves(tmp_path / "a.usda")
     prim.CreateWidthsAttr([0.0, 2.0, 0.0, 2.0, 0.0])
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    found = only(stage)
-    np.testing.assert_array_equal(found.radius, [0.0, 1.0, 0.0, 1.0, 0.0])
-    with CurvesWriter(tmp_path / "b.usda", found) as writer:
-        writer.write(0.0, found.points)
+    read_back = read_only_curves(stage)
+    np.testing.assert_array_equal(read_back.radius, [0.0, 1.0, 0.0, 1.0, 0.0])
+    with CurvesWriter(tmp_path / "b.usda", read_back) as writer:
+        writer.write(0.0, read_back.points)
     assert validate(tmp_path / "b.usda") == []
 
 
 def frames(count=3):
-    """(time [s], points [m]) of frames in which all moves."""
+    """Return (time [s], points [m]) of frames in which all points move."""
     return [(0.1 * k, rest_points() * (1.0 + 0.1 * k) + [0.0, 0.0, k]) for k in range(count)]
 
 
@@ -270,7 +272,7 @@ def test_written_curves_read_back(tmp_path, suffix):
     assert len(primvars.GetPrimvar("displayColor").Get()) == 1
 
 
-def test_open_and_closed_rods_of_a_batch_get_two_prims(tmp_path):
+def test_open_and_closed_rods_of_a_batch_make_two_prims(tmp_path):
     mixed = curves()
     mixed.batch[:] = 0
     mixed.names[:] = "rod number 1"
@@ -290,7 +292,7 @@ def test_each_save_leaves_a_valid_file(tmp_path):
         writer.write(time, points)
         assert path.exists() == (count >= 2)
         if count % 2 == 0:
-            copy = tmp_path / f"copy{count}.usdc"  # a name that USD has not cached
+            copy = tmp_path / f"copy{count}.usdc"  # USD caches stages by name
             copy.write_bytes(path.read_bytes())
             assert validate(copy) == []
             assert (
@@ -301,7 +303,7 @@ def test_each_save_leaves_a_valid_file(tmp_path):
     assert validate(path) == []
 
 
-def test_tubes_are_closed_surfaces_seen_from_outside(tmp_path):
+def test_tubes_are_closed_outward_surfaces(tmp_path):
     rods, points = curves(), rest_points()
     sizes, indices = tube_faces(rods.counts, rods.closed)
     vertices = tube_points(points, rods.counts, rods.closed, rods.radius)
@@ -309,14 +311,14 @@ def test_tubes_are_closed_surfaces_seen_from_outside(tmp_path):
     corners = np.split(indices, np.cumsum(sizes)[:-1])
     edges = [(a, b) for face in corners for a, b in zip(face, np.roll(face, -1), strict=True)]
     assert len(set(edges)) == len(edges)  # each directed edge once, ...
-    assert {(b, a) for a, b in edges} == set(edges)  # ... and once the other way: closed and oriented
+    assert {(b, a) for a, b in edges} == set(edges)  # ... and once reversed: closed and oriented
     volume = sum(
         np.dot(vertices[face[0]], np.cross(vertices[face[k]], vertices[face[k + 1]])) / 6.0
         for face in corners
         for k in range(1, len(face) - 1)
     )
-    polygon = 0.5 * SIDES * np.sin(2.0 * np.pi / SIDES)  # area of the cross-section over the square of the radius
-    # The ring's cross-sections stand in the mitre planes of its hexagon, which makes them narrower by cos 30 degrees.
+    polygon = 0.5 * SIDES * np.sin(2.0 * np.pi / SIDES)  # area of the cross-section over the radius squared
+    # The ring's cross-sections lie in mitre planes of the hexagon: narrower by cos 30 degrees.
     expected = polygon * (2 * 0.01**2 + 6 * 0.02**2 * np.cos(np.pi / 6))
     np.testing.assert_allclose(volume, expected, rtol=1e-3)
     distance = np.linalg.norm(vertices - np.repeat(points, SIDES, axis=0), axis=1)
@@ -335,19 +337,19 @@ def test_tubes_are_written(tmp_path):
     assert len(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("stretch").Get(0.0)) == 6 * SIDES
 
 
-def test_a_twisted_ring_of_tubes_has_no_seam():
-    """Rings that follow each other stay in step around a closed curve with torsion."""
+def test_tube_around_a_knot_has_no_seam():
+    """Successive cross-sections stay aligned around a closed curve with torsion."""
     angle = 2.0 * np.pi * np.arange(60) / 60
     trefoil = np.stack(
         [np.sin(angle) + 2 * np.sin(2 * angle), np.cos(angle) - 2 * np.cos(2 * angle), -np.sin(3 * angle)], axis=1
     )
     vertices = tube_points(trefoil, np.array([60]), np.array([True]), np.full(60, 0.1)).reshape(60, SIDES, 3)
     outward = (vertices[:, 0] - trefoil) / 0.1
-    turning = np.einsum("ij,ij->i", outward, np.roll(outward, -1, axis=0))
-    assert turning.min() > 0.9
+    alignment = np.einsum("ij,ij->i", outward, np.roll(outward, -1, axis=0))
+    assert alignment.min() > 0.9
 
 
-def test_validate_finds_what_is_wrong(tmp_path):
+def test_validate_finds_errors(tmp_path):
     path = tmp_path / "scene.usda"
     with CurvesWriter(path, curves()) as writer:
         for time, points in frames(2):
@@ -365,7 +367,7 @@ def test_validate_finds_what_is_wrong(tmp_path):
     assert "/World/strand: at time 2.4, point 0 is not finite" in problems
 
 
-def test_the_groom():
+def test_groom_of_the_scenes_is_valid():
     (groom,) = read_curves(GROOM)
     assert GROOM.stat().st_size < 300_000
     assert groom.path == "/Head/Strands"
@@ -380,7 +382,7 @@ def test_the_groom():
 
 
 def groom(name: str, more: str = "") -> str:
-    """A prim of one strand, as text."""
+    """Return a prim of one strand, as text."""
     return f"""def BasisCurves "{name}" {more}
 {{
     uniform token type = "linear"
@@ -411,48 +413,48 @@ HEAD = """#usda 1.0
     ],
     ids=["sublayer", "reference", "payload", "link", "reference of a reference", "arguments"],
 )
-def test_files_out_of_the_folder_are_opened_where_it_is_allowed(tmp_path, head, body):
-    here, away = tmp_path / "here", tmp_path / "away"
-    here.mkdir(), away.mkdir()
-    (away / "hair.usda").write_text(HEAD.format("") + groom("hair"))
-    (here / "link.usda").symlink_to(away / "hair.usda")
-    (here / "between.usda").write_text(HEAD.format("") + 'def "b" (references = @../away/hair.usda@</hair>)\n{\n}\n')
-    (here / "a.usda").write_text(HEAD.format(head) + body)
+def test_files_outside_the_folder_need_permission(tmp_path, head, body):
+    folder, outside = tmp_path / "here", tmp_path / "away"
+    folder.mkdir(), outside.mkdir()
+    (outside / "hair.usda").write_text(HEAD.format("") + groom("hair"))
+    (folder / "link.usda").symlink_to(outside / "hair.usda")
+    (folder / "between.usda").write_text(HEAD.format("") + 'def "b" (references = @../away/hair.usda@</hair>)\n{\n}\n')
+    (folder / "a.usda").write_text(HEAD.format(head) + body)
     with pytest.raises(CurveError, match=r"a\.usda: the file refers to .*\.usda, out of its folder; .*outside=True"):
-        read_curves(here / "a.usda")
-    (problem,) = validate(here / "a.usda")
+        read_curves(folder / "a.usda")
+    (problem,) = validate(folder / "a.usda")
     assert "out of its folder" in problem
-    (found,) = read_curves(here / "a.usda", outside=True)
-    assert found.counts.tolist() == [3]
+    (strand,) = read_curves(folder / "a.usda", outside=True)
+    assert strand.counts.tolist() == [3]
 
 
-def test_files_in_the_folder_are_opened_and_missing_ones_told(tmp_path):
+def test_missing_references_warn(tmp_path):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "hair.usda").write_text(HEAD.format("") + groom("hair"))
     text = 'def "a" (references = @parts/hair.usda@</hair>)\n{\n}\ndef "b" (references = @parts/none.usda@)\n{\n}\n'
     (tmp_path / "a.usda").write_text(HEAD.format("") + text)
     with pytest.warns(SceneWarning, match=r"@parts/none\.usda@.* is missing"):
-        (found,) = read_curves(tmp_path / "a.usda")
-    assert found.path == "/a"
+        (strand,) = read_curves(tmp_path / "a.usda")
+    assert strand.path == "/a"
 
 
-def test_other_curves_are_told(tmp_path):
+def test_unread_curves_warn(tmp_path):
     nurbs = groom("nurbs").replace("BasisCurves", "NurbsCurves").replace('    uniform token type = "linear"\n', "")
     (tmp_path / "a.usda").write_text(HEAD.format("") + nurbs + groom("hair"))
     with pytest.warns(SceneWarning, match=r"/nurbs \(NurbsCurves\) is not read"):
-        (found,) = read_curves(tmp_path / "a.usda")
-    assert found.path == "/hair"
+        (strand,) = read_curves(tmp_path / "a.usda")
+    assert strand.path == "/hair"
     (tmp_path / "b.usda").write_text(HEAD.format("") + nurbs)
     with pytest.raises(CurveError, match=r"no BasisCurves; it holds /nurbs \(NurbsCurves\)"):
         read_curves(tmp_path / "b.usda")
 
 
-def test_prototypes_of_instancers_are_read_by_their_path(tmp_path):
+def test_instancer_prototypes_are_read_by_path(tmp_path):
     instancer = 'def PointInstancer "p"\n{\nint[] protoIndices = [0, 0]\npoint3f[] positions = [(0, 0, 0), (5, 0, 0)]\n'
     (tmp_path / "a.usda").write_text(
         HEAD.format("") + instancer + "rel prototypes = </p/hair>\n" + groom("hair") + "}\n"
     )
     with pytest.raises(CurveError, match="/p is a PointInstancer, whose instances of /p/hair are not read"):
         read_curves(tmp_path / "a.usda")
-    (found,) = read_curves(tmp_path / "a.usda", "/p/hair")
-    assert found.path == "/p/hair"
+    (strand,) = read_curves(tmp_path / "a.usda", "/p/hair")
+    assert strand.path == "/p/hair"

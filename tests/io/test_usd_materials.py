@@ -1,4 +1,4 @@
-"""What a USD scene holds beside positions: materials, velocities, directors, and the attributes that a groom came with."""
+"""USD scenes beyond positions: materials, velocities, directors, and attributes of a groom."""
 
 import numpy as np
 import pytest
@@ -16,20 +16,20 @@ ATTRIBUTES = {
 }
 
 
-def drawn(path) -> dict[str, Usd.Prim]:
-    """Curves and meshes of a file by name; it is valid. The stage lives as long as the first prim's."""
+def prims_by_name(path) -> dict[str, Usd.Prim]:
+    """Return curves and meshes of a valid file by name; the stage stays open until the next call."""
     assert validate(path) == []
     stage = Usd.Stage.Open(str(path))
-    drawn.stage = stage
+    prims_by_name.stage = stage
     return {prim.GetName(): prim for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)}
 
 
 @pytest.mark.parametrize("tube", [False, True])
-def test_every_prim_has_a_preview_surface_of_its_color(tmp_path, tube):
+def test_every_prim_has_a_preview_surface_with_its_color(tmp_path, tube):
     with Recorder(Model(surfaces=surfaces()), tmp_path, tube=tube) as recorder:
         recorder.record(recorder._model.state())
     colors = []
-    for prim in drawn(tmp_path / SCENE).values():
+    for prim in prims_by_name(tmp_path / SCENE).values():
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         shader, *_ = material.ComputeSurfaceSource()
         assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
@@ -43,7 +43,7 @@ def test_every_prim_has_a_preview_surface_of_its_color(tmp_path, tube):
 
 @pytest.mark.parametrize("tube", [False, True])
 def test_groom_attributes_velocities_and_directors_are_kept(tmp_path, tube):
-    """In the scene, in what is exported from the trajectory, and in what is read from either."""
+    """Kept in the recorded scene, in the export of the trajectory, and in curves read from either."""
     model = Model()
     kept = {"attributes": ATTRIBUTES, "velocities": True, "directors": True}
     with Recorder(model, tmp_path, tube=tube, **kept) as recorder:
@@ -52,7 +52,7 @@ def test_groom_attributes_velocities_and_directors_are_kept(tmp_path, tube):
             recorder.record(state)
     export_usd(tmp_path / TRAJECTORY, tmp_path / "export.usdc", tube=tube, fps=100.0)
     for path in (tmp_path / SCENE, tmp_path / "export.usdc"):
-        prims = drawn(path)
+        prims = prims_by_name(path)
         shape, primvars = UsdGeom.PointBased(prims["strand"]), UsdGeom.PrimvarsAPI(prims["strand"])
         last = shape.GetPointsAttr().GetTimeSamples()[-1]
         np.testing.assert_allclose(np.array(shape.GetVelocitiesAttr().Get(last))[0], np.cos(states[1].q[0]), atol=1e-6)
@@ -63,7 +63,7 @@ def test_groom_attributes_velocities_and_directors_are_kept(tmp_path, tube):
         assert ids.GetInterpolation() == groups.GetInterpolation() == UsdGeom.Tokens.uniform
         values = np.array(ids.Get())
         assert set(values) == {7, 8} and set(groups.Get()) == {"left"}
-        if tube:  # a value for every face of a tube
+        if tube:  # one value per face of a tube
             assert len(values) == len(UsdGeom.Mesh(prims["strand"]).GetFaceVertexCountsAttr().Get())
             assert (np.diff(values) >= 0).all() or sorted(np.bincount(values)[7:]) == [len(values) // 2] * 2
         else:
@@ -72,7 +72,7 @@ def test_groom_attributes_velocities_and_directors_are_kept(tmp_path, tube):
             np.testing.assert_allclose(strands.attributes["clump"], [0.1, 0.2], rtol=1e-6)
 
 
-def test_a_resumed_scene_keeps_attributes(tmp_path):
+def test_resumed_scenes_keep_attributes(tmp_path):
     model = Model()
     with Recorder(model, tmp_path, attributes=ATTRIBUTES) as recorder:
         recorder.record(model.state())
@@ -82,7 +82,7 @@ def test_a_resumed_scene_keeps_attributes(tmp_path):
 
 
 def test_attributes_of_a_groom_are_read(tmp_path):
-    """Values of each curve, and one for all; what is drawn or has other lengths is no attribute of curves."""
+    """Uniform and constant primvars are read; display and per-vertex primvars are not."""
     stage = Usd.Stage.CreateNew(str(tmp_path / "groom.usda"))
     curves = UsdGeom.BasisCurves.Define(stage, "/Groom")
     curves.CreateTypeAttr("linear")
@@ -100,12 +100,12 @@ def test_attributes_of_a_groom_are_read(tmp_path):
     }
 
 
-def test_attributes_that_do_not_fit_are_named(tmp_path):
+def test_attributes_of_wrong_length_are_named(tmp_path):
     with pytest.raises(CurveError, match="attribute 'id' has 2 values for 3 rods"):
         Recorder(Model(), tmp_path, attributes={"id": np.array([1, 2])})
 
 
-def test_calls_of_one_name_and_material_make_one_prim(tmp_path, device):
+def test_rods_of_equal_name_and_material_make_one_prim(tmp_path, device):
     import ddg_warp as ddg
 
     scene = ddg.Scene()
@@ -116,6 +116,6 @@ def test_calls_of_one_name_and_material_make_one_prim(tmp_path, device):
     assert model.curves.batch.tolist() == [0, 0, 1, 2]
     with Recorder(model, tmp_path) as recorder:
         recorder.record(model.state())
-    prims = drawn(tmp_path / SCENE)
+    prims = prims_by_name(tmp_path / SCENE)
     assert list(prims["line"].GetAttribute("curveVertexCounts").Get()) == [4, 5]
     assert set(prims) == {"line", "line_2", "rope"}
