@@ -1,8 +1,10 @@
 """Shells of revolution against closed forms and reference solutions: at three resolutions, with the observed order.
 
-Small loads stand for linear theory, thin shells for shallow ones. Marguerre and Reissner's equations of shallow shells were
-solved by Chebyshev collocation (32 to 56 points, alike to 1e-9): x (x b')' - b = x f (b - x) - 2 x^3 p / p_cl and
-x (x f')' - f = x (x b - b^2 / 2), x = lambda r / a, lambda^4 = 12 (1 - nu^2) a^4 / (R h)^2.
+Small loads stand for linear theory, thin shells for shallow ones. Equations of shallow shells by Marguerre and Reissner were
+solved by Chebyshev collocation (32 to 56 points, equal to 1e-9):
+
+    x (x b')' - b = x f (b - x) - 2 x^3 p / p_cl ,   x (x f')' - f = x (x b - b^2 / 2) ,
+    x = lambda r / a ,   lambda^4 = 12 (1 - nu^2) a^4 / (R h)^2 .
 """
 
 import numpy as np
@@ -31,13 +33,13 @@ def rigidity(h):
 
 
 def differences_order(edges, values):
-    """Observed order from differences alone, for references with an error of their own; edges double."""
+    """Return the observed order from differences alone, for inexact references; edges double."""
     assert np.allclose(np.diff(np.log2(edges)), 1.0)
     return np.log2((values[1] - values[0]) / (values[2] - values[1]))
 
 
 def plate(n, h, thickness_load, clamped, immovable=False, load_steps=1):
-    """A circular plate of radius 1 under the dead pressure whose linear deflection, clamped, is `thickness_load` h."""
+    """Return a circular plate of radius 1 under dead pressure, with a linear deflection of `thickness_load` h if clamped."""
     scene = still(load_steps)
     r = np.linspace(0.0, 1.0, n + 1)
     shell = scene.add_axisymmetric_shell(np.column_stack([r, 0.0 * r]), thickness=h, material=MATERIAL)
@@ -47,9 +49,9 @@ def plate(n, h, thickness_load, clamped, immovable=False, load_steps=1):
     return scene
 
 
-# w0 = q a^4 / (64 D), and (5 + nu) / (1 + nu) of it where the rim may turn (Timoshenko and Woinowsky-Krieger 1959, articles 16, 17).
+# w0 = q a^4 / (64 D) clamped, times (5 + nu) / (1 + nu) supported (Timoshenko and Woinowsky-Krieger 1959, articles 16, 17).
 @pytest.mark.parametrize(("clamped", "factor"), [(True, 1.0), (False, (5.0 + NU) / (1.0 + NU))])
-def test_plate(device, clamped, factor):
+def test_linear_plate_deflection(device, clamped, factor):
     h, load = 1e-2, 1e-6
     errors = [
         equilibrium(plate(n, h, load, clamped), device)[1].points()[0, 2] / (factor * load * h) - 1.0 for n in REGULAR
@@ -60,15 +62,15 @@ def test_plate(device, clamped, factor):
 
 # Foeppl and von Karman's plate with a clamped, immovable rim, q a^4 / (64 D h) = 1 and 5, by collocation: w0 / h.
 @pytest.mark.parametrize(("load", "deflection"), [(1.0, 0.7582550143), (5.0, 1.7684923709)])
-def test_plate_with_large_deflection(device, load, deflection):
+def test_large_plate_deflection(device, load, deflection):
     h = 2e-3
     errors = [equilibrium(plate(n, h, load, True, True, 4), device)[1].points()[0, 2] / h - deflection for n in REGULAR]
     assert abs(errors[-1]) < 1e-3 * deflection
     assert order(REGULAR, errors) == pytest.approx(2.0, abs=0.1)
 
 
-def test_cylinder_under_pressure_at_large_strain(device):
-    """Free ends, following pressure: S_z = 0 gives l_z^2 = 1 - nu (l^2 - 1), and E h (l^2 - 1) / 2 = p R l_z. Exact on any mesh."""
+def test_pressurised_cylinder_is_exact_at_large_strain(device):
+    """Free ends, follower pressure: S_z = 0 gives l_z^2 = 1 - nu (l^2 - 1), and E h (l^2 - 1) / 2 = p R l_z. Exact on any mesh."""
     R, h, stretch = 2.0, 0.01, 1.3
     along = np.sqrt(1.0 - NU * (stretch**2 - 1.0))
     pressure = E * h * (stretch**2 - 1.0) / (2.0 * R * along)
@@ -81,7 +83,7 @@ def test_cylinder_under_pressure_at_large_strain(device):
     np.testing.assert_allclose(points, np.column_stack([R * stretch + 0.0 * z, 0.0 * z, along * z]), atol=1e-10)
 
 
-def test_edge_of_a_cylinder(device):
+def test_edge_force_decays_along_a_cylinder(device):
     """Radial force Q per length on a free edge: u = Q exp(-b z) cos(b z) / (2 b^3 D), b^4 = 3 (1 - nu^2) / (R h)^2 (Timoshenko)."""
     R, h, Q = 1.0, 1e-3, 1e-3
     b = (3.0 * (1.0 - NU**2)) ** 0.25 / np.sqrt(R * h)
@@ -99,10 +101,10 @@ def test_edge_of_a_cylinder(device):
     assert order((40, 80, 160), errors) == pytest.approx(2.0, abs=0.1)
 
 
-def test_point_loads_on_a_sphere(device):
-    """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946) under opposite forces on both poles; edges finer towards these.
+def test_stiffness_of_a_sphere_under_point_loads(device):
+    """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946) under opposite pole forces; edges are graded towards the poles.
 
-    With h = 1e-5 R rounding of membrane forces is 3 % of the load: the supports miss it, and the state is refused.
+    At h = 1e-5 R rounding of membrane forces is 3 % of the load: supports do not balance the load, and the state is refused.
     """
     R, h, load = 1.0, 1e-4, 1e-4
     stiffness = 4.0 * E * h**2 / (R * np.sqrt(3.0 * (1.0 - NU**2)))
@@ -123,11 +125,11 @@ def hemisphere(n, R, grading=1):
     return R * np.column_stack([np.sin(angle), np.cos(angle)])
 
 
-def test_sphere_buckles(device):
+def test_buckling_pressure_of_a_sphere(device):
     """The uniformly shrunk sphere is first singular at p = 2 E h^2 / (R^2 sqrt(3 (1 - nu^2))) (Zoelly 1915).
 
-    Shrunk by l it is under the pressure 2 E h (1 - l^2) / (2 (1 - nu) R l). It counts as given: on the way there by
-    equilibria, errors of the mesh act as imperfections do.
+    Shrunk by l the pressure is 2 E h (1 - l^2) / (2 (1 - nu) R l). The uniform state is prescribed: on a path of equilibria errors
+    of the mesh act as imperfections.
     """
     R, h = 1.0, 2e-3
     classical = 2.0 * E * h**2 / (R**2 * np.sqrt(3.0 * (1.0 - NU**2)))
@@ -161,7 +163,7 @@ def test_sphere_buckles(device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("load", "shallowness"), list(axisymmetric_dome.LIMITS))
-def test_cap_snaps(device, load, shallowness):
+def test_limit_loads_of_shallow_caps(device, load, shallowness):
     """Limit loads of shallow caps, clamped under pressure, or sliding under a force on the crown."""
     edges, loads = (40, 80, 160), []
     for n in edges:
@@ -181,7 +183,7 @@ def test_cap_snaps(device, load, shallowness):
 
 # Depth between pole and rim of the everted cap whose rim is free, in (R h) / sqrt(12 (1 - nu^2)) / R: b' + nu b / x = f = 0 at lambda.
 @pytest.mark.parametrize(("shallowness", "drop"), [(6.0, 31.354441973951), (10.0, 96.762668413187)])
-def test_everted_cap(device, shallowness, drop):
+def test_depth_of_an_everted_cap(device, shallowness, drop):
     R, h = 1.0, 2e-5
     unit = np.sqrt(R * h) / (12.0 * (1.0 - NU**2)) ** 0.25
     errors, edges = [], (40, 80, 160)
@@ -200,8 +202,8 @@ def test_everted_cap(device, shallowness, drop):
 
 
 @pytest.mark.slow
-def test_agrees_with_the_triangle_shell(device):
-    """A clamped cap of 0.5 rad, R / h = 50, well past linear: by triangles the crown's drop tends to the meridian's."""
+def test_triangle_shell_converges_to_shell_of_revolution(device):
+    """A clamped cap of 0.5 rad, R / h = 50, beyond the linear range: crown deflections by triangles converge to the meridian's."""
     R, h, angle = 1.0, 0.02, 0.5
     pressure = 0.35 * 2.0 * E * h**2 / (R**2 * np.sqrt(3.0 * (1.0 - NU**2)))
     scene = still()
@@ -227,7 +229,7 @@ def test_agrees_with_the_triangle_shell(device):
 
 
 def test_swelling_and_curling_are_free_of_stress(device):
-    """A free disc with metric 1.21 grows by 1.1; one with natural curvature k, small, is w = k r^2 / 2. Neither has energy."""
+    """A free disc with metric 1.21 grows by 1.1; small natural curvature k gives w = k r^2 / 2. Neither has energy."""
     r = np.linspace(0.0, 1.0, 21)
     curvature = 1e-7
     for rest, exact in (
@@ -245,8 +247,8 @@ def test_swelling_and_curling_are_free_of_stress(device):
 
 
 @pytest.mark.parametrize("angle", [1.0, np.pi])
-def test_sphere_bent_from_flat(device, angle):
-    """A clamped cap, or a sphere, flat at rest: D (1 + nu) / R^2 per area, 2 pi (1 - cos a) R^2 of it."""
+def test_bending_energy_of_a_sphere_flat_at_rest(device, angle):
+    """A clamped cap or sphere, flat at rest, has the energy D (1 + nu) / R^2 per area 2 pi (1 - cos a) R^2."""
     h, errors = 0.01, []
     for n in REGULAR:
         scene = still()
@@ -265,8 +267,8 @@ def test_sphere_bent_from_flat(device, angle):
     assert order(REGULAR, errors) == pytest.approx(2.0, abs=0.1)
 
 
-def test_prescribed_motion_and_reactions(device):
-    """The force on a pole that moves it by w is the one that moves it by w; supports carry the loads; weight is rho g h A."""
+def test_prescribed_motion_equals_force(device):
+    """A pole force and the resulting displacement, when prescribed, are equivalent. Supports carry loads and weight rho g h A."""
     angle = np.linspace(0.0, 0.6, 31)
     points = np.column_stack([np.sin(angle), np.cos(angle)])
     results = []
@@ -291,7 +293,7 @@ def test_prescribed_motion_and_reactions(device):
 
 
 # Clamped circular plate: omega_1 a^2 sqrt(rho h / D) = 10.2158 (Leissa 1969).
-def test_plate_vibrates(device):
+def test_frequency_of_a_clamped_plate(device):
     h, errors = 1e-2, []
     for n in REGULAR:
         scene = plate(n, h, 1e-3, True)
@@ -303,8 +305,8 @@ def test_plate_vibrates(device):
 
 
 @pytest.mark.slow
-def test_dynamics_of_a_plate(device):
-    """Let go from its shape under a pressure, a plate is near the mirrored one after half a period, with the energy kept."""
+def test_plate_oscillates_and_conserves_energy(device):
+    """A plate released from a static deflection is nearly mirrored after half a period, with its energy conserved."""
     h, n = 1e-2, 20
     scene = plate(n, h, 1e-3, True)
     model = scene.build(device, "float64")
@@ -324,6 +326,6 @@ def test_dynamics_of_a_plate(device):
     assert state.points()[0, 2] / static.points()[0, 2] == pytest.approx(-1.0, abs=0.1)
 
 
-def test_every_run_is_alike(device):
+def test_equilibria_repeat_bitwise(device):
     first, second = (equilibrium(plate(20, 2e-3, 1.0, True, True), device)[1].points() for _ in range(2))
     assert np.array_equal(first, second)

@@ -1,5 +1,7 @@
-"""Constants and laws of `scenes.overhand_knot`: the braid of a loose knot, by finite differences and a barrier that is made ever
-steeper, and what long braids tend to."""
+"""Constants and laws of `scenes.overhand_knot`: the braid of a loose knot, and the limits of long braids.
+
+The braid is solved by finite differences with a barrier of increasing steepness.
+"""
 
 from functools import cache
 
@@ -11,25 +13,28 @@ from scipy.sparse.linalg import spsolve
 
 from ddg_warp.scenes import _knots, overhand_knot
 
-MOST = 0.1  # by which points turn about the axis in an iteration, at most: the winding is kept
-TURN = 2.0 * np.pi / 12**0.75  # what a turn adds to sigma
+MOST = 0.1  # largest rotation of a point about the axis per iteration: keeps the winding
+TURN = 2.0 * np.pi / 12**0.75  # increment of sigma per winding
 
 
 def braid(turns: int, count: int) -> tuple[float, float]:
-    """Force of the unit disc on v(s), and the energy over that of two straight strands that cross; ends are held at first only."""
+    """Return the force of the unit disc on v(s), and the energy relative to two straight crossing strands.
+
+    Ends are fixed during the first barriers only.
+    """
     reach = 5.0 + 4.5 * turns
     s, step = np.linspace(-reach, reach, count + 1, retstep=True)
     second = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(count - 1, count + 1)) / step**2
     bend = sparse.kron(second.T @ second * step, sparse.eye_array(2))
-    ends, held = np.zeros((count + 1, 2)), np.zeros((count + 1, 2))
-    ends[[1, -1], 1], ends[[0, -2], 1], held[[0, -1], 0] = 0.5 / step, -0.5 / step, 100.0
+    ends, springs = np.zeros((count + 1, 2)), np.zeros((count + 1, 2))
+    ends[[1, -1], 1], ends[[0, -2], 1], springs[[0, -1], 0] = 0.5 / step, -0.5 / step, 100.0
     wound = 0.5 + 1.9 * turns
     angle = np.pi * ((2 * turns + 1) * np.clip(0.5 * (s / wound + 1.0), 0.0, 1.0) - 0.5)
-    away = 1.05 + np.maximum(abs(s) - wound, 0.0) ** 2 / 4.0
-    v = away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    radius = 1.05 + np.maximum(abs(s) - wound, 0.0) ** 2 / 4.0
+    v = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def state(v, law, barrier):
-        """Energy and its slope, infinite within the disc."""
+        """Return energy and gradient, infinite within the disc."""
         r = np.linalg.norm(v, axis=1)
         if r.min() <= 1.0:
             return np.inf, np.inf
@@ -39,32 +44,32 @@ def braid(turns: int, count: int) -> tuple[float, float]:
 
     barrier = 0.05
     while barrier > 1e-7:
-        law = bend + sparse.diags_array(held.ravel() * (barrier > 1e-3))
+        law = bend + sparse.diags_array(springs.ravel() * (barrier > 1e-3))
         for _ in range(500):
             r = np.linalg.norm(v, axis=1)
             normal, push = v / r[:, None], barrier * step / (r - 1.0)
             outward = normal[:, :, None] * normal[:, None, :]
-            now, slope = state(v, law, barrier)
-            for around in (1.0, 0.0):  # without what is not convex, where the direction would go up
-                own = (push / (r - 1.0))[:, None, None] * outward - around * (push / r)[:, None, None] * (
+            energy, slope = state(v, law, barrier)
+            for around in (1.0, 0.0):  # second try without the non-convex term, if the direction ascends
+                blocks = (push / (r - 1.0))[:, None, None] * outward - around * (push / r)[:, None, None] * (
                     np.eye(2) - outward
                 )
-                matrix = (law + sparse.block_diag(list(own))).tocsc()
+                matrix = (law + sparse.block_diag(list(blocks))).tocsc()
                 move = -spsolve(matrix, slope)
                 if move @ slope < 0.0 and move @ (matrix @ move) > 0.0:
                     break
             shift = move.reshape(-1, 2)
-            part = min(1.0, MOST * (r / np.maximum(np.linalg.norm(shift, axis=1), 1e-12)).min())
-            while part > 1e-9:
-                then, left = state(v + part * shift, law, barrier)
-                # differences of energies that drown in rounding say nothing
-                drowned = abs(then - now) < 1e-9 * (1.0 + abs(now))
-                if then <= now + 1e-4 * part * (move @ slope) or (
-                    drowned and np.linalg.norm(left) < np.linalg.norm(slope)
+            step_length = min(1.0, MOST * (r / np.maximum(np.linalg.norm(shift, axis=1), 1e-12)).min())
+            while step_length > 1e-9:
+                trial, trial_slope = state(v + step_length * shift, law, barrier)
+                # below the rounding floor of the energy, compare gradients
+                below_rounding = abs(trial - energy) < 1e-9 * (1.0 + abs(energy))
+                if trial <= energy + 1e-4 * step_length * (move @ slope) or (
+                    below_rounding and np.linalg.norm(trial_slope) < np.linalg.norm(slope)
                 ):
                     break
-                part *= 0.5
-            v = v + part * shift
+                step_length *= 0.5
+            v = v + step_length * shift
             if np.abs(shift).max() < 1e-6:
                 break
         force = barrier / (np.linalg.norm(v, axis=1) - 1.0)
@@ -74,59 +79,59 @@ def braid(turns: int, count: int) -> tuple[float, float]:
 
 
 @cache
-def found(turns: int) -> tuple[float, float]:
-    """The same by some 60 nodes a turn and more at the ends."""
+def braid_constants(turns: int) -> tuple[float, float]:
+    """Return force and energy with some 60 nodes per winding, and more at the ends."""
     return braid(turns, 300 * (turns + 1))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turns", overhand_knot.SIGMA)
-def test_normal_force_and_energy_of_a_braid(turns):
+def test_force_and_energy_of_braids(turns):
     # the energy over B is 2 h^(1/2) R^(-3/2) times that of v; F = -dU / d(2 pi R)
-    force, energy = found(turns)
+    force, energy = braid_constants(turns)
     assert force == pytest.approx(overhand_knot.SIGMA[turns], rel=5e-3)
     assert energy * 3.0 / (2.0 * np.pi) == pytest.approx(overhand_knot.BRAID[turns], rel=5e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turns", [2, 3, 4])
-def test_another_turn_of_a_braid_is_one_of_a_helix(turns):
-    """Of the force, from the first turn on but for half a turn at the ends; of the energy too, 3 / pi times that as c."""
-    (force, energy), (before, less) = found(turns), found(turns - 1)
-    assert force - before == pytest.approx(TURN, rel=4e-3)
+def test_each_winding_adds_that_of_a_helix(turns):
+    """Each winding adds the force of a helix, except for half a winding at the ends, and the energy 3 / pi times that."""
+    (force, energy), (previous_force, previous_energy) = braid_constants(turns), braid_constants(turns - 1)
+    assert force - previous_force == pytest.approx(TURN, rel=4e-3)
     assert force == pytest.approx((turns - 0.5) * TURN, rel=6e-3)
-    assert (energy - less) * 3.0 / (2.0 * np.pi) == pytest.approx(3.0 / np.pi * TURN, rel=1e-3)
+    assert (energy - previous_energy) * 3.0 / (2.0 * np.pi) == pytest.approx(3.0 / np.pi * TURN, rel=1e-3)
 
 
 @pytest.mark.parametrize("m", [1e-3, 0.3, 0.9, 0.999])
-def test_the_loop_is_an_elastica(m):
-    """Its integrals by quadrature; at m = 0 a circle that ends where it begins, at 1 a braid of eight radii less than the loop."""
-    length, apart = _knots.elastica(m)
-    # sharp where the loop is farthest from the braid
+def test_loop_length_and_end_distance(m):
+    """Length and end distance by quadrature, from a circle at m = 0 to a braid eight radii shorter than the loop at m = 1."""
+    length, distance = _knots.elastica(m)
+    # the integrand peaks at the far end of the loop
     pieces = {"points": np.pi - np.sqrt(1.0 - m) * np.array([1.0, 10.0]), "epsabs": 1e-13, "epsrel": 1e-12}
 
-    def bent(theta):
+    def root(theta):
         return np.sqrt(1.0 - m * np.sin(0.5 * theta) ** 2)
 
-    assert length == pytest.approx(2.0 * quad(lambda theta: 1.0 / bent(theta), 0.0, np.pi, **pieces)[0], rel=1e-10)
-    assert apart == pytest.approx(-2.0 * quad(lambda t: np.cos(t) / bent(t), 0.0, np.pi, **pieces)[0], rel=1e-9)
+    assert length == pytest.approx(2.0 * quad(lambda theta: 1.0 / root(theta), 0.0, np.pi, **pieces)[0], rel=1e-10)
+    assert distance == pytest.approx(-2.0 * quad(lambda t: np.cos(t) / root(t), 0.0, np.pi, **pieces)[0], rel=1e-9)
 
 
-def test_ends_of_the_range_of_loops():
+def test_loop_limits_at_circle_and_braid():
     m = 1e-4
-    length, apart = _knots.elastica(m)
+    length, distance = _knots.elastica(m)
     assert length == pytest.approx(2.0 * np.pi * (1.0 + m / 4.0), rel=m**2)
-    assert apart == pytest.approx(np.pi * m / 4.0 * (1.0 + 0.75 * m), rel=m**2)
+    assert distance == pytest.approx(np.pi * m / 4.0 * (1.0 + 0.75 * m), rel=m**2)
     # 8 is 4 int_0^(pi / 2) cos, of 1 + cos(theta) over cos(theta / 2)
-    length, apart = _knots.elastica(1.0 - 1e-9)
-    assert length - apart == pytest.approx(8.0, rel=1e-7)
+    length, distance = _knots.elastica(1.0 - 1e-9)
+    assert length - distance == pytest.approx(8.0, rel=1e-7)
 
 
 @pytest.mark.parametrize("turns", [0.5, 1.5, 2.5])
-def test_long_knots_are_loose_ones_in_the_end(turns):
-    """Jawed's law tends to sigma of a helix, and what tails that bend make of it; without friction the latter to the energy's c.
+def test_long_knots_tend_to_helices(turns):
+    """Jawed's law and the one with bent tails tend to sigma of a helix, the frictionless one to c of the energy.
 
-    What is left is of order epsilon, but of its root where friction's traction, of epsilon^3, bends the tails.
+    The remainder is of order epsilon, but sqrt(epsilon) where friction of order epsilon^3 bends the tails.
     """
     slack = np.array([1e8, 1e9])
     epsilon = np.sqrt(2.0 * np.pi / slack)
@@ -144,8 +149,8 @@ def test_long_knots_are_loose_ones_in_the_end(turns):
         assert np.log(off[0] / off[1]) / np.log(epsilon[0] / epsilon[1]) == pytest.approx(order, abs=0.03)
 
 
-def test_friction_in_long_knots():
-    """Jawed's law is n^-2 mu times a function of n^2 h / e; tails that bend press more, the more so the more friction there is."""
+def test_friction_scaling_of_long_knots():
+    """Jawed's law is n^-2 mu times a function of n^2 h / e; bent tails increase the pressure, the more so with more friction."""
     law = _knots.jawed(3.0, 1e4, 0.1)
     assert _knots.jawed(6.0, 4e4, 0.2) == pytest.approx(0.5 * law, rel=1e-10)
     pressed = [_knots.drawn(3.0, 1e4, friction)[1] for friction in (0.0, 0.02, 0.1, 0.3)]

@@ -1,14 +1,14 @@
-"""Brazier's collapse: a long tube that is bent flattens, and the moment it takes has a maximum.
+"""Brazier's collapse: a long tube flattens under bending, and its moment has a maximum.
 
-Bending is uniform, so a slice one cell long serves: its end sections stay plane and turn against each other, free to change their
-shape in their planes. Half of it is modelled, by symmetry. Curvature and moment are
+Bending is uniform, so a slice one cell long is enough: its end sections stay plane and rotate against each other, free to change
+shape within their planes. Half of the slice is modelled, by symmetry. Curvature and moment are
 
     c = kappa R^2 sqrt(1 - nu^2) / h ,   m = M sqrt(1 - nu^2) / (E R h^2) .
 
 Two references. Brazier (1927) keeps the leading order of the flattening z, U = c^2 (1 - 3 z / 2) / 2 + 3 z^2 / 8 in units of
-pi E h^3 R / (1 - nu^2): m = 0.987307 and z = 2/9 at most. A ring that cannot stretch, with the same energies but turns of any size,
-collapses at m = 0.958679 and z = 0.2568, and that is the limit of a thin shell: Brazier's moment is 3.0 % more, and his flattening
-13 % less, which no mesh changes.
+pi E h^3 R / (1 - nu^2): m = 0.987307 and z = 2/9 at most. An inextensible ring with the same energies at any rotation collapses
+at m = 0.958679 and z = 0.2568: the limit of a thin shell. Brazier's moment is 3.0 % larger and his flattening 13 % smaller, on
+any mesh.
 """
 
 from functools import cache
@@ -28,8 +28,10 @@ BRAZIER = 0.987307  # pi c (1 - 3 c^2 / 2) at c^2 = 2/9
 
 
 class Slice:
-    """Half a slice of a tube of radius 1 and E R h^2 = sqrt(1 - nu^2), bent in the plane of x and z; it lies between z = 0 and the
-    plane that `bend` turns. `cells` are around the half; the slice is as long as one of them."""
+    """Half a slice of a tube of radius 1 and E R h^2 = sqrt(1 - nu^2), bent in the plane of x and z.
+
+    The slice lies between z = 0 and the plane rotated by `bend`. `cells` is the number around the half; the length is one cell.
+    """
 
     def __init__(self, device, cells: int, thickness: float, membrane: str):
         self.thickness, self.length = thickness, np.pi / cells
@@ -48,29 +50,29 @@ class Slice:
         self.q = self.tangent.dofs(self.state)
         self.last = 3 * self.model.net.host.shells[0].nodes[last]
         free = self.tangent.free.copy()
-        free[self.last] = False  # they follow the plane
+        free[self.last] = False  # the last section follows the plane
         self.free = np.flatnonzero(free)
         self.held = np.where(free, 0.0, self.q)
         self.held[self.last] = self.held[self.last + 2] = 0.0
-        # free dofs, heights in the turned section, and how far it has moved along its normal
+        # free dofs, heights in the rotated section, and its displacement along the normal
         self.reduced = np.concatenate([self.q[self.free], self.q[self.last], [self.length]])
 
     def plane(self, angle: float) -> sparse.csc_matrix:
-        """q = held + plane(angle) reduced: points of the end section are at (x, z) = r (cos, -sin) + w (sin, cos)."""
+        """Return P of q = fixed + P reduced: points of the end section are at (x, z) = r (cos, -sin) + w (sin, cos)."""
         free, count = len(self.free), len(self.last)
         height, along = free + np.arange(count), np.full(count, free + count)
-        parts = [
+        triplets = [
             (np.ones(free), self.free, np.arange(free)),
             (np.full(count, np.cos(angle)), self.last, height),
             (np.full(count, -np.sin(angle)), self.last + 2, height),
             (np.full(count, np.sin(angle)), self.last, along),
             (np.full(count, np.cos(angle)), self.last + 2, along),
         ]
-        values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
+        values, rows, columns = (np.concatenate(column) for column in zip(*triplets, strict=True))
         return sparse.csc_matrix((values, (rows, columns)), shape=(self.tangent.size, free + count + 1))
 
     def bend(self, c: float) -> tuple[float, float]:
-        """Bend to the curvature c from where it is: moment m and flattening."""
+        """Bend to curvature c from the current state; return moment m and flattening."""
         angle = c * self.thickness / np.sqrt(1.0 - POISSON**2) * self.length
         to_q = self.plane(angle)
         for _ in range(30):
@@ -83,8 +85,9 @@ class Slice:
                 break
         else:
             raise AssertionError(f"no equilibrium at c = {c}")
-        assert factors.negative == 0  # stable where the turn is prescribed, past the largest moment too
-        # of the half, M = dU / d angle, and the points of the end section move like those of a plane turned by pi / 2 more
+        assert factors.negative == 0  # stable under prescribed rotation, also past the largest moment
+
+        # M = dU / d angle, doubled by symmetry; d/d angle of the end section is the plane map at angle + pi / 2
         ends = np.concatenate([self.last, self.last + 2])
         moment = 2.0 * gradient[ends] @ (self.plane(angle + 0.5 * np.pi) @ self.reduced)[ends]
         top, bottom = self.state.points()[self.crown, 0]
@@ -92,18 +95,19 @@ class Slice:
 
 
 def collapse(bend, curvatures=(0.1, 0.2, 0.3, 0.33, 0.36, 0.4, 0.44, 0.46, 0.48, 0.5, 0.52)) -> tuple[float, float]:
-    """Largest moment and the flattening there, of a function c -> (m, z), by quartics through the last five curvatures."""
+    """Return the largest moment of a function c -> (m, z), and its flattening, by quartics through the last five curvatures."""
     values = np.array([bend(c) for c in curvatures])[-5:]
     moment, flattening = (np.polynomial.Polynomial.fit(curvatures[-5:], column, 4) for column in values.T)
-    at = minimize_scalar(lambda c: -moment(c), bounds=curvatures[-5::4], method="bounded", options={"xatol": 1e-8}).x
-    return float(moment(at)), float(flattening(at))
+    peak = minimize_scalar(lambda c: -moment(c), bounds=curvatures[-5::4], method="bounded", options={"xatol": 1e-8}).x
+    return float(moment(peak)), float(flattening(peak))
 
 
 @cache
 def ring(c: float) -> tuple[float, float]:
-    """Moment m and flattening of a ring that cannot stretch: psi(s) = s + sum a_k sin(2 k s), U = c^2 I / 2 + mean((psi' - 1)^2) / 12.
+    """Return moment m and flattening of an inextensible ring.
 
-    I is the second moment of the section over that of the circle; quarter ring, midpoints.
+    Minimise U = c^2 I / 2 + mean((psi' - 1)^2) / 12 over psi(s) = s + sum a_k sin(2 k s). I is the second moment of the section over
+    that of the circle; quarter ring, midpoint rule.
     """
     count = 400
     ds = 0.5 * np.pi / count
@@ -124,8 +128,8 @@ def ring(c: float) -> tuple[float, float]:
     return np.pi * c * inertia(a), 1.0 - section(a)[1]
 
 
-def test_ring_is_braziers_at_small_curvature():
-    """z = c^2 and m = pi c (1 - 3 c^2 / 2), to relative errors that fall like c^2."""
+def test_ring_matches_brazier_at_small_curvature():
+    """Small c: z = c^2 and m = pi c (1 - 3 c^2 / 2), to relative errors of order c^2."""
     for c in (0.04, 0.08):
         moment, flattening = ring(c)
         assert (moment / (np.pi * c) - 1.0) / (-1.5 * c**2) == pytest.approx(1.0, abs=3.0 * c**2)
@@ -133,8 +137,8 @@ def test_ring_is_braziers_at_small_curvature():
 
 
 @pytest.mark.slow
-def test_collapse(device):
-    """R / h = 50: largest moment within 5 % of Brazier's and 0.1 % of the ring's; order 2 or more in the length of cells."""
+def test_collapse_moment_of_a_tube(device):
+    """R / h = 50: largest moment within 5 % of Brazier's and 0.1 % of the ring's; order 2 or more in the cell length."""
     exact, flattening = collapse(ring)
     assert exact == pytest.approx(0.958679, abs=2e-6)
     assert exact / BRAZIER - 1.0 == pytest.approx(-0.029, abs=0.0005)
@@ -147,9 +151,9 @@ def test_collapse(device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("thickness", "cells"), [(0.02, 64), (0.01, 96), (0.005, 128)])
-def test_thin_tubes_collapse_like_the_ring(device, thickness, cells):
+def test_collapse_is_independent_of_thickness(device, thickness, cells):
     """R / h = 50, 100, 200: the moment in units of E R h^2 does not depend on the thickness, nor do facets lock."""
     exact, flattening = collapse(ring)
-    moment, flat = collapse(Slice(device, cells, thickness, "flat").bend)
+    moment, tube_flattening = collapse(Slice(device, cells, thickness, "flat").bend)
     assert moment == pytest.approx(exact, rel=1.5e-3)
-    assert flat == pytest.approx(flattening, rel=2e-3)
+    assert tube_flattening == pytest.approx(flattening, rel=2e-3)

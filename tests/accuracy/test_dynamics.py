@@ -1,7 +1,7 @@
-"""Dynamics against closed forms: frequencies of beams, torsion and chains, one-step maps, rotating and flying rods, order in time.
+"""Dynamics against closed forms: frequencies, one-step maps, rotating and flying rods, order in time.
 
-Every case is refined three times; errors of space and time are fitted in the logarithm and must be of the order of the scheme, to
-a tenth. Closed forms stand above the test that uses them.
+Every case is refined three times; errors of space and time are fitted in the logarithm and must have the order of the scheme, to
+a tenth. Closed forms stand above the tests.
 """
 
 import numpy as np
@@ -16,12 +16,12 @@ slow = pytest.mark.slow
 
 
 def fitted_order(sizes, errors) -> float:
-    """Slope of log(error) over log(size)."""
+    """Return the slope of log(error) over log(size)."""
     return float(np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0])
 
 
 def planar_frequencies(scene, device: str, count: int) -> np.ndarray:
-    """Lowest angular frequencies [rad/s] of a scene in its rest state, rigid modes left out, by a dense solver."""
+    """Return the lowest angular frequencies [rad/s] of a scene at rest without rigid-body modes, by a dense solver."""
     model = scene.build(device=device, precision="float64")
     tangent = Tangent(model)
     free = np.flatnonzero(tangent.free)
@@ -36,7 +36,7 @@ def planar_frequencies(scene, device: str, count: int) -> np.ndarray:
 
 
 def beam(support: str, n: int) -> ddg.Scene:
-    """A straight planar beam with EI = rho A = L = 1, so stiff to stretching that no axial mode is among the lowest."""
+    """Return a straight planar beam with EI = rho A = L = 1, too stiff axially for axial modes among the lowest."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     points = np.zeros((n + 1, 3))
     points[:, 0] = np.linspace(0.0, 1.0, n + 1)
@@ -59,7 +59,7 @@ def beam(support: str, n: int) -> ddg.Scene:
         pytest.param("clamped-pinned", (100, 200, 400), marks=slow),
     ],
 )
-def test_bending_frequencies(support, edges, device):
+def test_bending_frequencies_match_closed_forms(support, edges, device):
     exact = np.array(vibration.BETA[support])
     errors = np.array([planar_frequencies(beam(support, n), device, 4) / exact**2 - 1.0 for n in edges])
     for n, row in zip(edges, errors, strict=True):
@@ -76,7 +76,7 @@ def test_bending_frequencies(support, edges, device):
 
 
 @pytest.mark.parametrize("support", sorted(vibration.TORSION))
-def test_torsional_frequencies(support, device):
+def test_torsional_frequencies_match_closed_forms(support, device):
     exact, edges = np.array(vibration.TORSION[support]), (25, 50, 100)
     errors = []
     for n in edges:
@@ -84,7 +84,7 @@ def test_torsional_frequencies(support, device):
         tangent = Tangent(model)
         spins = np.flatnonzero(tangent.free & tangent.angle & (tangent.mass > 0.0))
         scaling = 1.0 / np.sqrt(tangent.mass[spins])
-        matrix = tangent.hessian(model.state())[spins][:, spins].toarray()  # of a straight rod, twist is on its own
+        matrix = tangent.hessian(model.state())[spins][:, spins].toarray()  # twist of a straight rod is uncoupled
         values = linalg.eigh(scaling[:, None] * matrix * scaling, eigvals_only=True)
         measured = np.sqrt(values[values > 1e-6 * values[-1]][:3]) / vibration.torsion_rate()
         print(f"{support}, {n} edges: {measured}")
@@ -100,7 +100,7 @@ def test_torsional_frequencies(support, device):
 
 
 @pytest.mark.parametrize("edges", [(25, 50, 100), pytest.param((100, 200, 400), marks=slow)])
-def test_hanging_chain(edges, device):
+def test_hanging_chain_frequencies(edges, device):
     exact = np.array(hanging_chain.FREQUENCIES)
     errors = []
     for n in edges:
@@ -127,7 +127,7 @@ INTEGRATOR_FACTS = {
 
 @pytest.mark.parametrize("angle", [0.01, 0.1, 0.5])
 @pytest.mark.parametrize("scheme", sorted(INTEGRATOR_FACTS))
-def test_one_step_of_a_mode(scheme, angle, device):
+def test_one_step_map_of_a_mode(scheme, angle, device):
     model = vibration.build("clamped-free", 20).build(device=device, precision="float64")
     series = vibration.free_oscillation(model, scheme, 1, angle, max(30, round(4.0 / angle)), amplitude=1e-4)
     factor, phase = vibration.step_factor(series)
@@ -143,7 +143,10 @@ SPINS = [pytest.param(0.1, marks=pytest.mark.slow), 0.5, 1.0]
 
 
 def polygon(k: float, n: int) -> np.ndarray:
-    """The relative equilibrium of n edges (n + 1,) [m]: EA (e / h - 1) in the edges balances m W^2 r at the nodes, linear in r."""
+    """Return nodes of n edges in relative equilibrium (n + 1,) [m].
+
+    EA (e / h - 1) in the edges balances m W^2 r at the nodes, linear in r.
+    """
     h = spinning_rod.LENGTH / n
     mass = np.full(n + 1, h)
     mass[[0, -1]] *= 0.5
@@ -155,7 +158,7 @@ def polygon(k: float, n: int) -> np.ndarray:
 
 
 def spin(k: float, n: int, steps: int, device: str) -> dict[str, np.ndarray]:
-    """Observed series over a turn of a rod that starts in the relative equilibrium of its polygon."""
+    """Return observed series over one revolution of a rod, from the relative equilibrium of the polygon."""
     scene = spinning_rod.build(k, n, steps, 1.0)
     model = scene.build(device=device, precision="float64")
     points, velocities = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
@@ -170,7 +173,7 @@ def spin(k: float, n: int, steps: int, device: str) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("k", SPINS)
-def test_spinning_rod_keeps_length_momenta_and_energy(k, device):
+def test_spinning_rod_conserves_length_momenta_and_energy(k, device):
     steps, changes = (200, 400, 800), []
     for count in steps:
         series = spin(k, 50, count, device)
@@ -191,23 +194,23 @@ def test_spinning_rod_has_the_exact_length(k, device):
     edges, errors = (16, 32, 64), []
     for n in edges:
         coarse, fine = (spin(k, n, steps, device)["length"].mean() for steps in (200, 400))
-        errors.append((4.0 * fine - coarse) / 3.0 - LENGTH_RATIO[k])  # without the error of the step, of second order
+        errors.append((4.0 * fine - coarse) / 3.0 - LENGTH_RATIO[k])  # Richardson extrapolation of the time step error
     print(f"k = {k}: errors of the length {errors}, order {fitted_order(1.0 / np.array(edges), errors):.3f}")
     assert abs(errors[-1]) < 1e-4
-    if k > 0.1:  # below, the error of space drowns in what is left of that of the step
+    if k > 0.1:  # below, the remaining error of the time step exceeds the error in space
         assert abs(fitted_order(1.0 / np.array(edges), errors) - 2.0) < 0.1
 
 
 @pytest.mark.parametrize("k", sorted(LENGTH_RATIO))
 def test_spinning_rod_converges_in_space(k, device):
-    """Forces of the stretched shape against its centripetal ones, at any instant; lumped at nodes."""
+    """Forces of the stretched shape and centripetal forces, lumped at nodes, match the exact tension with second order."""
     edges, errors = (25, 50, 100), []
     for n in edges:
         model = spinning_rod.build(k, n).build(device=device, precision="float64")
         state = spinning_rod.spinning(model, k)
         tangent = Tangent(model)
         q, force = (v.reshape(-1, 4)[:, 0] for v in (tangent.dofs(state), tangent.gradient(state)))
-        # Tension in the edges is the sum of the forces before them; the exact one is EA (r' - 1) in their middles.
+        # Edge tension is the sum of forces before the edge; the exact one is EA (r' - 1) at the midpoint.
         tension = -np.cumsum(force)[:-1]
         middle = 0.5 * (model.scene.batches[0].points[0, 1:, 0] + model.scene.batches[0].points[0, :-1, 0])
         exact = spinning_rod.EA * (np.cos(k * middle) / np.cos(0.5 * k) - 1.0)
@@ -222,7 +225,7 @@ def test_spinning_rod_converges_in_space(k, device):
 
 
 def fly(n: int, dt: float, duration: float, device: str, scheme: str = "implicit_midpoint"):
-    """Times and observed series of the flying beam."""
+    """Return times and observed series of the flying beam."""
     scene = flying_beam.build(n, scheme)
     model = scene.build(device=device, precision="float64")
     integrator, state = ddg.Integrator(model, scheme, rtol=1e-8), model.state()
@@ -235,10 +238,10 @@ def fly(n: int, dt: float, duration: float, device: str, scheme: str = "implicit
 
 
 @pytest.mark.parametrize("scheme", [pytest.param("implicit_euler", marks=pytest.mark.slow), "implicit_midpoint"])
-def test_flying_beam_leaves_with_the_impulse_of_its_load(scheme, device):
+def test_flying_beam_gains_the_impulse_of_its_load(scheme, device):
     _, series = fly(20, 0.01, 5.0, device, scheme)
     print(f"{scheme}: momentum {series['momentum_x'][-1]}, {series['momentum_z'][-1]}")
-    # Implicit Euler adds up F at the ends of steps: the triangle is zero at both ends, so that its sum is exact, too.
+    # Implicit Euler sums F at the ends of steps: exact, too, as the triangle is zero at both ends.
     assert series["momentum_x"][-1] == pytest.approx(20.0, abs=1e-8)
     assert series["momentum_z"][-1] == pytest.approx(0.0, abs=1e-8)
 
@@ -254,7 +257,7 @@ def test_flying_beam_balances_angular_momentum(device):
 
 
 @slow
-def test_flying_beam_keeps_its_energy(device):
+def test_flying_beam_conserves_energy(device):
     steps, drifts = (0.01, 0.005, 0.0025), []
     for dt in steps:
         times, series = fly(40, dt, 15.0, device)
@@ -281,7 +284,7 @@ def test_implicit_euler_damps_the_flying_beam(device):
 
 
 @pytest.mark.parametrize("support", sorted(whirling.CRITICAL))
-def test_critical_whirling_rates(support, device):
+def test_critical_whirling_rates_are_bending_frequencies(support, device):
     edges = (25, 50, 100)
     measured = np.array([whirling.critical_rate(support, n, device=device, precision="float64") for n in edges])
     errors = measured / whirling.CRITICAL[support] - 1.0
@@ -292,7 +295,7 @@ def test_critical_whirling_rates(support, device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.5, 1.0])
-def test_bowed_shaft_swings_out(speed, device):
+def test_bowed_shaft_rides_at_the_exact_deflection(speed, device):
     periods = 4.0
     scene = whirling.build(speed=speed, bow=1e-3, n=20, periods=periods, steps=240)
     model = scene.build(device=device, precision="float64")
@@ -317,7 +320,10 @@ DURATION = 0.5  # s
 
 
 def ribbon(dt: float, scheme: str, device: str, duration: float = DURATION) -> np.ndarray:
-    """Positions [m] and a tenth of the first directors of a clamped helical ribbon, bent and twisted at its tip from rest."""
+    """Return positions [m] and first directors, scaled by 0.1, of a clamped helical ribbon.
+
+    The ribbon is bent and twisted at its tip from rest.
+    """
     s = np.linspace(0.0, 1.0, 13)
     points = np.stack([0.12 * np.cos(5.0 * s) - 0.12, 0.12 * np.sin(5.0 * s), 0.5 * s], axis=1)
     section = ddg.Stiffness(
@@ -342,7 +348,7 @@ def ribbon(dt: float, scheme: str, device: str, duration: float = DURATION) -> n
 @pytest.mark.parametrize(
     ("scheme", "order"), [pytest.param("implicit_euler", 1, marks=pytest.mark.slow), ("implicit_midpoint", 2)]
 )
-def test_order_in_time(scheme, order, device):
+def test_schemes_have_their_order_in_time(scheme, order, device):
     steps = DURATION / np.array([800, 1600, 3200] if order == 1 else [100, 200, 400])
     reference = ribbon(DURATION / 6400, "implicit_midpoint", device)
     moved = np.abs(reference - ribbon(1e-7, scheme, device, 1e-7)).max()

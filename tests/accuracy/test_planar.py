@@ -1,4 +1,4 @@
-"""Planar equilibria against closed forms: at three resolutions, with the observed order, and the finest within 1e-4 of the length."""
+"""Planar equilibria against closed forms: observed order at three resolutions, and errors below 1e-4 of the length."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from ddg_warp.solve import stability
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
-# Tip of a circle of curvature 2 pi turns / L: (sin a, 1 - cos a) L / a.
+# Tip of a circle of curvature `2 pi turns / L`: (sin a, 1 - cos a) L / a.
 @pytest.mark.parametrize(
     ("turns", "edges", "x", "z"),
     [
@@ -20,7 +20,7 @@ from ddg_warp.solve.statics import Equilibrium, StaticsOptions
         pytest.param(2.0, (200, 400, 800), 0.0, 0.0, marks=pytest.mark.slow),
     ],
 )
-def test_roll_up(device, turns, edges, x, z):
+def test_end_couple_rolls_up_a_circle(device, turns, edges, x, z):
     tips, curvatures = [], []
     for n in edges:
         _, state = equilibrium(roll_up.build(turns, n), device)
@@ -36,7 +36,7 @@ def test_roll_up(device, turns, edges, x, z):
 
 
 def test_roll_up_in_space_is_planar(device):
-    """In space a couple has no potential; its tangent must still take Newton to the planar circle."""
+    """A spatial couple has no potential; Newton with its tangent still converges to the planar circle."""
     tips = []
     for dimension in (2, 3):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension, analysis=ddg.Statics(load_steps=8))
@@ -56,7 +56,7 @@ def test_roll_up_in_space_is_planar(device):
         (10.0, 0.4450044022, 0.8106090249, 1.430285539),
     ],
 )
-def test_tip_load(device, load, x, drop, angle):
+def test_tip_load_matches_elastica(device, load, x, drop, angle):
     assert tip_load.exact(load) == pytest.approx((x, -drop, angle), abs=1e-9)
     edges = (100, 200, 400)
     tips = np.array([tip_load.tip(equilibrium(tip_load.build(load, n), device)[1]) for n in edges])
@@ -80,7 +80,7 @@ def test_tip_load(device, load, x, drop, angle):
         pytest.param(1000.0, 1e9, (400, 800, 1600), 0.04598645476, 0.9811412693, 1.570796322, marks=pytest.mark.slow),
     ],
 )
-def test_heavy_cantilever(device, weight, axial, edges, x, drop, angle):
+def test_heavy_cantilever_matches_elastica(device, weight, axial, edges, x, drop, angle):
     errors = []
     for n in edges:
         scene = ddg.Scene(gravity=(0.0, 0.0, -1.0), dimension=2, analysis=ddg.Statics(load_steps=8))
@@ -96,7 +96,7 @@ def test_heavy_cantilever(device, weight, axial, edges, x, drop, angle):
     assert order(edges, position) == pytest.approx(2.0, abs=0.1)
 
 
-# Elliptic integrals; load [EI/L^2], amplitude [L], angle of the ends [rad]. EA L^2 / EI = 1e9, as P over it adds to the shortening.
+# Elliptic integrals; load [EI/L^2], amplitude [L], angle of the ends [rad]. EA L^2 / EI = 1e9, as P / EA adds to the shortening.
 @pytest.mark.parametrize(
     ("shortening", "load", "amplitude", "angle"),
     [
@@ -108,7 +108,7 @@ def test_heavy_cantilever(device, weight, axial, edges, x, drop, angle):
         (0.4, 12.42345366, 0.3487125197, 1.323636176),
     ],
 )
-def test_post_buckling(device, shortening, load, amplitude, angle):
+def test_post_buckling_matches_elastica(device, shortening, load, amplitude, angle):
     reference = (load, amplitude, angle)
     assert post_buckling.exact(shortening) == pytest.approx(reference, rel=1e-8)
     edges = (40, 80, 160)
@@ -131,7 +131,7 @@ def test_post_buckling(device, shortening, load, amplitude, angle):
         ("clamped", "pinned", 20.19072856),
     ],
 )
-def test_euler_load(device, first, last, load):
+def test_buckling_loads_are_euler_loads(device, first, last, load):
     edges, measured = (20, 40, 80), []
     for n in edges:
         points = np.zeros((n + 1, 3))

@@ -1,5 +1,7 @@
-"""Kirchhoff plates: deflections and critical loads of squares at three resolutions, states that every mesh holds exactly, and how far
-the bending models that are no plates end up from them."""
+"""Kirchhoff plates: deflections and critical loads of squares at three resolutions, exact states, and errors of other models.
+
+States of constant moments are exact on every mesh; bending models without plate limit keep a finite error.
+"""
 
 import numpy as np
 import pytest
@@ -13,12 +15,12 @@ from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
 def deflection(device, *options, **more) -> float:
-    """Relative error of the deflection of the centre."""
+    """Return the relative error of the deflection at the centre."""
     return plate_square.deflection(equilibrium(plate_square.build(*options, **more), device)[1]) - 1.0
 
 
 def critical(device, *options, **more) -> float:
-    """Relative error of the critical load."""
+    """Return the relative error of the critical load."""
     return plate_buckling.critical_load(*equilibrium(plate_buckling.build(*options, **more), device)) - 1.0
 
 
@@ -36,7 +38,7 @@ def critical(device, *options, **more) -> float:
         pytest.param("clamped", "jittered", (12, 24, 48), marks=pytest.mark.slow),
     ],
 )
-def test_pressure(device, edges, mesh, cells):
+def test_deflection_under_pressure_converges(device, edges, mesh, cells):
     errors = [deflection(device, edges, "pressure", n, mesh) for n in cells]
     assert abs(errors[-1]) < 0.01
     assert order(cells, errors) == pytest.approx(2.0, abs=0.1)
@@ -53,7 +55,7 @@ def test_pressure(device, edges, mesh, cells):
         ("clamped", (14, 28, 56)),
     ],
 )
-def test_central_force(device, edges, cells):
+def test_deflection_under_a_force_converges(device, edges, cells):
     errors = [deflection(device, edges, "force", n) for n in cells]
     assert abs(errors[-1]) < 0.01
     assert order(cells, errors) == pytest.approx(1.78, abs=0.1)
@@ -69,8 +71,8 @@ def test_central_force(device, edges, cells):
         ("clamped", "force", 0.0235),
     ],
 )
-def test_thirty_cells(device, edges, load, error):
-    """What 30 x 30 crossed cells resolve, one percent or not: Morley's plate bends too much at a clamp and under a force."""
+def test_errors_at_thirty_cells(device, edges, load, error):
+    """Morley's plate at 30 x 30 crossed cells: too soft at a clamp and under a force."""
     assert deflection(device, edges, load, 30) == pytest.approx(error, abs=1e-4)
 
 
@@ -90,14 +92,14 @@ def test_thirty_cells(device, edges, load, error):
         pytest.param("clamped", "shear", "crossed", (24, 48, 96), marks=pytest.mark.slow),
     ],
 )
-def test_buckling(device, edges, load, mesh, cells):
+def test_critical_loads_converge(device, edges, load, mesh, cells):
     errors = [critical(device, edges, load, n, mesh) for n in cells]
     assert abs(errors[-1]) < 0.01
     assert order(cells, errors) == pytest.approx(2.0, abs=0.1)
 
 
-def test_linearised_buckling_is_where_the_tangent_vanishes(device):
-    """The factor from two tangents against the load at which the lowest eigenvalue of the exact tangent changes its sign."""
+def test_linearised_buckling_matches_singular_tangent(device):
+    """The buckling factor from two tangents is the load of the first sign change of an exact eigenvalue."""
     model, state = equilibrium(plate_buckling.build("supported", "shear", 8), device)
     factor = stability.buckling(model, model.state(), state)[0]
     solver = Equilibrium(model, StaticsOptions(mode="follow"))
@@ -109,8 +111,8 @@ def test_linearised_buckling_is_where_the_tangent_vanishes(device):
     assert factor == pytest.approx(exact, rel=1e-4)  # strains before buckling are 1e-5
 
 
-def twisted(device, mesh: str, bending: str) -> float:
-    """Relative error of the deflection of a free corner of a square pulled by P there and held at the others.
+def twist_error(device, mesh: str, bending: str) -> float:
+    """Return the relative error of the corner deflection of a square loaded by P at one corner and supported at the others.
 
     Pure twist, w = P x y / (2 D (1 - nu)).
     """
@@ -123,24 +125,24 @@ def twisted(device, mesh: str, bending: str) -> float:
     material = ddg.Material(12.0 * (1.0 - nu**2) / thickness**3, nu)  # D = 1 N m
     shell = scene.add_shell(points, triangles, thickness=thickness, material=material, bending=bending)
     corners = [int(np.argmin(np.hypot(*(points[:, :2] - corner).T))) for corner in ((0, 0), (1, 0), (0, 1), (1, 1))]
-    for corner, held in zip(corners, ("xyz", "yz", "z"), strict=False):
-        scene.hold(shell, [corner], held)
+    for corner, components in zip(corners, ("xyz", "yz", "z"), strict=False):
+        scene.hold(shell, [corner], components)
     scene.add_vertex_force(shell, corners[3:], (0.0, 0.0, 2.0 * (1.0 - nu) * deflection))
     return equilibrium(scene, device)[1].points()[corners[3], 2] / deflection - 1.0
 
 
 @pytest.mark.parametrize("mesh", ["right", "crossed", "equilateral", "jittered"])
 def test_twist_is_exact_on_every_mesh(device, mesh):
-    """A state of constant moments: Morley's plate has no error; that of the finite deflection is of the order of its square."""
-    assert abs(twisted(device, mesh, "midedge_dof")) < 1e-7
+    """Morley's plate is exact for constant moments; the error of finite deflection is of second order."""
+    assert abs(twist_error(device, mesh, "midedge_dof")) < 1e-7
 
 
 @pytest.mark.parametrize(
     ("mesh", "bending", "error"),
     [
         ("equilateral", "hinge", -0.48),  # nu = -1/3: (1 - nu) / (1 + 1/3) - 1 = -0.475, and half triangles at the ends
-        ("right", "hinge", -0.65),  # twice the stiffness of nu = 0: (1 - nu) / 2 - 1
-        ("crossed", "hinge", -0.30),  # that of nu = 0: (1 - nu) - 1
+        ("right", "hinge", -0.65),  # twice the stiffness at nu = 0: (1 - nu) / 2 - 1
+        ("crossed", "hinge", -0.30),  # stiffness at nu = 0: (1 - nu) - 1
         ("jittered", "hinge", -0.63),
         pytest.param("crossed", "midedge", 0.0, marks=pytest.mark.slow),
         # an error of first order in h from the free edges
@@ -148,9 +150,9 @@ def test_twist_is_exact_on_every_mesh(device, mesh):
         pytest.param("jittered", "midedge", -0.39, marks=pytest.mark.slow),
     ],
 )
-def test_models_without_poissons_ratio_or_turning_normals_are_no_plates(device, mesh, bending, error):
-    """Hinges do not know Poisson's ratio; averaged normals resist more than the plate where the mesh is not symmetric."""
-    assert twisted(device, mesh, bending) == pytest.approx(error, abs=0.02)
+def test_hinges_and_averaged_normals_are_no_plates(device, mesh, bending, error):
+    """Hinges have no Poisson's ratio; averaged normals are stiffer than the plate on asymmetric meshes."""
+    assert twist_error(device, mesh, bending) == pytest.approx(error, abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +167,7 @@ def test_models_without_poissons_ratio_or_turning_normals_are_no_plates(device, 
         pytest.param("clamped", "crossed", "midedge", -0.25, marks=pytest.mark.slow),
     ],
 )
-def test_errors_that_stay(device, edges, mesh, bending, error):
-    """Deflections under pressure of models that depend on the mesh: what they are off by does not go with its edges."""
+def test_mesh_dependent_models_keep_an_error(device, edges, mesh, bending, error):
+    """Deflections under pressure of mesh-dependent models keep an error that does not vanish with the edge length."""
     errors = [deflection(device, edges, "pressure", n, mesh, bending) for n in (20, 40)]
     assert errors == pytest.approx([error, error], abs=0.02)

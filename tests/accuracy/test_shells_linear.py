@@ -1,4 +1,4 @@
-"""Shells and deep strips of small displacements against closed forms, and bending models against each other."""
+"""Shells and deep strips at small displacements against closed forms, and bending models against each other."""
 
 import itertools
 
@@ -16,16 +16,16 @@ from ddg_warp.solve.tangent import Tangent
 
 
 def stiffness(device, *options) -> float:
-    """Relative error of the stiffness under a point force."""
+    """Return the relative error of the stiffness under a point force."""
     return sphere_indentation.stiffness(*equilibrium(sphere_indentation.build(*options), device)) - 1.0
 
 
-# k R / (E h^2) = 4 / sqrt(3 (1 - nu^2)) = 2.420910131 at nu = 0.3 (Reissner 1946), of a shallow shell: what the sphere tends to as it
-# gets thinner, so that the order shows in the differences of three levels.
+# Shallow shell: k R / (E h^2) = 4 / sqrt(3 (1 - nu^2)) = 2.420910131 at nu = 0.3 (Reissner 1946). It is the limit of thin spheres only,
+# so the order is taken from differences of three levels.
 @pytest.mark.slow
 @pytest.mark.parametrize("slenderness", [100.0, 1000.0, 10000.0])
-def test_sphere_indentation(device, slenderness):
-    """Order 1.7 under the point force, where moments grow like a logarithm; 1.2 % at the finest, and as much extrapolated."""
+def test_sphere_indentation_converges(device, slenderness):
+    """Order 1.7 under the point force, where moments grow logarithmically; 1.2 % at the finest level and extrapolated."""
     assert sphere_indentation.exact(0.01) / 1e5 == pytest.approx(2.420910131, rel=1e-9)
     errors = np.array([stiffness(device, slenderness, rings, 2.0) for rings in (12, 24, 48)])
     coarse, fine = np.diff(errors)
@@ -35,7 +35,7 @@ def test_sphere_indentation(device, slenderness):
 
 
 @pytest.mark.slow
-def test_sphere_indentation_on_coarse_meshes(device):
+def test_sphere_indentation_error_on_coarse_meshes(device):
     errors = [stiffness(device, 1000.0, rings, 2.0) for rings in (16, 32)]
     assert abs(errors[0]) < 0.03
     assert abs(errors[1]) < 0.006
@@ -43,16 +43,20 @@ def test_sphere_indentation_on_coarse_meshes(device):
 
 @pytest.mark.slow
 def test_uniform_meshes_are_too_soft_under_a_point_force(device):
-    """Edges of 0.3 sqrt(R h) all over, which is what a mesh for this shell is asked to have, and not three percent but fifteen: moments
-    grow like a logarithm towards the force, and Morley's plate takes them as constant a triangle."""
+    """Uniform edges of 0.3 sqrt(R h), as recommended for this shell, leave an error of 15 % instead of 3 %.
+
+    Moments grow logarithmically towards the force; Morley's plate takes them as constant per triangle.
+    """
     assert stiffness(device, 1000.0, 33, 1.0) == pytest.approx(-0.145, abs=0.01)
 
 
-def lateral(device, load: str, width: float, thickness: float, nu: float, cells: tuple, mesh: str) -> float:
-    """Critical load of a strip on edge, clamped at one end, over that of the narrow one; from a tenth of it.
+def lateral_buckling_load(
+    device, load: str, width: float, thickness: float, nu: float, cells: tuple, mesh: str
+) -> float:
+    """Return the critical load of a clamped strip on edge, relative to the narrow strip; linearised at a tenth of the load.
 
-    B = E W h^3 / 12, C = G W h^3 / 3: P L^2 / sqrt(B C) = 4.012599344 at the tip (Prandtl and Michell 1899), w L^3 / sqrt(B C) =
-    12.85376332 under its weight.
+    B = E W h^3 / 12, C = G W h^3 / 3. P L^2 / sqrt(B C) = 4.012599344 at the tip (Prandtl and Michell 1899),
+    w L^3 / sqrt(B C) = 12.85376332 under its weight.
     """
     young, fraction = 1e9, 0.1
     points, triangles = meshes.rectangle(*cells, (1.0, width), mesh)
@@ -74,16 +78,16 @@ def lateral(device, load: str, width: float, thickness: float, nu: float, cells:
 @pytest.mark.parametrize("load", ["tip", "weight"])
 @pytest.mark.parametrize("nu", [0.0, 0.3])
 @pytest.mark.parametrize("mesh", ["right", "crossed"])
-def test_lateral_buckling(device, load, nu, mesh):
+def test_lateral_buckling_load_of_narrow_strips(device, load, nu, mesh):
     """Width L / 50, thickness W / 200, 160 or 320 triangles: within one percent of the rod."""
-    assert lateral(device, load, 0.02, 1e-4, nu, (40, 2), mesh) == pytest.approx(1.0, abs=0.01)
+    assert lateral_buckling_load(device, load, 0.02, 1e-4, nu, (40, 2), mesh) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("load", ["tip", "weight"])
-def test_lateral_buckling_of_narrower_strips(device, load):
-    """What is left is the width: the clamp hinders warping over a length W, so that the load is higher by a number times W / L."""
+def test_lateral_buckling_error_is_proportional_to_width(device, load):
+    """The remaining error is proportional to W / L: the clamp hinders warping over a length W."""
     errors = [
-        lateral(device, load, width, 0.005 * width, 0.3, (round(2.0 / width), 4), "right") - 1.0
+        lateral_buckling_load(device, load, width, 0.005 * width, 0.3, (round(2.0 / width), 4), "right") - 1.0
         for width in (0.04, 0.02)
     ]
     assert errors[0] / errors[1] == pytest.approx(2.0, abs=0.2)
@@ -92,12 +96,15 @@ def test_lateral_buckling_of_narrower_strips(device, load):
 @pytest.mark.slow
 @pytest.mark.parametrize("load", ["tip", "weight"])
 def test_lateral_buckling_converges(device, load):
-    """Square cells, 4, 8 and 16 across: order 1.75 and rising to 2. Where the mesh has converged, the clamp's hindrance of warping
-    raises the load by about 0.5 W / L (tip) and 0.8 W / L (weight); extrapolated to W = 0, the rod's load is found to one percent."""
+    """Square cells, 4, 8 and 16 across, converge with order 1.75, rising to 2.
+
+    In the mesh limit hindered warping at the clamp raises the load by about 0.5 W / L (tip) and 0.8 W / L (weight). Extrapolated to
+    W = 0 the load of the rod is met to one percent.
+    """
     limits = []
     for width in (0.1, 0.05):
         cells = [(round(n / width), n) for n in (4, 8, 16)]
-        loads = [lateral(device, load, width, 0.005 * width, 0.3, each, "crossed") for each in cells]
+        loads = [lateral_buckling_load(device, load, width, 0.005 * width, 0.3, each, "crossed") for each in cells]
         coarse, fine = np.diff(loads)
         rate = np.log2(coarse / fine)
         assert rate == pytest.approx(1.8, abs=0.1)
@@ -106,8 +113,8 @@ def test_lateral_buckling_converges(device, load):
     assert 2.0 * limits[1] - limits[0] == pytest.approx(1.0, abs=0.01)
 
 
-def test_linearised_lateral_buckling_is_where_the_tangent_vanishes(device):
-    """The strip stays flat before it buckles, but bends in its plane: by (h / W)^2, which is nothing here."""
+def test_linearised_lateral_buckling_matches_singular_tangent(device):
+    """Bending in the plane before buckling is of order (h / W)^2, negligible here."""
     points, triangles = meshes.rectangle(20, 2, (1.0, 0.02))
     points = np.stack([points[:, 0], points[:, 2], points[:, 1] - 0.01], -1)
     scene = ddg.Scene(gravity=(0.0, 0.0, -1.0), analysis=ddg.Statics(load_steps=1))
@@ -123,8 +130,8 @@ def test_linearised_lateral_buckling_is_where_the_tangent_vanishes(device):
     assert factor == pytest.approx(stability.critical(loaded, 0.99 * factor, 1.01 * factor, tolerance=1e-4), rel=1e-3)
 
 
-def collapse(device, cells: int, dead: bool, membrane: str) -> float:
-    """Critical outer pressure of a long cylinder of radius 1 m, held from lengthening, over D / R^3; a quarter of a ring of it."""
+def collapse_pressure(device, cells: int, dead: bool, membrane: str) -> float:
+    """Return the critical outer pressure of a long cylinder of radius 1 m in plane strain, over D / R^3, by a quarter ring."""
     flat, triangles = meshes.rectangle(cells, 2, (0.5 * np.pi, 0.05), "crossed")
     points = np.stack([np.cos(flat[:, 0]), np.sin(flat[:, 0]), flat[:, 1]], -1)
     thickness, young, nu = 0.01, 1e9, 0.3
@@ -141,31 +148,37 @@ def collapse(device, cells: int, dead: bool, membrane: str) -> float:
     return 0.1 * stability.buckling(model, model.state(), state)[0]
 
 
-# p R^3 / D of a ring: 3 where the pressure follows, 4 where it keeps its direction (Timoshenko and Gere, Elastic Stability, 7.2).
+# p R^3 / D of a ring: 3 for follower pressure, 4 for dead pressure (Timoshenko and Gere, Elastic Stability, 7.2).
 @pytest.mark.parametrize(("dead", "exact"), [pytest.param(False, 3.0, marks=pytest.mark.slow), (True, 4.0)])
-def test_ring_collapses_under_pressure(device, dead, exact):
-    """Pressure that turns with the ring has a stiffness of its own, which the tangent counts in. Below 32 cells in a quarter facets
-    lock; those whose sides are curved need half as many."""
-    errors = np.array([[collapse(device, n, dead, m) / exact - 1.0 for n in (32, 64)] for m in ("flat", "curved")])
+def test_collapse_pressure_of_a_ring(device, dead, exact):
+    """Follower pressure has a load stiffness, which the tangent includes.
+
+    Flat facets lock below 32 cells per quarter; curved sides need half as many.
+    """
+    errors = np.array(
+        [[collapse_pressure(device, n, dead, m) / exact - 1.0 for n in (32, 64)] for m in ("flat", "curved")]
+    )
     assert np.all(np.abs(errors[:, 1]) < 5e-4)
     assert abs(errors[0, 0]) < 0.02
     assert abs(errors[1, 0]) < 0.002
 
 
-def bent(device, cells: int, bending: str, mesh: str, angle: float) -> float:
-    """Bending energy per area of a flat square bent to a cylinder of radius 2 along a direction [degrees], over D / (2 R^2); of the
-    triangles inside, to each of which half of its hinges belong."""
+def bending_energy(device, cells: int, bending: str, mesh: str, angle: float) -> float:
+    """Return the bending energy per area of a flat square on a cylinder of radius 2, over D / (2 R^2).
+
+    `angle`: bending direction [degrees]. Only inner triangles count, each with half of its hinges.
+    """
     rows = round(cells * 2.0 / np.sqrt(3.0)) if mesh == "equilateral" else cells
     points, triangles = meshes.rectangle(cells, rows, pattern=mesh)
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     u, v = points[:, :2] @ [c, s] / 2.0, points[:, :2] @ [-s, c]
     x, z = 2.0 * np.sin(u), 2.0 * (1.0 - np.cos(u))
-    place = np.stack([c * x - s * v, s * x + c * v, z], -1)
+    positions = np.stack([c * x - s * v, s * x + c * v, z], -1)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     material = ddg.Material(12.0 * (1.0 - 0.3**2), 0.3)  # D = 1 N m
     scene.hold(scene.add_shell(points, triangles, thickness=1.0, material=material, bending=bending), [0])
     model = scene.build(device, "float64")
-    state = model.state(points=place)
+    state = model.state(points=positions)
     if bending == "midedge_dof":
         _relax_normals(model, state)
     shell = model.net.host.shells[0]
@@ -178,13 +191,13 @@ def bent(device, cells: int, bending: str, mesh: str, angle: float) -> float:
 
 
 def _relax_normals(model, state) -> None:
-    """Turn the normals at mesh edges to where they cost least, at fixed points."""
+    """Minimise the energy over the normals at mesh edges, at fixed points."""
     tangent = Tangent(model)
-    chosen = np.flatnonzero(tangent.free & tangent.angle)
+    angles = np.flatnonzero(tangent.free & tangent.angle)
     for _ in range(4):
         q = tangent.dofs(state)
-        factor = Factorisation(tangent.hessian(state)[chosen][:, chosen].tocsc())
-        q[chosen] -= factor.solve(tangent.gradient(state)[chosen])
+        factor = Factorisation(tangent.hessian(state)[angles][:, angles].tocsc())
+        q[angles] -= factor.solve(tangent.gradient(state)[angles])
         tangent.assign(state, q)
 
 
@@ -195,19 +208,21 @@ def _relax_normals(model, state) -> None:
         for case in itertools.product(("equilateral", "right", "crossed"), (0.0, 30.0, 45.0))
     ],
 )
-def test_bent_cylinder(device, mesh, angle):
-    """Turning normals have the energy D / (2 R^2) of every cylinder on every mesh, averaged ones where the mesh is symmetric to its
-    points, both with order 2; hinges on equilateral triangles, here 14 rows of them over a height of 13.9."""
+def test_bending_energy_of_cylinders(device, mesh, angle):
+    """Edge-normal dofs give the energy D / (2 R^2) of every cylinder on every mesh, with order 2.
+
+    Averaged normals do so on point-symmetric meshes with order 2, hinges on equilateral triangles (14 rows over a height of 13.9).
+    """
     cells = (12, 24, 48)
-    errors = [bent(device, n, "midedge_dof", mesh, angle) - 1.0 for n in cells]
+    errors = [bending_energy(device, n, "midedge_dof", mesh, angle) - 1.0 for n in cells]
     assert abs(errors[-1]) < 3e-5
     assert order(cells[1:], errors[1:]) == pytest.approx(2.0, abs=0.1 if mesh != "equilateral" else 0.3)
     if mesh != "crossed":
-        assert bent(device, 24, "midedge", mesh, angle) == pytest.approx(
-            bent(device, 24, "midedge_dof", mesh, angle), abs=1e-5
+        assert bending_energy(device, 24, "midedge", mesh, angle) == pytest.approx(
+            bending_energy(device, 24, "midedge_dof", mesh, angle), abs=1e-5
         )
     if mesh == "equilateral":
-        assert bent(device, 24, "hinge", mesh, angle) == pytest.approx(1.0, abs=0.02)
+        assert bending_energy(device, 24, "hinge", mesh, angle) == pytest.approx(1.0, abs=0.02)
 
 
 # Slope jumps of a quadratic patch, by direction of bending [degrees].
@@ -222,6 +237,6 @@ def test_bent_cylinder(device, mesh, angle):
         ("midedge", "crossed", 45.0, 1.0),
     ],
 )
-def test_bent_cylinder_of_models_that_depend_on_the_mesh(device, bending, mesh, angle, limit):
+def test_bending_energy_of_mesh_dependent_models(device, bending, mesh, angle, limit):
     for cells in (12, 24):
-        assert bent(device, cells, bending, mesh, angle) == pytest.approx(limit, rel=1e-3)
+        assert bending_energy(device, cells, bending, mesh, angle) == pytest.approx(limit, rel=1e-3)

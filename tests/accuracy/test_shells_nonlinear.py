@@ -1,7 +1,7 @@
 """Large deflections of thin shells: the benchmarks of Sze, Liu and Lo, Finite Elem. Anal. Des. 40 (2004) 1551-1569.
 
-References are their tables of Abaqus S4R, digits as in public codes that quote them, good to about 0.3 %; for the plate the elastica,
-for the pinched cylinder the linear solution of Lindberg, Olson and Cowper (1969).
+References are the tables of Abaqus S4R in that paper, with digits as quoted in public codes, good to about 0.3 %. For the plate
+the reference is the elastica, for the pinched cylinder the linear solution of Lindberg, Olson and Cowper (1969).
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
 def path(module, device, steps, **parameters):
-    """Load parameter -> observed values, of a scene with this many load steps; and the solver."""
+    """Return observed values by load parameter, of a scene with a number of load steps, and the solver."""
     scene = module.build(steps=steps, **parameters)
     model = scene.build(device, "float64")
     solver, state, values = Equilibrium(model, StaticsOptions(rtol=1e-8)), model.state(), {}
@@ -25,8 +25,8 @@ def path(module, device, steps, **parameters):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("membrane", ["flat", "curved"])
-def test_cantilever_plate_shear(device, membrane):
-    """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.02 % of the length at 64."""
+def test_cantilever_plate_matches_elastica(device, membrane):
+    """Elastica of P L^2 / EI = 4: order 2 in the cell length, and 0.02 % of the length at 64 cells."""
     cells, errors = (16, 32, 64), []
     for n in cells:
         scene = cantilever_plate_shear.build(n, pattern="alternating", membrane=membrane, steps=3)
@@ -38,7 +38,7 @@ def test_cantilever_plate_shear(device, membrane):
 
 @pytest.mark.slow
 def test_slit_annulus_does_not_lock(device):
-    """Six cells across, thirty around: with facets the lip rises 4 to 6 % too little, with the arcs over their sides 1.5 %."""
+    """Six cells across, thirty around: flat facets lift the lip 4 to 6 % too little, curved sides 1.5 %."""
     inner, outer = slit_annulus.TABLE[1.0]
     errors = {}
     for membrane in ("flat", "curved"):
@@ -49,8 +49,8 @@ def test_slit_annulus_does_not_lock(device):
 
 
 @pytest.mark.slow
-def test_slit_annulus(device):
-    """The path at 40, 60 and 90 cells around: errors fall all along it, to 0.65 % at most."""
+def test_slit_annulus_path_converges(device):
+    """The path at 40, 60 and 90 cells around: errors fall along the whole path, to 0.65 % at most."""
     cells, errors = (40, 60, 90), []
     for n in cells:
         values, _ = path(slit_annulus, device, 20, radial=n // 10, around=n)
@@ -61,7 +61,7 @@ def test_slit_annulus(device):
 
 
 @pytest.mark.slow
-def test_slit_annulus_unstructured(device):
+def test_slit_annulus_error_on_unstructured_mesh(device):
     """A Delaunay mesh with 10 cells across is 2 % off."""
     values, _ = path(slit_annulus, device, 20, radial=10, around=50, pattern="jittered")
     inner, outer = slit_annulus.TABLE[1.0]
@@ -71,14 +71,14 @@ def test_slit_annulus_unstructured(device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "tolerance"), [(8, 0.015), (24, 0.006)])
-def test_pullout_cylinder(device, n, tolerance):
+def test_pullout_cylinder_matches_reference(device, n, tolerance):
     values, _ = path(pullout_cylinder, device, 20, n=n)
     for load, (radial,) in pullout_cylinder.TABLE.items():
         assert values[load]["radial"] == pytest.approx(radial, rel=tolerance), load
 
 
-def test_pinched_cylinder_linear(device):
-    """w E h / P = 164.24, on graded meshes: order 1.5 or better (a point force on a plate), below 2 % at 24 cells."""
+def test_pinched_cylinder_is_linear_at_small_load(device):
+    """w E h / P = 164.24 on graded meshes: order 1.5 or more (a point force on a plate), below 2 % at 24 cells."""
     cells = (8, 12, 16, 24)
     models = [pinched_cylinder.build(n).build(device, "float64") for n in cells]
     errors = [pinched_cylinder.compliance(model) / pinched_cylinder.LINEAR - 1.0 for model in models]
@@ -87,8 +87,8 @@ def test_pinched_cylinder_linear(device):
 
 
 @pytest.mark.slow
-def test_pinched_cylinder_folds(device):
-    """All of the load is reached, in steps that do nothing but dip further."""
+def test_pinched_cylinder_reaches_the_full_load(device):
+    """The full load is reached, with deflections that grow in every step."""
     values, _ = path(pinched_cylinder, device, 40)
     inwards = np.array([value["inwards"] for value in values.values()])
     assert np.all(np.diff(inwards) > 0.0)
@@ -103,8 +103,8 @@ def test_pinched_cylinder_folds(device):
         pytest.param(6.35, (4, 8, 16), 0.005, marks=pytest.mark.slow),
     ],
 )
-def test_hinged_roof(device, thickness, cells, tolerance):
-    """First limit load: order 2 in the length of the cells, 0.3 or 0.5 % at 16 of them, and 0.3 % extrapolated."""
+def test_hinged_roof_limit_load_converges(device, thickness, cells, tolerance):
+    """First limit load: order 2 in the cell length, 0.3 or 0.5 % at 16 cells, and 0.3 % extrapolated."""
     loads = []
     for n in cells:
         values, _ = path(hinged_roof, device, 16, thickness=thickness, n=n, membrane="flat")
@@ -116,8 +116,8 @@ def test_hinged_roof(device, thickness, cells, tolerance):
 
 
 @pytest.mark.slow
-def test_stresses_of_their_own_save_iterations(device):
-    """A plate that turns by 13 degrees a step takes at most five iterations; the search takes as few, by stresses of its last step."""
+def test_mixed_newton_needs_few_iterations(device):
+    """Each solver takes at most five iterations per rotation of 13 degrees; line search uses stresses of the last step."""
     scene = cantilever_plate_shear.build(16, membrane="flat")
     model = scene.build(device, "float64")
     counts = []
@@ -131,13 +131,13 @@ def test_stresses_of_their_own_save_iterations(device):
 
 
 @pytest.mark.slow
-def test_search_takes_over_where_the_mixed_iteration_fails(device):
-    """The jump of stiffness of the cylinder in one step is too long for it; the answer is a minimum all the same."""
+def test_line_search_replaces_failed_mixed_newton(device):
+    """One load step is too long for mixed Newton at the stiffness jump; line search still finds the minimum."""
     model = pullout_cylinder.build(6, membrane="flat").build(device, "float64")
     solver = Equilibrium(model)
     state = solver.load(model.state(), 1)
     residual = solver.tangent.loads(1.0, solver.tangent.dofs(state)) - solver.tangent.gradient(state)
     assert np.abs(residual[solver.tangent.free]).max() < 1e-5 * pullout_cylinder.FORCE
     steps = Equilibrium(model)
-    other = steps.load(model.state(), 10)
-    assert np.abs(other.points() - state.points()).max() < 1e-6
+    stepped = steps.load(model.state(), 10)
+    assert np.abs(stepped.points() - state.points()).max() < 1e-6

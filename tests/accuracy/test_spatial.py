@@ -1,4 +1,4 @@
-"""Rods bent and twisted in space against boundary value problems and exact helices, at three resolutions with the observed order."""
+"""Rods bent and twisted in space against boundary value problems and exact helices: observed order at three resolutions."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from ddg_warp.scenes import bend_45, helical_spring
         ("polar", True, 600.0, (15.68535578, 47.15215022, 53.47176295)),
     ],
 )
-def test_bend_45(device, torsion, extensible, load, tip):
+def test_45_degree_bend_tip_converges(device, torsion, extensible, load, tip):
     edges, errors = (32, 64, 128), []
     for n in edges:
         _, state = equilibrium(bend_45.build(load, torsion, extensible, n), device)
@@ -31,7 +31,7 @@ def test_bend_45(device, torsion, extensible, load, tip):
     assert order(edges, np.linalg.norm(errors, axis=1)) == pytest.approx(2.0, abs=0.1)
 
 
-# Axial force and moment of the spring, uniform helix; EA L^2 / B = 4e8. The number of turns is that at rest.
+# Axial force and moment of the spring, uniform helix; EA L^2 / B = 4e8. The number of coils is the rest value.
 @pytest.mark.parametrize(
     ("stretch", "force", "moment"),
     [
@@ -42,7 +42,7 @@ def test_bend_45(device, torsion, extensible, load, tip):
         (3.0, 0.3022162361, 0.008478190012),
     ],
 )
-def test_helical_spring_without_rotation(device, stretch, force, moment):
+def test_helical_spring_force_and_moment_with_fixed_ends(device, stretch, force, moment):
     assert helical_spring.exact(stretch, 10.0) == pytest.approx((force, moment), rel=1e-8)
     edges = (400, 800, 1600)
     springs = [equilibrium(helical_spring.build(stretch, 10.0, n), device, mode="follow") for n in edges]
@@ -53,12 +53,12 @@ def test_helical_spring_without_rotation(device, stretch, force, moment):
 
 
 @pytest.mark.parametrize("curvature", ["tangent", pytest.param("angle", marks=pytest.mark.slow)])
-def test_helical_spring_at_rest_is_free(device, curvature):
+def test_helical_spring_at_rest_is_stress_free(device, curvature):
     spring = equilibrium(helical_spring.build(1.0, 10.0, 400, curvature), device, mode="follow")
     assert helical_spring.measure(*spring) == pytest.approx((0.0, 0.0), abs=1e-10)
 
 
-# Force, and turns at which the axial moment vanishes.
+# Force, and number of coils at which the axial moment vanishes.
 @pytest.mark.parametrize(
     ("stretch", "force", "turns"),
     [
@@ -69,7 +69,7 @@ def test_helical_spring_at_rest_is_free(device, curvature):
         pytest.param(3.0, 0.3009346629, 9.90534787, marks=pytest.mark.slow),
     ],
 )
-def test_helical_spring_with_rotation(device, stretch, force, turns):
+def test_helical_spring_force_with_free_rotation(device, stretch, force, turns):
     edges, errors = (400, 800, 1600), []
     for n in edges:
 
@@ -85,8 +85,8 @@ def test_helical_spring_with_rotation(device, stretch, force, turns):
     assert order(edges, errors[:, 1]) == pytest.approx(2.0, abs=0.1)
 
 
-def test_helical_spring_constants(device):
-    """dF / dH with and without rotation, from central differences around rest."""
+def test_helical_spring_constants_converge(device):
+    """dF / dH with and without end rotation, from central differences at rest."""
     edges, errors = (400, 800, 1600), []
     for n in edges:
 

@@ -21,7 +21,7 @@ from ddg_warp.solve.statics import Equilibrium, StaticsOptions
         pytest.param(2500.0, (400, 800, 1600), 100.1978301, marks=pytest.mark.slow),
     ],
 )
-def test_greenhill(device, tension, edges, moment):
+def test_greenhill_moment_under_tension(device, tension, edges, moment):
     assert greenhill.exact(tension) == pytest.approx(moment, rel=1e-7)
     errors = [greenhill.critical_moment(tension, n, device) / moment - 1.0 for n in edges]
     assert abs(errors[-1]) < 1e-3
@@ -38,7 +38,7 @@ def test_greenhill(device, tension, edges, moment):
         (10.0 / 13.0, 14.14763505),
     ],
 )
-def test_michell_ring(device, ratio, twist):
+def test_michell_twist_of_a_ring(device, ratio, twist):
     edges = (60, 120, 240)
     errors = [michell_ring.critical_twist(ratio, n, device) / twist - 1.0 for n in edges]
     assert abs(errors[-1]) < 1e-3
@@ -58,7 +58,7 @@ def test_michell_ring(device, ratio, twist):
         (10.0, 28.7697064, True),
     ],
 )
-def test_bend_twist(device, curvature, weight, loses):
+def test_critical_weight_of_a_planar_arc(device, curvature, weight, loses):
     edges, errors = (40, 80, 160), []
     for n in edges:
         branch = bend_twist.PlanarBranch(curvature, n, device)
@@ -72,13 +72,13 @@ def test_bend_twist(device, curvature, weight, loses):
 @pytest.mark.slow
 @pytest.mark.parametrize("curvature", [4.0, 5.0, 5.5])
 def test_bend_twist_never_flips(device, curvature):
-    """Up to G = 1000 nothing leaves the plane."""
+    """The arc stays planar up to G = 1000."""
     branch = bend_twist.PlanarBranch(curvature, 140, device)
     assert min(branch.lowest(weight) for weight in np.geomspace(1.0, 1000.0, 60)) > 0.0
 
 
-def wound(device, n, stiffer=()):
-    """Model and state of the localised helix at EA L^2 / B = 1e6, from which stiffer rods start in turn."""
+def localized_helix_state(device, n, stiffer=()):
+    """Return model and state of the localised helix at EA L^2 / B = 1e6, then continued to stiffer rods in succession."""
     scene = localized_helix.build(n=n)
     model = scene.build(device, "float64")
     solver = Equilibrium(model)
@@ -95,26 +95,28 @@ def wound(device, n, stiffer=()):
     return model, state
 
 
-# 27 turns, shortening 0.3: largest angle p [rad], s* [m], moment [N m], tension [N] of the infinite rod (Coyne 1990).
+# 27 windings, shortening 0.3: largest angle p [rad], s* [m], moment [N m], tension [N] of the infinite rod (Coyne 1990).
 HELIX = (0.9185495351, 0.3816536653, 14.25201565, 46.98850021)
 
 
-def test_localized_helix_reference():
+def test_localized_helix_closed_form():
     assert localized_helix.exact(27.0, 0.3) == pytest.approx(HELIX, rel=1e-8)
 
 
 @pytest.mark.slow
-def test_localized_helix_at_coarse_edges(device):
-    """EA L^2 / B = 1e6."""
-    errors = np.array(localized_helix.measure(*wound(device, 400))) / HELIX - 1.0
+def test_localized_helix_error_at_coarse_edges(device):
+    """Errors below 5 % at EA L^2 / B = 1e6."""
+    errors = np.array(localized_helix.measure(*localized_helix_state(device, 400))) / HELIX - 1.0
     assert np.all(np.abs(errors) < 0.05)
 
 
 @pytest.mark.slow
-def test_localized_helix(device):
-    """EA L^2 / B = 1e8."""
+def test_localized_helix_converges(device):
+    """Errors below 1 % at EA L^2 / B = 1e8, of second order."""
     edges = (400, 600, 800)
-    errors = np.array([localized_helix.measure(*wound(device, n, (1e7, 1e8))) for n in edges]) / HELIX - 1.0
+    errors = (
+        np.array([localized_helix.measure(*localized_helix_state(device, n, (1e7, 1e8))) for n in edges]) / HELIX - 1.0
+    )
     assert np.all(np.abs(errors[-1]) < 0.01)
     for column in errors.T:
         assert order(edges, column) == pytest.approx(2.0, abs=0.1)

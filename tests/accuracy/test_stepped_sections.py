@@ -1,4 +1,4 @@
-"""Sections that jump at a node: half cells of both edges in series, h / B = h_1 / B_1 + h_2 / B_2, against closed forms."""
+"""Sections with a jump at a node: half cells of both edges in series, h / B = h_1 / B_1 + h_2 / B_2, against closed forms."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,8 @@ def section(stiffness, **options) -> ddg.Stiffness:
     return ddg.Stiffness(EA=1e6, EI1=stiffness, EI2=stiffness, GJ=stiffness, **options)
 
 
-def stepped(device, ratio: float, edges: int, joined: bool = False, dimension: int = 3) -> float:
-    """Deflection of a cantilever's tip, EI = 1 as far as its middle and `ratio` beyond it, of one rod or of two joined rigidly."""
+def stepped_deflection(device, ratio: float, edges: int, joined: bool = False, dimension: int = 3) -> float:
+    """Return the tip deflection of a cantilever, EI = 1 up to the middle and `ratio` beyond, of one rod or two joined rigidly."""
     scene, points = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension), np.linspace(0.0 * X, X, edges + 1)
     half = edges // 2
     if joined:
@@ -40,27 +40,27 @@ CASES = [
 
 # d = F (L2^3 / 3 EI2 + L1^3 / 3 EI1 + L1^2 L2 / EI1 + L1 L2^2 / EI1), L1 = L2 = 1/2
 @pytest.mark.parametrize(("ratio", "options"), CASES)
-def test_a_step_keeps_second_order(device, ratio, options):
+def test_stiffness_jump_keeps_second_order(device, ratio, options):
     exact = FORCE * min(1.0, ratio) * (1.0 / ratio + 7.0) / 24.0
-    errors = [abs(stepped(device, ratio, edges, **options) / exact - 1.0) for edges in (10, 20, 40)]
+    errors = [abs(stepped_deflection(device, ratio, edges, **options) / exact - 1.0) for edges in (10, 20, 40)]
     assert errors[-1] < 2e-3
     np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.05)
 
 
 def uneven(seed: int, edges: int = 8):
-    """Points of a straight rod of uneven edges, their lengths, and stiffnesses of edges over two decades."""
+    """Return points of a straight rod of uneven edges, edge lengths, and edge stiffnesses over two decades."""
     random = np.random.default_rng(seed)
     lengths = random.uniform(0.5, 1.5, edges) / edges
     return np.outer(np.concatenate([[0.0], np.cumsum(lengths)]), X), lengths, 10.0 ** random.uniform(-1.0, 1.0, edges)
 
 
 def to_middles(lengths, rates) -> np.ndarray:
-    """Integral of rates (edges,) from the first node to the middle of every edge."""
+    """Return the integral of rates (edges,) from the first node to the midpoint of every edge."""
     return np.cumsum(lengths * rates) - 0.5 * lengths * rates
 
 
-def test_a_shaft_of_many_sections_twists_exactly(device):
-    """A moment M turns the middle of edge k by the integral of M / GJ to there, whatever lengths and sections are."""
+def test_shaft_of_many_sections_twists_exactly(device):
+    """A moment M rotates midpoints of edges by the integral of M / GJ, for any lengths and sections."""
     points, lengths, GJ = uneven(3)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(points, section=ddg.Stiffness(EA=1e3, EI1=1.0, GJ=GJ))
@@ -70,17 +70,17 @@ def test_a_shaft_of_many_sections_twists_exactly(device):
     np.testing.assert_allclose(angles, to_middles(lengths, 0.3 / GJ), rtol=1e-9)
 
 
-def test_edges_with_natural_twists_of_their_own(device):
-    """The moment is continuous: free of loads each half twists by its own natural rate, held it is M = GJ_i (tau_i - tau0_i)."""
+def test_natural_twist_per_edge_is_exact(device):
+    """The moment is continuous: zero with a free end, M = GJ_i (tau_i - tau0_i) with both ends fixed."""
     points, lengths, GJ = uneven(4)
     natural = np.random.default_rng(5).uniform(-1.0, 1.0, len(GJ))
     laws = {"rod_bend_twist": ddg.Law(quadratic, stiffness=[1.0, 1.0, GJ], rest=[0.0, 0.0, natural])}
-    for held in (False, True):
+    for both_fixed in (False, True):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
         rod = scene.add_rod(points, section=section(1.0), laws=laws)
         scene.clamp_end(rod)
-        if held:
+        if both_fixed:
             scene.clamp_end(rod, "last")
         angles = ddg.statics.solve(scene.build(device, "float64")).angles()
-        moment = -(natural @ lengths) / (lengths / GJ).sum() if held else 0.0
+        moment = -(natural @ lengths) / (lengths / GJ).sum() if both_fixed else 0.0
         np.testing.assert_allclose(angles, to_middles(lengths, natural + moment / GJ), atol=1e-9)

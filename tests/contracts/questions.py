@@ -53,7 +53,7 @@ def assert_close(values, expected, rtol: float = 1e-9, atol: float = 0.0, messag
 
 
 def rest_model(kind: Object, variant: Variant, **options):
-    """Return a model without gravity, its rest state, and what was added to the scene."""
+    """Return a model without gravity, its rest state, and the record of the added objects."""
     scene, added = kind.scene(**({"gravity": (0.0, 0.0, 0.0)} | options))
     model = variant.build(scene)
     return model, model.state(), added
@@ -92,7 +92,7 @@ def energies(kind, variant):
 
 
 def _mass(model) -> np.ndarray:
-    """Return the mass of every point (P,) [kg], divided among points that share a node."""
+    """Return the mass of every point (P,) [kg], divided among points with a common node."""
     from ddg_warp.solve.tangent import Tangent
 
     tangent = Tangent(model)

@@ -84,7 +84,7 @@ def helix(nodes=48, turns=6, closed=False, young=1e7) -> ddg.Scene:
 
 
 def deflected_helix(solver, device, psd: str):
-    """Return a solver on a clamped helix whose predictor moves the tip by 0.2 and twists by up to 1 rad."""
+    """Return a solver on a clamped helix with a predictor 0.2 off in position and up to 1 rad in twist."""
     s = np.linspace(0.0, 1.0, 16)
     points = np.stack([0.3 * np.cos(2.0 * np.pi * s), 0.3 * np.sin(2.0 * np.pi * s), -0.5 * s], -1)
     scene = ddg.Scene()
