@@ -329,7 +329,7 @@ def test_assembly_along_rods_matches_incidence_lists(device, scene, psd):
         random = np.random.default_rng(5)
         newton.base.assign(newton.q.numpy() + 0.01 * random.normal(size=(newton.all, 3)))
         islands.load_scale.fill_(1.0)
-        islands.iteration.fill_(3)  # second derivatives enter from here on
+        islands.iteration.fill_(3)  # late enough for second derivatives
         for element_set in newton.parts:
             element_set["energy"].fill_(0.25)  # of the accepted iterate
         problem.assemble()
