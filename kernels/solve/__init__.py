@@ -1,1 +1,1 @@
-"""Linear solves: elimination along chains, cyclic reduction, conjugate gradients and what they are preconditioned with."""
+"""Linear solvers: direct elimination along rods, cyclic reduction, conjugate gradients and preconditioners."""

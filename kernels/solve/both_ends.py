@@ -1,16 +1,17 @@
-"""The block LDL^T of chains from both of their ends at once, which meet in the middle: twice the threads, each with half the way.
+"""Twisted factorisation: block LDL^T of a rod path from both ends at once, two threads a path.
 
-A thread that walks along a chain waits for memory most of the time, and where chains are many but short there are too few of them. The
-factorisation is the twisted one (Babuska, SIAM J. Numer. Anal. 9, 1972, 53; van der Vorst, Parallel Computing 5, 1987, 45): places
-0, 1, ... up to the middle are eliminated by one side, the last, the one before it, ... by the other, and the two places in the middle,
-h - 1 and h of n with h = n // 2, after that, with what both sides take from them. The far side is the near one of the chain turned
-round, whose blocks are D_k, E_(k-1)^T and F_(k-2)^T. A place keeps U, V, L and inverse pivots as in `block_band.factor_function`,
-which are those of the side that it belongs to. Not of edges that are split (`kernels.solve.tension`): a tension lies with the place
-that its edge ends at, and has to come after both of its nodes. From the other end it would come before one of them, with the slack
-alone as its pivot where the other is held, and all digits that it is there for would be lost.
+A thread that eliminates along a path mostly waits for memory, and many short paths give too few threads. The factorisation is by
+Babuska (SIAM J. Numer. Anal. 9, 1972, 53) and van der Vorst (Parallel Computing 5, 1987, 45). One side eliminates path nodes 0, 1,
+... up to the middle, the other n - 1, n - 2, .... The two middle nodes, h - 1 and h with h = n // 2, follow with the updates of both
+sides. The far side is the near side of the reversed path, with blocks D_k, E_(k-1)^T and F_(k-2)^T. A path node keeps U, V, L and
+inverse pivots of its side, as in `block_band.factor_function`.
 
-10,000 chains of 32 places, an H200, float32: 49 us, where load, solve and finish of `elimination` take 82; 64 us if a thread reads
-which dofs a place has only when it needs them. The factors take 26 us at 4 TB/s.
+Not for the mixed axial-force formulation (`kernels.solve.tension`). A tension is stored with the node where its edge ends, and has to
+be eliminated after both nodes. From the far end it would come before one of them. If the other is fixed, the slack alone is the
+pivot, and the digits that tensions are to save are lost.
+
+Measured: 10,000 paths of 32 nodes, an H200, float32: 49 us, against 82 us for load, solve and finish of `elimination`. Without
+prefetched dof indices 64 us. The factors take 26 us at 4 TB/s.
 """
 
 from functools import cache
@@ -25,33 +26,37 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @wp.func
 def share(n: int, side: int):
-    """How many of n places a side eliminates, beside the middle."""
+    """Return the number of path nodes that a side eliminates before the middle, of n."""
     return wp.where(side == 0, n / 2 - 1, n - 1 - n / 2)
 
 
 @wp.func
 def place_of(j: int, n: int, side: int):
-    """The j-th place that a side comes to."""
+    """Return the index of the j-th path node that a side eliminates."""
     return wp.where(side == 0, j, n - 1 - j)
 
 
 @cache
 def factor_kernels(twist: bool, span: int, linear):
-    """sides(...): all places but the middle, a thread for each side of a chain; middle(...): the two that are left."""
+    """Build the kernels of the factorisation.
+
+    `sides`: eliminate all path nodes but the middle, one thread a side.
+    `middle`: eliminate the two middle nodes.
+    """
     nb = place_dofs(twist)
     nb2 = nb**2
     M = wp.types.matrix((nb, nb), linear)
-    load, store, _, put = block_functions(nb, linear)
+    load, store, _, store_vector = block_functions(nb, linear)
     factor, lower, upper, _, _, congruence = pivot.functions(nb, linear)
 
     @wp.func
     def eliminate(D: M, E: M, F: M, factors: wp.array3d(dtype=linear), k: int, r: int):
-        """Writes the factors of a place.
+        """Write the factors of a path node and return the updates of later blocks.
 
-        Returns what that takes from the block of the next place, from what couples that one to the place after it and from the block of
-        the latter, and how many pivots were lost.
+        Updates are subtracted from the next diagonal block, from the coupling between the next node and the one after, and from the
+        diagonal block of the latter. The last result is the number of lost pivots.
         """
-        L, inverse, bad = factor(D)
+        L, inverse, lost_pivots = factor(D)
         Zb = lower(L, E)
         store(factors, 0, k, r, upper(L, inverse, Zb))
         taken = congruence(Zb, inverse, Zb)
@@ -63,16 +68,16 @@ def factor_kernels(twist: bool, span: int, linear):
             couple = congruence(Zb, inverse, Zc)
             beyond = congruence(Zc, inverse, Zc)
         store(factors, wp.static(2 * nb2), k, r, L)
-        put(factors, wp.static(3 * nb2), k, r, inverse)
-        return taken, couple, beyond, bad
+        store_vector(factors, wp.static(3 * nb2), k, r, inverse)
+        return taken, couple, beyond, lost_pivots
 
     @wp.func
-    def coupling(blocks: wp.array3d(dtype=linear), which: int, j: int, n: int, side: int, r: int):
-        """What couples the j-th place of a side to the one `which` places on, or its own block."""
+    def coupling(blocks: wp.array3d(dtype=linear), offset: int, j: int, n: int, side: int, r: int):
+        """Return the block between a side's j-th node and the node `offset` further; its diagonal block for 0."""
         k = place_of(j, n, side)
         if side == 0:
-            return load(blocks, which * wp.static(nb2), k, r)
-        return wp.transpose(load(blocks, which * wp.static(nb2), k - which, r))
+            return load(blocks, offset * wp.static(nb2), k, r)
+        return wp.transpose(load(blocks, offset * wp.static(nb2), k - offset, r))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sides(
@@ -84,9 +89,10 @@ def factor_kernels(twist: bool, span: int, linear):
         taken_out: wp.array3d(dtype=linear),
         lost: wp.array(dtype=int),
     ):
-        """`taken_out`: what a side takes from the block of its place in the middle, from the coupling there and from the other place.
+        """Write factors, and the updates of the middle to `taken_out`.
 
-        Lost and negative pivots become positive ones, and are noted. Factors may lie where the blocks are.
+        Updates of a side: of its middle block, of the middle coupling, of the other middle block. Lost and negative pivots become
+        positive, and raise `lost` of the world. Factors may overwrite blocks.
         """
         columns = wanted.shape[0] * count.shape[0]
         side = wp.tid() / columns
@@ -98,29 +104,31 @@ def factor_kernels(twist: bool, span: int, linear):
         minus = M()
         minus_couple = M()
         minus_next = M()
-        bad = int(0)
+        lost_pivots = int(0)
         steps = share(n, side)
         D, E, F = M(), M(), M()
         for j in range(-1, steps):
-            # what the next place has is read before this one is dealt with, as in `block_band.factor_function`
-            ahead = wp.min(j + 1, steps - 1)
-            if ahead < 0:
+            # Prefetch: data of the next path node is read first, as in `block_band.factor_function`.
+            next_j = wp.min(j + 1, steps - 1)
+            if next_j < 0:
                 break
-            D_ahead = coupling(blocks, 0, ahead, n, side, r)
-            E_ahead = coupling(blocks, 1, ahead, n, side, r)
+            D_ahead = coupling(blocks, 0, next_j, n, side, r)
+            E_ahead = coupling(blocks, 1, next_j, n, side, r)
             F_ahead = M()
             if wp.static(span == 2):
-                F_ahead = coupling(blocks, 2, ahead, n, side, r)
+                F_ahead = coupling(blocks, 2, next_j, n, side, r)
             if j >= 0:
-                taken, couple, beyond, own = eliminate(D - minus, E - minus_couple, F, factors, place_of(j, n, side), r)
-                bad += own
+                taken, couple, beyond, lost_here = eliminate(
+                    D - minus, E - minus_couple, F, factors, place_of(j, n, side), r
+                )
+                lost_pivots += lost_here
                 minus = minus_next + taken
                 minus_couple = couple
                 minus_next = beyond
             D = D_ahead
             E = E_ahead
             F = F_ahead
-        if bad > 0:
+        if lost_pivots > 0:
             lost[w] = 1
         store(taken_out, 0, side, r, minus)
         store(taken_out, wp.static(nb2), side, r, minus_couple)
@@ -141,18 +149,18 @@ def factor_kernels(twist: bool, span: int, linear):
         if wanted[w] == 0 or idle[r] != 0:
             return
         h = count[r - w * count.shape[0]] / 2
-        bad = int(0)
+        lost_pivots = int(0)
         D = load(blocks, 0, h, r) - load(taken, 0, 1, r)
         if h > 0:
             A = load(blocks, 0, h - 1, r) - load(taken, 0, 0, r) - load(taken, wp.static(2 * nb2), 1, r)
             E = load(blocks, wp.static(nb2), h - 1, r) - load(taken, wp.static(nb2), 0, r)
             E = E - wp.transpose(load(taken, wp.static(nb2), 1, r))
-            own, _couple, _beyond, number = eliminate(A, E, M(), factors, h - 1, r)
-            bad += number
-            D = D - load(taken, wp.static(2 * nb2), 0, r) - own
-        _own, _couple, _beyond, number = eliminate(D, M(), M(), factors, h, r)
-        bad += number
-        if bad > 0:
+            update, _couple, _beyond, lost_here = eliminate(A, E, M(), factors, h - 1, r)
+            lost_pivots += lost_here
+            D = D - load(taken, wp.static(2 * nb2), 0, r) - update
+        _update, _couple, _beyond, lost_here = eliminate(D, M(), M(), factors, h, r)
+        lost_pivots += lost_here
+        if lost_pivots > 0:
             lost[w] = 1
 
     return sides, middle
@@ -160,14 +168,15 @@ def factor_kernels(twist: bool, span: int, linear):
 
 @cache
 def solve_kernels(twist: bool, span: int, linear):
-    """inward(...): from a vector of blocks, along both sides up to the middle; outward(...): from there to both ends, and z.
+    """Build the kernels that solve with the factors, for paths without joints; one thread a side.
 
-    Both are launched over the sides of chains; without joints, these are what is to be solved for.
+    `inward`: substitute forward along both sides up to the middle.
+    `outward`: solve the middle, substitute back to both ends, and write z and r . z.
     """
     nb = place_dofs(twist)
     nb2 = nb**2
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    load, _, vector, put = block_functions(nb, linear)
+    load, _, vector, store_vector = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
     gather, angle_of = gather_function(twist, linear), angle_function(twist)
     right, hand = solve_functions(twist, linear)
@@ -177,7 +186,7 @@ def solve_kernels(twist: bool, span: int, linear):
         factors: wp.array3d(dtype=linear),
         residual: wp.array(dtype=H),
         places: wp.array3d(dtype=int),
-        held: wp.array2d(dtype=wp.uint8),
+        fixed_dofs: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
@@ -185,7 +194,7 @@ def solve_kernels(twist: bool, span: int, linear):
         values_out: wp.array3d(dtype=linear),
         taken_out: wp.array3d(dtype=linear),
     ):
-        """`taken_out`: what a side takes from its place in the middle, and from the other one."""
+        """Write substituted values, and to `taken_out` a side's updates of its own and of the other middle node."""
         columns = wanted.shape[0] * count.shape[0]
         side = wp.tid() / columns
         r = wp.tid() - side * columns
@@ -195,44 +204,44 @@ def solve_kernels(twist: bool, span: int, linear):
         c = r - w * count.shape[0]
         n, first = count[c], w * blocks
         before, before2 = B(), B()
-        # What the next place takes is read before this one is dealt with, as in `block_band.substitute_function`, and where its dofs
-        # are before that: else a thread waits twice.
+        # Prefetch: data of the next path node is read first, as in `block_band.substitute_function`, and dof indices one node
+        # earlier; otherwise a thread waits twice.
         k = place_of(0, n, side)
         U, V = load(factors, 0, k, r), M()
         if wp.static(span == 2):
             V = load(factors, wp.static(nb2), k, r)
-        here = right(residual, places[0, k, c], angle_of(places, k, c), held[k, c], first)
+        rhs = right(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
         k = place_of(wp.min(1, n - 1), n, side)
         node = places[0, k, c]
         angle = angle_of(places, k, c)
-        fixed = held[k, c]
+        fixed = fixed_dofs[k, c]
         for j in range(share(n, side)):
             k = place_of(j + 1, n, side)
             U_ahead, V_ahead = load(factors, 0, k, r), M()
             if wp.static(span == 2):
                 V_ahead = load(factors, wp.static(nb2), k, r)
-            here_ahead = right(residual, node, angle, fixed, first)
+            rhs_ahead = right(residual, node, angle, fixed, first)
             k = place_of(wp.min(j + 2, n - 1), n, side)
             node = places[0, k, c]
             angle = angle_of(places, k, c)
-            fixed = held[k, c]
-            u = here - before
-            put(values_out, 0, place_of(j, n, side), r, u)
+            fixed = fixed_dofs[k, c]
+            u = rhs - before
+            store_vector(values_out, 0, place_of(j, n, side), r, u)
             before = before2 + u * U
             if wp.static(span == 2):
                 before2 = u * V
             U = U_ahead
             V = V_ahead
-            here = here_ahead
-        put(taken_out, 0, side, r, before)
-        put(taken_out, wp.static(nb), side, r, before2)
+            rhs = rhs_ahead
+        store_vector(taken_out, 0, side, r, before)
+        store_vector(taken_out, wp.static(nb), side, r, before2)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def outward(
         factors: wp.array3d(dtype=linear),
         residual: wp.array(dtype=H),
         places: wp.array3d(dtype=int),
-        held: wp.array2d(dtype=wp.uint8),
+        fixed_dofs: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
@@ -242,7 +251,7 @@ def solve_kernels(twist: bool, span: int, linear):
         z: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """Both sides find what is in the middle, and write a place of it each; and r . z block by block."""
+        """Solve the middle on both sides, each of which writes one middle node; write z and r . z per block."""
         columns = wanted.shape[0] * count.shape[0]
         side = wp.tid() / columns
         r = wp.tid() - side * columns
@@ -251,7 +260,7 @@ def solve_kernels(twist: bool, span: int, linear):
             return
         c = r - w * count.shape[0]
         n, first, last = count[c], w * blocks, share(count[c], side)
-        # where the dofs of the first place on the way are, and what it has, is read before the middle is dealt with
+        # prefetch dof indices and factors of the first node outward before the middle is solved
         k = place_of(wp.max(last - 1, 0), n, side)
         node = places[0, k, c]
         angle = angle_of(places, k, c)
@@ -259,32 +268,30 @@ def solve_kernels(twist: bool, span: int, linear):
         if wp.static(span == 2):
             V = load(factors, wp.static(nb2), k, r)
         L, inverse = load(factors, wp.static(2 * nb2), k, r), vector(factors, wp.static(3 * nb2), k, r)
-        here = vector(values, 0, k, r)
+        value = vector(values, 0, k, r)
         h = n / 2
         a, a_right, C = B(), B(), M()
-        b_right = right(residual, places[0, h, c], angle_of(places, h, c), held[h, c], first)
+        b_right = right(residual, places[0, h, c], angle_of(places, h, c), fixed_dofs[h, c], first)
         b = b_right - vector(taken, 0, 1, r) - vector(taken, wp.static(nb), 0, r)
         if h > 0:
-            a_right = right(residual, places[0, h - 1, c], angle_of(places, h - 1, c), held[h - 1, c], first)
+            a_right = right(residual, places[0, h - 1, c], angle_of(places, h - 1, c), fixed_dofs[h - 1, c], first)
             a = a_right - vector(taken, 0, 0, r) - vector(taken, wp.static(nb), 1, r)
             C = load(factors, 0, h - 1, r)
             b -= a * C
-        own = lower_vector(load(factors, wp.static(2 * nb2), h, r), b)
-        own = upper_vector(load(factors, wp.static(2 * nb2), h, r), vector(factors, wp.static(3 * nb2), h, r), own)
-        other = B()
+        e1 = lower_vector(load(factors, wp.static(2 * nb2), h, r), b)
+        e1 = upper_vector(load(factors, wp.static(2 * nb2), h, r), vector(factors, wp.static(3 * nb2), h, r), e1)
+        e2 = B()
         if h > 0:
             L_first = load(factors, wp.static(2 * nb2), h - 1, r)
-            other = (
-                upper_vector(L_first, vector(factors, wp.static(3 * nb2), h - 1, r), lower_vector(L_first, a)) - C * own
-            )
+            e2 = upper_vector(L_first, vector(factors, wp.static(3 * nb2), h - 1, r), lower_vector(L_first, a)) - C * e1
         if side == 0:
-            swapped = own
-            own = other
-            other = swapped
+            swapped = e1
+            e1 = e2
+            e2 = swapped
             b_right = a_right
         if last >= 0:
             k = place_of(last, n, side)
-            hand(own, b_right, places[0, k, c], angle_of(places, k, c), w, first, z, dots_out)
+            hand(e1, b_right, places[0, k, c], angle_of(places, k, c), w, first, z, dots_out)
         for i in range(last):
             k = place_of(wp.max(last - 2 - i, 0), n, side)
             node_ahead = places[0, k, c]
@@ -293,19 +300,19 @@ def solve_kernels(twist: bool, span: int, linear):
             if wp.static(span == 2):
                 V_ahead = load(factors, wp.static(nb2), k, r)
             L_ahead, inverse_ahead = load(factors, wp.static(2 * nb2), k, r), vector(factors, wp.static(3 * nb2), k, r)
-            here_ahead = vector(values, 0, k, r)
+            value_ahead = vector(values, 0, k, r)
             b = gather(residual, node, angle, first)
-            u = upper_vector(L, inverse, lower_vector(L, here)) - U * own
+            u = upper_vector(L, inverse, lower_vector(L, value)) - U * e1
             if wp.static(span == 2):
-                u -= V * other
+                u -= V * e2
             hand(u, b, node, angle, w, first, z, dots_out)
-            other = own
-            own = u
+            e2 = e1
+            e1 = u
             U = U_ahead
             V = V_ahead
             L = L_ahead
             inverse = inverse_ahead
-            here = here_ahead
+            value = value_ahead
             node = node_ahead
             angle = angle_ahead
 

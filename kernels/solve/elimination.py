@@ -1,21 +1,22 @@
-"""The chain preconditioner of a net: rods are eliminated between their joints, the joints with what the rods do to them.
+"""Substructuring preconditioner: rod interiors are eliminated exactly, joints by their diagonal Schur complement blocks.
 
-Let I be the dofs of rods that lie between joints, a block-banded matrix H_II for each rod, and J those of the joints. The exact
-elimination of I leaves the joints with S = H_JJ - H_JI H_II^-1 H_IJ, of which the preconditioner keeps the blocks of single joints:
+Let I be the dofs of rods between joints, a block-banded matrix H_II for each rod path, and J the dofs of joints. Exact elimination
+of I leaves the joint Schur complement S = H_JJ - H_JI H_II^-1 H_IJ, of which the preconditioner keeps the blocks of single joints:
 
     w = H_II^-1 r_I ,    z_J = S_jj^-1 (r_J - H_JI w)_j ,    z_I = H_II^-1 (r_I - H_IJ z_J)
 
-(a substructuring method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996, ch. 4). It is symmetric and positive definite, and
-S knows rods only by their ends: the number of iterations does not depend on the nodes of a rod. Columns of S come from solves for
-unit movements of joints, V = -H_II^-1 H_IJ; joints that meet on a rod have different colours, those of one colour move at once. (A rod
-bends on over hinged joints, so that there a column also holds a little of what the joints after the next do.) Where no chain meets two
-joints of one colour, z_I = w + V z_J takes no second solve. Blocks of S that rounding leaves indefinite give way to those of H. All
-other blocks keep block Jacobi.
+(Smith, Bjorstad and Gropp, Domain Decomposition, 1996, ch. 4). The preconditioner is symmetric and positive definite. S knows rods
+only by their ends, so that the number of iterations does not depend on the nodes of a rod.
 
-For the gridshell of `scenes.gridshell_dome` at rest under its weight, iterations to a residual of 1e-3 at 2, 8 and 32 edges between
-crossings: block Jacobi 43, 250, 2378; rods that overlap in their joints, added up, 14, 35, 51; this 13, 16, 16.
+Columns of S come from solves for unit displacements of joints, V = -H_II^-1 H_IJ. Graph colouring: joints on one rod have different
+colours, and joints of one colour are probed together. Where a rod continues over hinged joints, a column also holds a little of the
+response to the joints after the next. If no path meets two joints of one colour, z_I = w + V z_J takes no second solve. Blocks of S
+that rounding leaves indefinite are replaced by blocks of H. All other dof blocks keep block Jacobi.
 
-Columns of chains are counted world by world, a solve for colour and dof d lies in column d * columns + r.
+Measured: iterations to a residual of 1e-3 for the gridshell of `scenes.gridshell_dome` in equilibrium under its weight, at 2, 8 and
+32 edges between crossings: block Jacobi 43, 250, 2378, additive overlapping rods 14, 35, 51, this 13, 16, 16.
+
+Columns of paths are counted world by world; a solve for colour and dof d is in column d * columns + r.
 """
 
 from functools import cache
@@ -42,10 +43,13 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
 
 @cache
 def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
-    """solve(...) of chains without joints by a thread each, for the CPU, which has one: load, solve and finish of `chain_kernels`."""
+    """Build the kernel that solves paths without joints on the CPU, one thread a path.
+
+    `solve`: load, solve and finish of `chain_kernels` in one.
+    """
     nb = place_dofs(twist, split)
     H = wp.types.vector(3, linear)
-    _, _, vector, put = block_functions(nb, linear)
+    _, _, vector, store_vector = block_functions(nb, linear)
     substitute = substitute_function(nb, span, linear, tensions=int(split))
     right, hand = solve_functions(twist, linear, split)
     value, angle_of = value_function(twist, linear, split), angle_function(twist)
@@ -55,7 +59,7 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
         factors: wp.array3d(dtype=linear),
         residual: wp.array(dtype=H),
         places: wp.array3d(dtype=int),
-        held: wp.array2d(dtype=wp.uint8),
+        fixed_dofs: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
@@ -71,7 +75,9 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
             return
         n, first = count[c], first_of(w, blocks)
         for k in range(n):
-            put(values, 0, k, r, right(residual, places[0, k, c], angle_of(places, k, c), held[k, c], first))
+            store_vector(
+                values, 0, k, r, right(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
+            )
         _product = substitute(factors, values, values, n, r, r)
         for k in range(n):
             b = value(residual, places, k, c, first)
@@ -82,15 +88,21 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
 
 @cache
 def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split: bool = False):
-    """factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
+    """Build the kernels of substructuring.
 
-    solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J. Between worlds and their columns are
-    spread(...) and note(...).
+    `factorise`: factorise H_II.
+    `load`: write right-hand sides of rod interiors.
+    `solve`: solve with H_II.
+    `solve_all`: solve for all `sides` unit displacements of a joint at once.
+    `follow`: add V z_J.
+    `finish`: write z of every block and r . z.
+    `spread`: write the wanted columns of wanted worlds.
+    `note`: mark worlds that lost pivots.
     """
     nb = place_dofs(twist, split)
-    parts, angle = 1 + twist, 2 + twist  # blocks of a place, node and angle of the edge ahead; where that is
+    parts, angle = 1 + twist, 2 + twist  # dof blocks of a path node (node, twist angle); index of the twist angle
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
-    _, _, _, put = block_functions(nb, linear)
+    _, _, _, store_vector = block_functions(nb, linear)
     factor = factor_function(nb, span, linear, int(split))
     substitute = substitute_function(nb, span, linear, tensions=int(split))
     substitute_all = substitute_all_function(nb, span, linear, sides)
@@ -107,7 +119,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         factors: wp.array3d(dtype=linear),
         lost: wp.array(dtype=int),
     ):
-        """Lost and negative pivots become positive ones, so that the solves stay definite, and are noted."""
+        """Factorise H_II; lost and negative pivots become positive, for definite solves, and raise `lost`."""
         r = wp.tid()
         w = r / count.shape[0]
         if wanted[w] != 0 and idle[r] == 0:
@@ -121,7 +133,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         places: wp.array3d(dtype=int),
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
-        held: wp.array2d(dtype=wp.uint8),
+        fixed_dofs: wp.array2d(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         joint_row: wp.array(dtype=int),
@@ -129,13 +141,13 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         wanted: wp.array(dtype=int),
         blocks: int,
         positions: int,
-        own: int,
-        joined: int,
+        with_residual: int,
+        with_joints: int,
         residual: wp.array(dtype=H),
         moved: wp.array(dtype=H),
         values_out: wp.array3d(dtype=linear),
     ):
-        """r_I (if `own`) - H_IJ z_J (if `joined`), with z_J in `moved`."""
+        """Write r_I (if `with_residual`) - H_IJ z_J (if `with_joints`), with z_J in `moved`."""
         start, s = wp.tid()
         worlds = wanted.shape[0]
         q = s / (worlds * count.shape[0])
@@ -147,13 +159,13 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         for k in range(start, until(start, count[c])):
             u = B()
             for part in range(wp.static(parts)):
-                at = places[part, k, c]
-                if at >= 0:
+                block = places[part, k, c]
+                if block >= 0:
                     v = H()
-                    if own != 0:
-                        v = residual[at + w * blocks]
-                    if joined != 0:
-                        for index in range(starts[at], starts[at + 1]):
+                    if with_residual != 0:
+                        v = residual[block + w * blocks]
+                    if with_joints != 0:
+                        for index in range(starts[block], starts[block + 1]):
                             p = items[index]
                             j = joint_row[columns[p]]
                             v -= multiply(matrix, p + w * positions, moved[(q * worlds + w) * joint_rows + j])
@@ -162,9 +174,9 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
                             u[d] = v[d]
                     else:
                         u[wp.static(angle)] = v[0]
-            if held[k, c] != wp.uint8(0):
-                u = wp.cw_mul(u, free_of(held[k, c]))
-            put(values_out, 0, k, s, u)
+            if fixed_dofs[k, c] != wp.uint8(0):
+                u = wp.cw_mul(u, free_of(fixed_dofs[k, c]))
+            store_vector(values_out, 0, k, s, u)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solve(
@@ -174,7 +186,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         wanted: wp.array(dtype=int),
         values: wp.array3d(dtype=linear),
     ):
-        """H_II^-1 of the values, in their place."""
+        """Replace values by H_II^-1 times values."""
         s = wp.tid()
         columns = wanted.shape[0] * count.shape[0]
         r = s - s / columns * columns
@@ -184,17 +196,17 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread(wanted: wp.array(dtype=int), idle: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):
-        """For `kernels.solve.cyclic_reduction`: which columns are wanted."""
+        """Write the wanted columns, for `kernels.solve.cyclic_reduction`."""
         r = wp.tid()
         wanted_out[r] = wp.where(wanted[r / columns] == 1 and idle[r] == 0, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def note(columns: int, bad: wp.array(dtype=int), lost: wp.array(dtype=int)):
-        """Which worlds lost pivots; starts counting them anew."""
+    def note(columns: int, lost_pivots: wp.array(dtype=int), lost: wp.array(dtype=int)):
+        """Mark worlds that lost pivots, and reset the counters."""
         r = wp.tid()
-        if bad[r] > 0:
+        if lost_pivots[r] > 0:
             lost[r / columns] = 1
-        bad[r] = 0
+        lost_pivots[r] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solve_all(
@@ -204,7 +216,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         wanted: wp.array(dtype=int),
         values: wp.array3d(dtype=linear),
     ):
-        """The same for every colour of joints and all of its movements."""
+        """Replace the values of all colours and unit displacements by H_II^-1 times values."""
         s = wp.tid()
         columns = wanted.shape[0] * count.shape[0]
         colour = s / columns
@@ -216,7 +228,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
-        met: wp.array3d(dtype=int),
+        joint_of_colour: wp.array3d(dtype=int),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         responses: wp.array3d(dtype=linear),
@@ -224,7 +236,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         joint_rows: int,
         values: wp.array3d(dtype=linear),
     ):
-        """Adds V z_J, with z_J in `moved`; `met` is the joint of each colour that the chain of a place meets, -1 for none."""
+        """Add V z_J, with z_J in `moved`; `joint_of_colour` is the joint of each colour on a node's path, or -1."""
         k, r = wp.tid()
         columns = wanted.shape[0] * count.shape[0]
         w = r / count.shape[0]
@@ -232,8 +244,8 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         if wanted[w] != 1 or k >= count[c]:
             return
         u = B()
-        for colour in range(met.shape[0]):
-            m = met[colour, k, c]
+        for colour in range(joint_of_colour.shape[0]):
+            m = joint_of_colour[colour, k, c]
             if m >= 0:
                 for d in range(wp.static(sides)):
                     z = moved[w * joint_rows + 2 * m + d // 3]
@@ -259,17 +271,17 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         z: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """z of blocks of rods and joints beside what block Jacobi left there, and r . z."""
+        """Write z of blocks of rods and joints, over the result of block Jacobi, and r . z."""
         start = wp.tid()
         for i in range(start, until(start, z.shape[0])):
             w = i / blocks
             if wanted[w] != 1 or barred[i] == BARRED:
                 continue
             b = i - w * blocks
-            at = where[b]
-            if at >= 0:
-                k = at / width
-                r = w * width + at - k * width
+            entry = where[b]
+            if entry >= 0:
+                k = entry / width
+                r = w * width + entry - k * width
                 if b < nodes:
                     z[i] = H(values[0, k, r], values[1, k, r], values[2, k, r])
                 else:

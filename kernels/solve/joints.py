@@ -1,4 +1,4 @@
-"""Joints of a net once the rods between them are eliminated: the blocks of S and what they make of a residual; see `chains`."""
+"""Joints of the coupled system after elimination of rod interiors: diagonal blocks of the joint Schur complement; see `elimination`."""
 
 from functools import cache
 
@@ -12,7 +12,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def coupling_functions(linear):
-    """multiply(matrix, p, v): block p of H times v; block(matrix, p): the block itself."""
+    """Return the device functions `multiply(matrix, p, v)` and `block(matrix, p)`.
+
+    `multiply`: block p of H times v.
+    `block`: block p of H.
+    """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
 
     @wp.func
@@ -36,10 +40,13 @@ def coupling_functions(linear):
 
 @cache
 def joint_kernels(linear):
-    """measure(...): S_jj of every joint and its inverse; meet(...): z_J.
+    """Build the kernels of joints.
 
-    A joint has one block or two (a node and the rotation of its rigid joint), a and b, rows 2 m and 2 m + 1 of all joints. With
-    P = S_aa^-1, Q = P S_ab, and R = (S_bb - S_ba Q)^-1 its solution is z_b = R (t_b - Q^T t_a), z_a = P t_a - Q z_b.
+    `measure`: compute S_jj of every joint and the inverse.
+    `meet`: compute z_J.
+
+    A joint has one dof block or two (a node and the rotation of its rigid joint), a and b, rows 2 m and 2 m + 1 of all joints. With P
+    = S_aa^-1, Q = P S_ab and R = (S_bb - S_ba Q)^-1 the solution is z_b = R (t_b - Q^T t_a), z_a = P t_a - Q z_b.
     """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
@@ -48,7 +55,10 @@ def joint_kernels(linear):
 
     @wp.func
     def inverse_or(m: M, instead: M, f: H):
-        """Inverse on the free dofs f of a matrix, of another one if it is not definite, or of that one's diagonal; whether it is."""
+        """Return the inverse of m on the free dofs f, and True if m is definite.
+
+        If m is not definite, `instead` is inverted, or as a last resort its diagonal.
+        """
         inverse, definite = invert(wp.cw_mul(m, wp.outer(f, f)), f)
         if not definite:
             inverse, good = invert(wp.cw_mul(instead, wp.outer(f, f)), f)
@@ -71,7 +81,7 @@ def joint_kernels(linear):
         first: int,
         shift: int,
     ):
-        """Row of H_JI times the values of chains whose columns begin at `shift`."""
+        """Return a row of H_JI times the values of paths, with columns from `shift` on."""
         y = H()
         for index in range(starts[row], starts[row + 1]):
             p = items[index]
@@ -97,7 +107,7 @@ def joint_kernels(linear):
         width: int,
         nodes: int,
         pairs: wp.array2d(dtype=int),
-        own: wp.array2d(dtype=int),
+        block_positions: wp.array2d(dtype=int),
         colour: wp.array(dtype=int),
         size: int,
         fixed: wp.array(dtype=wp.uint8),
@@ -129,8 +139,8 @@ def joint_kernels(linear):
                 for e in range(3):
                     aa[e, d] = y[e]
             f = free(fixed[a])
-            here = block(matrix, own[m, 0] + first)
-            P, definite = inverse_or(here + linear(0.5) * (aa + wp.transpose(aa)), here, f)
+            H_aa = block(matrix, block_positions[m, 0] + first)
+            P, definite = inverse_or(H_aa + linear(0.5) * (aa + wp.transpose(aa)), H_aa, f)
             if not definite:
                 lost[w] = 1
         if b >= 0:
@@ -145,12 +155,12 @@ def joint_kernels(linear):
                         ab[e, d] = y[e]
             f = free(fixed[b])
             if a >= 0:
-                if own[m, 2] >= 0:
-                    ab += block(matrix, own[m, 2] + first)
+                if block_positions[m, 2] >= 0:
+                    ab += block(matrix, block_positions[m, 2] + first)
                 ab = wp.cw_mul(ab, wp.outer(free(fixed[a]), f))
                 Q = P * ab
-            turned = block(matrix, own[m, 1] + first)
-            R, definite = inverse_or(turned + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q, turned, f)
+            H_bb = block(matrix, block_positions[m, 1] + first)
+            R, definite = inverse_or(H_bb + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q, H_bb, f)
             if not definite:
                 lost[w] = 1
         parts_out[0, i] = P

@@ -1,8 +1,8 @@
-"""Preconditioned conjugate gradients on a net, every world for itself: block Jacobi, scalars on the device.
+"""Preconditioned conjugate gradients on the coupled system, each world by itself: block Jacobi, scalars on the device.
 
-What `chains` or `levels` make of z follows the kernels that begin a solve and advance it, before r . z is summed.
-`wanted` is 1 while a world iterates, 2 once it is done, 3 if it can not go on; sums over blocks come in one order (tiles, then a
-tile of tiles).
+Substructuring (`elimination`) or `levels` update z after the kernels that start and advance a solve, before r . z is summed. `wanted`
+is 1 while a world iterates, 2 once it has converged, 3 if it cannot go on. Sums over blocks have a fixed order (tiles, then a tile of
+tiles).
 """
 
 from functools import cache
@@ -20,7 +20,11 @@ THREADS = 256
 
 @cache
 def sum_kernels(real, largest: bool = False):
-    """partial(values (worlds, n), (worlds, tiles)) and total(tiles, (worlds,)): sums of rows, or their largest entries."""
+    """Build the kernels that sum rows, or find their `largest` entries.
+
+    `partial`: reduce tiles of values (worlds, n) to (worlds, tiles).
+    `total`: reduce tiles to (worlds,).
+    """
 
     @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def partial(values: wp.array2d(dtype=real), tiles_out: wp.array2d(dtype=real)):
@@ -45,7 +49,10 @@ def sum_kernels(real, largest: bool = False):
 
 @cache
 def serial_sum_kernel(real, largest: bool = False):
-    """The same by one thread a row, for the CPU, which has one."""
+    """Build the kernel that sums rows, or finds their `largest` entries, on the CPU.
+
+    `total`: reduce values (worlds, n) to (worlds,), one thread a row.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
@@ -63,13 +70,16 @@ def serial_sum_kernel(real, largest: bool = False):
 
 @cache
 def inverse_function(linear):
-    """inverse_of(m, f) -> (inverse on the free dofs f of a matrix masked by them, whether it is definite); zero if it is not."""
+    """Return the device function `inverse_of(masked, f) -> (inverse, definite)`.
+
+    The inverse is on the free dofs f of a matrix masked by f, and zero if that is not definite.
+    """
     H, M, nonzero = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), nonzero_function(linear)
 
     @wp.func
     def inverse_of(masked: M, f: H):
         m = masked + wp.diag(H(linear(1.0)) - f)
-        # scaled to a unit diagonal: a block of a rod's end holds stretching and bending stiffness
+        # scaled to a unit diagonal: a block at the end of a rod mixes stretching and bending stiffness
         s = H()
         for d in range(3):
             s[d] = linear(1.0) / wp.sqrt(nonzero(wp.abs(m[d, d])))
@@ -88,10 +98,18 @@ def inverse_function(linear):
 
 @cache
 def solver_kernels(linear, indefinite: bool = False):
-    """Kernels of a solve, in the order of their use; see the module's text.
+    """Build the kernels of a solve, in the order of use.
 
-    If `indefinite`, H may be, with a preconditioner that is not: iterates then are the points of conjugate gradients of Paige and
-    Saunders (SIAM J. Numer. Anal. 12, 1975, 617), each of which there is unless a curvature is zero.
+    `invert`: invert diagonal blocks.
+    `start`: set up residual, solution and search direction.
+    `begin`: store the first r . z of each world.
+    `product`: compute H p and p . H p.
+    `advance`: step along p and precondition the new residual.
+    `turn`: update the search direction.
+    `test`: test convergence of each world.
+
+    If `indefinite`, H may be indefinite, with a definite preconditioner. Iterates are then the conjugate-gradient points of Paige and
+    Saunders (SIAM J. Numer. Anal. 12, 1975, 617), which exist unless a curvature is zero.
     """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
@@ -101,7 +119,10 @@ def solver_kernels(linear, indefinite: bool = False):
 
     @wp.func
     def ends(curvature: linear, rho: linear):
-        """Curvature that is negative, or lost to rounding: the solve ends with what it has, or a step of steepest descent."""
+        """Return True if the curvature is negative or lost in rounding.
+
+        The solve then ends with the solution so far, or with a step of steepest descent.
+        """
         if wp.static(indefinite):
             return not wp.abs(curvature) > eps * rho * linear(1.0e-6)
         else:
@@ -118,13 +139,13 @@ def solver_kernels(linear, indefinite: bool = False):
         more: wp.array(dtype=M),
         inverse_out: wp.array(dtype=M),
     ):
-        """Inverse of the diagonal blocks of H on free dofs; `diagonal` holds their positions, `more` what is not there, if anything."""
+        """Write inverses of the diagonal blocks of H on free dofs, at positions `diagonal`; `more` is added to blocks if not empty."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] == 0:
             return
         k = i - w * blocks
-        if diagonal[k] < 0:  # chains see to it, and it stays zero
+        if diagonal[k] < 0:  # eliminated with a rod path; stays zero
             return
         if barred[i] == BARRED:
             inverse_out[i] = M()
@@ -191,7 +212,7 @@ def solver_kernels(linear, indefinite: bool = False):
         iterations_out[w] = 0
         if total[w] > linear(0.0) and wp.isfinite(total[w]):
             busy_out[0] = 1
-        else:  # in this precision the preconditioner is not definite: there is no direction
+        else:  # the preconditioner is not definite in this precision: no direction
             wanted[w] = 3
             negative_out[w] = 1
 
@@ -208,7 +229,7 @@ def solver_kernels(linear, indefinite: bool = False):
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """H p on dofs that are not barred, and p . H p block by block."""
+        """Write H p on active dofs, and p . H p by block."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] != 1:
@@ -234,7 +255,7 @@ def solver_kernels(linear, indefinite: bool = False):
         dots_out: wp.array2d(dtype=linear),
         busy_out: wp.array(dtype=int),
     ):
-        """Step along p, new residual and its preconditioned form z, and r . z block by block; `test` says who is busy after it."""
+        """Step along p; write the new residual, z and r . z by block. `test` raises `busy_out` afterwards."""
         i = wp.tid()
         w = i / blocks
         if i == 0:
@@ -250,7 +271,7 @@ def solver_kernels(linear, indefinite: bool = False):
         solution[i] = solution[i] + (unit * alpha) * p[i]
         r = residual[i] - alpha * product[i]
         residual[i] = r
-        if diagonal[k] >= 0:  # chains see to the others
+        if diagonal[k] >= 0:  # rod paths write the others
             z = inverse[i] * r
             z_out[i] = z
             dots_out[w, k] = wp.dot(r, z)
@@ -265,7 +286,7 @@ def solver_kernels(linear, indefinite: bool = False):
         blocks: int,
         p: wp.array(dtype=H),
     ):
-        """The next direction."""
+        """Write the next search direction."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] == 1 and barred[i] != BARRED:
@@ -284,16 +305,16 @@ def solver_kernels(linear, indefinite: bool = False):
         wanted: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
-        """Whether a world goes on, by the residual in the norm of the preconditioner.
+        """Test convergence of a world by the residual in the norm of the preconditioner.
 
-        `negative` notes negative curvature, and a preconditioner that is not definite: such a norm is negative, or no number.
+        `negative` marks negative curvature, and an indefinite preconditioner, for which that norm is negative or not finite.
         """
         w = wp.tid()
         if wanted[w] != 1:
             return
         iterations[w] = iterations[w] + 1
         enough = forcing[w] * forcing[w] * first[w]
-        definite = total[w] >= -enough  # but for rounding
+        definite = total[w] >= -enough  # up to rounding
         if not (curvature[w] > linear(0.0) and definite):
             negative[w] = 1
         lost = ends(curvature[w], rho[w]) or not definite
@@ -310,7 +331,11 @@ def solver_kernels(linear, indefinite: bool = False):
 
 @cache
 def confirm_kernels(real, linear):
-    """compare(...) of what a solve leaves in every block with what it may be; confirm(...) that it is little enough."""
+    """Build the kernels that check a solution by dof block.
+
+    `compare`: write the ratio of residual to allowed residual.
+    `confirm`: continue worlds with too large a ratio.
+    """
     H = wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -342,9 +367,9 @@ def confirm_kernels(real, linear):
         wanted: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
-        """Sends worlds on whose largest ratio is above their goal, to a residual smaller by as much in the preconditioner's norm.
+        """Continue worlds with a largest ratio above `goal`, with a forcing term smaller by the same factor.
 
-        But for `most` bodies, which may be `farthest` times as far; `number` says of how many ratios are above.
+        Relaxed convergence: `most` bodies may exceed the goal by a factor of `farthest`; `number` counts ratios above the goal.
         """
         w = wp.tid()
         if wanted[w] != 2 or worst[w] <= goal[w] or real(forcing[w]) <= limit[w]:
@@ -354,8 +379,8 @@ def confirm_kernels(real, linear):
             if number[w] <= most and worst[w] <= farthest * goal[w]:
                 return
             least = real(0.5)
-        share = wp.clamp(goal[w] / worst[w], least, real(0.8))
-        forcing[w] = linear(wp.max(share * real(forcing[w]), limit[w]))
+        factor = wp.clamp(goal[w] / worst[w], least, real(0.8))
+        forcing[w] = linear(wp.max(factor * real(forcing[w]), limit[w]))
         wanted[w] = 1
         busy_out[0] = 1
 

@@ -1,13 +1,13 @@
-"""A multilevel preconditioner of a net: block Jacobi on every level of aggregates of nodes, added up (BPX).
+"""BPX multilevel preconditioner of the coupled system: block Jacobi on every level of aggregated nodes, summed.
 
-Nodes are numbered along a space-filling curve at rest; a group of level l holds `GROUP`^l neighbours on it and has three dofs, a
-common translation. With P_l the prolongation from groups to nodes and D_l the diagonal blocks of P_l^T H P_l,
+Nodes are numbered along a space-filling curve of the rest shape. A group of level l has `GROUP`^l neighbours on the curve and three
+dofs, a common translation. With P_l the prolongation from groups to nodes and D_l the diagonal blocks of P_l^T H P_l,
 
     z = D_0^-1 r + sum_l P_l D_l^-1 P_l^T r
 
 (Bramble, Pasciak and Xu 1990; Wu, Wang, Wang and Guo, A GPU-based multilevel additive Schwarz preconditioner for cloth, 2022, with
-dense blocks). D_0^-1 r may be what `chains` makes of it. D_l takes the blocks of D_l-1 of its members, and those blocks of H whose
-row and column meet first at level l.
+dense blocks). D_0^-1 r may come from substructuring (`elimination`). D_l sums the blocks of D_l-1 of its members, and the blocks of H
+whose row and column are first in one group at level l.
 """
 
 from functools import cache
@@ -24,7 +24,14 @@ PIECE = 32  # blocks of H that one thread sums
 
 @cache
 def level_kernels(linear):
-    """collect(...) and gather(...) of the diagonal blocks; restrict(...), correct(...) and finish(...) of an application."""
+    """Build the kernels of the levels.
+
+    `collect`: sum blocks of H in a piece of a group's list.
+    `gather`: sum and invert the diagonal block of a group.
+    `restrict`: sum a vector over the members of a group.
+    `correct`: compute the correction of a group.
+    `finish`: add the corrections to z, and write r . z.
+    """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
     nonzero = nonzero_function(linear)
@@ -42,15 +49,15 @@ def level_kernels(linear):
         wanted: wp.array(dtype=int),
         sum_out: wp.array(dtype=M),
     ):
-        """Sum of the blocks of H in a piece of a group's list, on free dofs."""
+        """Sum the blocks of H in a piece of a group's list, on free dofs."""
         i = wp.tid()
         w = i / pieces
         if wanted[w] == 0:
             return
         k = i - w * pieces
         m = M()
-        for at in range(starts[k], starts[k + 1]):
-            p = items[at]
+        for index in range(starts[k], starts[k + 1]):
+            p = items[index]
             q = p + w * positions
             block = M()
             for a in range(3):
@@ -71,7 +78,7 @@ def level_kernels(linear):
         sum_out: wp.array(dtype=M),
         inverse_out: wp.array(dtype=M),
     ):
-        """Diagonal block of a group and its inverse; `members` are the blocks of the level below (none at the first)."""
+        """Write the diagonal block of a group and the inverse; `members` are the blocks of the level below (none at the first)."""
         i = wp.tid()
         w = i / groups
         if wanted[w] == 0:
@@ -80,8 +87,8 @@ def level_kernels(linear):
         m = M()
         for k in range(g * wp.static(GROUP), wp.min((g + 1) * wp.static(GROUP), member_count)):
             m += members[k + w * member_count]
-        for at in range(starts[g], starts[g + 1]):
-            m += piece_sums[at + w * pieces]
+        for index in range(starts[g], starts[g + 1]):
+            m += piece_sums[index + w * pieces]
         sum_out[i] = m
         s = H()
         for d in range(3):
@@ -91,7 +98,7 @@ def level_kernels(linear):
         for d in range(3):
             scaled[d, d] = linear(1.0)
         inverse = wp.cw_mul(wp.inverse(scaled), scale)
-        # rounding may leave a block of a long way up indefinite: its diagonal serves as well
+        # Rounding may leave a block of a high level indefinite: the diagonal serves as well.
         if not (wp.determinant(scaled) > linear(1.0e-4)):
             inverse = wp.diag(wp.cw_mul(s, s))
         inverse_out[i] = inverse
@@ -106,7 +113,7 @@ def level_kernels(linear):
         wanted: wp.array(dtype=int),
         sum_out: wp.array(dtype=H),
     ):
-        """Sums over the members of a group; `order` says which blocks they are at the first level, and is empty above."""
+        """Sum over the members of a group; `order` maps members to blocks at the first level, and is empty above."""
         i = wp.tid()
         w = i / groups
         if wanted[w] != 1:
@@ -114,10 +121,10 @@ def level_kernels(linear):
         g = i - w * groups
         total = H()
         for k in range(g * wp.static(GROUP), wp.min((g + 1) * wp.static(GROUP), member_count)):
-            at = k
+            member = k
             if order.shape[0] > 1:
-                at = order[k]
-            total += values[at + w * stride]
+                member = order[k]
+            total += values[member + w * stride]
         sum_out[i] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -130,7 +137,7 @@ def level_kernels(linear):
         wanted: wp.array(dtype=int),
         correction_out: wp.array(dtype=H),
     ):
-        """Correction of a group: its own, and that of the group it is in."""
+        """Write the correction of a group: the sum of its own and the enclosing group's."""
         i = wp.tid()
         w = i / groups
         if wanted[w] != 1:
@@ -153,7 +160,7 @@ def level_kernels(linear):
         z: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """Adds the corrections to z, which holds D_0^-1 r, and r . z."""
+        """Add the corrections to z, which holds D_0^-1 r, and write r . z."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] != 1:

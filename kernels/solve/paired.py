@@ -1,14 +1,15 @@
-"""Nodes in pairs with the tensions of their edges: what cyclic reduction eliminates of rods whose edges are stiff.
+"""Pairs of nodes with edge tensions: the blocks of cyclic reduction in the mixed axial-force formulation.
 
-The matrix [H r^T; r -s] of `tension` has a tension for each edge, which should be eliminated after both of its nodes. Of the pairs of
-nodes that are the blocks of a level every other one is eliminated, so that tensions between pairs wait in those that stay: a pair that
-stays holds the tensions behind it, within it and ahead of it, another one that within it alone. From the next level on every tension of
-a pair is between its nodes or ends where nodes are gone, and whole pairs can be eliminated. (In float32 a pair that takes the tension
-ahead or behind with it leaves directions that err by as much as they are long where the rod is held there, from EA L^2 / EI = 1e9 on;
-this order leaves 1e-3 whatever EA is.)
+The matrix [H r^T; r -s] of `tension` has a tension for each edge, to be eliminated after both of its nodes. A level eliminates every
+other pair of nodes. So tensions between pairs are stored in the pairs that stay: a staying pair has the tensions behind, within and
+ahead, an eliminated pair only the tension within. From the next level on, every tension of a pair is between its nodes or ends at
+eliminated nodes, and whole pairs can be eliminated.
 
-A node has two rows more than dofs: the tension behind it, unless that waits in the pair before, and, last in a pair that waits, the
-one ahead. Rows without a tension are those of the identity with a minus.
+Alternative: eliminating the tension ahead or behind with a pair. In float32 errors of directions are then as large as the directions
+where the rod is fixed there, from EA L^2 / EI = 1e9 on. This order leaves 1e-3 for every EA.
+
+A node has two rows more than dofs: the tension behind, unless stored in the pair before, and, last in a staying pair, the tension
+ahead. Rows without a tension are rows of the negative identity.
 """
 
 from functools import cache
@@ -25,7 +26,10 @@ TENSIONS = 2  # rows of a node for tensions
 
 @cache
 def pair_kernel(kind: ChainKind, linear):
-    """The system of wanted rods in the form of a level; see `cyclic_reduction.level_rows`. A thread has a row of a pair."""
+    """Build the kernel that assembles pairs.
+
+    `pair`: write the system of wanted rods as a level of `cyclic_reduction.level_rows`, one thread a row of a pair.
+    """
     dim, nb = kind.dim, kind.block
     nb2, size = nb**2, nb + TENSIONS
     size2 = size**2
@@ -33,14 +37,14 @@ def pair_kernel(kind: ChainKind, linear):
 
     @wp.func
     def edge_of(k: int, row: int, n: int):
-        """The edge whose tension is in a row of node k, -1 for none."""
+        """Return the edge of the tension in a row of node k, -1 for none."""
         if row == wp.static(nb):
             return wp.where(k % 4 == 2, -1, k - 1)
         return wp.where(k % 4 == 1 and k + 1 < n, k, -1)
 
     @wp.func
     def coupling(F: wp.array3d(dtype=linear), fixed: wp.array2d(dtype=wp.uint8), edge: int, k: int, d: int, r: int):
-        """Between the tension of an edge and dof d of node k."""
+        """Return the entry between the tension of an edge and dof d of node k."""
         if edge < 0 or k < edge or k > edge + 1 or d >= wp.static(dim):
             return linear(0.0)
         if F[wp.static(slack_row), edge, r] == linear(0.0) or ((int(fixed[k, r]) >> d) & 1) == 1:
@@ -60,17 +64,17 @@ def pair_kernel(kind: ChainKind, linear):
         n: int,
         r: int,
     ):
-        """Between row i of node k and row j of node l, which is not before k."""
+        """Return the entry between row i of node k and row j of node l >= k."""
         if k == l and i == j and (k >= n or i >= wp.static(nb)):
-            own = linear(1.0)
+            diagonal = linear(1.0)
             if i >= wp.static(nb):
-                own = linear(-1.0)
+                diagonal = linear(-1.0)
                 edge = edge_of(k, i, n)
                 if k < n and edge >= 0:
                     slack = F[wp.static(slack_row), edge, r]
                     if slack > linear(0.0):
-                        own = -slack
-            return own
+                        diagonal = -slack
+            return diagonal
         if l >= n or (i >= wp.static(nb) and j >= wp.static(nb)):
             return linear(0.0)
         if i >= wp.static(nb):
@@ -104,19 +108,24 @@ def pair_kernel(kind: ChainKind, linear):
             value = right[i, k, r]
         right_out[c, b, r] = value
         for j in range(wp.static(size)):
-            at = i * wp.static(size) + j
+            offset = i * wp.static(size) + j
             for q in range(p, 2):
-                matrix_out[(p + q) * wp.static(size2) + at, b, r] = entry(blocks, F, fixed, k, i, 2 * b + q, j, n, r)
+                matrix_out[(p + q) * wp.static(size2) + offset, b, r] = entry(
+                    blocks, F, fixed, k, i, 2 * b + q, j, n, r
+                )
             for q in range(2):
-                ahead = entry(blocks, F, fixed, k, i, 2 * b + 2 + q, j, n, r)
-                matrix_out[(3 + 2 * p + q) * wp.static(size2) + at, b, r] = ahead
+                value_ahead = entry(blocks, F, fixed, k, i, 2 * b + 2 + q, j, n, r)
+                matrix_out[(3 + 2 * p + q) * wp.static(size2) + offset, b, r] = value_ahead
 
     return pair
 
 
 @cache
 def unpair_kernel(kind: ChainKind, real, linear):
-    """Directions of wanted rods from the solution: of nodes, and what edges lengthen by."""
+    """Build the kernel that extracts directions.
+
+    `unpair`: write the directions of nodes and the lengthening of edges of wanted rods.
+    """
     nb, dim = kind.block, kind.dim
     V, slack_row = wp.types.vector(dim, real), kind.factor_rows
     longer = tension.longer_function(dim, real, linear)

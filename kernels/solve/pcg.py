@@ -1,8 +1,8 @@
-"""Preconditioned conjugate gradients on chains: every rod is a problem of its own, with its own scalars on the device.
+"""Preconditioned conjugate gradients on uncoupled rods: each rod is solved by itself, with its own scalars on the device.
 
-An iteration is: product and partial p . H p (a thread a node), step length (a thread a rod), update of solution and residual and
-preconditioning (a node; the chain preconditioner: a rod), test and new direction. Residuals are judged in the norm of the
-preconditioner, relative to the first one. Curvature that is not positive beyond rounding ends a solve where it is.
+An iteration computes H p (one thread a node), then step length, update of solution and residual, preconditioning, test and new
+direction (one thread a rod). Residuals are measured in the norm of the preconditioner, relative to the first. Curvature that is not
+positive beyond rounding ends a solve with the solution so far.
 """
 
 from functools import cache
@@ -33,10 +33,15 @@ PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
 
 @cache
 def solver_kernels(kind: ChainKind, linear, preconditioner: str):
-    """Kernels start, product, length, update, turn, and finish of one preconditioner; see the module's text."""
+    """Build the kernels of conjugate gradients with one preconditioner.
+
+    `start`: set solution, residual and first search direction.
+    `product`: compute q = H p.
+    `advance`: take one iteration.
+    """
     nb = kind.block
     H = wp.types.vector(nb, linear)
-    load, _, vector, put = block_functions(nb, linear)
+    load, _, vector, store_vector = block_functions(nb, linear)
     times = product_function(kind, linear)
     substitute = substitute_function(nb, kind.span, linear, dotted=True)
     factor, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
@@ -68,15 +73,15 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         n: int,
         r: int,
     ):
-        """z = M^-1 v along one rod; returns v . z."""
+        """Write z = M^-1 v along one rod; return v . z."""
         if wp.static(by_chain):
             return substitute(factors, v, z, n, r, r)
         total = linear(0.0)
         for k in range(n):
-            here = vector(v, 0, k, r)
-            u = precondition(blocks, here, k, r)
-            put(z, 0, k, r, u)
-            total += wp.dot(here, u)
+            v_k = vector(v, 0, k, r)
+            u = precondition(blocks, v_k, k, r)
+            store_vector(z, 0, k, r, u)
+            total += wp.dot(v_k, u)
         return total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -95,16 +100,16 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         iterations: wp.array(dtype=int),
         busy: wp.array(dtype=int),
     ):
-        """Solution zero, residual the right-hand side, first direction M^-1 r; raises `busy`."""
+        """Set the solution to zero, the residual to the right-hand side and p to M^-1 r; raise `busy`."""
         r = wp.tid()
         if wanted[r] == 0:
             return
         n = count[r]
         total = apply(blocks, factors, right, z, n, r)
         for k in range(n):
-            put(residual, 0, k, r, vector(right, 0, k, r))
-            put(p, 0, k, r, vector(z, 0, k, r))
-            put(solution, 0, k, r, H())
+            store_vector(residual, 0, k, r, vector(right, 0, k, r))
+            store_vector(p, 0, k, r, vector(z, 0, k, r))
+            store_vector(solution, 0, k, r, H())
         rho[r] = total
         rho_first[r] = total
         iterations[r] = 0
@@ -122,12 +127,12 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         q_out: wp.array3d(dtype=linear),
         busy_out: wp.array(dtype=int),
     ):
-        """q = H p."""
+        """Write q = H p."""
         k, r = wp.tid()
         if k == 0 and r == 0:
             busy_out[0] = 0
         if wanted[r] == 1 and k < count[r]:
-            put(q_out, 0, k, r, times(blocks, p, k, count[r], r))
+            store_vector(q_out, 0, k, r, times(blocks, p, k, count[r], r))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(
@@ -148,7 +153,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         busy: wp.array(dtype=int),
         negative: wp.array(dtype=int),
     ):
-        """Step length, new residual, preconditioning, test, new direction; `wanted` becomes 2 where a rod is done."""
+        """Take a step, precondition, test, and set the new direction; `wanted` becomes 2 when a rod is done."""
         r = wp.tid()
         if wanted[r] != 1:
             return
@@ -167,8 +172,8 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
             return
         alpha = rho[r] / curvature
         for k in range(n):
-            put(solution, 0, k, r, vector(solution, 0, k, r) + alpha * vector(p, 0, k, r))
-            put(residual, 0, k, r, vector(residual, 0, k, r) - alpha * vector(q, 0, k, r))
+            store_vector(solution, 0, k, r, vector(solution, 0, k, r) + alpha * vector(p, 0, k, r))
+            store_vector(residual, 0, k, r, vector(residual, 0, k, r) - alpha * vector(q, 0, k, r))
         total = apply(blocks, factors, residual, z, n, r)
         iterations[r] = iterations[r] + 1
         beta = total / rho[r]
@@ -177,7 +182,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
             wanted[r] = 2
             return
         for k in range(n):
-            put(p, 0, k, r, vector(z, 0, k, r) + beta * vector(p, 0, k, r))
+            store_vector(p, 0, k, r, vector(z, 0, k, r) + beta * vector(p, 0, k, r))
         busy[0] = 1
 
     return start, product, advance
@@ -185,11 +190,13 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
 
 @cache
 def repeat_kernel(real, fails: bool, exact: bool = True):
-    """Where the exact Hessian is indefinite: end the solve (`fails`), or undo the acceptance and ask for the iterate again.
+    """Build the kernel that handles an indefinite exact Hessian.
 
-    `negative` counts lost pivots and negative curvatures of this iteration; `clamped` then leaves the geometric stiffness and
-    what compression takes away out of the next matrix, and the line search, which has the same numbers, accepts again.
-    `done` says that the direction has been found; `exact` that the matrix is the exact Hessian, unless it is indefinite.
+    `repeat`: end the solve (if it `fails`), or undo the acceptance and repeat the iterate.
+
+    `negative` counts lost pivots and negative curvatures of this iteration. `clamped` then drops the geometric stiffness and
+    compression from the next matrix, and the line search accepts again on the same numbers. `done`: the direction has been computed.
+    `exact`: the matrix is the exact Hessian unless that is indefinite.
     """
 
     out_of_patience = patience_function(real)
@@ -222,7 +229,10 @@ def repeat_kernel(real, fails: bool, exact: bool = True):
 
 @cache
 def take_kernel(kind: ChainKind, real, linear):
-    """Take the direction that was found: cap its rotation, move, and keep its decrement r . d."""
+    """Build the kernel that takes a direction.
+
+    `take`: cap the rotation, move, and store the predicted decrease r . d.
+    """
     dim = kind.dim
     V = wp.types.vector(dim, real)
     place, turn_angles, _, _ = search_functions(kind, real, linear)

@@ -1,7 +1,8 @@
-"""Elimination of one node: L D L^T of its symmetric block and what that does to the blocks it couples to.
+"""Elimination of one node: L D L^T of its symmetric block, and updates of the blocks that couple to it.
 
-A block of a slender rod holds stretching and bending stiffness, (l/r)^2 apart, so an explicit inverse by cofactors loses twice
-the digits; L D L^T with scalar pivots loses them once. Sizes 2, 3 and 4 are written out, so that everything stays in registers.
+A block of a slender rod mixes stretching and bending stiffness, a factor of (l/r)^2 apart. An explicit inverse by cofactors loses
+twice the digits of that factor, L D L^T with scalar pivots once. Sizes 2, 3 and 4 are written out, so that everything stays in
+registers.
 """
 
 from functools import cache
@@ -11,7 +12,13 @@ import warp as wp
 
 @cache
 def functions(size: int, real, sides: int | None = None):
-    """factor(A) -> (L, inverse pivots, negative pivots); lower(L, B) = L^-1 B; upper(L, d, Z) = L^-T D^-1 Z; the same for vectors.
+    """Return the device functions `factor`, `lower`, `upper`, `lower_vector`, `upper_vector` and `congruence`.
+
+    `factor(A) -> (L, inverse pivots, lost pivots)`: L D L^T.
+    `lower(L, B)`: L^-1 B.
+    `upper(L, inverse, Z)`: L^-T D^-1 Z.
+    `lower_vector`, `upper_vector`: solve for vectors.
+    `congruence(A, inverse, B)`: A^T D^-1 B.
 
     B and Z have as many columns as a block, or `sides`.
     """
@@ -21,7 +28,7 @@ def functions(size: int, real, sides: int | None = None):
 
     @wp.func
     def inverse_pivot(d: real, diagonal: real):
-        """1/d and 0, or for a pivot lost to rounding or negative: that of a small positive one, and 1."""
+        """Return (1/d, 0); for a negative pivot or one lost in rounding that of a small positive pivot, and 1."""
         floor = tiny * wp.abs(diagonal)
         if d > floor:
             return real(1.0) / d, int(0)
@@ -119,7 +126,7 @@ def functions(size: int, real, sides: int | None = None):
 
     @wp.func
     def congruence(A: M, inverse: H, B: M):
-        """A^T D^-1 B."""
+        """Return A^T D^-1 B."""
         out = M()
         for i in range(wp.static(size)):
             out += wp.outer(A[i] * inverse[i], B[i])
@@ -130,7 +137,7 @@ def functions(size: int, real, sides: int | None = None):
 
 @cache
 def signed_functions(size: int, negative: int, real):
-    """The same of a quasi-definite block: its last `negative` pivots are to be so; those of a definite one, if there are none."""
+    """Return the functions of `functions` for a quasi-definite block, with the last `negative` pivots negative."""
     if not negative:
         return functions(size, real)
     H, M = wp.types.vector(size, real), wp.types.matrix((size, size), real)
@@ -139,7 +146,7 @@ def signed_functions(size: int, negative: int, real):
 
     @wp.func
     def inverse_pivot(d: real, diagonal: real, sign: real):
-        """1/d and 0, or for a pivot lost to rounding or of the other sign: that of a small one of its own, and 1."""
+        """Return (1/d, 0); for a pivot of the wrong sign or lost in rounding that of a small one of `sign`, and 1."""
         floor = tiny * wp.abs(diagonal)
         if sign * d > floor:
             return real(1.0) / d, int(0)
@@ -160,9 +167,9 @@ def signed_functions(size: int, negative: int, real):
                 W[i, j] = w
                 L[i, j] = w * inverse[j]
                 d -= L[i, j] * w
-            own, bad = inverse_pivot(d, A[i, i], wp.where(i < wp.static(positive), real(1.0), real(-1.0)))
-            inverse[i] = own
-            lost += bad
+            inverse_d, lost_here = inverse_pivot(d, A[i, i], wp.where(i < wp.static(positive), real(1.0), real(-1.0)))
+            inverse[i] = inverse_d
+            lost += lost_here
         return L, inverse, lost
 
     @wp.func

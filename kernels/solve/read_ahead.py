@@ -1,4 +1,4 @@
-"""How the sweep reads what elements have written, and what its elimination has left: a node ahead, or when it is needed."""
+"""Reads of the sweep: factor rows of elements and kept data of eliminated nodes, prefetched or on demand."""
 
 from functools import cache
 
@@ -8,9 +8,14 @@ from ddg_warp.kernels.chain import ChainKind
 
 
 @cache
-def read_functions(kind: ChainKind, linear, rows: int, ahead: bool):
-    """rows_of(F, k, r): all rows of the elements that begin at a node, where these are read ahead; of them or of F itself entry(...),
-    part(...) of a node and with_angle(...); and positions(c): c times the identity of a node's positions.
+def read_functions(kind: ChainKind, linear, rows: int, prefetch: bool):
+    """Return the device functions `rows_of`, `entry`, `part`, `with_angle` and `positions`.
+
+    `rows_of(F, k, r)`: all rows of the elements that start at node k if `prefetch`, else nothing.
+    `entry`: one entry, of prefetched rows or of F.
+    `part`: the entries of a node's position.
+    `with_angle`: a vector with the twist angle's entry added.
+    `positions(c)`: c times the identity of a node's position.
     """
     dim, nb, twist, angle = kind.dim, kind.block, kind.twist, kind.block - 1
     H, M, Rows = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), wp.types.vector(rows, linear)
@@ -18,14 +23,14 @@ def read_functions(kind: ChainKind, linear, rows: int, ahead: bool):
     @wp.func
     def rows_of(F: wp.array3d(dtype=linear), k: int, r: int):
         v = Rows()
-        if wp.static(ahead):
+        if wp.static(prefetch):
             for i in range(wp.static(rows)):
                 v[i] = F[i, k, r]
         return v
 
     @wp.func
     def entry(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int):
-        if wp.static(ahead):
+        if wp.static(prefetch):
             return f[row]
         else:
             return F[row, k, r]
@@ -55,21 +60,26 @@ def read_functions(kind: ChainKind, linear, rows: int, ahead: bool):
 
 
 @cache
-def keep_functions(nb: int, linear, size: int, ahead: bool):
-    """kept(Y, k, r): all that the elimination of a node has left, where it is read ahead; left_at(...) and times(...) a vector."""
+def keep_functions(nb: int, linear, size: int, prefetch: bool):
+    """Return the device functions `kept`, `left_at` and `times`.
+
+    `kept(Y, k, r)`: all kept data of an eliminated node if `prefetch`, else nothing.
+    `left_at`: one entry of the kept data.
+    `times`: a kept block times a vector.
+    """
     H, Kept = wp.types.vector(nb, linear), wp.types.vector(size, linear)
 
     @wp.func
     def kept(Y: wp.array3d(dtype=linear), k: int, r: int):
         v = Kept()
-        if wp.static(ahead):
+        if wp.static(prefetch):
             for i in range(wp.static(size)):
                 v[i] = Y[i, k, r]
         return v
 
     @wp.func
     def left_at(left: Kept, Y: wp.array3d(dtype=linear), row: int, k: int, r: int):
-        if wp.static(ahead):
+        if wp.static(prefetch):
             return left[row]
         else:
             return Y[row, k, r]

@@ -1,13 +1,14 @@
-"""The chain sweep: one thread a rod takes a Newton iteration from element factors and forces to new dofs.
+"""Block LDL^T sweep of a rod: one thread takes a Newton iteration from element factors and forces to new dofs.
 
-The matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts there):
-H = sum F^T F + c I (edges) + inertia, and the geometric stiffness if asked for. The sweep forms its blocks in registers, takes the
-residual of `balance`, eliminates node by node, and at the end of the rod knows the change of the energy and the Newton decrement
-r^T H^-1 r. It then either rejects the iterate and shortens the step, or substitutes back and takes the next step. No physics
-here: strains are rows.
+The matrix of an open rod is block-pentadiagonal; a block has the position of a node and the twist angle of the edge that starts
+there. It is H = sum F^T F + c I (edges) + inertia, plus the geometric stiffness if enabled.
 
-Line search (Armijo, c = 1e-4) on the energy, summed as differences element by element. Where the expected decrease drowns in
-rounding, the decrement decides instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
+The sweep forms blocks in registers, reads the residual of `balance` and eliminates node by node. At the end of the rod it knows the
+change of the energy and the predicted decrease r^T H^-1 r. Then it either rejects the iterate and shortens the step, or substitutes
+back and takes the next step. Physics enters as factor rows only.
+
+Line search (Armijo, c = 1e-4) on the energy, summed as differences per element. If the predicted decrease is below the rounding
+floor, a smaller r^T H^-1 r accepts instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
 """
 
 from functools import cache
@@ -50,11 +51,13 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 def sweep_kernel(
     kind: ChainKind, real, linear, exact_from: int | None = None, fails: bool = False, split: bool = False
 ):
-    """The sweep for one kind of chain; see the module's text.
+    """Build the kernel of one Newton iteration for one kind of rod.
 
-    From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
-    with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
-    With `split`, factors end with the slack of edges, and directions with what edges lengthen by: see `kernels.solve.tension`.
+    `sweep`: eliminate, test the iterate, and shorten the step or take the next one.
+
+    From iteration `exact_from` on, the matrix includes the geometric stiffness G. A lost pivot ends the solve if it `fails`.
+    Otherwise the iterate is repeated with `clamped[r]` raised: without compression and, for this iteration, without G. If `split`,
+    factors end with the slack of edges, and directions with the lengthening of edges; see `kernels.solve.tension`.
     """
     balanced, _ = judge_functions(kind.twist, real)
     out_of_patience = patience_function(real)
@@ -64,21 +67,21 @@ def sweep_kernel(
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
     angle, rows = nb - 1, kind.factor_rows + split
-    # in float64 twice as many registers are more than a GPU has: 10 % slower on an H200
-    ahead = kind.serial or linear == wp.float32
-    beyond = 2 * nb2 + nb  # of what is kept, where that of tensions begins
-    kept_size = beyond + (tension.kept_rows(nb) if split else 0)
+    # Measured: in float64 prefetching takes more registers than a GPU has; 10 % slower on an H200.
+    prefetch = kind.serial or linear == wp.float32
+    tension_row = 2 * nb2 + nb  # row of the kept data where tensions begin
+    kept_size = tension_row + (tension.kept_rows(nb) if split else 0)
     Pending, eliminate = tension.functions(nb, linear)
     longer = tension.longer_function(dim, real, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
     slack_row = kind.factor_rows
     aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
-    rows_of, entry, part, with_angle, positions = read_functions(kind, linear, rows, ahead)
-    kept, left_at, times = keep_functions(nb, linear, kept_size, ahead)
+    rows_of, entry, part, with_angle, positions = read_functions(kind, linear, rows, prefetch)
+    kept, left_at, times = keep_functions(nb, linear, kept_size, prefetch)
     _, store, vector, _ = block_functions(nb, linear)
 
-    # what exceeds 255 registers goes to shared memory: 8 % on an H200; with tensions it is too much, and costs 12 %
+    # Measured: spilling registers beyond 255 to shared memory gains 8 % on an H200; with tensions it costs 12 %.
     @wp.kernel(
         module="unique",
         enable_backward=False,
@@ -112,7 +115,7 @@ def sweep_kernel(
         base: wp.array2d(dtype=V),
         Y: wp.array3d(dtype=linear),
         direction: wp.array3d(dtype=linear),
-        # state of the search
+        # state of the line search
     ):
         r = wp.tid()
         if balanced(flags, scalars, r):
@@ -138,16 +141,16 @@ def sweep_kernel(
         if wp.static(split):
             pending = Pending()
             pending.pivot = linear(1.0)
-        # What the next node has is read before this one is dealt with: a thread that walks waits for memory most of the time.
+        # Prefetch: data of the next node is read before this node is processed, since a sweeping thread mostly waits for memory.
         f = rows_of(F, 0, r)
         rj = vector(right, 0, 0, r)
         mask = fixed[0, r]
         more = energy_change[0, r]
         rounding = energy_noise[0, r]
-        own = real(0.0)
+        node_mass = real(0.0)
         spin = real(0.0)
         if wp.static(not drag):
-            own = mass[0, r]
+            node_mass = mass[0, r]
         if wp.static(twist):
             spin = rotary[0, r]
         for j in range(n):
@@ -157,10 +160,10 @@ def sweep_kernel(
             mask_ahead = fixed[next, r]
             more_ahead = energy_change[next, r]
             rounding_ahead = energy_noise[next, r]
-            own_ahead = real(0.0)
+            node_mass_ahead = real(0.0)
             spin_ahead = real(0.0)
             if wp.static(not drag):
-                own_ahead = mass[next, r]
+                node_mass_ahead = mass[next, r]
             if wp.static(twist):
                 spin_ahead = rotary[next, r]
             if wp.static(span == 2):
@@ -205,7 +208,7 @@ def sweep_kernel(
                     for i in range(wp.static(dim)):
                         Waa[d, i] = Waa[d, i] + linear(resistance[d, i])
             else:
-                inertia = linear(c * own)
+                inertia = linear(c * node_mass)
             for d in range(wp.static(dim)):
                 Waa[d, d] = Waa[d, d] + inertia
             if wp.static(twist):
@@ -227,10 +230,10 @@ def sweep_kernel(
                 ra = wp.cw_mul(ra, free)
                 if wp.static(split):
                     unmasked = free
-            # columns of held dofs ahead stay: their solution is zero, and what they gather is masked with their rows
+            # Columns of fixed dofs ahead stay: the solution there is zero, and gathered values are masked with the rows.
 
-            L, inverse, bad = factor_block(Waa)
-            lost_here += bad
+            L, inverse, lost_pivots = factor_block(Waa)
+            lost_here += lost_pivots
             z = lower_vector(L, rj + ra)
             newton += real(wp.dot(wp.cw_mul(z, inverse), z))
             y = upper_vector(L, inverse, z)
@@ -274,11 +277,11 @@ def sweep_kernel(
                     ahead_too = out.ahead + out.behind * q
                     for d in range(wp.static(nb)):
                         Y[wp.static(2 * nb2) + d, j, r] = y[d]
-                        Y[wp.static(beyond) + d, j, r] = ahead_too[d]
-                        Y[wp.static(beyond + nb) + d, j, r] = near[d]
-                        Y[wp.static(beyond + 2 * nb) + d, j, r] = far[d]
-                    Y[wp.static(beyond + 3 * nb), j, r] = q
-                    Y[wp.static(beyond + 3 * nb + 1), j, r] = lag
+                        Y[wp.static(tension_row) + d, j, r] = ahead_too[d]
+                        Y[wp.static(tension_row + nb) + d, j, r] = near[d]
+                        Y[wp.static(tension_row + 2 * nb) + d, j, r] = far[d]
+                    Y[wp.static(tension_row + 3 * nb), j, r] = q
+                    Y[wp.static(tension_row + 3 * nb + 1), j, r] = lag
             else:
                 Wab = M()
                 Wbb = M()
@@ -290,7 +293,7 @@ def sweep_kernel(
             mask = mask_ahead
             more = more_ahead
             rounding = rounding_ahead
-            own = own_ahead
+            node_mass = node_mass_ahead
             spin = spin_ahead
 
         scalars[RESIDUAL, r] = real(worst)
@@ -304,7 +307,7 @@ def sweep_kernel(
             if wp.static(fails):
                 flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
-            # the matrix is indefinite: the same iterate again, without what compression (or curvature) takes away
+            # The matrix is indefinite: repeat the iterate with compression (or the geometric stiffness) dropped.
             flags[CLAMPED, r] = 1
             flags[ACTIVE, 0] = 1
             return
@@ -314,9 +317,9 @@ def sweep_kernel(
             return
         if not first and finite:
             expected = taken * scalars[DECREMENT, r]
-            drowning = floor * noise
-            if expected > real(10.0) * drowning:
-                accept = change <= real(-1.0e-4) * expected + drowning
+            rounding_floor = floor * noise
+            if expected > real(10.0) * rounding_floor:
+                accept = change <= real(-1.0e-4) * expected + rounding_floor
             else:
                 accept = newton <= scalars[DECREMENT, r]
         if not accept:
@@ -324,9 +327,9 @@ def sweep_kernel(
             if flags[HALVINGS, r] > max_halvings:
                 flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return
-            less = shorter(taken, taken * scalars[DECREMENT, r], change, finite)
-            scalars[STEP_LENGTH, r] = less
-            scalars[ANGLE_CHANGE, r] = less - taken
+            shortened = shorter(taken, taken * scalars[DECREMENT, r], change, finite)
+            scalars[STEP_LENGTH, r] = shortened
+            scalars[ANGLE_CHANGE, r] = shortened - taken
             flags[TODO, r] = wp.static(PLACE)
             flags[ACTIVE, 0] = 1
             return
@@ -346,7 +349,7 @@ def sweep_kernel(
         flags[LOST, r] = flags[LOST, r] + lost_here
         if wp.static(twist):
             if flags[STALE, r] != 0:
-                # angles mean something else in new frames: take no step, and ask for a direction there
+                # Twist angles change meaning in updated frames: take no step, and compute a direction there.
                 flags[STALE, r] = 0
                 scalars[DECREMENT, r] = real(1.0e30)
                 scalars[STEP_LENGTH, r] = real(0.0)
@@ -361,31 +364,31 @@ def sweep_kernel(
         rotation = real(0.0)
         x_ahead = V()
         left = kept(Y, n - 1, r)
-        here = x[n - 1, r]
-        turned = real(0.0)
+        x_j = x[n - 1, r]
+        twist_angle = real(0.0)
         if wp.static(twist):
-            turned = theta[n - 1, r]
+            twist_angle = theta[n - 1, r]
         for i in range(n):
             j = n - 1 - i
             before = wp.max(j - 1, 0)
             left_before = kept(Y, before, r)
-            here_before = x[before, r]
-            turned_before = real(0.0)
+            x_before = x[before, r]
+            twist_angle_before = real(0.0)
             if wp.static(twist):
-                turned_before = theta[before, r]
+                twist_angle_before = theta[before, r]
             step = -times(left, Y, 0, j, r, e1)
             if wp.static(span == 2):
                 step -= times(left, Y, wp.static(nb2), j, r, e2)
             if wp.static(split):
-                # the tension ahead is known from the node there; that of the edge behind is for the node before
-                behind = left_at(left, Y, wp.static(beyond + 3 * nb), j, r) * pulled
-                behind -= left_at(left, Y, wp.static(beyond + 3 * nb + 1), j, r)
+                # The tension ahead is known from the node there; the tension of the edge behind is for the node before.
+                tension_behind = left_at(left, Y, wp.static(tension_row + 3 * nb), j, r) * pulled
+                tension_behind -= left_at(left, Y, wp.static(tension_row + 3 * nb + 1), j, r)
                 for d in range(wp.static(nb)):
-                    step[d] = step[d] - left_at(left, Y, wp.static(beyond) + d, j, r) * pulled
-                    behind += left_at(left, Y, wp.static(beyond + nb) + d, j, r) * e1[d]
-                    behind += left_at(left, Y, wp.static(beyond + 2 * nb) + d, j, r) * e2[d]
+                    step[d] = step[d] - left_at(left, Y, wp.static(tension_row) + d, j, r) * pulled
+                    tension_behind += left_at(left, Y, wp.static(tension_row + nb) + d, j, r) * e1[d]
+                    tension_behind += left_at(left, Y, wp.static(tension_row + 2 * nb) + d, j, r) * e2[d]
                 pull = pulled
-                pulled = behind
+                pulled = tension_behind
             for d in range(wp.static(nb)):
                 step[d] = step[d] + left_at(left, Y, wp.static(2 * nb2) + d, j, r)
                 direction[d, j, r] = step[d]
@@ -395,20 +398,20 @@ def sweep_kernel(
                 dx[d] = real(step[d])
                 bent[d] = real(e1[d] - step[d])
             if i > 0:
-                span_sq = wp.length_sq(x_ahead - here)
+                span_sq = wp.length_sq(x_ahead - x_j)
                 rotation = wp.max(rotation, wp.length_sq(bent) / span_sq)
                 if wp.static(split):
                     slack = F[wp.static(slack_row), j, r]
-                    direction[wp.static(nb), j, r] = longer(slack, pull, per_root, x_ahead - here, bent)
-            x_ahead = here
-            x[j, r] = here + dx
+                    direction[wp.static(nb), j, r] = longer(slack, pull, per_root, x_ahead - x_j, bent)
+            x_ahead = x_j
+            x[j, r] = x_j + dx
             if wp.static(twist):
-                theta[j, r] = turned + real(step[wp.static(angle)])
+                theta[j, r] = twist_angle + real(step[wp.static(angle)])
             e2 = e1
             e1 = step
             left = left_before
-            here = here_before
-            turned = turned_before
+            x_j = x_before
+            twist_angle = twist_angle_before
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)

@@ -1,16 +1,18 @@
-"""Elimination of a node with the tensions of its edges as unknowns of their own.
+"""Mixed axial-force formulation: elimination of a node with the tensions of its edges as extra unknowns.
 
-Stretching of an edge, k |t . de|^2 / 2, may be stiffer than the rest of a rod's matrix by more than float32 has digits. What exceeds
-the share k' that the matrix can carry is taken as a constraint with a little slack: with the row r = sqrt(k') (-t, t) of an edge, and
-s = k' / (k - k'), the matrix H + r^T r / s is the Schur complement of
+The stretching energy of an edge, k |t . de|^2 / 2, may be stiffer than the remaining matrix of a rod by more digits than float32 has.
+Stiffness beyond k', which the matrix can carry, becomes a constraint with a little slack. With the row r = sqrt(k') (-t, t) of an
+edge and s = k' / (k - k'), the matrix H + r^T r / s is the Schur complement of
 
     [ H   r^T ]
     [ r   -s  ],
 
-which is quasi-definite where H is positive definite: L D L^T exists in any order of elimination (Vanderbei, SIAM J. Optim. 5, 1995,
-100). Which order is not all the same: a tension eliminated before one of its nodes leaves the full stiffness in the other's block, so
-that it waits until both are gone. Tensions are increments that are found in the solve for a step and then forgotten, but for how much
-their edges lengthen, s T / sqrt(k'): in a turned step that is exact, where the difference of displacements has lost it in rounding.
+which is quasi-definite if H is positive definite: L D L^T exists in any order of elimination (Vanderbei, SIAM J. Optim. 5, 1995,
+100). The order still matters. A tension eliminated before one of its nodes leaves the full stiffness in the other node's block, so it
+is eliminated after both.
+
+Tensions are increments of one linear solve. Only the lengthening of edges, s T / sqrt(k'), is kept: in an edge-rotation update it is
+exact, while the difference of displacements has lost it in rounding.
 """
 
 from functools import cache
@@ -21,20 +23,22 @@ from ddg_warp.kernels.solve import pivot
 
 
 def kept_rows(size: int) -> int:
-    """Reals of a node that substitution needs beyond its blocks."""
+    """Return the number of reals that substitution needs for a node, beyond its blocks."""
     return 3 * size + 2
 
 
 @cache
 def functions(size: int, linear):
-    """Struct `Pending`, and eliminate(L, inverse, z, Zb, Zc, pending, row, slack, free) -> what it leaves.
+    """Return the struct `Pending` and the device function `eliminate(...) -> Eliminated`.
 
-    Pending is a tension that waits for a node: what couples it to that node and to the one ahead, its negative pivot and its right-hand
-    side. What is eliminated are a node, by the factors, right-hand side and couplings L^-1 of its block (`pivot.functions`), and the
-    tension of the edge behind it. They leave `weight` (b, c) (b, c)^T in the two blocks ahead, and `weight` `right` (b, c) on their
-    right-hand sides; the tension behind, T = `weight` (b . e1 + c . e2 + `coupling` T_ahead - `right`); what it and the one ahead do
-    to the node, `behind` and `ahead`; and, pending, the tension of the edge ahead, whose row is -`row` on the node and `row` on the
-    next. `slack` is zero where there is none; `free` is one for dofs that are.
+    `Pending` is a tension waiting for a node: its coupling to that node and to the node ahead, its negative pivot and its right-hand
+    side. `eliminate` eliminates a node, given the factors, right-hand side and couplings L^-1 of its block (`pivot.functions`), and
+    the tension of the edge behind.
+
+    Updates of the two blocks ahead are `weight` (b, c) (b, c)^T, of their right-hand sides `weight` `right` (b, c). The tension
+    behind is T = `weight` (b . e1 + c . e2 + `coupling` T_ahead - `right`). `behind` and `ahead` are the effects of the two tensions
+    on the node. `pending` is the tension of the edge ahead, with row -`row` on the node and `row` on the next. `slack` is zero
+    without a tension; `free` is one for free dofs.
     """
     H, M = wp.types.vector(size, linear), wp.types.matrix((size, size), linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.functions(size, linear)
@@ -73,11 +77,11 @@ def functions(size: int, linear):
             u = lower_vector(L, -wp.cw_mul(row, free))
             ud = wp.cw_mul(u, inverse)
             q = -wp.dot(ud, g)
-            share = q * out.weight
-            next.pivot = slack + wp.dot(ud, u) - q * share
-            next.right = share * out.right - wp.dot(ud, z)
-            next.node = row - ud * Zb + share * out.b
-            next.ahead = share * out.c - ud * Zc
+            coupling = q * out.weight
+            next.pivot = slack + wp.dot(ud, u) - q * coupling
+            next.right = coupling * out.right - wp.dot(ud, z)
+            next.node = row - ud * Zb + coupling * out.b
+            next.ahead = coupling * out.c - ud * Zc
             out.coupling = q
             out.ahead = upper_vector(L, inverse, u)
         out.pending = next
@@ -88,9 +92,10 @@ def functions(size: int, linear):
 
 @cache
 def longer_function(dim: int, real, linear):
-    """longer(slack, pull, per_root, edge, step): what an edge lengthens by, from its tension or, without slack, from its step.
+    """Return the device function `longer(slack, pull, per_root, edge, step) -> lengthening` of an edge.
 
-    `pull` is its tension, `per_root` the reciprocal of sqrt(k'), and `step` the difference of the displacements of its nodes.
+    It follows from the tension or, without slack, from the step. `pull`: tension of the edge. `per_root`: 1 / sqrt(k'). `step`:
+    difference of the displacements of its nodes.
     """
     V = wp.types.vector(dim, real)
 

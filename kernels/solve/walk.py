@@ -1,7 +1,7 @@
-"""The chains of a net on the CPU: a thread takes one from what its elements write to the solution.
+"""Rod paths of the coupled system on the CPU: one thread takes a path from element contributions to the solution.
 
-Blocks of places are summed, eliminated and substituted in one walk, as in `sweep`, and H is never stored. A GPU has a thread for each
-place to sum them; see `matrix.bands`, `matrix.chain_blocks` and `elimination`.
+Blocks of path nodes are assembled, eliminated and substituted in one sweep, as in `sweep`, and H is never stored. A GPU assembles
+with one thread a path node; see `matrix.bands`, `matrix.chain_blocks` and `elimination`.
 """
 
 from functools import cache
@@ -30,17 +30,18 @@ def walk_kernel(
     drag: bool,
     joined: bool,
 ):
-    """walk(...): H_II^-1 r_I of every column of chains; notes where a pivot is lost or negative; see `elimination`.
+    """Build the kernel that solves rod paths on the CPU.
 
-    Where there are joints, chains are `joined`: factors and solution stay at the places, for what joints make of them. Else the
-    solution goes to the blocks z.
+    `walk`: compute H_II^-1 r_I of every path, and mark worlds with lost or negative pivots; see `elimination`.
+
+    If paths are `joined`, factors and solution stay at path nodes, for the joints. Otherwise the solution goes to the blocks z.
     """
     nb = 4 if twist else 3
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
     blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
     value = value_function(twist, linear)
-    load, store, vector, put = block_functions(nb, linear)
+    load, store, vector, store_vector = block_functions(nb, linear)
     factor, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -50,12 +51,12 @@ def walk_kernel(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        set0: Along,
+        set1: Along,
+        set2: Along,
+        set3: Along,
+        set4: Along,
+        set5: Along,
         right: wp.array(dtype=H),
         blocks: int,
         factors: wp.array3d(dtype=linear),
@@ -70,16 +71,18 @@ def walk_kernel(
             return
         n = layout.count[c]
         shift = first_of(w, blocks)
-        bad = int(0)
-        minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
+        lost_pivots = int(0)
+        minus = (
+            M()
+        )  # updates of the diagonal block of this node, of its coupling, and of the next block, by the nodes before
         minus_couple = M()
         minus_next = M()
         before = B()
         before2 = B()
         for k in range(n):
-            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, own0, own1, own2, own3, own4, own5, k, c, w)
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, set0, set1, set2, set3, set4, set5, k, c, w)
             L, inverse, lost_here = factor(D - minus)
-            bad += lost_here
+            lost_pivots += lost_here
             Zb = lower(L, E - minus_couple)
             U = upper(L, inverse, Zb)
             minus = minus_next + congruence(Zb, inverse, Zb)
@@ -95,9 +98,9 @@ def walk_kernel(
                 store(factors, wp.static(nb**2), k, r, V)
             if wp.static(joined):
                 store(factors, wp.static(2 * nb**2), k, r, L)
-                put(factors, wp.static(3 * nb**2), k, r, inverse)
-            put(values, 0, k, r, upper_vector(L, inverse, lower_vector(L, u)))
-        if bad > 0:
+                store_vector(factors, wp.static(3 * nb**2), k, r, inverse)
+            store_vector(values, 0, k, r, upper_vector(L, inverse, lower_vector(L, u)))
+        if lost_pivots > 0:
             lost[w] = 1
         e1 = B()
         e2 = B()
@@ -109,7 +112,7 @@ def walk_kernel(
             e2 = e1
             e1 = u
             if wp.static(joined):
-                put(values, 0, k, r, u)
+                store_vector(values, 0, k, r, u)
             else:
                 node = layout.places[0, k, c]
                 if node >= 0:
