@@ -1,1 +1,1 @@
-"""Hessians as blocks: bands of rods, slices of nets."""
+"""Hessians as blocks: bands of rods, slices of the coupled system."""

@@ -1,6 +1,6 @@
-"""H of a net between the places of its chains, in bands: blocks D, E and F of `chain_blocks`, laid out as `block_band` has them.
+"""Bands of H between path nodes of the coupled system: blocks D, E and F of `chain_blocks`, stored as in `block_band`.
 
-Blocks of H that belong to two places of a chain lie here, not among the positions of `matrix.sliced`, which hold all others.
+Blocks of H between two nodes of a path are stored here. The positions of `matrix.sliced` hold all others.
 """
 
 from functools import cache
@@ -20,7 +20,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS, first_of, until_fu
 
 @cache
 def times_functions(nb: int, linear):
-    """along(m, u) and back(m, u): a block and its transpose times a vector, summed in one order by all kernels."""
+    """Return the device functions `along(m, u)` and `back(m, u)`, with one order of summation for all kernels.
+
+    `along`: block times vector.
+    `back`: transposed block times vector.
+    """
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
 
     @wp.func
@@ -54,8 +58,11 @@ def band_kernels(
     serial: bool,
     split: bool = False,
 ):
-    """assemble(...): blocks of places, see `blocks_function`; clear(...): positions of H that they took over; product(...): H p on
-    dofs that are not barred, and p . H p block by block.
+    """Build the kernels of bands.
+
+    `assemble`: write blocks of path nodes, see `blocks_function`.
+    `clear`: zero the positions of H that moved to bands.
+    `product`: compute H p on active dofs, and p . H p by block.
     """
     nb = place_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
@@ -75,12 +82,12 @@ def band_kernels(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        set0: Along,
+        set1: Along,
+        set2: Along,
+        set3: Along,
+        set4: Along,
+        set5: Along,
         blocks_out: wp.array3d(dtype=linear),
     ):
         start, r = wp.tid()
@@ -90,7 +97,7 @@ def band_kernels(
         if flags[WANTED, w] == 0 or layout.idle[r] != 0 or start >= n:
             return
         for k in range(start, until(start, n)):
-            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, own0, own1, own2, own3, own4, own5, k, c, w)
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, set0, set1, set2, set3, set4, set5, k, c, w)
             store(blocks_out, 0, k, r, D)
             store(blocks_out, wp.static(nb**2), k, r, E)
             if wp.static(span == 2):
@@ -120,16 +127,20 @@ def band_kernels(
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
         threads: int,
-        apart: wp.array(dtype=int),
+        separate_blocks: wp.array(dtype=int),
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """`threads` have places, in tiles of `TILE` chains, whose neighbours read what the cache still has; others blocks `apart`."""
+        """Write H p and p . H p by block.
+
+        The first `threads` threads have path nodes, in tiles of `TILE` paths, so that neighbouring nodes are still cached. The others
+        have `separate_blocks`.
+        """
         tid = wp.tid()
         if tid >= threads:
-            w = (tid - threads) / apart.shape[0]
+            w = (tid - threads) / separate_blocks.shape[0]
             if wanted[w] == 1:
-                b = apart[tid - threads - w * apart.shape[0]]
+                b = separate_blocks[tid - threads - w * separate_blocks.shape[0]]
                 settle(matrix, columns, slices, barred, p, blocks, positions, b, w, H(), product_out, dots_out)
             return
         tile = tid / (bands.shape[1] * TILE)
@@ -168,7 +179,10 @@ def band_kernels(
 
 @cache
 def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
-    """walk(...): the same product by one thread, for the CPU: it reads each block once, and goes on with what its transpose adds."""
+    """Build the kernel of the product on the CPU.
+
+    `walk`: compute H p path by path; each block is read once, and its transposed product carried to later nodes.
+    """
     nb = place_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     load, _, _, _ = block_functions(nb, linear)
@@ -207,26 +221,26 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
                 if idle[r] != 0:
                     continue
                 n = count[c]
-                here, ahead = value(p, places, 0, c, shift), B()
+                u_here, u_ahead = value(p, places, 0, c, shift), B()
                 if n > 1:
-                    ahead = value(p, places, 1, c, shift)
-                before, before_too, later = B(), B(), B()  # what E and F of places behind add here, and F to the next
+                    u_ahead = value(p, places, 1, c, shift)
+                before, before2, next_before2 = B(), B(), B()  # products of E and F of nodes before; of F for the next
                 for k in range(n):
-                    beyond = B()
+                    u_beyond = B()
                     if k + 2 < n:
-                        beyond = value(p, places, k + 2, c, shift)
+                        u_beyond = value(p, places, k + 2, c, shift)
                     E = load(bands, wp.static(nb**2), k, r)
-                    u = along(load(bands, 0, k, r), here)
-                    u += along(E, ahead)
+                    u = along(load(bands, 0, k, r), u_here)
+                    u += along(E, u_ahead)
                     u += before
-                    before = back(E, here)
+                    before = back(E, u_here)
                     if wp.static(span == 2):
                         F = load(bands, wp.static(2 * nb**2), k, r)
-                        u += along(F, beyond)
-                        u += before_too
-                        before_too = later
-                        later = back(F, here)
-                    here, ahead = ahead, beyond
+                        u += along(F, u_beyond)
+                        u += before2
+                        before2 = next_before2
+                        next_before2 = back(F, u_here)
+                    u_here, u_ahead = u_ahead, u_beyond
                     node = places[0, k, c]
                     if node >= 0:
                         product_out[node + shift] += H(u[0], u[1], u[2])
@@ -244,21 +258,24 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
 
 @cache
 def lengthen_kernel(terms: tuple[Term, ...], real, linear):
-    """lengthen(...): slack of the edges behind places, and what they lengthen by, from solutions that end with tensions."""
+    """Build the kernel of edge lengthening.
+
+    `lengthen`: write slack and lengthening of the edges behind path nodes, from solutions with tensions.
+    """
     Layout, Along = layout_type(), along_type(real, linear)
-    behind = behind_function(terms, real, linear)
+    tension_behind = behind_function(terms, real, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lengthen(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        set0: Along,
+        set1: Along,
+        set2: Along,
+        set3: Along,
+        set4: Along,
+        set5: Along,
         values: wp.array3d(dtype=linear),
         longer_out: wp.array3d(dtype=linear),
     ):
@@ -267,7 +284,7 @@ def lengthen_kernel(terms: tuple[Term, ...], real, linear):
         c = r - w * layout.count.shape[0]
         if flags[WANTED, w] == 0 or k >= layout.count[c]:
             return
-        _t, slack = behind(own0, own1, own2, own3, own4, own5, k, c, w)
+        _t, slack = tension_behind(set0, set1, set2, set3, set4, set5, k, c, w)
         longer_out[0, k, r] = slack
         longer_out[1, k, r] = (
             slack * values[values.shape[0] - 1, k, r] * linear(real(1.0) / wp.sqrt(scalars[CARRIED, w]))

@@ -1,8 +1,8 @@
-"""The system of a chain as blocks, open or closed: assembly by gather, product, and its block LDL^T.
+"""Block-banded system of a rod, open or closed: assembly, product and block LDL^T.
 
-Node k has the blocks D_k, its coupling E_k to node k + 1 and F_k to node k + 2 (modulo the nodes of a closed rod), which lie in
-one array of 3 nb^2 rows: [component][node][rod]. Every block is gathered by one thread, so sums come in one order, without
-atomics. Rows and columns of held dofs are those of the identity.
+Node k has the blocks D_k, E_k (coupling to node k + 1) and F_k (to node k + 2; modulo the nodes of a closed rod), in one array of 3
+nb^2 rows: [component][node][rod]. One thread gathers a block, so that sums have a fixed order, without atomics. Rows and columns of
+fixed dofs are rows and columns of the identity.
 """
 
 from functools import cache
@@ -22,7 +22,11 @@ TILE = wp.constant(32)
 
 @cache
 def block_functions(nb: int, linear):
-    """load(A, row, k, r), store(A, row, k, r, M), vector(v, row, k, r), put(v, row, k, r, u) for blocks and block vectors."""
+    """Return the device functions `load`, `store`, `vector` and `store_vector`.
+
+    `load(A, row, k, r)`, `store(A, row, k, r, M)`: read and write a block.
+    `vector(v, row, k, r)`, `store_vector(v, row, k, r, u)`: read and write a block vector.
+    """
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
 
     @wp.func
@@ -47,20 +51,22 @@ def block_functions(nb: int, linear):
         return u
 
     @wp.func
-    def put(v: wp.array3d(dtype=linear), row: int, k: int, r: int, u: H):
+    def store_vector(v: wp.array3d(dtype=linear), row: int, k: int, r: int, u: H):
         for i in range(wp.static(nb)):
             v[row + i, k, r] = u[i]
 
-    return load, store, vector, put
+    return load, store, vector, store_vector
 
 
 @cache
 def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, stored=None):
-    """Blocks of H of every rod that is not in balance.
+    """Build the kernel of assembly.
 
-    From iteration `exact_from` on, H has the geometric stiffness of rods that are not `clamped`. Blocks are `stored` in another
-    precision than they are made in, if one is given. Launched over (tiles of `TILE` rods, nodes, rods of a tile): what three nodes read
-    is still in the cache then.
+    `assemble`: write the blocks of H of every rod that has not converged.
+
+    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not `clamped`. `stored`: precision of the
+    stored blocks, if it differs. Launched over (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still
+    cached.
     """
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
@@ -68,7 +74,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
     stored = stored or linear
-    _, behind, *_ = node_functions(kind, real)
+    _, previous, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     rests = rests_function(real)
     curved, begin = exact_from is not None, exact_from or 0
@@ -82,18 +88,18 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         return v
 
     @wp.func
-    def own(F: wp.array3d(dtype=linear), row: int, k: int, r: int, which: int):
-        """Row of the factor as seen by the first (0), second (1) or third (2) node of the vertex."""
+    def own(F: wp.array3d(dtype=linear), row: int, k: int, r: int, local_node: int):
+        """Return the factor row at the first (0), second (1) or third (2) node of the vertex."""
         v = H()
-        if which == 0:
+        if local_node == 0:
             v = -part(F, row, k, r)
-        if which == 1:
+        if local_node == 1:
             v = part(F, row, k, r) - part(F, row + wp.static(dim), k, r)
-        if which == 2:
+        if local_node == 2:
             v = part(F, row + wp.static(dim), k, r)
         if wp.static(twist):
-            if which < 2:
-                v[wp.static(nb - 1)] = F[row + wp.static(2 * dim) + which, k, r]
+            if local_node < 2:
+                v[wp.static(nb - 1)] = F[row + wp.static(2 * dim) + local_node, k, r]
         return v
 
     @wp.func
@@ -145,7 +151,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         if reuse != 0 and flags[ITERATION, r] > 0:
             return
         c = scalars[COEFFICIENT, r]
-        b = behind(k, n)
+        b = previous(k, n)
         free = free_of(fixed, k, r)
         D = M()
         E = M()
@@ -153,7 +159,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         if wp.static(span == 2):
             bb = int(-1)
             if b >= 0:
-                bb = behind(b, n)
+                bb = previous(b, n)
             for m in range(wp.static(vertex_rows)):
                 row = m * wp.static(window)
                 if wp.static(closed) or k < n - 2:
@@ -202,9 +208,9 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             E = wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r)))
         store(blocks_out, wp.static(nb2), k, r, E)
         if wp.static(span == 2):
-            ahead = along(k + 2, n)
+            second_next = along(k + 2, n)
             if wp.static(closed) or k < n - 2:
-                G = wp.cw_mul(G, wp.outer(free, free_of(fixed, ahead, r)))
+                G = wp.cw_mul(G, wp.outer(free, free_of(fixed, second_next, r)))
             store(blocks_out, wp.static(2 * nb2), k, r, G)
 
     return assemble
@@ -212,10 +218,10 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
 
 @cache
 def product_function(kind: ChainKind, linear):
-    """times(blocks, v, k, n, r): row k of H v."""
+    """Return the device function `times(blocks, v, k, n, r)`: row k of H v."""
     nb2, span, closed = kind.block**2, kind.span, kind.closed
     load, _, vector, _ = block_functions(kind.block, linear)
-    _, behind, *_ = node_functions(kind, wp.float64)
+    _, previous, *_ = node_functions(kind, wp.float64)
     along, *_ = gather_functions(kind, wp.float64)
 
     @wp.func
@@ -223,14 +229,14 @@ def product_function(kind: ChainKind, linear):
         y = load(blocks, 0, k, r) * vector(v, 0, k, r)
         if wp.static(closed) or k < n - 1:
             y += load(blocks, wp.static(nb2), k, r) * vector(v, 0, along(k + 1, n), r)
-        b = behind(k, n)
+        b = previous(k, n)
         if b >= 0:
             y += vector(v, 0, b, r) * load(blocks, wp.static(nb2), b, r)
         if wp.static(span == 2):
             if wp.static(closed) or k < n - 2:
                 y += load(blocks, wp.static(2 * nb2), k, r) * vector(v, 0, along(k + 2, n), r)
             if b >= 0:
-                bb = behind(b, n)
+                bb = previous(b, n)
                 if bb >= 0:
                     y += vector(v, 0, bb, r) * load(blocks, wp.static(2 * nb2), bb, r)
         return y
@@ -240,37 +246,39 @@ def product_function(kind: ChainKind, linear):
 
 @cache
 def factor_function(nb: int, span: int, linear, tensions: int = 0):
-    """factorise(blocks, out, n, r): block LDL^T of an open chain of n nodes; returns how many pivots were lost.
+    """Return the device function `factorise(blocks, out, n, r) -> lost pivots`: block LDL^T of an open rod of n nodes.
 
     Writes U = D^-1 E, D^-1 F, L and inverse pivots of every node (3 nb^2 + nb rows); `out` may be the array of the blocks. The last
-    of the dofs of a node may be `tensions`, with negative pivots.
+    dofs of a node may be `tensions`, with negative pivots.
     """
     nb2 = nb**2
     M = wp.types.matrix((nb, nb), linear)
-    load, store, _, put = block_functions(nb, linear)
+    load, store, _, store_vector = block_functions(nb, linear)
     factor, lower, upper, _, _, congruence = pivot.signed_functions(nb, tensions, linear)
 
     @wp.func
     def factorise(blocks: wp.array3d(dtype=linear), out: wp.array3d(dtype=linear), n: int, r: int):
         lost = int(0)
-        minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
+        minus = (
+            M()
+        )  # updates of the diagonal block of this node, of its coupling, and of the next block, by the nodes before
         minus_couple = M()
         minus_next = M()
-        # what the next node has is read before this one is dealt with; see `substitute_function`
+        # prefetch; see `substitute_function`
         D = load(blocks, 0, 0, r)
         E = load(blocks, wp.static(nb2), 0, r)
         F = M()
         if wp.static(span == 2):
             F = load(blocks, wp.static(2 * nb2), 0, r)
         for j in range(n):
-            ahead = wp.min(j + 1, n - 1)
-            D_ahead = load(blocks, 0, ahead, r)
-            E_ahead = load(blocks, wp.static(nb2), ahead, r)
+            next_j = wp.min(j + 1, n - 1)
+            D_ahead = load(blocks, 0, next_j, r)
+            E_ahead = load(blocks, wp.static(nb2), next_j, r)
             F_ahead = M()
             if wp.static(span == 2):
-                F_ahead = load(blocks, wp.static(2 * nb2), ahead, r)
-            L, inverse, bad = factor(D - minus)
-            lost += bad
+                F_ahead = load(blocks, wp.static(2 * nb2), next_j, r)
+            L, inverse, lost_here = factor(D - minus)
+            lost += lost_here
             B = M()
             if j < n - 1:
                 B = E - minus_couple
@@ -286,7 +294,7 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
                 minus_couple = congruence(Zb, inverse, Zc)
                 minus_next = congruence(Zc, inverse, Zc)
             store(out, wp.static(2 * nb2), j, r, L)
-            put(out, wp.static(3 * nb2), j, r, inverse)
+            store_vector(out, wp.static(3 * nb2), j, r, inverse)
             D = D_ahead
             E = E_ahead
             F = F_ahead
@@ -297,7 +305,10 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
 
 @cache
 def factor_kernel(kind: ChainKind, linear):
-    """Block LDL^T of the open chain's part of H; see `factor_function`."""
+    """Build the kernel of factorisation.
+
+    `factorise`: write the block LDL^T of H without its periodic blocks; see `factor_function`.
+    """
     factor = factor_function(kind.block, kind.span, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -320,13 +331,13 @@ def factor_kernel(kind: ChainKind, linear):
 
 @cache
 def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensions: int = 0):
-    """substitute(factor, v, out, n, r, s): out = (L D L^T)^-1 v along a chain; returns v . out if it is `dotted`.
+    """Return the device function `substitute(factor, v, out, n, r, s)`: out = (L D L^T)^-1 v along a rod.
 
-    The factors lie in column r, the vectors in column s.
+    It returns v . out if `dotted`. Factors are in column r, vectors in column s.
     """
     nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    load, _, vector, put = block_functions(nb, linear)
+    load, _, vector, store_vector = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.signed_functions(nb, tensions, linear)
 
     @wp.func
@@ -338,60 +349,60 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
         r: int,
         s: int,
     ):
-        # What the next node takes is read before this one is dealt with: a thread that walks waits for memory most of the time.
+        # Prefetch: data of the next node is read before this node is processed, since a sweeping thread mostly waits for memory.
         before = H()
         before2 = H()
         U = load(factor, 0, 0, r)
         V = M()
         if wp.static(span == 2):
             V = load(factor, wp.static(nb2), 0, r)
-        here = vector(v, 0, 0, s)
+        value = vector(v, 0, 0, s)
         for j in range(n):
-            ahead = wp.min(j + 1, n - 1)
-            U_ahead = load(factor, 0, ahead, r)
+            next_j = wp.min(j + 1, n - 1)
+            U_ahead = load(factor, 0, next_j, r)
             V_ahead = M()
             if wp.static(span == 2):
-                V_ahead = load(factor, wp.static(nb2), ahead, r)
-            here_ahead = vector(v, 0, ahead, s)
+                V_ahead = load(factor, wp.static(nb2), next_j, r)
+            value_ahead = vector(v, 0, next_j, s)
             # z = D^-1 (v - E^T z_before - ...): with U = D^-1 E stored, E^T D^-1 w = U^T w
-            w = here - before
-            put(out, 0, j, s, w)
+            w = value - before
+            store_vector(out, 0, j, s, w)
             before = before2 + w * U
             if wp.static(span == 2):
                 before2 = w * V
             U = U_ahead
             V = V_ahead
-            here = here_ahead
+            value = value_ahead
         e1 = H()
         e2 = H()
         total = linear(0.0)
         L = load(factor, wp.static(2 * nb2), n - 1, r)
         inverse = vector(factor, wp.static(3 * nb2), n - 1, r)
-        here = vector(out, 0, n - 1, s)
+        value = vector(out, 0, n - 1, s)
         for i in range(n):
             j = n - 1 - i
-            ahead = wp.max(j - 1, 0)
-            U_ahead = load(factor, 0, ahead, r)
+            next_j = wp.max(j - 1, 0)
+            U_ahead = load(factor, 0, next_j, r)
             V_ahead = M()
             if wp.static(span == 2):
-                V_ahead = load(factor, wp.static(nb2), ahead, r)
-            L_ahead = load(factor, wp.static(2 * nb2), ahead, r)
-            inverse_ahead = vector(factor, wp.static(3 * nb2), ahead, r)
-            here_ahead = vector(out, 0, ahead, s)
-            u = upper_vector(L, inverse, lower_vector(L, here))
+                V_ahead = load(factor, wp.static(nb2), next_j, r)
+            L_ahead = load(factor, wp.static(2 * nb2), next_j, r)
+            inverse_ahead = vector(factor, wp.static(3 * nb2), next_j, r)
+            value_ahead = vector(out, 0, next_j, s)
+            u = upper_vector(L, inverse, lower_vector(L, value))
             u -= U * e1
             if wp.static(span == 2):
                 u -= V * e2
             if wp.static(dotted):
                 total += wp.dot(vector(v, 0, j, s), u)
-            put(out, 0, j, s, u)
+            store_vector(out, 0, j, s, u)
             e2 = e1
             e1 = u
             U = U_ahead
             V = V_ahead
             L = L_ahead
             inverse = inverse_ahead
-            here = here_ahead
+            value = value_ahead
         return total
 
     return substitute
@@ -399,9 +410,9 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
 
 @cache
 def substitute_all_function(nb: int, span: int, linear, sides: int):
-    """substitute(factor, v, n, r, s, columns): as above in the place of v, for as many vectors, which are `columns` apart.
+    """Return the device function `substitute(factor, v, n, r, s, columns)`, which overwrites `sides` vectors.
 
-    A thread reads the factors once for all of them.
+    Vectors are `columns` apart. A thread reads the factors once for all of them.
     """
     nb2 = nb**2
     W = wp.types.matrix((nb, sides), linear)
@@ -450,7 +461,10 @@ def substitute_all_function(nb: int, span: int, linear, sides: int):
 
 @cache
 def direct_kernel(kind: ChainKind, linear):
-    """Direction of every rod that wants one, straight from the factors."""
+    """Build the kernel of the direct solve.
+
+    `direct`: compute the search direction of every wanted rod from the factors.
+    """
     substitute = substitute_function(kind.block, kind.span, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

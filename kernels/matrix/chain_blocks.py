@@ -1,7 +1,7 @@
-"""Blocks of H at the places of a net's chains: D of a place, E and F with the next two, as `matrix.block_band` has them.
+"""Blocks of H at path nodes of the coupled system: D of a node, E and F with the next two, as in `matrix.block_band`.
 
-A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none. What elements along rods add is
-summed from what they have written; what other elements, such as joints, add between two places is taken from positions of H.
+A path node has a node and the twist angle of the edge ahead, a dof block of -1 if missing. Contributions of elements along rods are
+summed from element data. Contributions of other elements, such as joints, come from positions of H.
 """
 
 from functools import cache
@@ -20,7 +20,10 @@ from ddg_warp.kernels.threads import first_of
 
 @cache
 def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...], split: bool = False):
-    """add(along..., k, c, w, late) -> D, E, F of what the last of the terms, and by calling itself those before, add at a place."""
+    """Return the device function `add(set0, ..., set5, k, c, w, with_second) -> (D, E, F)` at a path node.
+
+    It adds the contributions of the last of the terms, and calls itself for the terms before.
+    """
     term, curved = terms[-1], exact[-1]
     measure, nb = term.measure, place_dofs(twist, split)
     B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(real, linear)
@@ -37,86 +40,95 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     part = part_function(measure, linear)
 
     @wp.func
-    def row(own: Along, m: int, i: int, e: int):
-        """Factor row of a strain at node i of its element and the angle of the edge ahead."""
+    def row(element_set: Along, m: int, i: int, e: int):
+        """Return the factor row of a strain at node i of an element and the twist angle ahead."""
         v = B()
-        u = part(own.factor, m * wp.static(size), i, e)
+        u = part(element_set.factor, m * wp.static(size), i, e)
         for d in range(3):
             v[d] = u[d]
         if wp.static(twist and angles > 0):
             if i < wp.static(angles):
-                u = part(own.factor, m * wp.static(size), wp.static(nodes) + i, e)
+                u = part(element_set.factor, m * wp.static(size), wp.static(nodes) + i, e)
                 v[3] = u[0]
         return v
 
     @wp.func
-    def between(own: Along, i: int, j: int, e: int):
-        """Second derivatives between nodes i and j and the angles ahead of them."""
+    def between(element_set: Along, i: int, j: int, e: int):
+        """Return second derivatives between nodes i and j, with the twist angles ahead."""
         m = M()
-        u = second_of(own.second, e, i, j)
+        u = second_of(element_set.second, e, i, j)
         for a in range(3):
             for b in range(3):
                 m[a, b] = u[a, b]
         if wp.static(twist and angles > 0):
             if j < wp.static(angles):
-                u = second_of(own.second, e, i, wp.static(nodes) + j)
+                u = second_of(element_set.second, e, i, wp.static(nodes) + j)
                 for a in range(3):
                     m[a, 3] = u[a, 0]
             if i < wp.static(angles):
-                u = second_of(own.second, e, wp.static(nodes) + i, j)
+                u = second_of(element_set.second, e, wp.static(nodes) + i, j)
                 for b in range(3):
                     m[3, b] = u[0, b]
                 if j < wp.static(angles):
-                    u = second_of(own.second, e, wp.static(nodes) + i, wp.static(nodes) + j)
+                    u = second_of(element_set.second, e, wp.static(nodes) + i, wp.static(nodes) + j)
                     m[3, 3] = u[0, 0]
         return m
 
     @wp.func
-    def stretched(own: Along, e: int):
-        """Geometric stiffness of an edge."""
+    def stretched(element_set: Along, e: int):
+        """Return the geometric stiffness of an edge."""
         m = M()
         for d in range(3):
-            m[d, d] = own.tension[0, e]
+            m[d, d] = element_set.tension[0, e]
         return m
 
     @wp.func
-    def own_sum(own: Along, k: int, c: int, w: int, late: bool):
+    def own_sum(element_set: Along, k: int, c: int, w: int, with_second: bool):
         D = M()
         E = M()
         F = M()
         for i in range(wp.static(nodes)):
-            e = own.at[i, k, c]
+            e = element_set.at[i, k, c]
             if e >= 0:
-                e += first_of(w, own.elements)
+                e += first_of(w, element_set.elements)
                 for m in range(wp.static(n)):
-                    a = row(own, m, i, e)
+                    a = row(element_set, m, i, e)
                     D += wp.outer(a, a)
                     if i + 1 < wp.static(nodes):
-                        E += wp.outer(a, row(own, m, i + 1, e))
+                        E += wp.outer(a, row(element_set, m, i + 1, e))
                     if i + 2 < wp.static(nodes):
-                        F += wp.outer(a, row(own, m, i + 2, e))
+                        F += wp.outer(a, row(element_set, m, i + 2, e))
                 if wp.static(tensions > 0):
-                    T = stretched(own, e)
+                    T = stretched(element_set, e)
                     D += T
                     if i == 0:
                         E -= T
                 if wp.static(curved):
-                    if late:
-                        D += between(own, i, i, e)
+                    if with_second:
+                        D += between(element_set, i, i, e)
                         if i + 1 < wp.static(nodes):
-                            E += between(own, i, i + 1, e)
+                            E += between(element_set, i, i + 1, e)
                         if i + 2 < wp.static(nodes):
-                            F += between(own, i, i + 2, e)
+                            F += between(element_set, i, i + 2, e)
         return D, E, F
 
     @wp.func
     def add(
-        own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int, late: bool
+        set0: Along,
+        set1: Along,
+        set2: Along,
+        set3: Along,
+        set4: Along,
+        set5: Along,
+        k: int,
+        c: int,
+        w: int,
+        with_second: bool,
     ):
-        own = one(own0, own1, own2, own3, own4, own5)
-        D, E, F = own_sum(own, k, c, w, late)
+        element_set = one(set0, set1, set2, set3, set4, set5)
+        D, E, F = own_sum(element_set, k, c, w, with_second)
         if wp.static(not first):
-            D1, E1, F1 = before(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            D1, E1, F1 = before(set0, set1, set2, set3, set4, set5, k, c, w, with_second)
             D += D1
             E += E1
             F += F1
@@ -127,7 +139,10 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
 
 @cache
 def layout_type():
-    """Where the blocks of chains are: of places, see `ChainPlan`, and the positions of H_ii of blocks; `idle`: see `Chains`."""
+    """Return the struct `Layout`: dof maps of path nodes (see `ChainPlan`) and positions of diagonal blocks of H.
+
+    `idle`: see `Chains`.
+    """
 
     @wp.struct
     class Layout:
@@ -153,20 +168,20 @@ def blocks_function(
     drag: bool,
     split: bool = False,
 ):
-    """blocks_at(...) -> D, E, F of a place on free dofs, those of the identity on others.
+    """Return the device function `blocks_at(...) -> (D, E, F)` of a path node; fixed dofs have rows of the identity.
 
-    `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
-    terms all blocks are taken from positions of H. With `split` the last dof of a place is the tension of the edge behind it, see
-    `kernels.solve.tension`: it is eliminated after both of its nodes. A place without one has a row of the identity with a minus.
+    `exact_from`: for each term, the first iteration with second derivatives, the same for all, or None without. Without terms all
+    blocks come from positions of H. If `split`, the last dof of a path node is the tension of the edge behind, eliminated after both
+    of its nodes; see `kernels.solve.tension`. A path node without tension has a row of the negative identity.
     """
     nb = place_dofs(twist, split)
-    parts = 1 + twist  # blocks of a place: node, and angle of the edge ahead
+    parts = 1 + twist  # dof blocks of a path node: node, twist angle of the edge ahead
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
     free_of, block_of = place_functions(twist, linear, split)
     late_terms = tuple(first is not None for first in exact_from)
     add = sum_function(terms, twist, real, linear, late_terms, split) if terms else None
-    behind = behind_function(terms, real, linear) if split else None
+    tension_behind = behind_function(terms, real, linear) if split else None
     begin = next((first for first in exact_from if first is not None), 0)
 
     @wp.func
@@ -176,41 +191,41 @@ def blocks_function(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        set0: Along,
+        set1: Along,
+        set2: Along,
+        set3: Along,
+        set4: Along,
+        set5: Along,
         k: int,
         c: int,
         w: int,
     ):
-        """Nodes and angles that have no position of their own have their inertia and drag from here.
+        """Return the blocks; inertia and drag are added for nodes and angles without a position in H.
 
-        Bits of `held` are dofs of a place that are held, or that it does not have.
+        Bits of `held` are dofs of a path node that are fixed or missing.
         """
         D = M()
         E = M()
         F = M()
         first = w * layout.positions
         if wp.static(add is not None):
-            # what is wanted has been counted as an iteration since it was evaluated
-            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-            D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            # the iteration has been counted since its evaluation
+            with_second = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            D, E, F = add(set0, set1, set2, set3, set4, set5, k, c, w, with_second)
             for part in range(wp.static(parts)):
-                at = layout.places[part, k, c]
-                if at >= 0:
-                    if layout.diagonal[at] < 0:
+                block = layout.places[part, k, c]
+                if block >= 0:
+                    if layout.diagonal[block] < 0:
                         for d in range(3):
                             if part == 0 or d == 0:
                                 if wp.static(drag):
-                                    inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
+                                    inertia = mass[w, block].mass[d] * scalars[COEFFICIENT, w]
                                 else:
-                                    inertia = mass[w, at][d] * scalars[COEFFICIENT, w]
+                                    inertia = mass[w, block][d] * scalars[COEFFICIENT, w]
                                 D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
                         if wp.static(drag):
-                            resistance = mass[w, at].resistance
+                            resistance = mass[w, block].resistance
                             for i in range(3):
                                 for j in range(3):
                                     if part == 0 or i + j == 0:
@@ -218,39 +233,39 @@ def blocks_function(
                                             resistance[i, j]
                                         )
         n = layout.count[c]
-        here = layout.held[k, c]
+        fixed_here = layout.held[k, c]
         listed = layout.places.shape[0] > wp.static(parts)
         if listed:
             D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
         if wp.static(split):
-            t, slack = behind(own0, own1, own2, own3, own4, own5, k, c, w)
+            t, slack = tension_behind(set0, set1, set2, set3, set4, set5, k, c, w)
             D[wp.static(nb - 1), wp.static(nb - 1)] = linear(-1.0)
             if slack > linear(0.0):
                 D[wp.static(nb - 1), wp.static(nb - 1)] = -slack
                 for d in range(3):
                     D[d, wp.static(nb - 1)] = t[d]
                     D[wp.static(nb - 1), d] = t[d]
-        if here != wp.uint8(0):
-            f = free_of(here)
+        if fixed_here != wp.uint8(0):
+            f = free_of(fixed_here)
             D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
         if k + 1 < n and layout.chain[k + 1, c] == layout.chain[k, c]:
             if listed:
                 E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
             if wp.static(split):
-                t, slack = behind(own0, own1, own2, own3, own4, own5, k + 1, c, w)
+                t, slack = tension_behind(set0, set1, set2, set3, set4, set5, k + 1, c, w)
                 if slack > linear(0.0):
                     for d in range(3):
                         E[d, wp.static(nb - 1)] = -t[d]
-            if (here | layout.held[k + 1, c]) != wp.uint8(0):
-                E = wp.cw_mul(E, wp.outer(free_of(here), free_of(layout.held[k + 1, c])))
+            if (fixed_here | layout.held[k + 1, c]) != wp.uint8(0):
+                E = wp.cw_mul(E, wp.outer(free_of(fixed_here), free_of(layout.held[k + 1, c])))
         else:
             E = M()
         if wp.static(span == 2):
             if k + 2 < n and layout.chain[k + 2, c] == layout.chain[k, c]:
                 if listed:
                     F += block_of(matrix, layout.places, wp.static(parts + 2 * parts**2), k, c, first)
-                if (here | layout.held[k + 2, c]) != wp.uint8(0):
-                    F = wp.cw_mul(F, wp.outer(free_of(here), free_of(layout.held[k + 2, c])))
+                if (fixed_here | layout.held[k + 2, c]) != wp.uint8(0):
+                    F = wp.cw_mul(F, wp.outer(free_of(fixed_here), free_of(layout.held[k + 2, c])))
             else:
                 F = M()
         return D, E, F

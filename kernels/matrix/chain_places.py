@@ -1,7 +1,7 @@
-"""Places of a net's chains: their dofs, and what vectors, positions of H and edges have there.
+"""Dof map of rod paths in the coupled system: path nodes to vectors, positions of H and edges.
 
-A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none, and, where edges are split, the
-tension of the edge behind it; see `kernels.solve.tension`.
+A path node has a node and the twist angle of the edge ahead, a dof block of -1 if missing. In the mixed axial-force formulation it
+has the tension of the edge behind, too; see `kernels.solve.tension`.
 """
 
 from functools import cache
@@ -14,21 +14,25 @@ from ddg_warp.kernels.threads import first_of
 
 
 def place_dofs(twist: bool, split: bool = False) -> int:
-    """Dofs of a place: its node, with `twist` the angle of the edge ahead, and at last, if `split`, the tension of the edge behind."""
+    """Return the number of dofs of a path node: position, twist angle ahead (`twist`), tension behind (`split`)."""
     return 3 + twist + split
 
 
 @cache
 def place_functions(twist: bool, linear, split: bool = False):
-    """free_of(held): by bits, 1 at the free dofs of a place, else 0; block_of(...): its block with another one from positions of H."""
+    """Return the device functions `free_of` and `block_of`.
+
+    `free_of(fixed_dofs)`: 1 at free dofs of a path node, 0 at fixed ones, from bits.
+    `block_of(...)`: the block of two path nodes, from positions of H.
+    """
     nb = place_dofs(twist, split)
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
 
     @wp.func
-    def free_of(held: wp.uint8):
+    def free_of(fixed_dofs: wp.uint8):
         f = B()
         for d in range(wp.static(nb)):
-            f[d] = linear(1 - ((int(held) >> d) & 1))
+            f[d] = linear(1 - ((int(fixed_dofs) >> d) & 1))
         return f
 
     @wp.func
@@ -58,7 +62,10 @@ def place_functions(twist: bool, linear, split: bool = False):
 
 @cache
 def gather_function(twist: bool, linear, split: bool = False):
-    """gather(v, node, angle, shift): of a vector of blocks, what belongs to a place with these; its world begins at `shift`."""
+    """Return the device function `gather(v, node, angle, shift)`: the dofs of a path node from a vector of dof blocks.
+
+    Blocks of its world start at `shift`.
+    """
     H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
 
     @wp.func
@@ -79,7 +86,7 @@ def gather_function(twist: bool, linear, split: bool = False):
 
 @cache
 def angle_function(twist: bool):
-    """angle_of(places, k, c): the block of the angle of a place, -1 without."""
+    """Return the device function `angle_of(places, k, c)`: the dof block of a twist angle, -1 without."""
 
     @wp.func
     def angle_of(places: wp.array3d(dtype=int), k: int, c: int):
@@ -93,7 +100,7 @@ def angle_function(twist: bool):
 
 @cache
 def value_function(twist: bool, linear, split: bool = False):
-    """value(v, places, k, c, shift): as `gather_function`, by the place."""
+    """Return the device function `value(v, places, k, c, shift)`: as `gather_function`, by path node."""
     H, gather, angle_of = wp.types.vector(3, linear), gather_function(twist, linear, split), angle_function(twist)
 
     @wp.func
@@ -105,20 +112,20 @@ def value_function(twist: bool, linear, split: bool = False):
 
 @cache
 def solve_functions(twist: bool, linear, split: bool = False):
-    """Of chains that are all that there is to a solve.
+    """Return the device functions `right` and `hand`, for systems that consist of rod paths alone.
 
-    right(v, node, angle, held, shift): what stands on the right for a place, nothing for what is held; hand(u, b, node, angle, w,
-    shift, z, dots): its solution u, of a residual b, to its blocks in world w.
+    `right(v, node, angle, fixed_dofs, shift)`: the right-hand side of a path node, zero at fixed dofs.
+    `hand(u, b, node, angle, w, shift, z, dots_out)`: write the solution u, of residual b, to its dof blocks in world w.
     """
     H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
     free_of, _ = place_functions(twist, linear, split)
     gather = gather_function(twist, linear, split)
 
     @wp.func
-    def right(v: wp.array(dtype=H), node: int, angle: int, held: wp.uint8, shift: int):
+    def right(v: wp.array(dtype=H), node: int, angle: int, fixed_dofs: wp.uint8, shift: int):
         u = gather(v, node, angle, shift)
-        if held != wp.uint8(0):
-            u = wp.cw_mul(u, free_of(held))
+        if fixed_dofs != wp.uint8(0):
+            u = wp.cw_mul(u, free_of(fixed_dofs))
         return u
 
     @wp.func
@@ -138,30 +145,33 @@ def solve_functions(twist: bool, linear, split: bool = False):
 
 
 def splits(term: Term) -> bool:
-    """Whether the stiffness of the elements of a term is that of edges, which may be `split`."""
+    """Return True if the stiffness of a term is axial stiffness of edges, which may be `split`."""
     return term.measure.tensions == len(term.measure.strains) == 1
 
 
 @cache
 def behind_function(terms: tuple[Term, ...], real, linear):
-    """behind(along..., k, c, w) -> row and slack of the edge that ends at a place, no slack where it has no tension of its own."""
+    """Return the device function `behind(set0, ..., set5, k, c, w) -> (row, slack)` of the edge that ends at a path node.
+
+    The slack is zero for an edge without tension.
+    """
     H, Along = wp.types.vector(3, linear), along_type(real, linear)
     first, one, own_splits = len(terms) == 1, one_function(len(terms) - 1, real, linear), splits(terms[-1])
     before = None if first else behind_function(terms[:-1], real, linear)
 
     @wp.func
-    def behind(own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int):
-        own = one(own0, own1, own2, own3, own4, own5)
+    def behind(set0: Along, set1: Along, set2: Along, set3: Along, set4: Along, set5: Along, k: int, c: int, w: int):
+        element_set = one(set0, set1, set2, set3, set4, set5)
         t = H()
         slack = linear(0.0)
         if wp.static(not first):
-            t, slack = before(own0, own1, own2, own3, own4, own5, k, c, w)
+            t, slack = before(set0, set1, set2, set3, set4, set5, k, c, w)
         if wp.static(own_splits):
-            e = own.at[1, k, c]
+            e = element_set.at[1, k, c]
             if e >= 0:
-                e += first_of(w, own.elements)
-                t = H(own.factor[0, e], own.factor[1, e], own.factor[2, e])
-                slack = own.tension[1, e]
+                e += first_of(w, element_set.elements)
+                t = H(element_set.factor[0, e], element_set.factor[1, e], element_set.factor[2, e])
+                slack = element_set.tension[1, e]
         return t, slack
 
     return behind

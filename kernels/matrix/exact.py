@@ -1,4 +1,4 @@
-"""The exact Hessian of a net by index, from those of its elements in their local dofs; it lies as `sliced` says."""
+"""Exact Hessian of the coupled system by dof block, from element Hessians in local dofs; stored as in `sliced`."""
 
 from functools import cache
 
@@ -11,12 +11,16 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 FIRST, SIGN, COUNT = range(
     3
-)  # what a slot sees of local dofs: the first, with which sign, and how many (three, or one of an angle)
+)  # local dofs of a local node: the first, their sign, and their number (three; one for a twist angle)
 
 
 @cache
 def exact_kernels(real, linear, drag: bool, serial: bool):
-    """begin(...): what inertia, and drag, bring to H; add(...): adds what the elements of one set bring."""
+    """Build the kernels of the exact Hessian.
+
+    `begin`: write inertia and drag.
+    `add`: add the Hessians of one element set.
+    """
     M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
     inertia_of = inertia_function(real, linear, drag)
 
@@ -33,12 +37,12 @@ def exact_kernels(real, linear, drag: bool, serial: bool):
         start = wp.tid()
         for p in range(start, until(start, matrix.shape[1])):
             w = p / positions
-            at = p - w * positions
-            row = rows[at]
+            position = p - w * positions
+            row = rows[position]
             if flags[WANTED, w] == 0 or row < 0:
                 continue  # padding stays zero
             m = M()
-            if row == columns[at]:
+            if row == columns[position]:
                 m = inertia_of(mass, scalars[COEFFICIENT, w], w, row)
             for i in range(3):
                 for j in range(3):
@@ -55,20 +59,21 @@ def exact_kernels(real, linear, drag: bool, serial: bool):
         positions: int,
         matrix: wp.array2d(dtype=linear),
     ):
-        """`hessian` is [element][row][column], rounding apart symmetric; items as of `sliced.sum_function`.
+        """Add element Hessians; see `sliced.sum_function` for items.
 
-        `ends` (slots * n, 3) are `FIRST`, `SIGN` and `COUNT` of the n dofs that each slot sees at most; a sign of zero ends them early.
+        `hessian` is [element][row][column], symmetric up to rounding. `ends (slots * n, 3)` has `FIRST`, `SIGN` and `COUNT` of up to
+        n runs of dofs per local node; a sign of zero ends them early.
         """
         start = wp.tid()
         n = ends.shape[0] / slots
         for p in range(start, until(start, matrix.shape[1])):
             w = p / positions
-            at = p - w * positions
-            if flags[WANTED, w] == 0 or starts[at] == starts[at + 1]:
+            position = p - w * positions
+            if flags[WANTED, w] == 0 or starts[position] == starts[position + 1]:
                 continue
             elements = hessian.shape[0] / flags.shape[1]
             m = M()
-            for index in range(starts[at], starts[at + 1]):
+            for index in range(starts[position], starts[position + 1]):
                 item = items[index]
                 pair = item / slots
                 b = item - pair * slots

@@ -1,7 +1,7 @@
-"""Geometric stiffness of a window in the system of a rod: as blocks of its nodes, and made positive semi-definite.
+"""Geometric stiffness of an element window of a rod: as blocks of its nodes, and made positive semidefinite.
 
-G = w psi' : d2e is what the exact Hessian of bending and twist has beyond the Gauss-Newton matrix F^T F. `evaluate_kernel`
-writes it as the upper triangle of a symmetric matrix, row by row: [entry][element][rod].
+G = w psi' : d2e is the difference between the exact Hessian of bending and twist and the Gauss-Newton matrix F^T F. `evaluate_kernel`
+writes the upper triangle of a symmetric matrix, row by row: [entry][element][rod].
 """
 
 from functools import cache
@@ -16,11 +16,13 @@ SWEEPS = 12  # of Jacobi's method; 8 x 8 matrices take 5 or 6
 
 @cache
 def project_kernel(kind: ChainKind, real, linear):
-    """Raise G of all windows of active rods as far as F^T F + G needs to be positive semi-definite.
+    """Build the kernel of projected Newton.
 
-    The window's matrix, with the factors of both edges at half their weight (each edge lies in two windows) and scaled by the
-    lengths of the edges so that positions count like angles, gets its negative eigenvalues replaced by zero (Teran et al. 2005,
-    Robust Quasistatic Finite Elements and Flesh Simulation, for elements).
+    `project`: raise G of all windows of active rods until F^T F + G is positive semidefinite.
+
+    The matrix of a window includes the factors of both edges at half weight, as each edge is in two windows. It is scaled by edge
+    lengths, so that positions count like angles. Negative eigenvalues are replaced by zero (Teran et al. 2005, Robust Quasistatic
+    Finite Elements and Flesh Simulation, for elements).
     """
     size, dim, closed = kind.window, kind.dim, kind.closed
     V, W = wp.types.vector(dim, real), wp.types.vector(size, real)
@@ -31,7 +33,7 @@ def project_kernel(kind: ChainKind, real, linear):
 
     @wp.func
     def factored(F: wp.array3d(dtype=linear), scale: W, k: int, n: int, r: int):
-        """F^T F of the window, scaled."""
+        """Return the scaled F^T F of a window."""
         a = M()
         for m in range(wp.static(vertex_rows)):
             row = W()
@@ -52,9 +54,9 @@ def project_kernel(kind: ChainKind, real, linear):
 
     @wp.func
     def lifted(a0: M, n: int):
-        """What takes the negative eigenvalues of a symmetric matrix to zero: sum |lambda| v v^T, by Jacobi's method.
+        """Return the matrix that lifts negative eigenvalues to zero: sum |lambda| v v^T, by Jacobi's method.
 
-        n, its size, comes as an argument, so that the loops are not unrolled.
+        The size n is an argument so that the loops are not unrolled.
         """
         a = a0
         v = wp.identity(n=size, dtype=real)
@@ -123,23 +125,23 @@ def project_kernel(kind: ChainKind, real, linear):
         for i in range(wp.static(size)):
             for j in range(wp.static(size)):
                 row = wp.min(i, j)
-                at = row * wp.static(size) - row * (row - 1) // 2 + wp.max(i, j) - row
-                a[i, j] = a[i, j] + real(geometric[at, k, r]) * scale[i] * scale[j]
+                entry = row * wp.static(size) - row * (row - 1) // 2 + wp.max(i, j) - row
+                a[i, j] = a[i, j] + real(geometric[entry, k, r]) * scale[i] * scale[j]
         up = lifted(a, dofs)
         for i in range(wp.static(size)):
             for j in range(wp.static(size)):
                 if j >= i:
-                    at = i * wp.static(size) - i * (i - 1) // 2 + j - i
-                    geometric[at, k, r] = geometric[at, k, r] + linear(up[i, j] / (scale[i] * scale[j]))
+                    entry = i * wp.static(size) - i * (i - 1) // 2 + j - i
+                    geometric[entry, k, r] = geometric[entry, k, r] + linear(up[i, j] / (scale[i] * scale[j]))
 
     return project
 
 
 @cache
 def block_functions(kind: ChainKind, linear):
-    """Blocks of nodes a, b, c of the window's matrix, G of element k: aa, ab, ac, bb, bc, cc (G, k, r).
+    """Return the device functions `aa`, `ab`, `ac`, `bb`, `bc`, `cc` (G, k, r): blocks of nodes a, b, c of element k.
 
-    Edges are differences of nodes: H_ab = sum over edges with their signs; the angles of edges e and f are dofs of a and b.
+    Edges are differences of nodes: H_ab = sum over edges with their signs. The twist angles of edges e and f are dofs of a and b.
     """
     size, dim, twist = kind.window, kind.dim, kind.twist
     M = wp.types.matrix((kind.block, kind.block), linear)
@@ -152,7 +154,7 @@ def block_functions(kind: ChainKind, linear):
 
     @wp.func
     def edges(G: wp.array3d(dtype=linear), i: int, j: int, k: int, r: int):
-        """Second derivative in edges i and j."""
+        """Return the second derivative with respect to edges i and j."""
         m = M()
         for a in range(wp.static(dim)):
             for b in range(wp.static(dim)):
@@ -161,7 +163,7 @@ def block_functions(kind: ChainKind, linear):
 
     @wp.func
     def column(G: wp.array3d(dtype=linear), i: int, j: int, k: int, r: int):
-        """Second derivative in edge i and angle j, as the last column of a block."""
+        """Return the second derivative with respect to edge i and twist angle j, as last column of a block."""
         m = M()
         for a in range(wp.static(dim)):
             m[a, wp.static(angle)] = entry(G, i * wp.static(dim) + a, wp.static(2 * dim) + j, k, r)

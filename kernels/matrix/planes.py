@@ -1,7 +1,7 @@
-"""Blocks on planes that are not across an axis of space: their dofs in a frame, the plane's normal first, for the linear algebra.
+"""Skew supports: dof blocks whose constraint axis is no coordinate axis, rotated into nodal frames for linear algebra.
 
-With the frame's rows Q (orthonormal), forces become Q f, rows and columns of H Q_i H_ij Q_j^T, and a direction d is Q^T d in space. The
-iterate itself stays in space.
+The first row of a frame Q (orthonormal) is the normal of the plane. Forces become Q f, blocks of H Q_i H_ij Q_j^T, and a direction d
+is Q^T d in space. The iterate itself stays in space.
 """
 
 from functools import cache
@@ -13,7 +13,10 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def turn_kernel(real, back: bool):
-    """turn(...): vectors of the blocks `where` into their frames, or back, in the worlds that want it."""
+    """Build the kernel that rotates vectors.
+
+    `turn`: rotate the vectors of dof blocks `where` into their nodal frames, or back, in wanted worlds.
+    """
     V, F = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -27,18 +30,21 @@ def turn_kernel(real, back: bool):
         i, w = wp.tid()
         if wanted[w] == 0:
             return
-        at = where[i] + w * blocks
+        block = where[i] + w * blocks
         if wp.static(back):
-            vectors[at] = wp.transpose(frames[i]) * vectors[at]
+            vectors[block] = wp.transpose(frames[i]) * vectors[block]
         else:
-            vectors[at] = frames[i] * vectors[at]
+            vectors[block] = frames[i] * vectors[block]
 
     return turn
 
 
 @cache
 def matrix_kernel(linear):
-    """turn(...): entries of H whose row or column is in a frame, in the worlds that want H."""
+    """Build the kernel that rotates H.
+
+    `turn`: rotate entries of H into the nodal frames of row and column, in wanted worlds.
+    """
     F = wp.types.matrix((3, 3), linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -49,21 +55,21 @@ def matrix_kernel(linear):
         positions: int,
         matrix: wp.array2d(dtype=linear),
     ):
-        """`entries` are position, frame of the row and frame of the column, -1 for none."""
+        """Rotate `entries`: position, frame of the row and frame of the column, -1 for none."""
         i, w = wp.tid()
         if wanted[w] == 0:
             return
-        at = entries[i, 0] + w * positions
+        position = entries[i, 0] + w * positions
         h = F()
         for a in range(3):
             for b in range(3):
-                h[a, b] = matrix[3 * a + b, at]
+                h[a, b] = matrix[3 * a + b, position]
         if entries[i, 1] >= 0:
             h = frames[entries[i, 1]] * h
         if entries[i, 2] >= 0:
             h = h * wp.transpose(frames[entries[i, 2]])
         for a in range(3):
             for b in range(3):
-                matrix[3 * a + b, at] = h[a, b]
+                matrix[3 * a + b, position] = h[a, b]
 
     return turn

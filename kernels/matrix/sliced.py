@@ -1,8 +1,8 @@
-"""The sparse system of a net: blocks of H by index, their product with a vector.
+"""Sparse matrix of the coupled system: blocks of H by dof block, and their product with a vector.
 
-H lies in slices of 32 rows (sliced ELLPACK, Kreutzer et al. 2014): position p = start of the slice + 32 * place in the row + row of
-the slice, so that neighbouring threads, on neighbouring rows, touch neighbouring memory; [component][position]. What adds to a position
-is listed once, so sums come in one order, without atomics.
+H is stored in slices of 32 rows (sliced ELLPACK, Kreutzer et al. 2014). Position p = start of the slice + 32 * index in the row + row
+of the slice: neighbouring threads, on neighbouring rows, read neighbouring memory. Arrays are [component][position]. Contributions to
+a position are listed, so that sums have a fixed order, without atomics.
 """
 
 from functools import cache
@@ -17,12 +17,12 @@ from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLICE = 32  # rows of a slice of H
-BARRED = wp.constant(wp.uint8(7))  # bits of a block none of whose dofs takes part in a direction
+BARRED = wp.constant(wp.uint8(7))  # bits of a dof block without active dofs
 
 
 @cache
 def contributions(linear, local: bool):
-    """What a set adds to H: its factor rows (see `factor_type`), geometric stiffness, second derivatives, items of each position."""
+    """Return the struct of a set's data for H: factor rows (see `factor_type`), geometric stiffness, incidence list."""
     Factor = factor_type(linear, local)
 
     @wp.struct
@@ -39,14 +39,17 @@ def contributions(linear, local: bool):
 
 @cache
 def second_function(measure: Measure, linear):
-    """block(second, e, a, b): what the packed second derivatives of an element (`Measure.packed`) are between two of its slots."""
+    """Return the device function `block(second, e, a, b)`: second derivatives between local nodes a and b of an element.
+
+    They are packed as in `Measure.packed`.
+    """
     size, (angles, spins, _) = measure.size, measure.starts
     M, I = wp.types.matrix((3, 3), linear), wp.types.vector(measure.slots, int)
-    plus, minus = (I(*of) for of in measure.ends)
+    plus, minus = (I(*first_dofs) for first_dofs in measure.ends)
 
     @wp.func
     def part(second: wp.array2d(dtype=linear), e: int, p: int, q: int):
-        """Between the dofs from p and those from q on: three of an edge or a rotation, one of an angle; -1 for none."""
+        """Return the block of dofs from p and q on: three of an edge or a rotation, one of a twist angle; -1 for none."""
         m = M()
         if p >= 0 and q >= 0:
             for i in range(3):
@@ -68,34 +71,33 @@ def second_function(measure: Measure, linear):
 
 @cache
 def sum_function(term: Term, linear, exact: bool, local: bool):
-    """add(contributions, position, world, late): F^T F and geometric stiffness of one set.
+    """Return the device function `add(contributions, position, world, with_second)`: F^T F and geometric stiffness of one set.
 
-    If `exact`, also the second derivatives, where it is `late` enough for these.
-
-    An item is (element * slots + row's slot) * slots + column's slot.
+    If `exact`, second derivatives are added where `with_second`. Items are
+    `(element * slots + a) * slots + b` with the local nodes a of the row and b of the column.
     """
     measure = term.measure
     M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear, local)
     n, slots, size, tensions = len(measure.strains), measure.slots, measure.size, measure.tensions
-    edges = measure.edges[:2]  # geometric stiffness is between the first two
+    edges = measure.edges[:2]  # geometric stiffness concerns the first two
     second_of = second_function(measure, linear) if exact else None
     part = part_function(measure, linear) if local else None
 
     @wp.func
-    def row(own: Contributions, m: int, slot: int, e: int):
-        """What a row of the factor has for a slot."""
+    def row(element_set: Contributions, m: int, local_node: int, e: int):
+        """Return the entries of a factor row at a local node."""
         if wp.static(local):
-            return part(own.factor, m * wp.static(size), slot, e)
+            return part(element_set.factor, m * wp.static(size), local_node, e)
         else:
-            return own.factor[m * wp.static(slots) + slot, e]
+            return element_set.factor[m * wp.static(slots) + local_node, e]
 
     @wp.func
-    def weight(edge_first: int, edge_second: int, slot: int):
-        """How an edge vector depends on the node of a slot."""
+    def weight(edge_first: int, edge_second: int, local_node: int):
+        """Return the derivative of an edge vector with respect to a local node."""
         c = linear(0.0)
-        if slot == edge_first:
+        if local_node == edge_first:
             c -= linear(1.0)
-        if slot == edge_second:
+        if local_node == edge_second:
             c += linear(1.0)
         return c
 
@@ -111,24 +113,24 @@ def sum_function(term: Term, linear, exact: bool, local: bool):
         return c
 
     @wp.func
-    def add(own: Contributions, at: int, w: int, late: bool):
+    def add(element_set: Contributions, position: int, w: int, with_second: bool):
         m = M()
-        for index in range(own.starts[at], own.starts[at + 1]):
-            item = own.items[index]
+        for index in range(element_set.starts[position], element_set.starts[position + 1]):
+            item = element_set.items[index]
             pair = item / wp.static(slots)
             b = item - pair * wp.static(slots)
             e = pair / wp.static(slots)
             a = pair - e * wp.static(slots)
-            e += w * own.elements
+            e += w * element_set.elements
             for i in range(wp.static(n)):
-                m += wp.outer(row(own, i, a, e), row(own, i, b, e))
+                m += wp.outer(row(element_set, i, a, e), row(element_set, i, b, e))
             if wp.static(tensions > 0):
-                c = geometric(own.tension, e, a, b)
+                c = geometric(element_set.tension, e, a, b)
                 for d in range(3):
                     m[d, d] = m[d, d] + c
             if wp.static(exact):
-                if late:
-                    m += second_of(own.second, e, a, b)
+                if with_second:
+                    m += second_of(element_set.second, e, a, b)
         return m
 
     return add
@@ -136,7 +138,7 @@ def sum_function(term: Term, linear, exact: bool, local: bool):
 
 @cache
 def inertia_function(real, linear, drag: bool):
-    """inertia_of(mass, coefficient, world, block): what inertia and drag bring to H."""
+    """Return the device function `inertia_of(mass, coefficient, w, block)`: inertia and drag of a dof block in H."""
     M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
 
     @wp.func
@@ -158,7 +160,7 @@ def inertia_function(real, linear, drag: bool):
     return inertia_of
 
 
-SETS = 6  # sets that one launch sums
+SETS = 6  # element sets summed in one launch
 
 
 @cache
@@ -172,15 +174,17 @@ def assemble_kernel(
     drag: bool,
     serial: bool,
 ):
-    """H of up to `SETS` sets, a thread a position, with inertia and drag where it `begins`; else it adds to what is there.
+    """Build the kernel of assembly.
 
-    `exact_from` says of each set from which iteration on it has second derivatives, one for all, or None where it has none; `local`,
-    how its factor is written.
+    `assemble`: write or update H with up to `SETS` element sets, one thread a position.
+
+    The kernel that `begins` adds inertia and drag; others add to H. `exact_from`: for each set, the first iteration with second
+    derivatives, the same for all, or None without. `local`: layout of the set's factor.
     """
     M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
     sums = tuple(
-        sum_function(term, linear, first is not None, own)
-        for term, first, own in zip(terms, exact_from, local, strict=True)
+        sum_function(term, linear, first is not None, is_local)
+        for term, first, is_local in zip(terms, exact_from, local, strict=True)
     )
     begin = next((first for first in exact_from if first is not None), 0)
     inertia_of = inertia_function(real, linear, drag)
@@ -196,12 +200,12 @@ def assemble_kernel(
         rows: wp.array(dtype=int),
         columns: wp.array(dtype=int),
         positions: int,
-        own0: Own0,
-        own1: Own1,
-        own2: Own2,
-        own3: Own3,
-        own4: Own4,
-        own5: Own5,
+        set0: Own0,
+        set1: Own1,
+        set2: Own2,
+        set3: Own3,
+        set4: Own4,
+        set5: Own5,
         matrix: wp.array2d(dtype=linear),
     ):
         start = wp.tid()
@@ -209,31 +213,31 @@ def assemble_kernel(
             w = p / positions
             if flags[WANTED, w] == 0:
                 continue
-            # what is wanted has been counted as an iteration since it was evaluated
-            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-            at = p - w * positions
-            row = rows[at]
+            # the iteration has been counted since its evaluation
+            with_second = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            position = p - w * positions
+            row = rows[position]
             if row < 0:
                 continue  # padding stays zero
             m = M()
             if wp.static(begins):
-                if row == columns[at]:
+                if row == columns[position]:
                     m = inertia_of(mass, scalars[COEFFICIENT, w], w, row)
             else:
                 for i in range(3):
                     for j in range(3):
                         m[i, j] = matrix[3 * i + j, p]
-            m += wp.static(sums[0])(own0, at, w, late)
+            m += wp.static(sums[0])(set0, position, w, with_second)
             if wp.static(count > 1):
-                m += wp.static(sums[min(1, last)])(own1, at, w, late)
+                m += wp.static(sums[min(1, last)])(set1, position, w, with_second)
             if wp.static(count > 2):
-                m += wp.static(sums[min(2, last)])(own2, at, w, late)
+                m += wp.static(sums[min(2, last)])(set2, position, w, with_second)
             if wp.static(count > 3):
-                m += wp.static(sums[min(3, last)])(own3, at, w, late)
+                m += wp.static(sums[min(3, last)])(set3, position, w, with_second)
             if wp.static(count > 4):
-                m += wp.static(sums[min(4, last)])(own4, at, w, late)
+                m += wp.static(sums[min(4, last)])(set4, position, w, with_second)
             if wp.static(count > 5):
-                m += wp.static(sums[min(5, last)])(own5, at, w, late)
+                m += wp.static(sums[min(5, last)])(set5, position, w, with_second)
             for i in range(3):
                 for j in range(3):
                     matrix[3 * i + j, p] = m[i, j]
@@ -243,7 +247,11 @@ def assemble_kernel(
 
 @cache
 def product_functions(linear):
-    """times(...): row of H v; free(mask): 1 at free dofs and 0 at held ones."""
+    """Return the device functions `times` and `free`.
+
+    `times(...)`: one row of H v.
+    `free(mask)`: 1 at free dofs, 0 at fixed ones.
+    """
     H = wp.types.vector(3, linear)
 
     @wp.func
@@ -263,18 +271,18 @@ def product_functions(linear):
         first: int,
         shift: int,
     ):
-        """Row `row` of H of a world whose positions begin at `first` and blocks at `shift`."""
+        """Return row `row` of H v in a world with positions from `first` and dof blocks from `shift` on."""
         y = H()
         slice = row / wp.static(SLICE)
         start = slices[slice] + row - slice * wp.static(SLICE)
         for p in range(start, slices[slice + 1], wp.static(SLICE)):
             j = columns[p]
             if j >= 0:
-                at = p + first
+                entry = p + first
                 x = v[j + shift]
-                y[0] = y[0] + matrix[0, at] * x[0] + matrix[1, at] * x[1] + matrix[2, at] * x[2]
-                y[1] = y[1] + matrix[3, at] * x[0] + matrix[4, at] * x[1] + matrix[5, at] * x[2]
-                y[2] = y[2] + matrix[6, at] * x[0] + matrix[7, at] * x[1] + matrix[8, at] * x[2]
+                y[0] = y[0] + matrix[0, entry] * x[0] + matrix[1, entry] * x[1] + matrix[2, entry] * x[2]
+                y[1] = y[1] + matrix[3, entry] * x[0] + matrix[4, entry] * x[1] + matrix[5, entry] * x[2]
+                y[2] = y[2] + matrix[6, entry] * x[0] + matrix[7, entry] * x[1] + matrix[8, entry] * x[2]
         return y
 
     return times, free
@@ -282,7 +290,10 @@ def product_functions(linear):
 
 @cache
 def settle_function(linear):
-    """settle(...): writes H p of a block with y, what else comes to it, on dofs that are not barred, and p . H p."""
+    """Return the device function `settle(...)`, which writes H p of a dof block, and p . H p.
+
+    `y` is added to H p; inactive dofs get zero.
+    """
     H = wp.types.vector(3, linear)
     times, free = product_functions(linear)
 
