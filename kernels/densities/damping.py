@@ -1,9 +1,9 @@
-"""Strain-rate damping of any law (Kelvin and Voigt): the dissipation potential of a step of length h is added to it,
+"""Kelvin-Voigt damping of any law: the dissipation potential of a step of length h is added,
 
     psi(e) + (tau / 2h) (e - e^n) . psi''(e0) (e - e^n) ,
 
-with e^n the strains at the start of the step, e0 those at rest, and the retardation time tau [s]: the viscous analogy of Bergou et al.
-(2010) over one step. At rest psi'' is positive, so that damping takes energy whatever the law does elsewhere.
+with e^n the strains at the start of the step, e0 the rest strains, and the retardation time tau [s]: the viscous analogy of Bergou et
+al. (2010) over one step. psi'' is positive at rest, so that damping dissipates energy for every law.
 """
 
 from functools import cache
@@ -17,7 +17,7 @@ VISCOSITY = Parameter("viscosity", "s", NOT_NEGATIVE, default=0.0)
 
 @cache
 def damped(density: Density) -> Density:
-    """The law with damping; its parameter `viscosity` is the time tau."""
+    """Return the law with damping, which adds the parameter `viscosity`, the time tau [s]."""
 
     @cache
     def laws(real, n):
@@ -41,14 +41,20 @@ def damped(density: Density) -> Density:
 
 
 def _split(density: Density, real, n: int):
-    """own(p) -> parameters of the law itself; ratio(p) -> tau / h; before(p), rest(p) -> strains of the last step, and at rest."""
+    """Return the device functions that split p.
+
+    `law_parameters(p)`: parameters of the undamped law.
+    `ratio(p)`: tau / h.
+    `before(p)`: strains of the last step.
+    `rest(p)`: rest strains.
+    """
     size = len(density.parameters(n))
-    at = [i for i, known in enumerate(density.parameters(n)) if known.family == "rest"]
-    first = at[0] if at else -1
+    rest_indices = [i for i, parameter in enumerate(density.parameters(n)) if parameter.family == "rest"]
+    first = rest_indices[0] if rest_indices else -1
     E, P, O = (wp.types.vector(s, real) for s in (n, size + n + 2, size))
 
     @wp.func
-    def own(p: P):
+    def law_parameters(p: P):
         o = O()
         for i in range(wp.static(size)):
             o[i] = p[i]
@@ -73,18 +79,18 @@ def _split(density: Density, real, n: int):
                 e[i] = p[wp.static(first) + i]
         return e
 
-    return own, ratio, before, rest, E, P
+    return law_parameters, ratio, before, rest, E, P
 
 
 def _laws(density: Density, real, n: int):
     energy_of, slope_of, curvature_of = density.laws(real, n)
-    own, ratio, before, rest, E, P = _split(density, real, n)
+    law_parameters, ratio, before, rest, E, P = _split(density, real, n)
     coupled = density.coupled
 
     @wp.func
     def viscous(p: P):
-        """psi'' of the dissipation, but for tau / h."""
-        return curvature_of(rest(p), own(p))
+        """Return psi'' of the dissipation potential without the factor tau / h."""
+        return curvature_of(rest(p), law_parameters(p))
 
     @wp.func
     def drag(e: E, p: P):
@@ -95,26 +101,26 @@ def _laws(density: Density, real, n: int):
 
     @wp.func
     def energy(e: E, p: P):
-        return energy_of(e, own(p)) + real(0.5) * wp.dot(drag(e, p), e - before(p))
+        return energy_of(e, law_parameters(p)) + real(0.5) * wp.dot(drag(e, p), e - before(p))
 
     @wp.func
     def slope(e: E, p: P):
-        return slope_of(e, own(p)) + drag(e, p)
+        return slope_of(e, law_parameters(p)) + drag(e, p)
 
     @wp.func
     def curvature(e: E, p: P):
-        return curvature_of(e, own(p)) + viscous(p) * ratio(p)
+        return curvature_of(e, law_parameters(p)) + viscous(p) * ratio(p)
 
     return energy, slope, curvature
 
 
 def _root(density: Density, real, n: int):
-    """Of a quadratic law with a root of its own: that, larger by the root of 1 + tau / h."""
-    own, ratio, _, _, E, P = _split(density, real, n)
+    """Return the root of a quadratic law with a closed form, scaled by sqrt(1 + tau / h)."""
+    law_parameters, ratio, _, _, E, P = _split(density, real, n)
     root_of = density.own_root(real, n)
 
     @wp.func
     def root(e: E, p: P, shift: E):
-        return root_of(e, own(p), shift) * wp.sqrt(real(1.0) + ratio(p))
+        return root_of(e, law_parameters(p), shift) * wp.sqrt(real(1.0) + ratio(p))
 
     return root

@@ -1,4 +1,4 @@
-"""The square root of psi'', made positive semi-definite: what the factor of a Gauss-Newton matrix is formed with."""
+"""Square root of psi'', made positive semidefinite, for the Gauss-Newton factor."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @cache
 def root_function(density, real, n: int):
-    """root(e, p, shift) of a law; see `Density.functions`. Negative curvature, or eigenvalues of it, are left out."""
+    """Return the device function `root(e, p, shift)` of a law, without negative curvatures; see `Density.functions`."""
     _, _, curvature = density.laws(real, n)
     E, M3 = wp.types.vector(n, real), wp.types.matrix((3, 3), real)
     M = wp.types.matrix((n, n), real)

@@ -1,11 +1,11 @@
-"""Magnetic dipoles of magnetisation M [A/m] per volume, in a field and in each other's.
+"""Magnetic dipoles of magnetisation M [A/m] per volume, in a field and in pairs.
 
-In a field: psi = -M n . B with n the unit direction of the dipole, of the strains (n, B). Where n turns its energy has the curvature
-M n . B along the unit sphere, which is positive in a field that is aligned with it: the square root of that is the root of n. What
-couples n and B, and what is negative, is left to the exact Hessian.
+In a field: psi = -M n . B with n the unit direction of the dipole, of the strains (n, B). For rotations of n, psi has the curvature M
+n . B along the unit sphere, positive in an aligned field; the square root of that is the root of n. The coupling of n and B, and
+negative curvature, are left to the exact Hessian.
 
-Two of them: psi = mu0 / (4 pi) M M' f / r^3 of their orientation f = n . n' - 3 (n . u) (n' . u) and distance r, per product of their
-volumes (Jackson, Classical Electrodynamics, 1999, section 5.7: the energy of a dipole in the field of a point dipole).
+In pairs: psi = mu0 / (4 pi) M M' f / r^3 per product of volumes. Strains are the orientation f = n . n' - 3 (n . u) (n' . u) and
+the distance r (Jackson, Classical Electrodynamics, 1999, section 5.7: a dipole in the field of a point dipole).
 """
 
 from functools import cache
@@ -31,7 +31,7 @@ def _field_laws(real, n):
 
     @wp.func
     def curvature(e: E, p: P):
-        """The diagonal of psi''."""
+        """Return the diagonal of psi''."""
         return E()
 
     return energy, slope, curvature

@@ -6,18 +6,18 @@ natural strains kappa_10, k0 and t0, B = EI_2 / (1 - nu^2) = D W the stiffness o
 
     psi = EI_1 (kappa_1 - kappa_10)^2 / 2 + EI_2 (k - k0)^2 / 2 + GJ (t - t0)^2 / 2 + B/2 N(k, t) g(k) ,
 
-a rod's energy and that of a cross-section kept from what it would do alone. The ribbon with k, t and the curvature
-c = f - nu (k - k0) across its width has the Gauss curvature k c - t^2, that at rest is -t0^2, and where these differ it stretches:
-the longitudinal strain e(y) has e'' = q - k f with the defect q = t^2 - t0^2 + nu k (k - k0). Over e, D f^2 / 2 + E h e^2 / 2 is least
-where D e'''' / k^2 + E h e = 0 with e'' = q and e''' = 0 at both edges, a beam on an elastic foundation (Ashwell, J. R. Aeronaut. Soc.
-54, 1950, for t = 0), which leaves B/2 q^2 g per length:
+the energy of a rod plus the energy of a constrained cross-section. The ribbon with k, t and the curvature c = f - nu (k - k0) across
+its width has the Gauss curvature k c - t^2; at rest it is -t0^2. Where they differ the ribbon stretches: the longitudinal strain e(y)
+has e'' = q - k f with the defect q = t^2 - t0^2 + nu k (k - k0). Minimising D f^2 / 2 + E h e^2 / 2 over e gives
+D e'''' / k^2 + E h e = 0 with e'' = q and e''' = 0 at both edges. This is a beam on an elastic foundation (Ashwell, J. R. Aeronaut.
+Soc. 54, 1950, for t = 0). It leaves B/2 q^2 g per length:
 
     audoly_neukirch   N = q^2 ,  g = 360 zeta^2 phi(v) ,  v = sqrt(720) zeta k ,  x = sqrt(|v| / 2) ,
                       phi = (1/2 - (cosh x - cos x) / (x (sinh x + sin x))) / x^4 :
                       Audoly and Neukirch, J. Mech. Phys. Solids 153, 104457 (2021). There, and here for k0 = t0 = 0, the term
                       is (E h W^5 / 4) (nu k^2 + t^2)^2 phi(v), v = sqrt(12 (1 - nu^2)) W^2 k / h.
     sano_wada         N = (t^2 - t0^2)^2 ,  g = 1 / (1 / zeta^2 + k^2) : Sano and Wada, Phys. Rev. Lett. 122, 114301 (2019), who leave
-                      out what bending alone does to the section. The factor B is that for which g(0) is the stretching of a
+                      out the effect of bending alone on the section. The factor B is that for which g(0) is the stretching of a
                       twisted ribbon, E h W^5 t^4 / 1440 (Green, Proc. R. Soc. A 154, 1936).
     sadowsky          N = q^2 + nu e^2 (nu (k - k0)^2 + 2 (t - t0)^2) ,  g = 1 / (k^2 + e^2) , which for k0 = t0 = 0, EI_2 and GJ of a
                       plate is the energy of Sadowsky (1930) with a regularised fraction, B/2 (k^2 + 2 t^2 + t^4 / (k^2 + e^2)):
@@ -41,7 +41,7 @@ SWITCH = 256.0  # y up to which phi is a quotient of series: nine terms of each 
 
 
 def _series() -> list[float]:
-    """Coefficients (6, 9) of P, P', P'', Q, Q', Q'' in powers of z = y / SWITCH, where phi = P / 2 Q."""
+    """Return coefficients (6, 9) of P, P', P'', Q, Q', Q'' in powers of z = y / SWITCH, where phi = P / 2 Q."""
     n, rows = range(9), []
     for terms in ([(4 * i + 4) / factorial(4 * i + 6) for i in n], [1 / factorial(4 * i + 1) for i in n]):
         for _ in range(3):
@@ -52,7 +52,7 @@ def _series() -> list[float]:
 
 @cache
 def _phi(real):
-    """Device function y -> (phi, phi', phi'') of y = x^4 = v^2 / 4, in which phi is smooth.
+    """Return the device function `phi(y) -> (phi, phi', phi'')` of y = x^4 = v^2 / 4, in which phi is smooth.
 
     Small y: 2 phi = sum (4 n + 4) y^n / (4 n + 6)! / sum y^n / (4 n + 1)!, where all terms are positive and nothing cancels.
     """
@@ -72,7 +72,7 @@ def _phi(real):
 
     @wp.func
     def far(y: real):
-        """With r, t and u the quotients of cosh x - cos x, cosh x + cos x and sinh x - sin x by sinh x + sin x."""
+        """Return phi for large y, with r, t, u = (cosh x - cos x, cosh x + cos x, sinh x - sin x) / (sinh x + sin x)."""
         one = real(1.0)
         two = real(2.0)
         x = wp.sqrt(wp.sqrt(y))
@@ -105,7 +105,7 @@ def _phi(real):
 
 @cache
 def _compliance(name: str, real):
-    """Device function (k, crossover) -> (g, dg/dk, d2g/dk2)."""
+    """Return the device function `(k, crossover) -> (g, dg/dk, d2g/dk2)` of a law."""
     V, phi = wp.types.vector(3, real), _phi(real)
 
     @wp.func
@@ -126,7 +126,7 @@ def _compliance(name: str, real):
 
 @cache
 def _defect(name: str, real):
-    """Device function (k, t, k0, t0, nu, crossover) -> (N, dN/dk, dN/dt, d2N/dk2, d2N/dk dt, d2N/dt2)."""
+    """Return the device function `(k, t, k0, t0, nu, crossover) -> (N, dN/dk, dN/dt, d2N/dk2, d2N/dk dt, d2N/dt2)`."""
     D = wp.types.vector(6, real)
     bends, kept = float(name != "sano_wada"), float(name == "sadowsky")
 
@@ -161,7 +161,7 @@ def _law(name: str):
 
         @wp.func
         def half(p: P):
-            """B / 2."""
+            """Return B / 2."""
             return real(0.5) * p[1] / (real(1.0) - p[3] * p[3])
 
         @wp.func

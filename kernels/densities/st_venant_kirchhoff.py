@@ -23,12 +23,12 @@ from ddg_warp.kernels.densities import FINITE, NOT_NEGATIVE, POSITIVE, Density, 
 
 @cache
 def _tensor(real):
-    """Device functions energy, slope and root of the quadratic form, for a change of strain d."""
+    """Return the device functions `energy`, `slope` and `root` of the quadratic form, for a change of strain d."""
     E, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(5, real)
 
     @wp.func
     def components(b: B):
-        """Matrix that takes (d11, d12, d22) to (x, y, z)."""
+        """Return the matrix that maps (d11, d12, d22) to (x, y, z)."""
         zero = real(0.0)
         u = real(1.0) / wp.sqrt(b[2])  # abar^-1 = V V^T with the columns (u, 0) and (v, t)
         t = real(1.0) / wp.sqrt(b[4] - b[3] * b[3] / b[2])

@@ -1,11 +1,12 @@
-"""Measures: the geometry. A measure maps the local dofs of an element to a few strains.
+"""Strain measures: geometry. A measure maps the local dofs of an element to a few strains.
 
-The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints..., positions...], so
-that translation invariance holds by construction and forces on nodes are differences of edge forces; positions are there only
-where the place in space is a strain, as the radius of a surface of revolution is, or a field differs from place to place. Where a
-measure needs more it reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the
-normal of a clamp or the magnetic field. w is the rest measure of the element (rest length, Voronoi length, area, volume): strains
-are pointwise quantities, so a density and its parameters do not depend on the mesh.
+The local dofs are q = [edge vectors of the stencil..., twist angles of edges..., rotation vectors of joints..., positions...].
+Translation invariance holds by construction, and forces on nodes are differences of edge forces. Positions are included only where a
+strain depends on them: the radius of a surface of revolution, or a field that varies in space.
+
+Measures may also read s, constant during a step: lagged frames of a rod, or element data such as a clamp's normal or the
+magnetic field. The rest measure w of an element is its rest length, Voronoi length, area or volume. Strains are pointwise, so a density
+and its parameters do not depend on the mesh.
 """
 
 from collections.abc import Callable
@@ -17,39 +18,39 @@ import warp as wp
 
 @dataclass(frozen=True)
 class Measure:
-    """One kind of strain.
+    """A kind of strain.
 
     Attributes:
-        name: field's name of the measure.
+        name: name of the measure.
         dim: dimension of space, 2 or 3.
         edges: pairs of local nodes; edge i of the stencil is x[j] - x[i].
-        angles: how many edges bring their angle as a dof; of a rod the first of the stencil, of a triangle its sides.
+        angles: number of edges with an angle as dof; of a rod the first of the stencil, of a triangle its sides.
         lag_size: reals of lagged data of the stencil; 0 for a measure without frames.
         data_size: reals of constant data of the element; 0 for a measure without.
-        tensions: scalars of the geometric stiffness; 0 where it is left to the exact Hessian.
+        tensions: scalars of the geometric stiffness; 0 if left to the exact Hessian.
         spins: rotation vectors of rigid joints among the dofs, after the angles.
-        points: how many nodes, the first of the stencil, are read as positions, too; after the rotation vectors.
-        field: how many of the data, the last, are the magnetic field, which changes with time.
-        apart: whether it couples what may be far apart along a rod, which preconditioners of chains leave out.
-        frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
-        by_angle: whether a rod's curvature is its turning angle over the length, instead of 2 tan(phi/2).
-        revolved: whether elements are of the meridian of a surface of revolution, in the plane y = 0.
-        vectors: rows of the lagged data behind the frames, and of the constant data after these, at which a vector of space begins,
-            three reals that turn with the element. (Frames turn too, and the field.)
-        strains: names and units of the strains; those of a vector of space end in _x, _y, _z.
-        functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
-            `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
-            w slope : d2e = C + w J^T diag(shift) J. One edge has one tension, a scalar c with C = c I. A triangle has
-            three, the vector c = (c11, c12, c22), and C has the blocks c_ij I between its edge vectors i and j.
-            `curvature` is None, or `curvature(q, s, w, slope)`, of rod vertices and rigid joints: w slope : d2e as the upper
-            triangle of a symmetric matrix, row by row.
-        advance: None, or real -> advance(q, s): the lagged data beside the frames at the end of a step, from the dofs and frames there
-            and what they were.
-        stale: None, or real -> stale(q, s): whether frames have to be renewed before the next step of a solve.
-        sample: None, or (random, count) -> of the elements that `ddg_warp.run.derivatives` tries the measure at what is to be chosen:
-            nodes (nodes, 3), about which theirs lie; data (data_size, count); frame (6, frames * count), the first ones of all
-            elements first; lag (rows, count), behind the frames; felt (slots, count), which of them the strains depend on. Else
-            nodes lie unit steps along x, z and y in turns apart, data between 0.5 and 1.5, frames are 25 degrees old, lag is large.
+        points: number of nodes, the first of the stencil, read as positions, too; after the rotation vectors.
+        field: number of data, the last, that are the magnetic field, which changes with time.
+        apart: True if it couples nodes far apart along a rod; substructuring leaves it out.
+        frames: number of angles of edges with a reference frame; the lagged data begin with these frames.
+        by_angle: True if a rod's curvature is the turning angle over the length, instead of 2 tan(phi/2).
+        revolved: True if elements are of the meridian of a surface of revolution, in the plane y = 0.
+        vectors: rows of the lagged data behind the frames, and of the constant data after them, at which a vector of space begins,
+            three reals that rotate with the element. (Frames and the field rotate, too.)
+        strains: names and units of the strains; components of a vector of space end in _x, _y, _z.
+        functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`. `jacobian(q, s, w) -> (E, J)`. `tension`
+            is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains, w slope : d2e = C + w J^T
+            diag(shift) J. One edge has one tension, a scalar c with C = c I. A triangle has three, the vector c = (c11, c12, c22),
+            and C has the blocks c_ij I between its edge vectors i and j. `curvature` is None, or `curvature(q, s, w, slope)`, of rod
+            vertices and rigid joints: w slope : d2e as the upper triangle of a symmetric matrix, row by row.
+        advance: None, or real -> advance(q, s): lagged data behind the frames at the end of a step, from the dofs and frames there
+            and the old data.
+        stale: None, or real -> stale(q, s): True if frames have to be updated before the next step of a solve.
+        sample: None, or (random, count) -> non-default data of sample elements for `ddg_warp.run.derivatives`, by name. `nodes
+            (nodes, 3)`: centres of the nodes. `data (data_size, count)`. `frame (6, frames * count)`: the first frames of all
+            elements first. `lag (rows, count)`: behind the frames. `felt (slots, count)`: local nodes that the strains depend on.
+            Default nodes are unit steps along x, z and y in alternation, data between 0.5 and 1.5, frames 25 degrees old, the lag
+            large.
     """
 
     name: str
@@ -80,12 +81,12 @@ class Measure:
 
     @property
     def nodes(self) -> int:
-        """Nodes of the stencil."""
+        """Number of nodes of the stencil."""
         return max((1 + max(pair) for pair in self.edges), default=self.points)
 
     @property
     def slots(self) -> int:
-        """Nodes, angles and rotation vectors of the stencil."""
+        """Number of nodes, angles and rotation vectors of the stencil."""
         return self.nodes + self.angles + self.spins
 
     @property
@@ -97,40 +98,40 @@ class Measure:
 
     @property
     def ends(self) -> tuple[list[int], list[int]]:
-        """Of each slot, the first local dof that it sees with weight 1, and with -1, -1 for none.
+        """First local dofs seen with weight 1, and with -1, by each node, angle and rotation; -1 for none.
 
-        A node sees the edge that ends in it and that which starts in it, of which there is one each at most, or itself as a position
-        where no edge ends; angles and rotations see themselves.
+        A node sees the edge that ends in it and the edge that starts in it, at most one each, or its own position where no edge ends.
+        Angles and rotations see themselves.
         """
         angles, spins, points = self.starts
-        own = [*range(angles, spins), *range(spins, points, 3)]
+        single = [*range(angles, spins), *range(spins, points, 3)]
         minus, plus = ({edge[end]: 3 * i for i, edge in enumerate(self.edges)} for end in (0, 1))
         plus = {n: points + 3 * n for n in range(self.points)} | plus
         nodes = range(self.nodes)
-        return [*(plus.get(n, -1) for n in nodes), *own], [*(minus.get(n, -1) for n in nodes), *([-1] * len(own))]
+        return [*(plus.get(n, -1) for n in nodes), *single], [*(minus.get(n, -1) for n in nodes), *([-1] * len(single))]
 
     @property
     def packed(self) -> int:
-        """Reals of its second derivatives, contracted with stresses: an upper triangle; 0 where they are left to reverse mode."""
+        """Number of reals of second derivatives contracted with stresses (an upper triangle); 0 if left to reverse mode."""
         return self.size * (self.size + 1) // 2 if self.functions(wp.float64)[3] else 0
 
     @property
     def twists(self) -> bool:
-        """Whether the strains are the curvatures and the twist between two edges of a rod."""
+        """True if the strains are the curvatures and the twist between two edges of a rod."""
         return self.strains[-1].startswith("twist")
 
     @property
     def vector(self) -> bool:
-        """Whether the strains are the components of a vector in space."""
+        """True if the strains are the components of a vector in space."""
         return [name.split()[0][-2:] for name in self.strains] == ["_x", "_y", "_z"]
 
     @property
     def span(self) -> int:
-        """Edges of a chain stencil: 1 for an edge, 2 for a vertex."""
+        """Number of edges of a rod stencil: 1 for an edge, 2 for a vertex."""
         return len(self.edges)
 
     def types(self, real):
-        """Vector of dofs, of lagged and constant data, of strains, and matrix of the Jacobian."""
+        """Return the types of dofs, of lagged and constant data, of strains (vectors) and of the Jacobian (matrix)."""
         return (
             wp.types.vector(self.size, real),
             wp.types.vector(max(1, self.lag_size + self.data_size), real),
@@ -140,7 +141,7 @@ class Measure:
 
 
 def lagged_frames(random: np.random.Generator, edges: np.ndarray) -> np.ndarray:
-    """Reference frames (u, t) (6, ...) of edges (..., 3), with tangents 25 degrees from theirs at random; for samples."""
+    """Return reference frames (u, t) (6, ...) of edges (..., 3), with tangents rotated by 25 degrees at random; for samples."""
     t = edges / np.linalg.norm(edges, axis=-1, keepdims=True)
     across, director = np.cross(t, random.normal(size=t.shape)), random.normal(size=t.shape)
     t = t + across / np.linalg.norm(across, axis=-1, keepdims=True) * np.tan(np.radians(25.0))

@@ -1,9 +1,9 @@
-"""Curvatures of a surface of revolution at a node of its meridian, and at the ends of it [1/m].
+"""Curvatures of a surface of revolution at a node of the meridian, and at the ends of the meridian [1/m].
 
 The meridian lies in the plane of x (the radius) and z; phi is the angle of its tangent from x. Along the meridian the curvature is
-that of a planar rod, 2 tan(dphi / 2) / l with dphi the turning angle and l the rest length of the cell (Bergou et al. 2008); around
-the axis it is sin(phi) / R with R the rest radius, the mean of both edges (Reissner 1950: per rest length, as the curvature
-along the meridian is, so that a uniform stretch of the surface changes neither). y is not read.
+that of a planar rod, 2 tan(dphi / 2) / l with l the rest length of the cell (Bergou et al. 2008). Around the axis it is sin(phi) / R
+with R the rest radius, the mean of both edges (Reissner 1950). Both are per rest length, so that a uniform stretch of the surface
+changes neither. y is not read.
 
     axisymmetric_curvature  nodes with two edges; data: l, R.
     axisymmetric_rim        an end, with the one edge there is, run as the meridian runs. With K = 2 tan(dphi / 2) from the unit
@@ -11,7 +11,7 @@ along the meridian is, so that a uniform stretch of the surface changes neither)
                             (c1 K, 0, c2 K + c3 S + c4 tz); data: tx, ty = 0, tz, c1, c2, c3, c4.
                             A pole, where the meridian goes on as its mirror image across the axis and the surface is
                             curved alike in all directions: c1 = c2 = 2 / l, (tx, tz) = (1, 0). A clamped rim, with (tx, tz)
-                            as the clamp has it: c1 = 2 / l, c4 = 1 / R. A rim that is free to turn, without moment along
+                            as the clamp has it: c1 = 2 / l, c4 = 1 / R. A rim that is free to rotate, without moment along
                             the meridian: c3 = 1 / R with R in the middle of the edge, all else zero.
 
 Derivatives: K' = 1 + K^2 / 4 in phi, phi' = (-z, x) / (x^2 + z^2), sin(phi)' = cos(phi) phi'.
@@ -67,7 +67,7 @@ def _rim_functions(real):
 
     @wp.func
     def turning(q: Q, s: S, length: real):
-        """K; zero without a direction."""
+        """Return K; zero without a direction."""
         return real(2.0) * (s[0] * q[2] - s[2] * q[0]) / (length + s[0] * q[0] + s[2] * q[2])
 
     @wp.func
@@ -90,7 +90,7 @@ def _rim_functions(real):
 
 
 def _rim_sample(random, count: int) -> dict:
-    """Clamps a little off the radius."""
+    """Return clamps a little off the radius."""
     data, angle = random.uniform(0.5, 1.5, size=(7, count)), random.uniform(0.0, 0.3, count)
     data[[0, 2]] = np.cos(angle), np.sin(angle)
     return {"data": data}

@@ -1,14 +1,14 @@
-"""First fundamental form of a surface of revolution over an edge of its meridian, (a_ss, a_st, a_tt) / 2 [m^2].
+"""First fundamental form of a surface of revolution over a meridian edge, (a_ss, a_st, a_tt) / 2 [m^2].
 
 With the meridian in the plane of x (the radius r) and z, coordinates s from 0 to 1 along the edge and t the angle around the axis,
 
     a_ss = |x1 - x0|^2,    a_st = 0,    a_tt = r^2 with r = (r0 + r1) / 2, in the middle of the edge.
 
 With half the rest metric as rest strain, the difference is the Green strain along the meridian and around the axis (Reissner 1950).
-q holds the edge and the position of its first node; y is not read. w is the rest area, 2 pi r times the length [m^2].
+The dofs q are the edge and the position of its first node; y is not read. The rest area w is 2 pi r times the length [m^2].
 
-The strains are quadratic in q: d2(a_ss / 2) = I on the edge, and d2(a_tt / 2) = g g^T with g the derivative of r, so that the
-geometric stiffness is w s1 I plus w J^T diag(0, 0, s3 / r^2) J with s the slope of the density.
+The strains are quadratic in q: d2(a_ss / 2) = I on the edge, and d2(a_tt / 2) = g g^T with g the derivative of r. So the geometric
+stiffness is w s1 I plus w J^T diag(0, 0, s3 / r^2) J with s the slope of the density.
 """
 
 from functools import cache

@@ -1,22 +1,22 @@
-"""The closest points of two simplices, and what the vector between them and its length depend on.
+"""Closest points of two simplices, with derivatives of the vector between them and of its length.
 
-The vector is r = sum_k rho_k e_k of the edge vectors e of a chain of nodes, with coefficients rho that make it shortest:
+The vector is r = sum_k rho_k e_k of the edge vectors e of a sequence of nodes, with coefficients rho that make it shortest:
 
     point, edge        nodes 0 | 1 2       r = e0 + t e1            0 <= t <= 1
     edge, edge         nodes 0 1 | 2 3     r = s e0 + e1 + t e2     0 <= s, t <= 1, s = 1 at node 0
     point, triangle    nodes 0 | 1 2 3     r = e0 + s e1 + t e2     0 <= t <= s <= 1
 
-Which of the bounds hold is the region: a vertex, an edge, or all between. What is free to move there is given by up to two
-directions m, coefficients with which r changes as sum_k m_k e_k = r_m; one of zeros is none. At the closest points r . r_m = 0, so that
+The active bounds define the region: a vertex, an edge, or the interior. Free motions in a region are given by up to two directions m,
+coefficients with which r changes as sum_k m_k e_k = r_m; one of zeros is none. At the closest points r . r_m = 0, so that
 with n = r / |r| the derivative of the distance is (rho_k n)_k in every region: it is continuous where regions meet. The second one is
 not. With two directions that are made to have r_m at right angles,
 
     d2|r| = (rho_k rho_l I - g_k g_l^T - sum_m B_mk B_ml^T / |r_m|^2) / |r| ,   g_k = rho_k n ,   B_mk = rho_k r_m + m_k r ,
 
-the last of which is what the points give way (the implicit function theorem).
+the last term from the motion of the closest points (implicit function theorem).
 
-Two lines are closest where r is along e0 x e2; both crossings are found by products with it, which lose no digits where the lines are
-nearly parallel, as differences of squared lengths do (Ericson, Real-Time Collision Detection, 2005, 5.1.9, for the clamping).
+Two lines are closest where r is along e0 x e2. Both crossings are found by products with e0 x e2, which lose no digits for nearly
+parallel lines, as differences of squared lengths do. Clamping is by Ericson, Real-Time Collision Detection, 2005, 5.1.9.
 """
 
 from functools import cache
@@ -31,7 +31,7 @@ PARALLEL = {wp.float64: 1.0e-20, wp.float32: 1.0e-10}
 
 @cache
 def point_edge(real):
-    """closest(q) -> (rho, m, none) of a point and an edge."""
+    """Return the device function `closest(q) -> (rho, m, zeros)` of a point and an edge."""
     Q, K, V = wp.types.vector(6, real), wp.types.vector(2, real), wp.types.vector(3, real)
 
     @wp.func
@@ -46,7 +46,7 @@ def point_edge(real):
 
 @cache
 def _edges(real):
-    """Device function: the three edges of a chain of four nodes."""
+    """Return the device function `edges(q)`: the three edges of a sequence of four nodes."""
     Q, V = wp.types.vector(9, real), wp.types.vector(3, real)
 
     @wp.func
@@ -58,7 +58,7 @@ def _edges(real):
 
 @cache
 def edge_edge(real):
-    """closest(q) -> (rho, m, m') of two edges."""
+    """Return the device function `closest(q) -> (rho, m, m')` of two edges."""
     Q, K = wp.types.vector(9, real), wp.types.vector(3, real)
     parallel, edges = PARALLEL[real], _edges(real)
 
@@ -83,13 +83,13 @@ def edge_edge(real):
 
 @cache
 def point_triangle(real):
-    """closest(q) -> (rho, m, m') of a point and a triangle."""
+    """Return the device function `closest(q) -> (rho, m, m')` of a point and a triangle."""
     Q, K = wp.types.vector(9, real), wp.types.vector(3, real)
     parallel, edges = PARALLEL[real], _edges(real)
 
     @wp.func
     def along(a: K, e: K):
-        """Of a + t e the t between 0 and 1 where it is shortest."""
+        """Return the minimiser t of |a + t e| between 0 and 1."""
         return wp.clamp(-wp.dot(a, e) / wp.dot(e, e), real(0.0), real(1.0))
 
     @wp.func
@@ -128,11 +128,12 @@ def point_triangle(real):
 
 @cache
 def distance_functions(closest_of, size: int, real):
-    """Of one of the above, on `size` local dofs q.
+    """Return the device functions of a distance, given `closest_of` from above, on `size` local dofs q.
 
-    Returns:
-        between(q, rho) -> r; spread(rho, v) -> (rho_k v)_k; slope(q) -> (|r|, its derivative); bend(q) -> (g, B, B', rho, 1 / |r|)
-        with B / |r_m| of two directions at right angles, zero for none.
+    `between(q, rho)`: r.
+    `spread(rho, v)`: (rho_k v)_k.
+    `slope(q)`: (|r|, its derivative).
+    `bend(q)`: (g, B, B', rho, 1 / |r|) with B / |r_m| of two orthogonal directions, zero for none.
     """
     edges = size // 3
     Q, K, V = wp.types.vector(size, real), wp.types.vector(edges, real), wp.types.vector(3, real)
@@ -163,7 +164,7 @@ def distance_functions(closest_of, size: int, real):
 
     @wp.func
     def yielding(rho: K, r: V, m: K, rm: V):
-        """B / |r_m|."""
+        """Return B / |r_m|."""
         return (spread(rho, rm) + spread(m, r)) / nonzero(wp.length(rm))
 
     @wp.func

@@ -27,7 +27,7 @@ def _functions(real):
 
     @wp.func
     def row(axis: V, k: real, te: V, tf: V, ie: real, i_f: real):
-        """Derivative of the component of kb along `axis`, whose value is k; ie, if are 1/(chi |e|), 1/(chi |f|)."""
+        """Return the derivative of the component k of kb along `axis`; ie, i_f are 1/(chi |e|), 1/(chi |f|)."""
         a = real(2.0) * wp.cross(tf, axis) - k * tf
         b = real(2.0) * wp.cross(axis, te) - k * te
         a = (a - te * wp.dot(a, te)) * ie
@@ -54,7 +54,7 @@ def _functions(real):
 
     @wp.func
     def packed(ee: M3, ef: M3, ff: M3):
-        """Upper triangle of the matrix, row by row."""
+        """Return the upper triangle of the matrix, row by row."""
         h = H()
         for i in range(3):
             for j in range(3):

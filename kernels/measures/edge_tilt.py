@@ -1,4 +1,4 @@
-"""Angle between a triangle's normal and its target about an edge [rad]: half a hinge, at a clamped edge or a symmetry plane.
+"""Angle between a triangle's normal and a target normal about an edge [rad]: half a hinge, at a clamp or a symmetry plane.
 
 Nodes 0, 1 on the edge (the way the triangle runs it), 2 opposite. With e = x1 - x0, a = x2 - x0, n = e x a:
 
@@ -22,7 +22,7 @@ from ddg_warp.kernels.measures.hinge_angle import dihedral
 
 @cache
 def mirror(real):
-    """Device function: a vector mirrored at the plane with the unit normal N."""
+    """Return the device function `mirrored(a, N)`: a vector mirrored at the plane with the unit normal N."""
     V = wp.types.vector(3, real)
 
     @wp.func
@@ -34,7 +34,7 @@ def mirror(real):
 
 @cache
 def tilt(real):
-    """Device function (e, a, N) -> (alpha, dalpha/de, dalpha/da) of a triangle at a clamp with the prescribed normal N."""
+    """Return the device function `tilted(e, a, N) -> (alpha, dalpha/de, dalpha/da)` of a triangle clamped with the normal N."""
     V, nonzero = wp.types.vector(3, real), nonzero_function(real)
 
     @wp.func
@@ -42,13 +42,13 @@ def tilt(real):
         # y = (n x N) . t / |e| and x = n . N / |e| with t = e / |e|; n x N . e = (a . e) (N . e) - (N . a) |e|^2
         length = wp.length(e)
         t = e / length
-        Nt = wp.dot(N, t)
-        at = wp.dot(a, t)
-        Na = wp.dot(N, a)
-        y = at * Nt - Na
+        N_t = wp.dot(N, t)
+        a_t = wp.dot(a, t)
+        N_a = wp.dot(N, a)
+        y = a_t * N_t - N_a
         x = wp.dot(wp.cross(t, a), N)
-        y_e = N * at + a * Nt - t * (at * Nt + Na)
-        y_a = (t * Nt - N) * length
+        y_e = N * a_t + a * N_t - t * (a_t * N_t + N_a)
+        y_a = (t * N_t - N) * length
         scale = real(1.0) / (length * nonzero(x * x + y * y))
         return (
             wp.atan2(y, x),
@@ -94,7 +94,7 @@ def _functions(real):
 
 
 def _sample(random, count: int) -> dict:
-    """A clamp and a symmetry plane in turns, with normals some 25 degrees away."""
+    """Return alternating clamps and symmetry planes, with normals some 25 degrees away."""
     kind = 2.0 + np.arange(count) % 2
     normal = np.where(kind[:, None] > 2.5, [0.1, 0.2, 1.0], [0.2, -1.0, 0.1]) + 0.2 * random.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

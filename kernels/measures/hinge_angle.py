@@ -4,15 +4,18 @@ With e = x1 - x0, a = x2 - x0, b = x3 - x0 the area normals are n = e x a and m 
 
     theta = atan2((n x m) . e / |e|, n . m),   positive where the surface is convex seen from the side that the normals point to.
 
-Derivatives (Wardetzky et al. 2007; Tamstorf and Grinspun 2013), with the heights h = |n| / |e|, k = |m| / |e|:
-d theta / da = -n / (|n| h), d theta / db = -m / (|m| k), and that of e follows from the invariance under rotations. A triangle
-without area has zero derivatives; theta jumps by 2 pi where the surface folds onto itself.
+Derivatives, with the heights h = |n| / |e| and k = |m| / |e|:
+
+    d theta / da = -n / (|n| h),   d theta / db = -m / (|m| k);
+
+d theta / de follows from rotation invariance (Wardetzky et al. 2007; Tamstorf and Grinspun 2013). A triangle without area has zero
+derivatives; theta jumps by 2 pi where the surface folds onto itself.
 
 The quadratic density with stiffness k [J] and w = |e|^2 / A_e, A_e a third of the two triangles' rest area (Grinspun et al.
-2003), makes the energy k w theta^2 / 2. On a mesh of equilateral triangles this is the plate of bending stiffness D = 3 k with
-Gaussian modulus -4 k = -(4/3) D (Seung and Nelson 1988): it has the Poisson's ratio -1/3 whatever the material's. So k = D / 3
-bends that mesh right into cylinders, and spheres with the energy of nu = -1/3. On right triangles with the diagonal at 45 degrees
-cylinders bent along 0, 90 and 135 degrees still have D = 3 k, but 9 k along 45 degrees, and refining does not change it.
+2003), gives the energy k w theta^2 / 2. On a mesh of equilateral triangles this is the plate of bending stiffness D = 3 k with
+Gaussian modulus -4 k = -(4/3) D (Seung and Nelson 1988). Its Poisson's ratio is -1/3 for every material. So k = D / 3 is correct for
+cylinders on that mesh, and gives spheres the energy of nu = -1/3. On right triangles with the diagonal at 45 degrees, cylinders bent
+along 0, 90 and 135 degrees have D = 3 k, but 9 k along 45 degrees, and refining does not change it.
 """
 
 from functools import cache
@@ -25,10 +28,10 @@ from ddg_warp.kernels.measures import Measure
 
 @cache
 def dihedral(real):
-    """Device functions of an edge e with the corners a and b beside it, all from the first node of the edge.
+    """Return the device functions `angle` and `derivative` of an edge e with corners a and b on both sides.
 
-    Returns:
-        angle(e, a, b) -> theta; derivative(e, a, b) -> (theta, dtheta/de, dtheta/da, dtheta/db).
+    Vectors start at the first node of the edge. `angle(e, a, b) -> theta`. `derivative(e, a, b) -> (theta, dtheta/de, dtheta/da,
+    dtheta/db)`.
     """
     V, nonzero = wp.types.vector(3, real), nonzero_function(real)
 
@@ -40,7 +43,7 @@ def dihedral(real):
 
     @wp.func
     def by_height(n: V, length: real):
-        """Unit normal over the height of its triangle on an edge of that length; zero where the triangle has no area."""
+        """Return the unit normal divided by the height of a triangle over an edge of `length`; zero without area."""
         h = n / length
         return h / nonzero(wp.dot(h, h))
 

@@ -1,15 +1,15 @@
 """Integrated mean curvature vector of a hinge, sum_j K_j x_j [m]: linear in the positions (Bergou et al. 2006).
 
-Four nodes, 0 and 1 on the edge, 2 and 3 opposite; from the cotangents of the flat rest shape (Bergou, Wardetzky, Harmon, Zorin,
-Grinspun, "A quadratic bending model for inextensible surfaces", 2006; Wardetzky et al. 2007), c02 the cotangent of the angle
-between the edge and the side 0-2 and so on,
+Four nodes, 0 and 1 on the edge, 2 and 3 opposite (Bergou, Wardetzky, Harmon, Zorin, Grinspun, A quadratic bending model for
+inextensible surfaces, 2006; Wardetzky et al. 2007). With cotangents of the flat rest shape, c02 of the angle between the edge and
+the side 0-2 and so on,
 
     K0 = c12 + c13,   K1 = c02 + c03,   K2 = -c02 - c12,   K3 = -c03 - c13,   sum K_j = 0.
 
-Its length is |e| theta for small angles as long as lengths are kept, so with w = 1 / A_e [1/m^2] (A_e a third of the two triangles'
-rest area) and stiffness k in all three components it has the energy of `hinge_angle` with the same k [J], with the same continuum
-moduli (D = 3 k and nu = -1/3 on equilateral triangles) and the same dependence on the mesh, at a constant Hessian. It holds for
-isometric deformations of flat rest shapes; stretch raises the energy as well. Data: K1, K2, K3.
+Its length is |e| theta for small angles if lengths do not change. With w = 1 / A_e [1/m^2] and stiffness k in all three components,
+the energy is that of `hinge_angle` with the same k [J]. A_e is a third of the two triangles' rest area. Continuum moduli (D = 3 k
+and nu = -1/3 on equilateral triangles) and mesh dependence are the same, at a constant Hessian. It holds for isometric deformations
+of flat rest shapes; stretch raises the energy as well. Data: K1, K2, K3.
 """
 
 from functools import cache

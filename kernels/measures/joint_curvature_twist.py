@@ -1,25 +1,25 @@
-"""Curvatures and twist between a rigid joint and an edge that meets it, (kappa_1, kappa_2, tau), pointwise [1/m].
+"""Curvatures and twist between a rigid joint and one of the joint's edges, (kappa_1, kappa_2, tau), pointwise [1/m].
 
-A rigid joint carries, for each edge that meets it, a ghost edge with the tangent and the first director that the edge had at rest.
-The ghost turns with the joint, by exp(omega) since the last step; between ghost and edge lie the strains of a rod vertex
-(`rod_curvature_twist`), with half the edge as Voronoi length, as at a clamped end. Two collinear rods joined rigidly are one rod: the
-half cells, in series, twist exactly as its cell and bend as it up to the square of the angle a between the edges, as
-8 B tan(a/4)^2 / l differs from 2 B tan(a/2)^2 / l.
+A rigid joint carries, for each of its edges, a ghost edge with the rest tangent and first director of the edge. The ghost rotates
+with the joint, by exp(omega) since the last step. Strains between ghost and edge are as at a rod vertex (`rod_curvature_twist`)
+with half the edge as Voronoi length, as at a clamped end. Two collinear rods joined rigidly are one rod. The half cells, in series,
+twist exactly as its cell. They bend as the cell up to the square of the angle a between the edges: 8 B tan(a/4)^2 / l differs from 2
+B tan(a/2)^2 / l.
 
-With phi the rotation of space, a row of the rod's Jacobian (a with respect to the ghost's edge t, b to its angle) turns into
-t x a + b t, and with the left Jacobian T(omega) of the exponential map (d phi = T d omega) into T^T of that.
+With phi a rotation of space, a row of the rod's Jacobian (a with respect to the ghost's edge t, b to its angle) becomes t x a + b t.
+With the left Jacobian T(omega) of the exponential map (d phi = T d omega) it becomes T^T of that.
 
 Second derivatives, contracted with moments: a rotation phi moves the ghost's edge by phi x t and its angle by t . phi. With the rod's
-Hessian in these and with (phi . t) (phi . a), as t x a turns with the ghost, that is a quadratic form in phi. Along a line in omega
+Hessian in these and with (phi . t) (phi . a), as t x a rotates with the ghost, that is a quadratic form in phi. Along a line in omega
 with direction d, phi = T d changes at the rate
 
     (omega . d) (p' omega x d + q' omega x (omega x d)) + q d x (omega x d),   T = I + p [omega] + q [omega]^2,
 
-where ' is the derivative by |omega| over |omega|, so that the work of t x a + b t on it is added. (That the rod's frames spin at a
-rate as they are transported drops out: the ghost's is as new, z = 0, and dz = t x (phi x t) / 2 is at right angles to phi x t.)
+where ' is the derivative by |omega| over |omega|, so that the work of t x a + b t on it is added. The spin rate of transported frames
+drops out: the ghost's frame is current, z = 0, and dz = t x (phi x t) / 2 is orthogonal to phi x t.
 
-Dofs: edge from the joint outwards (3), its angle, omega (3). Lagged data: frame (u, t) of the edge; (u, t) of the ghost, reference
-twist. Data: +1 where the rod's edge starts at the joint, -1 where it ends there: seen backwards, t and theta change their sign.
+Dofs: edge from the joint outwards (3), twist angle, omega (3). Lagged data: frame (u, t) of the edge; (u, t) of the ghost, reference
+twist. Data: +1 where the rod's edge starts at the joint, -1 where it ends there: seen backwards, t and theta change sign.
 """
 
 from functools import cache
@@ -34,15 +34,19 @@ from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 
 @cache
 def rotations(real):
-    """turned(omega, v) = exp(omega) v; transposed(omega, v) = T(omega)^T v, and tangent(omega) = T, the left Jacobian of exp;
-    bent(omega, c), the symmetric part of d(T^T c) / d omega.
+    """Return the device functions `turned`, `transposed`, `tangent` and `bent` of a rotation vector.
+
+    `turned(omega, v)`: exp(omega) v.
+    `transposed(omega, v)`: T(omega)^T v.
+    `tangent(omega)`: T, the left Jacobian of exp.
+    `bent(omega, moment)`: the symmetric component of d(T^T moment) / d omega.
     """
     V = wp.types.vector(3, real)
     small = wp.constant(real(1.0e-3))
 
     @wp.func
     def coefficients(square: real):
-        """sin(a) / a, (1 - cos(a)) / a^2, (a - sin(a)) / a^3 of the angle with this square; by series where it is small."""
+        """Return sin(a) / a, (1 - cos(a)) / a^2, (a - sin(a)) / a^3 for a^2 = `square`, by series if small."""
         s = real(1.0) - square / real(6.0) + square * square / real(120.0)
         c = real(0.5) - square / real(24.0) + square * square / real(720.0)
         d = real(1.0) / real(6.0) - square / real(120.0) + square * square / real(5040.0)
@@ -90,7 +94,7 @@ def rotations(real):
 
 @cache
 def functions(real, between: bool = False):
-    """Functions of the measure, `between` as for a rod's vertex."""
+    """Return the functions of the measure; `between` as for a rod vertex."""
     Q, S, E, _ = joint_curvature_twist.types(real)
     R, T, _, _ = rod_curvature_twist.types(real)
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
@@ -100,7 +104,7 @@ def functions(real, between: bool = False):
 
     @wp.func
     def vertex(q: Q, s: S):
-        """The rod vertex between the ghost and the edge: its dofs and lagged data, and the ghost's tangent."""
+        """Return dofs and lagged data of the rod vertex between ghost and edge, the ghost's tangent, omega and the sign."""
         omega = V(q[4], q[5], q[6])
         u = turned(omega, V(s[6], s[7], s[8]))
         t = turned(omega, V(s[9], s[10], s[11]))
@@ -132,7 +136,7 @@ def functions(real, between: bool = False):
         _e, j = rod_jacobian(r, lag, w)
         f = (slope * w) * j
         h = rod_curvature(r, lag, w, slope)
-        gg = M()  # of the ghost's edge (g) and angle (a), and of the edge (e) and its angle (b)
+        gg = M()  # g: ghost edge, a: ghost angle, e: edge, b: its twist angle
         ge = M()
         ee = M()
         ga = V()
@@ -156,11 +160,11 @@ def functions(real, between: bool = False):
         a = V(f[0], f[1], f[2])
         mixed = wp.outer(x * ga + a * real(0.5), t)
         spin = mixed + wp.transpose(mixed) + wp.outer(t, t) * h[33] - x * (gg * x)
-        turn = tangent(omega)
-        back = wp.transpose(turn)
-        oo = back * (spin * turn) + bent(omega, wp.cross(t, a) + t * f[6])
-        oe = back * (x * ge + wp.outer(t, ea))
-        ob = back * (x * gb) * sign
+        T_left = tangent(omega)
+        T_transposed = wp.transpose(T_left)
+        oo = T_transposed * (spin * T_left) + bent(omega, wp.cross(t, a) + t * f[6])
+        oe = T_transposed * (x * ge + wp.outer(t, ea))
+        ob = T_transposed * (x * gb) * sign
         return H(
             ee[0, 0],
             ee[0, 1],
@@ -204,7 +208,7 @@ def _advance(real):
 
     @wp.func
     def advance(q: Q, s: S):
-        """The ghost, turned by the joint's rotation, and the angle between its frame and that of the edge."""
+        """Return the ghost frame, rotated by the joint, and the angle from it to the frame of the edge."""
         omega = V(q[4], q[5], q[6])
         t = wp.normalize(turned(omega, V(s[9], s[10], s[11])))
         u = turned(omega, V(s[6], s[7], s[8]))
@@ -224,7 +228,7 @@ def _stale(real):
 
     @wp.func
     def stale(q: Q, s: S):
-        """Of the ghost, which turns with its frame, and the edge seen outwards."""
+        """Return True if the frames of ghost and edge, seen outwards, have to be updated."""
         omega = V(q[4], q[5], q[6])
         u = turned(omega, V(s[6], s[7], s[8]))
         t = turned(omega, V(s[9], s[10], s[11]))
@@ -234,7 +238,7 @@ def _stale(real):
 
 
 def _sample(random, count: int) -> dict:
-    """Edges along x of rods that run either way, and ghosts, twisted by several turns."""
+    """Return edges along x of rods of both directions, and ghosts twisted by several revolutions."""
     sign, along = np.where(np.arange(count) % 2, 1.0, -1.0), np.eye(3)[:1]
     ghost = lagged_frames(random, np.repeat(along, count, axis=0))
     return {

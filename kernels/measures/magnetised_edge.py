@@ -1,24 +1,24 @@
-"""Hard-magnetic edges of rods: the direction of their magnetisation in space, the field at their middle, the place of two of them.
+"""Hard-magnetic edges of rods: direction of magnetisation and field at the middle of an edge; orientation of a pair.
 
-The magnetisation is fixed in the material frame (m1, m2, t) of its edge and turns with it (Zhao, Kim, Cabrera, Ferracin, Nguyen and
+The magnetisation is fixed in the material frame (m1, m2, t) of its edge and rotates with it (Zhao, Kim, Cabrera, Ferracin, Nguyen and
 Dunn, J. Mech. Phys. Solids 124, 2019, 244; of rods Sano, Pezzulla and Reis, J. Mech. Phys. Solids 160, 2022, 104739). With the unit
 vector a in that frame its direction in space is
 
     n = a1 m1 + a2 m2 + a3 t ,
 
-which no stretch changes. An edge that turns by w turns it by w x n; de turns the edge by t x de / |e|, and its frame, which is
-transported in time, about t by -z . de / |e| with z = (t0 x t) / (1 + t0 . t) (see `rod_curvature_twist`). So for v held in space and
-h = n x v
+independent of stretch. A rotation w of the edge changes n by w x n. A change de rotates the edge by t x de / |e|. It rotates the
+frame, transported in time, about t by -z . de / |e| with z = (t0 x t) / (1 + t0 . t) (see `rod_curvature_twist`). So for a constant
+v and h = n x v
 
     v . dn = ((h x t - (h . t) z) . de) / |e| + (h . t) dtheta .
 
 A magnetisation along the tangent needs neither frames nor angles: rods without twist have it, too.
 
-In a field: strains n and B(x) = B + G x at the middle x of the edge. Nodes: its two. Data: a (3), B (3), G (9, row by row). The field
-may change with time: what prescribes it writes B and G; see `ddg_warp.solve.net.prescribed`.
+In a field: strains n and B(x) = B + G x at the middle x of the edge. Nodes: the two of the edge. Data: a (3), B (3), G (9, row by
+row). For a field that changes with time, `ddg_warp.solve.net.prescribed` writes B and G.
 
-Two of them: with r = r u from the middle of one edge to that of the other, strains are the factor n . n' - 3 (n . u) (n' . u) of the
-energy of two point dipoles, and their distance r. Nodes: two of either edge. Data: a, a' (3 each).
+Pairs: with r = r u between the middles of two edges, strains are the orientation n . n' - 3 (n . u) (n' . u) of two point dipoles and
+their distance r. Nodes: two of each edge. Data: a, a' (3 each).
 """
 
 from functools import cache
@@ -33,7 +33,11 @@ FIELD = 12  # data of the field: B and the rows of its gradient
 
 @cache
 def direction_functions(real, framed: bool):
-    """direction(e, theta, u0, t0, a) -> (n, t, z, 1 / |e|); turned(n, v, t, z, 1 / |e|) -> derivatives of v . n by e and theta."""
+    """Return the device functions `direction` and `turned`.
+
+    `direction(e, theta, u0, t0, a) -> (n, t, z, 1 / |e|)`: direction of the magnetisation.
+    `turned(n, v, t, z, inverse)`: derivatives of v . n with respect to e and theta.
+    """
     V = wp.types.vector(3, real)
     transport, _, rotate = frames.functions(real)
 
@@ -61,7 +65,7 @@ def direction_functions(real, framed: bool):
 
 
 def _in_field(measure_of, framed: bool):
-    """Of one edge: dofs are its vector, its angle if it is framed, and its first node."""
+    """Return the functions of one edge in a field; dofs are its vector, twist angle if framed, and first node."""
 
     @cache
     def functions(real):
@@ -73,7 +77,7 @@ def _in_field(measure_of, framed: bool):
 
             @wp.func
             def read(q: Q, s: S):
-                """Edge, angle, first node, lagged director and tangent, a, B and G."""
+                """Return edge, angle, first node, lagged director and tangent, a, B and G."""
                 u0 = V(s[0], s[1], s[2])
                 t0 = V(s[3], s[4], s[5])
                 a = V(s[6], s[7], s[8])
@@ -106,7 +110,7 @@ def _in_field(measure_of, framed: bool):
             return E(n[0], n[1], n[2], b[0], b[1], b[2])
 
         @wp.func
-        def turn(n: V, v: V, t: V, z: V, inverse: real):
+        def direction_row(n: V, v: V, t: V, z: V, inverse: real):
             de, angle = turned(n, v, t, z, inverse)
             return row(de, angle, V())
 
@@ -117,9 +121,9 @@ def _in_field(measure_of, framed: bool):
             b = B + G * (x + e * real(0.5))
             zero, one, half = real(0.0), real(1.0), real(0.5)
             return E(n[0], n[1], n[2], b[0], b[1], b[2]), wp.matrix_from_rows(
-                turn(n, V(one, zero, zero), t, z, inverse),
-                turn(n, V(zero, one, zero), t, z, inverse),
-                turn(n, V(zero, zero, one), t, z, inverse),
+                direction_row(n, V(one, zero, zero), t, z, inverse),
+                direction_row(n, V(zero, one, zero), t, z, inverse),
+                direction_row(n, V(zero, zero, one), t, z, inverse),
                 row(G[0] * half, zero, G[0]),
                 row(G[1] * half, zero, G[1]),
                 row(G[2] * half, zero, G[2]),
@@ -131,7 +135,7 @@ def _in_field(measure_of, framed: bool):
 
 
 def _pair(measure_of, framed: bool):
-    """Of two edges: dofs are their vectors, that from the first node of one to that of the other, and their angles if framed."""
+    """Return the functions of two edges; dofs are both vectors, the vector between first nodes, and angles if framed."""
 
     @cache
     def functions(real):
@@ -143,7 +147,7 @@ def _pair(measure_of, framed: bool):
 
             @wp.func
             def one(q: Q, s: S):
-                """Direction of the first: edge, angle, lagged director and tangent, a."""
+                """Return the direction of the first dipole, by edge, angle, lagged director and tangent, a."""
                 return direction(
                     V(q[0], q[1], q[2]), q[9], V(s[0], s[1], s[2]), V(s[3], s[4], s[5]), V(s[12], s[13], s[14])
                 )
@@ -174,7 +178,7 @@ def _pair(measure_of, framed: bool):
 
         @wp.func
         def apart(q: Q):
-            """From the middle of one edge to that of the other."""
+            """Return the vector between the middles of the edges."""
             return V(q[6], q[7], q[8]) + (V(q[3], q[4], q[5]) - V(q[0], q[1], q[2])) * real(0.5)
 
         @wp.func

@@ -4,30 +4,30 @@ In the basis a1 = x1 - x0, a2 = x2 - x0, with edge i opposite to corner i and h_
 
     b11 = c0 + c1,   b12 = c0,   b22 = c0 + c2,   c_i = -2 h_i phi_i ,
 
-phi_i the angle about edge i from the triangle's normal to the normal at the middle of the edge. For small angles this is
-b_ij = -dn(a_i) . a_j with n linear between the mid-edge normals (Grinspun, Gingold, Reisman, Zorin 2006; Weischedel 2012; Chen,
-Sastry, van Rees, Vouga 2018), for which c_i = -2 h_i sin(phi_i). The angle itself has the same limit on fine meshes and
-two thirds of the error of sin(phi) on a clamped strip that rolls up; and it grows with the fold, so that an edge holds any fold
-below 180 degrees and a normal can not turn over. By the kind of the edge:
+phi_i the angle about edge i from the triangle's normal to the normal at the middle of the edge. For small angles this is b_ij =
+-dn(a_i) . a_j with n linear between the mid-edge normals. Then c_i = -2 h_i sin(phi_i) (Grinspun, Gingold, Reisman and Zorin
+2006, Weischedel 2012, Chen, Sastry, van Rees and Vouga 2018). The angle itself has the same limit on fine meshes, and two thirds of
+the error of sin(phi) on a clamped strip that rolls up. It grows with the fold, so that an edge resists any fold below 180 degrees
+and a normal cannot flip. By the kind of the edge:
 
     0 free:        phi = 0, the normal of the triangle
     1 neighbour:   phi = theta / 2, the mean of the two triangles' unit normals, theta the dihedral angle
     2 clamped:     phi = alpha, the angle to the prescribed unit normal N, as in `edge_tilt`
     3 symmetry:    as 1, with the mirrored triangle as neighbour; that is the normal projected into the plane and normalised
 
-`midedge_curvature_dof` adds to phi of kinds 0 and 1 the sign of the edge times an angle xi of the edge, a dof: the normal turns
-about the edge as the mesh stores it, and is the same for both triangles (the mid-edge directors of Chen et al. 2018; the rotations
-of Morley's plate). At kinds 2 and 3 xi has no effect and must be fixed. Across an edge between flat triangles of equal heights h the
-energy is that of phi^2 = (theta / 2 + xi)^2 and (theta / 2 - xi)^2, least at xi = 0 whatever theta; theta jumps by 2 pi where the
-surface folds onto itself.
+`midedge_curvature_dof` adds to phi of kinds 0 and 1 the sign of the edge times an angle xi of the edge, a dof. The normal rotates
+about the edge as stored in the mesh, and is the same for both triangles. (Chen et al. 2018 call it a mid-edge director; Morley's
+plate has this rotation.) At kinds 2 and 3 xi has no effect and must be fixed. Between flat triangles of equal heights the energy of
+an edge is that of phi^2 = (theta / 2 + xi)^2 and (theta / 2 - xi)^2, least at xi = 0 for every theta. The angle theta jumps by 2 pi
+where the surface folds onto itself.
 
 Nodes: corners 0, 1, 2 and the corners 3, 4, 5 behind edges 0, 1, 2; a missing one may be any node. Data: the three kinds, the three
 vectors (prescribed normal or unit normal of the plane), and, with angles, the three signs. w is the rest area [m^2].
 
-Accuracy (tests/kernels/test_shell_orders.py). Averaged normals are consistent where the mesh is alike everywhere (right or
-equilateral triangles): order 2 in the energy of exact shapes. Elsewhere their energy does not converge: where diagonals alternate it
-is 65 % too high for a cylinder across them and 186 % for twist, on irregular meshes 5 to 35 %. With angles, relaxed, the order is
-2 on every mesh. A free edge without angle takes no moment of its triangle's normal, an error of order 1; an angle there mends it.
+Measured: (tests/kernels/test_shell_orders.py) averaged normals are consistent on uniform meshes (right or equilateral triangles), of
+order 2 in the energy of exact shapes. Elsewhere their energy does not converge: with alternating diagonals it is 65 % too high for a
+cylinder across them and 186 % for twist, on irregular meshes 5 to 35 %. With angles, relaxed, the order is 2 on every mesh. A free
+edge without angle takes no moment of its triangle's normal, an error of order 1; an angle there removes it.
 """
 
 from dataclasses import replace
@@ -43,9 +43,10 @@ from ddg_warp.kernels.measures.hinge_angle import dihedral
 
 @cache
 def _edge(real):
-    """Device functions c(e, a, b, kind, N, xi) of one edge and its derivatives (c, dc/de, dc/da, dc/db, dc/dxi).
+    """Return the device functions `value` and `derivatives` of one edge.
 
-    e runs along the edge as the triangle does, a to the triangle's corner, b to the corner behind it, all from the edge's first node.
+    `value(e, a, b, kind, N, xi) -> c`. `derivatives(...) -> (c, dc/de, dc/da, dc/db, dc/dxi)`. e runs along the edge as in the
+    triangle, a to the triangle's corner, b to the corner behind the edge, all from the edge's first node.
     """
     V = wp.types.vector(3, real)
     angle, derivative = dihedral(real)
@@ -66,7 +67,7 @@ def _edge(real):
 
     @wp.func
     def turned(e: V, a: V, phi: real):
-        """c = -2 h phi at constant phi, and its derivatives (c, dc/de, dc/da, dc/dphi)."""
+        """Return c = -2 h phi at constant phi, with derivatives: (c, dc/de, dc/da, dc/dphi)."""
         length = wp.length(e)
         n = wp.cross(e, a)
         unit = wp.normalize(n)
@@ -193,7 +194,7 @@ _STRAINS = ("b11 [m]", "b12 [m]", "b22 [m]")
 
 
 def _sample(angles: int, random, count: int) -> dict:
-    """Edges of every kind; of a symmetry the plane contains the normal, more or less, which a clamp prescribes."""
+    """Return edges of every kind; symmetry planes roughly contain the normal, clamps prescribe it."""
     some = [[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [1, 1, 1], [0, 1, 1], [1, 3, 1], [1, 2, 0]]
     kinds = np.resize(some, (count, 3)).T
     vectors = np.where((kinds == 3)[..., None], [1.0, 0.2, -0.1], [0.2, -0.1, 1.0])
@@ -203,7 +204,9 @@ def _sample(angles: int, random, count: int) -> dict:
     return {
         "nodes": 0.1 * np.array([[0, 0, 0], [10, 0, 0], [4, 9, 0], [13, 11, 3], [-7, 6, 3], [5, -8, 3]]),
         "data": np.concatenate([kinds, vectors.transpose(0, 2, 1).reshape(9, count), signs]),
-        "felt": np.concatenate([kinds >= 0, kinds == 1, (kinds <= 1)[:angles]]),  # corners behind edges are neighbours'
+        "felt": np.concatenate(
+            [kinds >= 0, kinds == 1, (kinds <= 1)[:angles]]
+        ),  # corners behind edges belong to neighbours
     }
 
 

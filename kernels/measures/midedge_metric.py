@@ -1,8 +1,8 @@
-"""Metric of a curved triangle, (a11, a12, a22) / 2 [m^2]: facets whose sides have the length of the arcs over them.
+"""Metric of a curved triangle, (a11, a12, a22) / 2 [m^2]: facets with the lengths of arcs as side lengths.
 
-A facet's side is a chord of the surface. Where the surface has the normal curvature k along it, a geodesic arc of length s has the
-chord s (1 - k^2 s^2 / 24), so that bending without stretch shortens the sides of facets, each in its own way, and a mesh can not
-follow it without stress: constant strain triangles lock, the more the thinner the shell. Here squared lengths of the sides e are
+A facet's side is a chord of the surface. With the normal curvature k along a side, a geodesic arc of length s has the chord
+s (1 - k^2 s^2 / 24). Bending without stretch thus shortens sides unequally, and a mesh cannot follow it without stress: constant
+strain triangles lock, the more the thinner the shell. Here squared lengths of the sides e are
 
     a(e, e) = |e|^2 + b(e, e)^2 / 12 ,
 
@@ -11,7 +11,7 @@ with b the second fundamental form of `midedge_curvature_dof`, and (a11, a12, a2
     a11 = |a1|^2 + b11^2 / 12 ,   a22 = |a2|^2 + b22^2 / 12 ,   2 a12 = a11 + a22 - a(a2 - a1, a2 - a1) .
 
 An isometric bending of a smooth surface leaves strains of third order in the length of the sides instead of second. Flat triangles
-have the strains of `triangle_metric`. Stencil and data are those of `midedge_curvature_dof`; w is the rest area [m^2].
+have the strains of `triangle_metric`. Stencil and data as in `midedge_curvature_dof`; w is the rest area [m^2].
 """
 
 from dataclasses import replace
@@ -69,7 +69,7 @@ def _functions(real):
 
     @wp.func
     def tension(q: Q, w: real, slope: E):
-        """That of the chords; what b adds is left out."""
+        """Return the geometric stiffness of the chords, without the contribution of b."""
         return V(w * slope[0], real(0.5) * w * slope[1], w * slope[2]), E()
 
     return strains, jacobian, tension, None

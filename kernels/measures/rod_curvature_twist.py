@@ -1,20 +1,20 @@
 """Material curvatures and twist of a rod vertex, (kappa_1, kappa_2, tau), pointwise [1/m] (Bergou et al. 2008, 2010).
 
-Edges e, f meet at the vertex; m1, m2 are the material frames at angle theta from the reference frames, which are the lagged
-ones (u, t0) transported to the current tangent. With kb = 2 te x tf / (1 + te . tf), w the Voronoi length and m_ref the
-angle between the reference frames (reference twist, continued past pi from its lagged value),
+Edges e, f meet at the vertex. The material frames m1, m2 are at the angle theta from the reference frames, which are the lagged frames
+(u, t0) transported to the current tangent. With kb = 2 te x tf / (1 + te . tf), w the Voronoi length and m_ref the angle between the
+reference frames (reference twist, continued past pi from its lagged value),
 
     kappa_1 = kb . (m2e + m2f) / 2w,   kappa_2 = -kb . (m1e + m1f) / 2w,   tau = (theta_f - theta_e + m_ref) / w.
 
-The published gradients hold the reference frame still; a frame transported in time spins about te by
-z . de / |e| with z = (t0 x te) / (1 + t0 . te), which subtracts (d/dtheta_e) z / |e| from every strain's derivative.
-Singular where the rod folds back by 180 degrees, or an edge turns by 180 degrees from its lagged tangent.
+The published gradients are for a constant reference frame. A frame transported in time spins about te by z . de / |e| with
+z = (t0 x te) / (1 + t0 . te), which subtracts (d/dtheta_e) z / |e| from the derivative of every strain.
+Singular where the rod folds back by 180 degrees, or an edge rotates by 180 degrees from its lagged tangent.
 
-Second derivatives, contracted with moments M: a frame that spins by s_e = dtheta_e - z . de / |e| turns m1 by s_e m2, and
-m2 by -s_e m1, and te by v (see `turning`). With h = M1 m1 + M2 m2 and g = M1 m2 - M2 m1 of each edge, b half of the curvature
-binormal, i and tt as in `turning`, the derivative of w M . strains along a line is
+Second derivatives, contracted with moments M: the spin s_e = dtheta_e - z . de / |e| of a frame changes m1 by s_e m2, m2 by -s_e
+m1, and te changes by v (see `turning`). Let h = M1 m1 + M2 m2 and g = M1 m2 - M2 m1 of each edge, b half of the curvature binormal,
+i and tt as in `turning`. The derivative of w M . strains along a line is
 
-    A . v + B . u - (b . h_e + M3) s_e - (b . h_f - M3) s_f,   A, B those of g = g_e + g_f, plus M3 b,
+    A . v + B . u - (b . h_e + M3) s_e - (b . h_f - M3) s_f,   A, B of g = g_e + g_f, plus M3 b,
 
 and its derivative adds to that of `turning`: 2 (tt . (v + u)) (b . h_e s_e + b . h_f s_f) + (g_e . v) (b . v) + (g_f . u) (b . u)
 - 2 i s_e (v . tf x h_e - u . te x h_e) - 2 i s_f (v . tf x h_f - u . te x h_f) - b . g_e s_e^2 - b . g_f s_f^2
@@ -34,7 +34,7 @@ from ddg_warp.kernels.measures import Measure, turning
 
 @cache
 def functions(real, between: bool = False):
-    """Functions of the measure; with `between`, about the directors halfway between those of both edges (see `turning_angle`)."""
+    """Return the functions of the measure; if `between`, about directors halfway between both edges (see `turning_angle`)."""
     Q, S, E, M = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
     H, M3 = wp.types.vector(36, real), wp.types.matrix((3, 3), real)
@@ -109,7 +109,7 @@ def functions(real, between: bool = False):
 
     @wp.func
     def packed(ee: M3, ef: M3, ff: M3, ea: V, eb: V, fa: V, fb: V, aa: real, bb: real):
-        """Upper triangle of the matrix, row by row; angles do not couple to each other."""
+        """Return the upper triangle of the matrix, row by row; angles do not couple to each other."""
         h = H()
         for i in range(3):
             for j in range(3):
@@ -187,7 +187,7 @@ def _advance(real):
 
     @wp.func
     def advance(q: Q, s: S):
-        """The angle between the reference frames."""
+        """Return the angle between the reference frames."""
         return L(
             reference_twist(V(s[0], s[1], s[2]), V(s[6], s[7], s[8]), V(s[3], s[4], s[5]), V(s[9], s[10], s[11]), s[12])
         )

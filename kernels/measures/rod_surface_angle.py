@@ -1,25 +1,26 @@
-"""Angle from a surface to the directors of a rod edge that lies on a mesh edge, about that edge [rad].
+"""Angle about a mesh edge from the surface to the directors of a rod on that edge [rad]: rod-shell coupling.
 
-The triangles beside the edge are at the angles beta_a and beta_b in the edge's reference frame (u, v = t x u), which is the lagged one
-transported to the current tangent t: beta = atan2(a . v, a . u), a from the edge to the corner opposite, continued past pi from its
-lagged value. Normals turn as the triangles do. Of the surface's turn it is the mean, shared out by m, that counts, and where the
-normal at the middle of the edge has an angle xi of its own (`midedge_curvature_dof`), that is added:
+The two triangles of the edge are at the angles beta_a and beta_b in its reference frame (u, v = t x u). That is the lagged frame
+transported to the current tangent t. With a from the edge to the opposite corner, beta = atan2(a . v, a . u), continued past pi
+from its lagged value. Normals rotate with the triangles. The mean rotation of the surface counts, with weight m. If the normal at
+the middle of the edge has its own angle xi (`midedge_curvature_dof`), that is added:
 
     psi = theta - (1 - m) beta_a - m beta_b - r xi .
 
-A symmetric fold about the edge leaves psi as it is, so that what is glued by it adds no bending across. With m = h_a / (h_a + h_b), h
-the heights of the triangles at rest, neither does a uniform curvature across; with xi, m = 1/2 as in the definition of that normal.
+A symmetric fold about the edge does not change psi, so that the coupling adds no bending stiffness across. With m = h_a / (h_a +
+h_b), h the heights of the triangles at rest, neither does a uniform curvature across. With xi, m = 1/2 as in the definition of that
+normal.
 
-With h the distance of a from the edge's line, n = (e x a) / |e x a| the direction in which beta grows, and z = (t0 x t) / (1 + t0 . t)
-the spin of the frame, which is transported in time (see `rod_curvature_twist`),
+Let h be the distance of a from the edge's line and n = (e x a) / |e x a| the direction in which beta grows. The frame, transported
+in time, spins by z = (t0 x t) / (1 + t0 . t) (see `rod_curvature_twist`). Then
 
     d beta / da = n / h,   d beta / de = -n (a . t) / (h |e|) + z / |e| .
 
-Singular where a triangle has no area, or the edge turns by 180 degrees from its lagged tangent.
+Singular where a triangle has no area, or the edge rotates by 180 degrees from its lagged tangent.
 
-Nodes: 0, 1 on the edge as the rod runs it, 2 and 3 opposite; of an edge with one triangle 3 is 2, and m = 0. Angles: theta, xi.
-Lagged data: frame (u, t) of the edge; beta_a, beta_b. Data: m; r, +1 where the rod runs the edge as the mesh stores it, -1 where it
-runs it backwards, 0 without xi, which may then be any angle.
+Nodes: 0, 1 on the edge in rod order, 2 and 3 opposite; of an edge with one triangle 3 is 2, and m = 0. Angles: theta, xi. Lagged
+data: frame (u, t) of the edge; beta_a, beta_b. Data: m; r, +1 where the rod runs along the edge as stored in the mesh, -1 against it,
+0 without xi, which may then be any angle.
 """
 
 from functools import cache
@@ -49,7 +50,7 @@ def _functions(real):
 
     @wp.func
     def by_height(e: V, a: V):
-        """n / h of a triangle with the sides e and a."""
+        """Return n / h of a triangle with the sides e and a."""
         h = wp.cross(wp.normalize(e), a)
         return h / nonzero(wp.dot(h, h))
 
@@ -84,7 +85,7 @@ def _advance(real):
 
     @wp.func
     def advance(q: Q, s: S):
-        """The angles of both triangles in the frame of the edge."""
+        """Return the angles of both triangles in the frame of the edge."""
         u = V(s[0], s[1], s[2])
         t = V(s[3], s[4], s[5])
         return L(angle_between(u, V(q[3], q[4], q[5]), t, t, s[6]), angle_between(u, V(q[6], q[7], q[8]), t, t, s[7]))
@@ -93,12 +94,12 @@ def _advance(real):
 
 
 def _sample(random, count: int) -> dict:
-    """Both triangles count, or one alone; xi of either sign, or none."""
-    share, sign = random.uniform(0.2, 0.8, count), np.arange(count) % 3 - 1.0
-    share[count // 2] = 0.0
-    felt = np.ones((6, count), bool)
-    felt[3], felt[5] = share > 0.0, sign != 0.0
-    return {"data": np.stack([share, sign]), "felt": felt}
+    """Return edges with two triangles or one, and xi of either sign or none."""
+    weight, sign = random.uniform(0.2, 0.8, count), np.arange(count) % 3 - 1.0
+    weight[count // 2] = 0.0
+    dependent = np.ones((6, count), bool)
+    dependent[3], dependent[5] = weight > 0.0, sign != 0.0
+    return {"data": np.stack([weight, sign]), "felt": dependent}
 
 
 rod_surface_angle = Measure(

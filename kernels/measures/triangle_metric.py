@@ -1,7 +1,7 @@
 """First fundamental form of a triangle, (a11, a12, a22) / 2 [m^2], a_ij = a_i . a_j in the basis a1 = x1 - x0, a2 = x2 - x0.
 
-With half the rest metric as rest strain, the difference is the Green strain E_ij of the triangle in that basis, constant over
-it (constant strain triangle). w is the rest area [m^2]. Polynomial: nothing is singular, an inverted triangle not told apart.
+With half the rest metric as rest strain, the difference is the Green strain E_ij in that basis, constant over the triangle (constant
+strain triangle). The rest area is w [m^2]. Polynomial: never singular, and blind to inversion.
 
 The strains are quadratic in q: d2(a11 / 2) = I in block (1, 1), d2(a12 / 2) = I / 2 in blocks (1, 2) and (2, 1), d2(a22 / 2) = I
 in block (2, 2). So the geometric stiffness is w (s1, s2 / 2, s3), exact, with s the slope of the density.

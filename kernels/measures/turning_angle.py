@@ -1,21 +1,21 @@
-"""Curvature by the turning angle: phi / w where the other measures of rods have 2 tan(phi/2) / w, w the Voronoi length [m].
+"""Curvature by the angle between edges: phi / w instead of the 2 tan(phi/2) / w of other measures, w the Voronoi length [m].
 
-Both are discrete curvatures of second order (Crane and Wardetzky, A glimpse into discrete differential geometry, Notices of the AMS 64,
-2017). By phi a regular polygon has the curvature and the energy of a circle, exactly; at a fold it stays finite, and a rod can be
-pushed through it. Singular where the rod folds back by 180 degrees: there curvature has no direction.
+Both are discrete curvatures of second order (Crane and Wardetzky, A glimpse into discrete differential geometry, Notices of the AMS
+64, 2017). With phi a regular polygon has exactly the curvature and energy of a circle. At a fold the curvature stays finite, and a
+rod can pass through the fold. Singular where the rod folds back by 180 degrees: curvature has no direction there.
 
 A bending strain k of the other measure becomes a(y) k with a = atan(sqrt y) / sqrt y and y = (w |k| / 2)^2 = tan^2(phi/2); twist
-stays. With g = w^2 / 2, so that dy = g k . dk, this map has the Jacobian D = a I + a' g k k^T, and contracted with a slope M its second
-derivative is, in the bending strains,
+stays. Let g = w^2 / 2, so that dy = g k . dk. This map has the Jacobian D = a I + a' g k k^T, and the second derivative, contracted
+with a slope M, in the bending strains
 
     X = a' g (M k^T + k M^T) + (a' g I + a'' g^2 k k^T) (M . k) .
 
-The chain rule then makes D J of the other measure's Jacobian, and its second derivative contracted with D^T M, plus J^T X J.
+The chain rule gives D J of the other measure's Jacobian, and its second derivative contracted with D^T M, plus J^T X J.
 
-For that, |k| has to be 2 tan(phi/2) / w, of which means of the directors of both edges see cos(m/2) where these differ by the twist m.
-So each edge has its directors turned towards the other's by m/2 (`between`): they are one direction then, and turn smoothly with m,
-any number of times. Strains k(q, c) about directors turned by c = m/2 towards each other do not change with c, to first order, and
-d2k/dc2 = -k. So J is as if c were constant, and to the second derivative k (dm/2)^2 is added: (w^2 / 4) (D^T M . k) in X for the
+This needs |k| = 2 tan(phi/2) / w. Means of the directors of both edges see it reduced by cos(m/2) where these differ by the twist m.
+So the directors of each edge are rotated towards the other's by m/2 (`between`): they then coincide, and rotate smoothly with m, over
+any number of revolutions. Strains k(q, c) about directors rotated by c = m/2 towards each other do not change with c to first order,
+and d2k/dc2 = -k. So J is as for constant c, and k (dm/2)^2 is added to the second derivative: (w^2 / 4) (D^T M . k) in X for the
 twist, which is m / w.
 """
 
@@ -30,13 +30,13 @@ from ddg_warp.kernels.measures import rod_curvature_twist as rod
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 
-# The y up to which 14 terms of the series of atan are exact in float64; above, differences lose less than 3 digits.
+# Limit of y up to which 14 terms of the series of atan are exact in float64; above, differences lose less than 3 digits.
 NEAR = 1.0 / 16.0
 
 
 @cache
 def ratio_function(real):
-    """ratio(y) -> a, a', a'' of a = atan(sqrt y) / sqrt y."""
+    """Return the device function `ratio(y) -> (a, a', a'')` of a = atan(sqrt y) / sqrt y."""
     near = wp.constant(real(NEAR))
 
     @wp.func
@@ -44,7 +44,7 @@ def ratio_function(real):
         a = real(0.0)
         first = real(0.0)
         second = real(0.0)
-        for i in range(14):  # Horner's rule for sum (-y)^n / (2 n + 1), of each by the one before
+        for i in range(14):  # Horner's rule for sum (-y)^n / (2 n + 1) and its derivatives
             second = first - y * second
             first = a - y * first
             a = real(1.0) / real(27 - 2 * i) - y * a
@@ -82,8 +82,8 @@ def _functions(tangent: Measure, functions, real):
         e, j = jacobian_of(q, s, w)
         k = wp.cw_mul(e, bends)
         a, first, _second = ratio(real(0.25) * w * w * wp.dot(k, k))
-        turn = wp.diag(bends * a + twists) + wp.outer(k, k) * (real(0.5) * w * w * first)
-        return k * a + wp.cw_mul(e, twists), turn * j
+        D = wp.diag(bends * a + twists) + wp.outer(k, k) * (real(0.5) * w * w * first)
+        return k * a + wp.cw_mul(e, twists), D * j
 
     if curvature_of is None:
         return strains, jacobian, None, None
@@ -104,8 +104,8 @@ def _functions(tangent: Measure, functions, real):
         total = H()
         for row in range(wp.static(size)):
             for column in range(row, wp.static(size)):
-                at = row * wp.static(size) - row * (row - 1) // 2 + column - row  # `packed_index`
-                total[at] = h[at] + added[row, column]
+                entry = row * wp.static(size) - row * (row - 1) // 2 + column - row  # `packed_index`
+                total[entry] = h[entry] + added[row, column]
         return total
 
     return strains, jacobian, None, curvature
