@@ -1,6 +1,6 @@
-"""Loads that a step is given world by world, added to those of the scene, and the load scales that follow from them.
+"""Control loads of a step, per world, added to loads of the scene, and the load scales that follow.
 
-See `ddg_warp.solve.controls`; sums run in one order, without atomics.
+See `ddg_warp.solve.controls`; sums have a fixed order, without atomics.
 """
 
 from functools import cache
@@ -12,7 +12,10 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def load_kernel(real):
-    """Loads on all places of a storage in every world, and their sizes as `ddg_warp.compile.tolerance` counts them."""
+    """Build the kernel of loads.
+
+    `add`: write loads at all dof indices of every world, and their sizes as in `ddg_warp.compile.tolerance`.
+    """
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -33,33 +36,42 @@ def load_kernel(real):
         value_out: wp.array2d(dtype=V),
         size_out: wp.array2d(dtype=real),
     ):
-        """`shared` are the scene's loads now, `constant` those that do not change, `changing` sizes of the others at full amplitude.
+        """Add loads.
 
-        `mass` is [node][column] of all worlds, each of which has so many `columns`; `items` are rows of the forces that belong to a
-        node, of the moments that belong to an angle; `usual` is the scene's gravity, `gravity` what is added to it.
+        Args:
+            shared: current loads of the scene.
+            constant: loads of the scene that do not change.
+            changing: sizes of the others at full amplitude.
+            mass: [node][column] of all worlds, with `columns` each.
+            items: rows of forces per node, of moments per angle.
+            usual: gravity of the scene.
+            gravity: added gravity.
         """
         w, k = wp.tid()
-        given = V()
+        control = V()
         weight = V()
         if k < nodes:
             m = mass[k / columns, k % columns + w * columns]
             weight = usual[0] * m
-            given = gravity[w] * m
-            for at in range(starts[k], starts[k + 1]):
-                given += forces[w, items[at]]
+            control = gravity[w] * m
+            for index in range(starts[k], starts[k + 1]):
+                control += forces[w, items[index]]
         else:
-            for at in range(starts[k], starts[k + 1]):
-                given[0] = given[0] + moments[w, items[at]]
-        value_out[w, k] = shared[k] + given
-        outer = weight + constant[k] + given
-        size_out[w, k] = changing[k] + (wp.abs(outer[0]) + wp.abs(outer[1]) + wp.abs(outer[2])) / arm[k]
+            for index in range(starts[k], starts[k + 1]):
+                control[0] = control[0] + moments[w, items[index]]
+        value_out[w, k] = shared[k] + control
+        external = weight + constant[k] + control
+        size_out[w, k] = changing[k] + (wp.abs(external[0]) + wp.abs(external[1]) + wp.abs(external[2])) / arm[k]
 
     return add
 
 
 @cache
 def sum_kernel(real):
-    """Sums of the sizes over the places of each body, of the worlds one after the other."""
+    """Build the kernel of sums over bodies.
+
+    `add`: sum load sizes over each body, world by world.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(
@@ -71,8 +83,8 @@ def sum_kernel(real):
     ):
         w, body = wp.tid()
         total = real(0.0)
-        for at in range(starts[body], starts[body + 1]):
-            total += size[w, items[at]]
+        for index in range(starts[body], starts[body + 1]):
+            total += size[w, items[index]]
         load_out[w * bodies + body] = total
 
     return add
@@ -80,9 +92,11 @@ def sum_kernel(real):
 
 @cache
 def share_kernel(real):
-    """Loads of the bodies of a net from the sums over them: of those that are connected none has less than the mean.
+    """Build the kernel of load distribution in the coupled system.
 
-    As `Bodies.loads` and `Allowed.assign`: a world without any load has the scale 0 and loads 1, another one the scale 1.
+    `share`: raise body loads to at least the mean of their connected component.
+
+    As `Bodies.loads` and `Allowed.assign`: a world without any load has the scale 0 and loads 1, others the scale 1.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -94,33 +108,36 @@ def share_kernel(real):
         load: wp.array(dtype=real),
         scale_out: wp.array(dtype=real),
     ):
-        """`items` are bodies of one component after the other."""
+        """Distribute loads; `items` are the bodies of one component after the other."""
         w = wp.tid()
         first = w * bodies
-        everything = real(0.0)
+        world_total = real(0.0)
         for body in range(bodies):
-            everything += load[first + body]
-        scale_out[w] = wp.where(everything > real(0.0), real(1.0), real(0.0))
+            world_total += load[first + body]
+        scale_out[w] = wp.where(world_total > real(0.0), real(1.0), real(0.0))
         for c in range(components):
             total = real(0.0)
-            for at in range(starts[c], starts[c + 1]):
-                total += load[first + items[at]]
+            for index in range(starts[c], starts[c + 1]):
+                total += load[first + items[index]]
             least = total / real(starts[c + 1] - starts[c])
             if total == real(0.0):
-                least = everything / real(bodies)
-            for at in range(starts[c], starts[c + 1]):
-                body = items[at]
-                own = wp.max(load[first + body], least)
-                if everything == real(0.0):
-                    own = real(1.0)
-                load[first + body] = own
+                least = world_total / real(bodies)
+            for index in range(starts[c], starts[c + 1]):
+                body = items[index]
+                body_load = wp.max(load[first + body], least)
+                if world_total == real(0.0):
+                    body_load = real(1.0)
+                load[first + body] = body_load
 
     return share
 
 
 @cache
 def limit_kernel(real):
-    """What residuals may be at rtol = 1: the largest, over what a block or part belongs to, of the load of the body times a weight."""
+    """Build the kernel of residual limits at rtol = 1.
+
+    `limit`: write the largest weighted load of the bodies of a dof block or cluster.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def limit(
@@ -133,8 +150,8 @@ def limit_kernel(real):
     ):
         w, k = wp.tid()
         most = real(0.0)
-        for at in range(starts[k], starts[k + 1]):
-            most = wp.max(most, load[w * bodies + body[at]] * weight[at])
+        for index in range(starts[k], starts[k + 1]):
+            most = wp.max(most, load[w * bodies + body[index]] * weight[index])
         limit_out[w, k] = most
 
     return limit

@@ -1,18 +1,19 @@
-"""Drag by resistive force theory: on every piece of a rod, per length, by its own velocity v against the fluid,
+"""Drag by resistive force theory, per length of a rod, from the local velocity v relative to the fluid,
 
     f = -(zeta_t t t^T + zeta_n (I - t t^T)) v ,
 
-and a moment -zeta_r times the spin about its tangent t. Coefficients are constants (Gray and Hancock, J. Exp. Biol. 32, 1955), or
-depend on v as in granular media, where forces depend on the direction of v, not on its size: with the angle psi between v and t,
+and a moment -zeta_r times the spin about the tangent t. Coefficients are constant (Gray and Hancock, J. Exp. Biol. 32, 1955), or
+depend on v as in granular media, where forces depend on the direction of v alone. With the angle psi between v and t,
 
     f_n = C_S sin(beta) ,  f_t = C_F cos(psi) + C_L (1 - sin(beta)) ,  tan(beta) = sin(psi) / tan(gamma)
 
-(Maladen, Ding, Li and Goldman, Science 325, 2009, 314; J. R. Soc. Interface 8, 2011, 1332), where |v| counts as sqrt(v^2 + v0^2).
+(Maladen, Ding, Li and Goldman, Science 325, 2009, 314; J. R. Soc. Interface 8, 2011, 1332), where |v| is regularised as sqrt(v^2 +
+v0^2).
 
-Within a time step tangents and coefficients are constant, so that drag has a potential: a node with the resistance D, the sum of the
-halves of its edges, which the fluid alone would carry to a = x_n + s u in a solve of length s, adds (x - a) . D (x - a) / 2 s to the
-energy. A body at a node, such as a ball, adds c I to D. The energy goes where inertia goes. Angles have the same mass-like quadratic:
-drag and rotary inertia make one, about a mean target.
+Within a time step tangents and coefficients are constant, so that drag has a potential. A node has the resistance D, half the sum of
+its edges. The fluid alone would carry it to a = x_n + s u in a solve of length s, and the energy is (x - a) . D (x - a) / 2 s. A body
+at a node, such as a ball, adds c I to D. The potential is assembled with inertia. Angles have the same mass-like quadratic: drag and
+rotary inertia make one, about a mean target.
 """
 
 from functools import cache
@@ -25,15 +26,15 @@ from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
 from ddg_warp.kernels.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
-# rows of coefficients of an edge; SLOPE is tan(gamma), SPEED is zero where nothing is granular; FIRST and LAST are force over velocity
-# of bodies at its first and last node [N s/m]
+# Rows of coefficients of an edge. SLOPE is tan(gamma); SPEED is zero except in granular media. FIRST and LAST are force over velocity
+# of bodies at the first and last node [N s/m].
 TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED, FIRST, LAST = range(10)
 ROWS = 10
 
 
 @cache
 def edge_function(dim: int, real):
-    """half(e, v, p): resistance [N s/m] of half an edge, with coefficients p, that moves at v against the fluid."""
+    """Return the device function `half(e, v, p)`: resistance [N s/m] of half an edge, at relative velocity v."""
     V, P = wp.types.vector(dim, real), wp.types.vector(ROWS, real)
 
     @wp.func
@@ -49,9 +50,9 @@ def edge_function(dim: int, real):
             slope = p[wp.static(SLOPE)]
             sine = wp.length(v - t * along) / speed
             root = wp.sqrt(slope * slope + sine * sine)
-            ahead = (real(1.0) - sine / root) / wp.sqrt(along * along + least * least)
+            leading = (real(1.0) - sine / root) / wp.sqrt(along * along + least * least)
             normal += p[wp.static(LATERAL)] / (root * speed)
-            tangential += wp.max(real(0.0), p[wp.static(FRICTION)] / speed + p[wp.static(LEADING)] * ahead)
+            tangential += wp.max(real(0.0), p[wp.static(FRICTION)] / speed + p[wp.static(LEADING)] * leading)
         one = wp.identity(n=wp.static(dim), dtype=real)
         return (one * normal + wp.outer(t, t) * (tangential - normal)) * (real(0.5) * length)
 
@@ -60,12 +61,16 @@ def edge_function(dim: int, real):
 
 @cache
 def chain_kernels(kind: ChainKind, real):
-    """resist(...): inertia and drag of every node at the start of a solve; settle(...): rates of what has no inertia after it."""
+    """Build the kernels of drag on uncoupled rods.
+
+    `resist`: write inertia and drag of every node at the start of a solve.
+    `settle`: write rates of massless dofs after a solve.
+    """
     dim, twist, closed = kind.dim, kind.twist, kind.closed
     V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
     Inertia = inertia_type(kind, real)
     half = edge_function(dim, real)
-    _, behind, *_ = node_functions(kind, real)
+    _, previous, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind.serial)
 
@@ -103,7 +108,10 @@ def chain_kernels(kind: ChainKind, real):
         rotary_out: wp.array2d(dtype=real),
         target_angle: wp.array2d(dtype=real),
     ):
-        """Edges of `tangents` say which way the rod runs. Raises the load scale to the drag on a rod that moves as its fastest node."""
+        """Write inertia and drag; edges of `tangents` give the direction of the rod.
+
+        The load scale is raised to the drag on the rod if all of it moved as its fastest node.
+        """
         start, r = wp.tid()
         n = count[r]
         if scalars[PROGRESS, r] >= real(1.0) or start >= n:
@@ -114,7 +122,7 @@ def chain_kernels(kind: ChainKind, real):
         one = wp.identity(n=wp.static(dim), dtype=real)
         for k in range(start, until(start, n)):
             D = M()
-            b = behind(k, n)
+            b = previous(k, n)
             if wp.static(closed) or k < n - 1:
                 D += of_edge(tangents, v0, coefficients, u, k, n, r) + one * coefficients[wp.static(FIRST), k, r]
             if b >= 0:
@@ -132,12 +140,12 @@ def chain_kernels(kind: ChainKind, real):
                     length = wp.length(tangents[end, r] - tangents[k, r])
                     spin = coefficients[wp.static(ROTATIONAL), k, r] * length * rate
                 node.spin = spin
-                share = spin / scalars[COEFFICIENT, r]
-                both = rotary[k, r] + share
-                rotary_out[k, r] = both
-                if share > real(0.0):
+                drag_mass = spin / scalars[COEFFICIENT, r]
+                total = rotary[k, r] + drag_mass
+                rotary_out[k, r] = total
+                if drag_mass > real(0.0):
                     target = target_angle[k, r]
-                    target_angle[k, r] = target + (theta0[k, r] - target) * (share / both)
+                    target_angle[k, r] = target + (theta0[k, r] - target) * (drag_mass / total)
             inertia_out[k, r] = node
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -158,9 +166,9 @@ def chain_kernels(kind: ChainKind, real):
         a_out: wp.array2d(dtype=V),
         alpha_out: wp.array2d(dtype=real),
     ):
-        """Rates of what has no inertia are means over the step of the midpoint rule, which would keep them swinging about these.
+        """Write mean rates over the step of massless dofs, which the midpoint rule would keep oscillating.
 
-        Accelerations are the change of means over the step, zero where there was no motion before. The rule has made 2 mean - v0 of v.
+        Accelerations are changes of means over the step, zero without motion before. The midpoint rule has written v = 2 mean - v0.
         """
         start, r = wp.tid()
         n = count[r]
@@ -192,7 +200,7 @@ def chain_kernels(kind: ChainKind, real):
 
 @cache
 def block_inertia(real):
-    """Inertia and drag of a block of a net over a solve: `ddg_warp.kernels.chain.inertia_type` with a mass for each of three dofs."""
+    """Return the struct of inertia and drag of a dof block: `ddg_warp.kernels.chain.inertia_type` with a mass per dof."""
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
     @wp.struct
@@ -206,13 +214,17 @@ def block_inertia(real):
 
 @cache
 def mass_type(real, drag: bool):
-    """Masses of the dofs of blocks (worlds, blocks); with drag, inertia and drag."""
+    """Return the array type of masses of dof blocks (worlds, blocks); with drag, of inertia and drag."""
     return wp.array2d(dtype=block_inertia(real) if drag else wp.types.vector(3, real))
 
 
 @cache
 def net_kernels(real):
-    """The same of the blocks of a net."""
+    """Build the kernels of drag on the coupled system.
+
+    `resist`: write inertia and drag of every dof block at the start of a solve.
+    `settle`: write rates of massless dofs after a solve.
+    """
     V, M, P = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(ROWS, real)
     Inertia = block_inertia(real)
     half = edge_function(3, real)
@@ -229,16 +241,16 @@ def net_kernels(real):
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         flow: wp.array(dtype=V),
-        outer: wp.array(dtype=real),
+        load: wp.array(dtype=real),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         blocks: int,
         nodes: int,
         inertia_out: wp.array2d(dtype=Inertia),
     ):
-        """Items of a block are edges that meet there, or the one whose angle it is. Where loads give no scale, drag does.
+        """Write inertia and drag; items of a block are the edges of its node, or the edge of its angle.
 
-        Coefficients (rows, worlds edges) are of one world after the other.
+        Where loads give no scale, drag does. Coefficients (rows, worlds edges) are world by world.
         """
         i = wp.tid()
         w = i / blocks
@@ -249,8 +261,8 @@ def net_kernels(real):
         u = V()
         if k < nodes:
             u = flow[0]
-        for at in range(starts[k], starts[k + 1]):
-            edge = items[at]
+        for index in range(starts[k], starts[k + 1]):
+            edge = items[index]
             a = ends[edge, 0] + w * blocks
             b = ends[edge, 1] + w * blocks
             e = tangents[b] - tangents[a]
@@ -270,7 +282,7 @@ def net_kernels(real):
         block.resistance = D * rate
         block.carried = q0[i] + u / rate
         inertia_out[w, k] = block
-        if k < nodes and outer[w] == real(0.0):
+        if k < nodes and load[w] == real(0.0):
             moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
             wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
 
@@ -286,7 +298,7 @@ def net_kernels(real):
         v_out: wp.array(dtype=V),
         a_out: wp.array(dtype=V),
     ):
-        """As of chains, of dofs that feel drag."""
+        """Write rates of massless dofs with drag; see `chain_kernels`."""
         i = wp.tid()
         w = i / blocks
         if scalars[PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):

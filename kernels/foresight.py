@@ -1,8 +1,8 @@
-"""From where the solve of a step starts: its predictor, and what the last solve added to its own; see `kernels.step`.
+"""Warm start: extrapolate the correction of the last step, an acceleration, from the inertial predictor; see `kernels.step`.
 
-By implicit Euler the search starts from s^2 a beyond the predictor, where a is what the last solve added to its own, over the square of
-its step: constant accelerations of what is loaded are foreseen. (By the midpoint rule what stiff modes add changes sign from step to
-step.) No solution depends on that: what is lagged is that of the predictor.
+With implicit Euler the iteration starts at s^2 a from the predictor. The acceleration a is the last solve's correction of its
+predictor over the square of its step, so that constant accelerations are anticipated. With the midpoint rule corrections of stiff
+modes change sign every step. Solutions do not depend on the warm start: time-lagged quantities stay at the predictor.
 """
 
 from functools import cache
@@ -15,14 +15,14 @@ from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 from ddg_warp.kernels.turns import FURTHER, loose_function
 
-FORESEEN = 6  # iterations of a solve, at most, after which the next one starts from what it added
+FORESEEN = 6  # maximum iterations of a solve whose correction is extrapolated
 
 
 @cache
 def ahead_function(real):
-    """ahead(flags, scalars, i): the square of the step by which accelerations lead on from the predictor of an island.
+    """Return the device function `ahead(flags, scalars, i)`: squared step by which accelerations extrapolate the predictor.
 
-    Zero where they do not: from x_n, and without loads, as the tolerance is of the residual that a solve starts with then.
+    Zero after a cold start, and without loads, as the tolerance then is relative to the first residual of a solve.
     """
 
     @wp.func
@@ -36,33 +36,35 @@ def ahead_function(real):
 
 @cache
 def told_function(real, midpoint: bool, crowd: bool = False):
-    """told(flags, scalars, i): square of the rate by which what a solve added is an acceleration that the next one starts with.
+    """Return the device function `told(flags, scalars, i)`: squared rate that makes a correction an acceleration.
 
-    Zero where that is not foreseen: by the midpoint rule, after a solve from x_n, or one of so many iterations that the motion was none
-    that goes on. In a `crowd` these tell of contacts, and `kernels.net.foresight` of the motion.
+    Zero where corrections are not extrapolated: with the midpoint rule, after a cold start, or after so many iterations that the
+    motion does not continue. In a `crowd` many iterations indicate contacts, and `kernels.net.foresight` decides instead.
     """
 
     @wp.func
     def told(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
-        known = (
+        valid = (
             wp.static(not midpoint)
             and flags[CAUTIOUS, i] == 0
             and (wp.static(crowd) or flags[ITERATION, i] <= wp.static(FORESEEN))
         )
-        return wp.where(known, scalars[RATE, i] * scalars[RATE, i], real(0.0))
+        return wp.where(valid, scalars[RATE, i] * scalars[RATE, i], real(0.0))
 
     return told
 
 
 @cache
 def foresee_kernel(kind: ChainKind, real, linear):
-    """Keep the predictor of every rod that still has to move, and start from where its accelerations lead from there.
+    """Build the kernel of the warm start.
 
-    They are a `direction`, along which `further_kernel` moves rods whose edges turn.
+    `foresee`: store the predictor of every rod that still has to move, and add extrapolated accelerations.
+
+    For rods with rotated edges they are written as a `direction` for `further_kernel`.
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    until, ahead, loose = until_function(kind.serial), ahead_function(real), loose_function(dim, real)
+    until, squared_step, loose = until_function(kind.serial), ahead_function(real), loose_function(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def foresee(
@@ -82,16 +84,16 @@ def foresee_kernel(kind: ChainKind, real, linear):
         n = count[r]
         if scalars[PROGRESS, r] >= real(1.0) or start >= n:
             return
-        weight = ahead(flags, scalars, r)
+        weight = squared_step(flags, scalars, r)
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
-            here = x[k, r]
-            predicted[k, r] = here
-            more = loose(mask, weight * a0[k, r])
-            x[k, r] = here + more
+            position = x[k, r]
+            predicted[k, r] = position
+            correction = loose(mask, weight * a0[k, r])
+            x[k, r] = position + correction
             if flags[BENT, r] != 0:
                 for d in range(wp.static(dim)):
-                    direction[d, k, r] = linear(more[d])
+                    direction[d, k, r] = linear(correction[d])
             if wp.static(twist):
                 angle = theta[k, r]
                 predicted_angle[k, r] = angle
@@ -103,7 +105,10 @@ def foresee_kernel(kind: ChainKind, real, linear):
 
 @cache
 def further_kernel(kind: ChainKind, real, linear):
-    """Redo that of a rod whose edges its predictor turned: they turn and lengthen as the last solve has turned and lengthened them."""
+    """Build the kernel of the warm start after predictors with rotated edges.
+
+    `further`: extrapolate the last edge rotations and stretches.
+    """
     V = wp.types.vector(kind.dim, real)
     place, *_ = search_functions(kind, real, linear)
 

@@ -7,7 +7,10 @@ import warp as wp
 
 @cache
 def functions(real):
-    """transport(d, t0, t1), reference_twist(u, v, te, tf, lagged), rotate(d, t, angle) of 3-vectors of `real`."""
+    """Return the device functions `transport`, `reference_twist` and `rotate` of 3-vectors of `real`.
+
+    `transport(d, t0, t1)`, `reference_twist(ue, uf, te, tf, lagged)`, `rotate(d, t, angle)`.
+    """
     V = wp.types.vector(3, real)
     turn = wp.constant(real(6.283185307179586476925286766559))
 
@@ -20,7 +23,7 @@ def functions(real):
 
     @wp.func
     def reference_twist(ue: V, uf: V, te: V, tf: V, lagged: real):
-        """Angle about tf from the transported ue to uf, taken on the branch nearest to its lagged value."""
+        """Return the angle about tf from the transported ue to uf, on the branch nearest to the lagged value."""
         up = transport(ue, te, tf)
         angle = wp.atan2(wp.dot(wp.cross(up, uf), tf), wp.dot(up, uf))
         return angle - turn * wp.round((angle - lagged) / turn)
@@ -35,9 +38,9 @@ def functions(real):
 
 @cache
 def stale_function(real):
-    """stale(e, f, ue, te, uf, tf, lagged): whether edges e and f ask for newer frames than (ue, te) and (uf, tf).
+    """Return the device function `stale(e, f, ue, te, uf, tf, lagged)`: True if a frame update is needed.
 
-    They do where one has turned by more than 90 degrees from its lagged tangent, or their reference twist nears a jump.
+    That is where edge e or f has rotated by more than 90 degrees from its lagged tangent, or their reference twist nears a jump.
     """
     V = wp.types.vector(3, real)
     transport, reference_twist, _ = functions(real)
@@ -46,7 +49,7 @@ def stale_function(real):
     def stale(e: V, f: V, ue: V, te: V, uf: V, tf: V, lagged: real):
         along_e = wp.dot(e, te)
         along_f = wp.dot(f, tf)
-        far = real(0.81)  # squared cosine of the turn from which the reference twist can matter
+        far = real(0.81)  # squared cosine of the rotation above which the reference twist can matter
         if along_e * wp.abs(along_e) >= far * wp.length_sq(e) and along_f * wp.abs(along_f) >= far * wp.length_sq(f):
             return False
         t = wp.normalize(e)

@@ -1,8 +1,10 @@
-"""Islands: what shares one Newton loop. A rod on its own is one; so is, in each world, everything that is coupled.
+"""Islands: dofs with a common Newton loop, an uncoupled rod or the coupled system of one world.
 
-Whatever decides is an entry of an island in one of two arrays, `flags` (integers) and `scalars`, each (row, island); the rows are
-named here. A kernel finds the island from its thread: the column of a chain, the world of a net. (A kernel's arguments are copied with
-every launch of a graph: two arrays instead of thirty are worth some percent of a step of few rods on a GPU.)
+Solver state of an island is an entry in one of two arrays, `flags` (integers) and `scalars`, each (row, island); rows are named here.
+A kernel finds the island from its thread: the column of a rod, the world of the coupled system.
+
+Measured: arguments are copied with every launch of a graph; two arrays instead of thirty save some percent of a step of few rods on a
+GPU.
 """
 
 from functools import cache
@@ -14,59 +16,59 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.turns import TURNED
 
 FLAGS = (
-    # the solve: its outcome (see `outcome`), accepted iterates, and how the iterate at hand compares with the tolerance
+    # The solve: outcome (see `outcome`), accepted iterates, and convergence test of the current iterate
     "status",
     "iteration",
-    "unbalanced",  # a residual is neither small nor rounding
-    "drowned",  # a residual is not small, though it may be rounding
-    # the line search, from the accepted iterate along the direction
-    "slot",  # which half of the energies is the accepted iterate's
+    "unbalanced",  # A residual is above tolerance and rounding floor.
+    "drowned",  # A residual is above tolerance, but within the rounding floor.
+    # The line search, from the accepted iterate along the direction
+    "slot",  # Which half of the energy buffer belongs to the accepted iterate.
     "halvings",
-    "wanted",  # whether a direction is
-    "todo",  # what is left to be done with the iterate
-    "placed",  # whether its edges were turned rather than moved straight
-    "stale",  # whether frames have to be renewed before the next step
-    # the matrix: whether it leaves out what compression takes away, and pivots lost in all iterations and in this one
+    "wanted",  # Whether a direction is to be computed.
+    "todo",  # Remaining action on the iterate, see `search`.
+    "placed",  # Whether the iterate came from an edge-rotation update, not a straight one.
+    "stale",  # Whether frames have to be updated before the next step.
+    # The matrix: whether compression is dropped, and pivots lost in all iterations and in this one
     "clamped",
     "lost",
     "bad",
-    "detours",  # iterations of a solve with such a matrix in place of the exact Hessian
-    "patience",  # how many there may be
-    # the step: whether it starts from the last state instead of the predictor, and what became of it
+    "detours",  # Iterations of a solve with a projected instead of the exact Hessian.
+    "patience",  # Limit of projected iterations.
+    # The step: whether it is a cold start (from the last state instead of the predictor), and its progress
     "cautious",
-    "retries",  # of the part of the step at hand, or of the last one of a step that is done
-    "reason",  # outcome of the solve that made it be given up
-    "bent",  # whether the predictor has to turn edges
-    "moved",  # whether this part of it succeeded
-    "driven",  # whether supports that contact holds up moved in the last step of the solve; see `kernels.net.touch`
-    "cut",  # whether contact has cut the last motion, of the predictor or of a step
-    # in float32, see `judge`: whether rounding excuses more than `ROUNDED` of the loads, the iteration from which on it excuses all,
-    # and whether a solve has ended so
+    "retries",  # Of the current substep, or of the last one of a finished step.
+    "reason",  # Outcome of the solve that made it fail for good.
+    "bent",  # Whether the predictor has to rotate edges.
+    "moved",  # Whether this substep succeeded.
+    "driven",  # Whether supports blocked by contact moved in the last iteration; see `kernels.net.touch`.
+    "cut",  # Whether CCD has limited the last motion, of the predictor or of an iteration.
+    # In float32, see `judge`: whether the rounding floor decides and exceeds `ROUNDED` of the loads, the iteration from which it
+    # decides anyway, and whether a solve has ended so.
     "doubtful",
     "polished",
     "doubted",
-    # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames; of
-    # nets, whether one wants a direction
+    # In the first column: whether any island is active, whether one rotates edges or updates frames, and, in the coupled system,
+    # whether one needs a direction
     "active",
     "turning",
     "wanting",
 )
 SCALARS = (
-    # the quadratic of inertia, coefficient * m |x - target|^2 / 2, and the reciprocal of the step that the solve is about
+    # The quadratic of inertia, coefficient * m |x - target|^2 / 2, and the reciprocal of the solve's step length
     "coefficient",
     "rate",
     "load_scale",
-    "residual",  # largest
+    "residual",  # Largest.
     "step_length",
-    "decrement",  # expected decrease of the energy by a whole step
-    "merit",  # square of the accepted iterate's residual
-    "angle_change",  # what angles have yet to move along the direction
-    "carried",  # largest stiffness of an edge that a matrix in float32 has [N/m]; see `solve.tension`
-    "turn",  # largest turn of an edge that is still taken straight [rad]; see `turns`
-    # the part of the time step that is done, and the part being tried
+    "decrement",  # Predicted decrease of the energy by a full step.
+    "merit",  # Squared residual of the accepted iterate.
+    "angle_change",  # Remaining motion of twist angles along the direction.
+    "carried",  # Largest axial stiffness of an edge in a float32 matrix [N/m]; see `solve.tension`.
+    "turn",  # Largest edge rotation of a straight update [rad]; see `turns`.
+    # The fraction of the time step that is done, and of the current substep
     "progress",
     "portion",
-    # the largest part that is tried at once, and the part that a row of the poses of motions is of; see `solve.net.arcs`
+    # The largest fraction tried at once, and the interval of a row of poses; see `solve.net.arcs`
     "substep",
     "interval",
 )
@@ -76,12 +78,13 @@ DOUBTFUL, POLISHED, DOUBTED = range(22, 25)
 ACTIVE, TURNING, WANTING = range(25, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE) = range(8)
 CARRIED, TURN, PROGRESS, PORTION, SUBSTEP, INTERVAL = range(8, len(SCALARS))
-DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step, or of its substeps, that are larger than this
+DETOURS_ALLOWED, LEAST = 30, 0.125  # Projected iterations of substeps larger than this fraction.
 
 
 class Islands:
-    """The entries of `count` islands, zero at first but for `turn`, `patience` and parts of steps; each row by its name, too, such as
-    `islands.status`.
+    """Solver state of `count` islands; each row is also an attribute, such as `islands.status`.
+
+    Entries are zero at first, except `turn`, `patience` and step fractions.
 
     Attributes:
         arrays: `flags` and `scalars`, for kernels.
@@ -109,20 +112,20 @@ class Islands:
 
 @cache
 def patience_function(real):
-    """out_of_patience(flags, scalars, i): enters an iteration of island i by its kind of matrix; whether the solve should end.
+    """Return the device function `out_of_patience(flags, scalars, i)`: True if the solve of island i should end.
 
-    Where the exact Hessian is indefinite an iteration does without second derivatives, and goes on slowly along a valley that bends,
-    or leaves a saddle. A shorter step, for which inertia makes the Hessian definite, gets there sooner, and to the solution that the
-    motion leads to. `DETOURS_ALLOWED` such iterations are enough, unless the part of the step is the `LEAST` already, or steps may
-    not be tried again.
+    It counts projected iterations. Where the exact Hessian is indefinite, an iteration omits second derivatives, and proceeds slowly
+    along a curved valley or leaves a saddle. A shorter step, for which inertia makes the Hessian definite, is faster, and finds the
+    solution that the motion leads to. After `DETOURS_ALLOWED` such iterations the solve ends, unless the substep is `LEAST` already
+    or retries are off.
     """
 
     @wp.func
     def out_of_patience(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
-        detours = flags[DETOURS, i] + flags[CLAMPED, i]
-        flags[DETOURS, i] = detours
+        projected = flags[DETOURS, i] + flags[CLAMPED, i]
+        flags[DETOURS, i] = projected
         flags[CLAMPED, i] = 0
-        if detours <= flags[PATIENCE, i] or scalars[PORTION, i] <= real(LEAST) * scalars[SUBSTEP, i]:
+        if projected <= flags[PATIENCE, i] or scalars[PORTION, i] <= real(LEAST) * scalars[SUBSTEP, i]:
             return False
         flags[STATUS, i] = wp.static(outcome.INDEFINITE)
         return True
@@ -132,7 +135,11 @@ def patience_function(real):
 
 @cache
 def attempt_functions(real, midpoint: bool):
-    """length(scalars, i, dt) of the implicit Euler step that the next solve of island i is about; restart(...) of its search."""
+    """Return the device functions `length` and `restart`.
+
+    `length(scalars, i, dt)`: length of the implicit Euler step of the next solve of island i.
+    `restart(...)`: reset the line search.
+    """
 
     @wp.func
     def length(scalars: wp.array2d(dtype=real), i: int, dt: real):

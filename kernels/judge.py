@@ -1,12 +1,12 @@
-"""Line search on an assembled system: what becomes of a rod at its iterate, from sums over its nodes.
+"""Armijo line search and convergence test of a rod, from sums over its nodes.
 
-A rod stops where it balances; else its iterate is accepted, or the step to it is shortened: Armijo's rule (c = 1e-4) on the
-energy, or, where the expected decrease drowns in rounding, a residual that has not grown much.
+A rod stops where it has converged. Otherwise its iterate is accepted, or the step is shortened, by Armijo's rule (c = 1e-4) on the
+energy. If the predicted decrease is below the rounding floor, a residual that has not grown much is accepted.
 
-In float32 the bound of what rounding leaves of a residual may be much of the load itself, and far more than rounding does leave. A
-residual above `ROUNDED` of the load scale that is within that bound ends a solve where the last Newton step has moved its node by less
-than `SETTLED` of the length of the rod, or turned its edge by less than `SETTLED`; else after `POLISHES` more iterations, and such
-solves are told, see `Integrator`.
+In float32 the rounding floor of a residual may be much of the load itself, and far above actual rounding errors. A residual above
+`ROUNDED` of the load scale but within the floor ends a solve if the last Newton step was small. It has moved the node by less than
+`SETTLED` of the length of the rod, or rotated the edge by less than `SETTLED`. Otherwise `POLISHES` more iterations follow, and
+such solves are reported, see `Integrator`.
 """
 
 from functools import cache
@@ -38,13 +38,13 @@ from ddg_warp.kernels.islands import (
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
+STOP, DIRECT = 0, 3  # actions in addition to `PLACE` and `RELAG`: none, and compute a direction
 ROUNDED, SETTLED, POLISHES = 1e-4, 1e-5, 10
 
 
 @cache
 def rests_function(real):
-    """rests(flags, i): whether residuals of island i are small, or rounding excuses them, by the flags of its iterate."""
+    """Return the device function `rests(flags, i)`: True if island i has converged, by the flags of its iterate."""
 
     @wp.func
     def rests(flags: wp.array2d(dtype=int), i: int):
@@ -52,7 +52,7 @@ def rests_function(real):
             return False
         if flags[DROWNED, i] == 0:
             return True
-        # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
+        # The rounding floor counts only after an iteration: in a coarse precision the predictor's residual may be all of the load.
         if flags[ITERATION, i] == 0:
             return False
         if wp.static(real is wp.float32):
@@ -67,15 +67,18 @@ def rests_function(real):
 
 @cache
 def judge_functions(twist: bool, real, driven: bool = False):
-    """balanced(...): whether a rod has stopped; decide(...): what an active rod does next (STOP, PLACE, RELAG or DIRECT).
+    """Return the device functions `balanced` and `decide` of a rod.
 
-    `driven`: whether supports may have moved in the last step, whose work the search does not know.
+    `balanced(...)`: True if the rod has stopped.
+    `decide(...)`: next action of an active rod (`STOP`, `PLACE`, `RELAG` or `DIRECT`).
+
+    `driven`: supports may have moved in the last step, which does work unknown to the line search.
     """
     shorter, rests = shorter_function(real), rests_function(real)
 
     @wp.func
     def balanced(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), r: int):
-        """Whether the rod has stopped, by its last iterate or before; lowers its flags where it has not."""
+        """Return True if the rod has stopped, now or before; otherwise reset its flags."""
         if flags[STATUS, r] != 0:
             return True
         if rests(flags, r):
@@ -91,7 +94,7 @@ def judge_functions(twist: bool, real, driven: bool = False):
         if wp.static(real is wp.float32):
             if flags[UNBALANCED, r] == 0 and flags[POLISHED, r] == 0:
                 flags[POLISHED, r] = flags[ITERATION, r]
-                if flags[ITERATION, r] == 0 and scalars[LOAD_SCALE, r] == real(0.0):  # all that moves it is rounding
+                if flags[ITERATION, r] == 0 and scalars[LOAD_SCALE, r] == real(0.0):  # only rounding moves it
                     flags[POLISHED, r] = -wp.static(POLISHES)
             flags[DOUBTFUL, r] = 0
         flags[UNBALANCED, r] = 0
@@ -110,9 +113,9 @@ def judge_functions(twist: bool, real, driven: bool = False):
         scalars: wp.array2d(dtype=real),
         r: int,
     ):
-        """From the energy's change and its rounding, the square and the largest component of the residual.
+        """Return the action, from change and rounding of the energy, square and largest component of the residual.
 
-        PLACE leaves the shorter step in `step_length`; RELAG asks for frames of the iterate and a step of no length.
+        `PLACE` leaves the shorter step in `step_length`. `RELAG` requests a frame update and a step of zero length.
         """
         first = flags[ITERATION, r] == 0
         scalars[RESIDUAL, r] = worst
@@ -151,7 +154,7 @@ def judge_functions(twist: bool, real, driven: bool = False):
         flags[HALVINGS, r] = 0
         if wp.static(twist):
             if flags[STALE, r] != 0:
-                # angles mean something else now: take no step, and ask for a direction in the new frames
+                # Twist angles change meaning: take no step, and compute a direction in the updated frames.
                 flags[STALE, r] = 0
                 scalars[DECREMENT, r] = real(1.0e30)
                 scalars[STEP_LENGTH, r] = real(0.0)
@@ -163,7 +166,10 @@ def judge_functions(twist: bool, real, driven: bool = False):
 
 @cache
 def judge_kernel(kind: ChainKind, real, linear):
-    """The line search of a rod by one thread: sums over its nodes, decides, and puts a shortened step or new frames."""
+    """Build the kernel of the line search.
+
+    `judge`: sum over a rod's nodes, decide, and write a shortened step or updated frames, one thread a rod.
+    """
     V = wp.types.vector(kind.dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
     balanced, decide = judge_functions(kind.twist, real)
@@ -205,20 +211,20 @@ def judge_kernel(kind: ChainKind, real, linear):
                 worst = wp.max(worst, size)
                 square += size * size
         taken = scalars[STEP_LENGTH, r]
-        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
-        if what == wp.static(STOP):
+        action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
+        if action == wp.static(STOP):
             return
         flags[ACTIVE, 0] = 1
-        if what == wp.static(PLACE):
-            less = scalars[STEP_LENGTH, r]
-            place(x, base, base, direction, fixed, anchor, less, 0, n, r)
-            turn_angles(theta, direction, less - taken, n, r)
+        if action == wp.static(PLACE):
+            shortened = scalars[STEP_LENGTH, r]
+            place(x, base, base, direction, fixed, anchor, shortened, 0, n, r)
+            turn_angles(theta, direction, shortened - taken, n, r)
         if wp.static(twist):
-            if what == wp.static(RELAG):
+            if action == wp.static(RELAG):
                 relag(x, frame, n, r)
                 for k in range(n):
                     base[k, r] = x[k, r]
-        if what == wp.static(DIRECT):
+        if action == wp.static(DIRECT):
             flags[WANTED, r] = 1
 
     return judge

@@ -1,7 +1,7 @@
-"""Loads that change, and those that follow what they act on, as forces on the predicted configuration; they are kept within a step.
+"""Follower and time-dependent loads as forces on the predicted configuration, constant within a step.
 
-Followers write the forces on all places of their elements, one after the other; spread(...) sums them place by place in one order,
-without atomics, over loads that follow nothing.
+Follower loads write the forces on all nodes of their elements, one after the other. `spread` sums them by dof index in a fixed order,
+without atomics, on top of dead loads.
 """
 
 from functools import cache
@@ -15,36 +15,36 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def force_functions(real):
-    """Forces on up to four places of an element from its first three points and three values; see `ddg_warp.compile.loads`.
+    """Return device functions by name: forces on up to four dof indices of an element.
 
-    By name: "press" of triangles, "squeeze" of meridian edges, couples "twist" of rod and "bend" of mesh edges. A moment is component
-    0 of the force on an angle.
+    "press" of triangles, "squeeze" of meridian edges, couples "twist" of rod and "bend" of mesh edges. Each takes the first three
+    points and three values; see `ddg_warp.compile.loads`. A moment is component 0 of the force on an angle.
     """
     V = wp.types.vector(3, real)
     third = wp.constant(real(np.pi / 3.0))
 
     @wp.func
     def press(a: V, b: V, c: V, value: V):
-        """On all corners alike, p A n / 3."""
+        """Return equal forces on the corners, p A n / 3."""
         force = wp.cross(b - a, c - a) * (value[0] / real(6.0))
         return force, force, force, V()
 
     @wp.func
     def squeeze(a: V, b: V, c: V, value: V):
-        """See `ddg_warp.compile.axisymmetric.BandPressure`."""
+        """Return the forces of a pressure on a band; see `ddg_warp.compile.axisymmetric.BandPressure`."""
         across = V(a[2] - b[2], real(0.0), b[0] - a[0]) * (value[0] * third)
         return across * (real(2.0) * a[0] + b[0]), across * (a[0] + real(2.0) * b[0]), V(), V()
 
     @wp.func
     def twist(a: V, b: V, c: V, couple: V):
-        """Of a couple M on an edge e: -M x e / |e|^2 and M x e / |e|^2 on its nodes, M . t on its angle."""
+        """Return the forces of a couple M on an edge e: -M x e / |e|^2 and M x e / |e|^2 on nodes, M . t on the angle."""
         e = b - a
         pair = wp.cross(couple, e) / wp.length_sq(e)
         return -pair, pair, V(wp.dot(couple, e) / wp.length(e), real(0.0), real(0.0)), V()
 
     @wp.func
     def bend(a: V, b: V, c: V, moment: V):
-        """On the ends and the corner opposite, and on the angle; see `ddg_warp.compile.loads.EdgeCouple`."""
+        """Return forces on the ends and the opposite corner, and on the angle; see `ddg_warp.compile.loads.EdgeCouple`."""
         e = b - a
         n = wp.cross(e, c - a)
         lift = n * (moment[0] * wp.length(e) / wp.length_sq(n))
@@ -56,7 +56,10 @@ def force_functions(real):
 
 @cache
 def follower_kernel(name: str, count: int, dim: int, real):
-    """Writes the forces of one kind of load on the `count` places of its elements, from `first` on among the `total` of a world."""
+    """Build the kernel of one kind of follower load.
+
+    `follow`: write forces at the `count` dof indices of each element, from `first` on among the `total` of a world.
+    """
     V, P = wp.types.vector(3, real), wp.types.vector(dim, real)
     get, _ = point_functions(dim, real)
     forces = force_functions(real)[name]
@@ -78,25 +81,27 @@ def follower_kernel(name: str, count: int, dim: int, real):
         if wp.static(name in ("press", "bend")):
             c = get(x, places[k, 2], w, columns)
         f0, f1, f2, f3 = forces(a, b, c, values[k])
-        at = first + wp.static(count) * k + w * total
-        force_out[at] = f0
-        force_out[at + 1] = f1
+        index = first + wp.static(count) * k + w * total
+        force_out[index] = f0
+        force_out[index + 1] = f1
         if wp.static(count > 2):
-            force_out[at + 2] = f2
+            force_out[index + 2] = f2
         if wp.static(count > 3):
-            force_out[at + 3] = f3
+            force_out[index + 3] = f3
 
     return follow
 
 
 @cache
 def spread_kernel(dim: int, real):
-    """Writes the loads on nodes of `dim` components, or on angles, of one: dead ones, and the forces that belong to each.
+    """Build the kernel that assembles loads on nodes of `dim` components, or on angles (one component).
 
-    Dead ones are shared by all worlds, with `stride` 0, or lie as many apart.
+    `spread`: write dead loads plus the listed follower forces.
+
+    Dead loads are shared by all worlds with `stride` 0, else `stride` apart.
     """
     V, P = wp.types.vector(3, real), wp.types.vector(dim, real) if dim > 1 else real
-    _, put = point_functions(max(2, dim), real)
+    _, put_point = point_functions(max(2, dim), real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread(
@@ -112,10 +117,10 @@ def spread_kernel(dim: int, real):
     ):
         k, w = wp.tid()
         f = dead[k + w * stride]
-        for at in range(starts[k], starts[k + 1]):
-            f += force[items[at] + w * total]
+        for index in range(starts[k], starts[k + 1]):
+            f += force[items[index] + w * total]
         if wp.static(dim > 1):
-            put(load_out, places[k], w, columns, f)
+            put_point(load_out, places[k], w, columns, f)
         else:
             load_out[places[k] / columns, column_of(places[k], w, columns)] = f[0]
 

@@ -1,13 +1,13 @@
-"""Motion of supports over a time step on the device, as `ddg_warp.scene.motion.Motion.pose` describes it.
+"""Prescribed motion of supports over a time step on the device, as in `ddg_warp.scene.motion.Motion.pose`.
 
-A pose is a row of an array: the rotation vector of the step (3), the rotation at its start (9), the pivot (3), the translations
-at its start and end (3 each). s is the fraction of the step; the turn runs at a constant rate, so that no part of it is a chord.
-Where worlds are moved each for itself, by `Grip`, the rows of one world follow those of another, `stride` apart, which else is zero.
-Of a step that is taken in K = 2^k intervals (`solve.net.arcs`), K sets of `rows` follow those of all coarser intervals: the motion
-of an interval, extended to the whole step, so that s means the same.
+A pose is a row of an array: rotation vector of the step (3), rotation at its start (9), pivot (3), translations at start and end (3
+each). The fraction of the step is s. The rotation has a constant rate, so that substeps follow arcs, not chords. For grips, which
+differ by world, rows of worlds follow each other with `stride`, which is zero otherwise. For a step in K = 2^k intervals
+(`solve.net.arcs`), K sets of `rows` follow the sets of all coarser intervals. A set is the motion of an interval, extended to the
+whole step, so that s means the same.
 
-Supports are at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its
-ends, so that the extrapolated ones are exact, and angles and normals those in the middle.
+Supports are at the end of the current substep. With the midpoint rule positions are the mean of both ends, so that extrapolated
+positions are exact; angles and normals are at the middle.
 """
 
 from functools import cache
@@ -19,26 +19,31 @@ from ddg_warp.kernels.gather import column_of, point_functions
 from ddg_warp.kernels.islands import INTERVAL, PORTION, PROGRESS, REASON, STATUS, SUBSTEP
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-POSE = 21  # reals of a motion over a step
-MOST_PARTS = 1024  # substeps of a step, at most
-HALF = 1e-6  # half the angle by which what counts as half a turn is off [rad]
-COUNTED = 3.1415926535897932 + HALF  # length of a rotation vector, beyond which it counts turns [rad]
-SLACK = 1.0 - 1e-6  # of a turn that substeps are to resolve, for rounding
+POSE = 21  # Reals of a motion over a step.
+MOST_PARTS = 1024  # Maximum substeps of a step.
+HALF = 1e-6  # Tolerance of half a revolution, as half the angle [rad].
+COUNTED = 3.1415926535897932 + HALF  # Length of a rotation vector above which it counts revolutions [rad].
+SLACK = 1.0 - 1e-6  # Factor on rotations that substeps have to resolve, for rounding.
 
 
 @cache
 def functions(real):
-    """turned(pose, m, s, v): a vector of the rest state; placed(pose, m, s, rest): a point of it; branch(...): see there."""
+    """Return the device functions `turned`, `placed` and `branch` of a pose.
+
+    `turned(pose, m, s, v)`: a rotated vector.
+    `placed(pose, m, s, rest)`: a moved point.
+    `branch(...)`: the twist angle of a rotated director.
+    """
     X = wp.types.vector(3, real)
-    turn = wp.constant(real(6.283185307179586476925286766559))
+    full_turn = wp.constant(real(6.283185307179586476925286766559))
 
     @wp.func
-    def row(pose: wp.array2d(dtype=real), m: int, at: int):
-        return X(pose[m, at], pose[m, at + 1], pose[m, at + 2])
+    def row(pose: wp.array2d(dtype=real), m: int, entry: int):
+        return X(pose[m, entry], pose[m, entry + 1], pose[m, entry + 2])
 
     @wp.func
     def turned(pose: wp.array2d(dtype=real), m: int, s: real, v: X):
-        """v of the rest state, rotated to the fraction s of the step (Rodrigues)."""
+        """Return v of the rest state, rotated to the fraction s of the step (Rodrigues)."""
         w = X(wp.dot(row(pose, m, 3), v), wp.dot(row(pose, m, 6), v), wp.dot(row(pose, m, 9), v))
         rotation = row(pose, m, 0) * s
         angle = wp.length(rotation)
@@ -59,18 +64,18 @@ def functions(real):
 
     @wp.func
     def branch(pose: wp.array2d(dtype=real), m: int, s0: real, s1: real, rest: X, u: X, t: X, angle0: real):
-        """Angle from u about t to the director `rest` at s1, on the branch that the rotation since s0 leads to from angle0."""
+        """Return the angle from u about t to the director `rest` at s1, on the branch that follows from angle0 at s0."""
         d = turned(pose, m, s1, rest)
         angle = wp.atan2(wp.dot(wp.cross(u, d), t), wp.dot(u, d))
         expected = angle0 + wp.dot(row(pose, m, 0), t) * (s1 - s0)
-        return angle - turn * wp.round((angle - expected) / turn)
+        return angle - full_turn * wp.round((angle - expected) / full_turn)
 
     return turned, placed, branch
 
 
 @cache
 def row_function(real):
-    """row(scalars, i, rows): the first row of the interval that a solve of island i is in."""
+    """Return the device function `row(scalars, i, rows)`: the first row of the interval of a solve of island i."""
 
     @wp.func
     def row(scalars: wp.array2d(dtype=real), i: int, rows: int):
@@ -82,7 +87,7 @@ def row_function(real):
 
 @cache
 def reached_function(real, midpoint: bool):
-    """reached(scalars, i): fraction of the step that a solve of island i is about."""
+    """Return the device function `reached(scalars, i)`: the fraction of the step at the solve of island i."""
 
     @wp.func
     def reached(scalars: wp.array2d(dtype=real), i: int):
@@ -96,9 +101,13 @@ def reached_function(real, midpoint: bool):
 
 @cache
 def support_kernels(dim: int, real, midpoint: bool):
-    """nodes(...) and angles(...) of an iterate, put where their motions have them."""
+    """Build the kernels of prescribed motion.
+
+    `nodes`: write positions of supports.
+    `angles`: write twist angles of supports.
+    """
     X, V = wp.types.vector(3, real), wp.types.vector(dim, real)
-    get, put = point_functions(dim, real)
+    get, put_point = point_functions(dim, real)
     transport, *_ = frames.functions(real)
     _, placed, branch = functions(real)
     reached, row = reached_function(real, midpoint), row_function(real)
@@ -115,14 +124,14 @@ def support_kernels(dim: int, real, midpoint: bool):
         columns: int,
         x: wp.array2d(dtype=V),
     ):
-        """`where` is the place, then the pose of each component, -1 for none; `rest` the position at rest."""
+        """Write positions; `where` is the dof index, then the pose of each component, -1 for none, `rest` the rest position."""
         i, w = wp.tid()
-        place = where[i, 0]
-        r = column_of(place, w, columns)
+        dof_index = where[i, 0]
+        r = column_of(dof_index, w, columns)
         start = scalars[PROGRESS, r]
         if start >= real(1.0):
             return
-        here = get(x, place, w, columns)
+        position = get(x, dof_index, w, columns)
         first = w * stride + row(scalars, r, rows)
         for d in range(3):
             m = where[i, 1 + d]
@@ -131,8 +140,8 @@ def support_kernels(dim: int, real, midpoint: bool):
                 p = placed(pose, m, start + scalars[PORTION, r], rest[i])
                 if wp.static(midpoint):
                     p = real(0.5) * (p + placed(pose, m, start, rest[i]))
-                here[d] = p[d]
-        put(x, place, w, columns, here)
+                position[d] = p[d]
+        put_point(x, dof_index, w, columns, position)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def angles(
@@ -148,7 +157,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         frame: wp.array3d(dtype=real),
         theta: wp.array2d(dtype=real),
     ):
-        """`where` is the angle, its edge, the nodes of that and the pose, `rest` the edge's first material director at rest."""
+        """Write twist angles; `where` is the angle, its edge, both nodes and the pose, `rest` the first material director at rest."""
         i, w = wp.tid()
         r = column_of(where[i, 0], w, columns)
         start = scalars[PROGRESS, r]
@@ -168,8 +177,12 @@ def support_kernels(dim: int, real, midpoint: bool):
 
 @cache
 def grip_kernel(real, arcs: bool):
-    """Poses of all motions over a step, world by world: those of grips between two states, of functions of time as they are given; with
-    `arcs` also the substeps that resolve those of grips."""
+    """Build the kernel of poses.
+
+    `grip`: write poses of all motions over a step, world by world, of grips between two states and of functions of time as given.
+
+    With `arcs` it also writes the substeps that resolve the arcs of grips.
+    """
     X, Q = wp.types.vector(3, real), wp.types.quaternion(real)
 
     @wp.func
@@ -187,16 +200,18 @@ def grip_kernel(real, arcs: bool):
 
     @wp.func
     def turn_between(r0: X, r1: X):
-        """The rotation vector of the shortest turn from one orientation to another, exactly none where they are the same; of half a
-        turn that which rotation vectors differ by. What counts more than half a turn is no number: see `turns_between`."""
+        """Return the rotation vector of the shortest rotation between two orientations, exactly zero if equal.
+
+        A rotation by 180 degrees has the direction of r1 - r0. Rotation vectors that count revolutions give nan: see `turns_between`.
+        """
         if wp.length(r1) > real(wp.static(COUNTED)) and wp.length(r1 - r0) > real(wp.static(COUNTED)):
             return X(real(wp.nan), real(wp.nan), real(wp.nan))
         q = quaternion(r1) * wp.quat_inverse(quaternion(r0))
         v = X(q[0], q[1], q[2])
-        back = q[3] < real(0.0)
+        flip = q[3] < real(0.0)
         if wp.abs(q[3]) < real(wp.static(HALF)):
-            back = wp.dot(v, r1 - r0) < real(0.0)
-        if back:
+            flip = wp.dot(v, r1 - r0) < real(0.0)
+        if flip:
             v = -v
         size = wp.length(v)
         if size == real(0.0) or r0 == r1:
@@ -205,7 +220,7 @@ def grip_kernel(real, arcs: bool):
 
     @wp.func
     def largest_turn(arms: wp.array2d(dtype=X), g: int, axis: X, allowed: real):
-        """Turn about an axis of the rest state [rad] whose chords are off the arcs of `arms` (grips, points) by what is allowed."""
+        """Return the largest rotation about `axis` [rad] with chords within `allowed` of the arcs of `arms` (grips, points)."""
         far = real(0.0)
         for p in range(arms.shape[1]):
             far = wp.max(far, wp.length(wp.cross(axis, arms[g, p])))
@@ -224,14 +239,13 @@ def grip_kernel(real, arcs: bool):
         most: wp.array2d(dtype=real),
         parts: real,
     ):
-        """Number of substeps that resolve the arcs of all grips of a world, a power of two and `parts` at least; more than
-        `MOST_PARTS` where so many do not."""
+        """Return the number of substeps that resolve all grips: a power of two >= `parts`, above `MOST_PARTS` if too many."""
         for g in range(count):
             r0 = row(before, 3, g + w * count)
-            turn = turn_between(r0, row(after, 3, g + w * count))
-            angle = wp.length(turn)
+            rotation = turn_between(r0, row(after, 3, g + w * count))
+            angle = wp.length(rotation)
             if angle > real(0.0):
-                axis = wp.quat_rotate_inv(quaternion(r0), turn / angle)
+                axis = wp.quat_rotate_inv(quaternion(r0), rotation / angle)
                 largest = wp.min(most[w, g], largest_turn(arms, g, axis, allowed[w, g]))
                 while parts * largest < real(wp.static(SLACK)) * angle and parts <= real(wp.static(float(MOST_PARTS))):
                     parts *= real(2.0)
@@ -252,8 +266,10 @@ def grip_kernel(real, arcs: bool):
         scalars: wp.array2d(dtype=real),
         tally: wp.array(dtype=wp.int64),
     ):
-        """`grips` is the number of the grip of each row, among `count`, -1 where it is a function of time. Worlds whose arcs substeps
-        do not resolve are given up; see `kernels.step.advance_kernel` for `tally`."""
+        """Write poses; `grips` is the grip of each row, among `count`, -1 for a function of time.
+
+        Worlds whose arcs are not resolved fail; see `kernels.step.advance_kernel` for `tally`.
+        """
         n, w = wp.tid()
         if wp.static(arcs):
             if n == 0:
@@ -263,20 +279,20 @@ def grip_kernel(real, arcs: bool):
                     flags[REASON, w] = wp.static(outcome.TURNED_TOO_FAR)
                     wp.atomic_add(tally, wp.static(outcome.TURNED_TOO_FAR), wp.int64(1))
                 scalars[SUBSTEP, w] = real(1.0) / parts
-        m, at = n % grips.shape[0], n + w * shared.shape[0]
+        m, pose_row = n % grips.shape[0], n + w * shared.shape[0]
         for c in range(wp.static(POSE)):
-            pose_out[at, c] = shared[n, c]
+            pose_out[pose_row, c] = shared[n, c]
         if grips[m] < 0:
             return
         i = grips[m] + w * count
         r0 = row(before, 3, i)
-        turn = turn_between(r0, row(after, 3, i))
+        rotation_vector = turn_between(r0, row(after, 3, i))
         rotation = wp.quat_to_matrix(quaternion(r0))
         for d in range(3):
-            pose_out[at, d] = turn[d]
+            pose_out[pose_row, d] = rotation_vector[d]
             for e in range(3):
-                pose_out[at, 3 + 3 * d + e] = rotation[d, e]
-            pose_out[at, 15 + d] = before[d, i]
-            pose_out[at, 18 + d] = after[d, i]
+                pose_out[pose_row, 3 + 3 * d + e] = rotation[d, e]
+            pose_out[pose_row, 15 + d] = before[d, i]
+            pose_out[pose_row, 18 + d] = after[d, i]
 
     return grip

@@ -1,4 +1,4 @@
-"""Outcomes of a Newton solve, as the device writes them into `status`."""
+"""Outcomes of a Newton solve, as kernels write them into `status`."""
 
 ACTIVE = 0
 CONVERGED = 1
@@ -6,19 +6,17 @@ CONVERGED_TO_ROUNDING = 2
 MAX_ITERATIONS = 3
 LINE_SEARCH_FAILED = 4
 NON_FINITE = 5
-# the exact Hessian has a negative pivot, and nothing was to be put in its place; or, of a net, conjugate gradients have no direction,
-# as their preconditioner is not definite in this precision
+# The exact Hessian has a negative pivot, and no projected Hessian is allowed. In the coupled system also: conjugate gradients have no
+# direction, as the preconditioner is not definite in this precision.
 INDEFINITE = 6
-GIVEN_UP = 7  # an earlier step failed for good; the rod rests at its last good state
-LOST_IN_ROUNDING = (
-    8  # counted instead of CONVERGED_TO_ROUNDING where rounding decides the motion, and the user allowed that
-)
-ENERGY_DRIFT = 9  # the midpoint rule would have made or lost more energy than it may; see `kernels.energy`
-CROSSED = 10  # things would have passed through each other
-NO_ROOM = 11  # surfaces have come so near that a barrier, whose forces grow without bound, has lost its digits
-TURNED_TOO_FAR = 12  # supports or obstacles would turn farther in a step than substeps resolve
-INVALID_INPUT = 13  # a parameter or control that a step was handed as a tensor is not finite, or none that it may be
-NO_GRADIENT = 14  # a step that converged, through which no gradient goes; see `ddg_warp.learn.engine`
+GIVEN_UP = 7  # An earlier step failed for good; the rod stays in its last good state.
+LOST_IN_ROUNDING = 8  # Instead of CONVERGED_TO_ROUNDING where rounding decides the motion, as allowed by the user.
+ENERGY_DRIFT = 9  # The midpoint rule would have exceeded the allowed energy drift; see `kernels.energy`.
+CROSSED = 10  # Primitives would have crossed.
+NO_ROOM = 11  # Minimum gap reached: the forces of the barrier, which grow without bound, have lost their digits.
+TURNED_TOO_FAR = 12  # Supports or obstacles would rotate farther in a step than substeps resolve.
+INVALID_INPUT = 13  # A parameter or control of a step, given as a tensor, is not finite or not allowed.
+NO_GRADIENT = 14  # A converged step through which no gradient goes; see `ddg_warp.learn.engine`.
 
 NAMES = {
     CONVERGED: "converged",

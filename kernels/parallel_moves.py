@@ -1,7 +1,7 @@
-"""Moves of few, long rods, a thread a node: what `search.adjust` and `step.predict` do with one thread a rod.
+"""Moves of few, long rods, one thread a node; `search.adjust` and `step.predict` use one thread a rod.
 
-Turned edges are summed to positions by a prefix sum: within ranges of about the root of a rod's nodes, a thread a range, then over
-the ranges, a thread a rod.
+A prefix sum maps rotated edges to positions. It runs within ranges of about the square root of a rod's nodes, one thread a range,
+then over the ranges, one thread a rod.
 """
 
 from functools import cache
@@ -19,13 +19,15 @@ from ddg_warp.kernels.turns import onward_function
 
 @cache
 def move_kernels(kind: ChainKind, real, linear, split: bool = False):
-    """`turn`, `scan` and `offset`, the prefix sum of turned edges, then `move`, which puts nodes or frames; see `search.place`.
+    """Build the kernels of an edge-rotation update or a frame update.
 
-    `turn` also carries frames, into a second array, as neighbours still read those of before.
+    `turn`: compute the excess of rotated edges, or their frames, into a second array as neighbours read the old frames.
+    `scan`, `offset`: take the prefix sum of edges.
+    `move`: write nodes or frames; see `search.place`.
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    step_of, excess, put, carry = move_functions(kind, real, linear, split)
+    step_of, excess, put_node, carry = move_functions(kind, real, linear, split)
     onward_of = onward_function(real)
     _, reference_twist, _ = frames.functions(real)
 
@@ -36,21 +38,23 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         direction: wp.array3d(dtype=linear),
         step_length: wp.array(dtype=real),
         straight: wp.array(dtype=real),
-        onward: int,
+        extrapolation: int,
         base: wp.array2d(dtype=V),
-        now: wp.array2d(dtype=V),
+        positions: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         excess_out: wp.array2d(dtype=V),
         frame_out: wp.array3d(dtype=real),
     ):
-        """Of every edge: excess of turning it over shearing it, or its frame in the iterate."""
+        """Write for every edge the excess of rotation over shear, or its frame in the iterate."""
         k, r = wp.tid()
         n = count[r]
         if k >= n - 1:
             return
         if todo[r] == wp.static(PLACE):
-            excess_out[k, r] = excess(base, now, direction, step_length[r], onward_of(straight[r], onward), k, n, r)
+            excess_out[k, r] = excess(
+                base, positions, direction, step_length[r], onward_of(straight[r], extrapolation), k, n, r
+            )
         if wp.static(twist):
             if todo[r] == wp.static(RELAG):
                 u, t = carry(x, frame, k, n, r)
@@ -71,7 +75,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         excess_to_sum: wp.array2d(dtype=V),
         sum_out: wp.array3d(dtype=V),
     ):
-        """Sums of the edges before every node within its range of `width` nodes; of a range, its sum and that of these sums."""
+        """Write the exclusive sum of edges within a range of `width` nodes; of the range its sum and the sum of these sums."""
         i, r = wp.tid()
         if todo[r] != wp.static(PLACE):
             return
@@ -79,12 +83,12 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         running = V()
         area = V()
         for k in range(i * width, wp.min(n, (i + 1) * width)):
-            here = V()
+            edge_excess = V()
             if k < n - 1:
-                here = excess_to_sum[k, r]
+                edge_excess = excess_to_sum[k, r]
             excess_to_sum[k, r] = running
             area += running
-            running += here
+            running += edge_excess
         sum_out[0, i, r] = running
         sum_out[1, i, r] = area
 
@@ -97,7 +101,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         sums: wp.array3d(dtype=V),
         mean_out: wp.array(dtype=V),
     ):
-        """Replaces a range's sum by that of all ranges before it; mean over the nodes of what the edges before them sum to."""
+        """Replace the sum of a range by that of all ranges before; write the mean over nodes of the exclusive sums."""
         r = wp.tid()
         if todo[r] != wp.static(PLACE):
             return
@@ -105,17 +109,17 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         running = V()
         mean = V()
         for i in range(ranges):
-            here = sums[0, i, r]
+            range_sum = sums[0, i, r]
             sums[0, i, r] = running
             nodes = wp.min(n, (i + 1) * width) - i * width
             if nodes > 0:
                 mean += sums[1, i, r] + running * real(nodes)
-                running += here
+                running += range_sum
         mean_out[r] = mean / real(n)
 
     @wp.func
     def before(prefix: wp.array2d(dtype=V), sums: wp.array3d(dtype=V), width: int, k: int, r: int):
-        """Sum over all edges before node k."""
+        """Return the sum over all edges before node k."""
         return prefix[k, r] + sums[0, k // width, r]
 
     @wp.func
@@ -127,14 +131,14 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         k: int,
         r: int,
     ):
-        """What lies between a held node and where the straight step ends."""
+        """Return the difference between a fixed node and the end of the straight update."""
         return x[k, r] - base[k, r] - step_of(direction, k, r) * amount
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def move(
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
-        held: wp.array3d(dtype=int),
+        anchors: wp.array3d(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         direction: wp.array3d(dtype=linear),
@@ -148,12 +152,12 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         frame: wp.array3d(dtype=real),
         base: wp.array2d(dtype=V),
     ):
-        """Puts a node where its step ends: of turned edges the sum from the held node before it, closing at the next."""
+        """Write a node's end position: for rotated edges the sum from the anchor before, corrected to close at the next anchor."""
         k, r = wp.tid()
-        what = flags[TODO, r]
-        if what == 0 or k >= count[r]:
+        action = flags[TODO, r]
+        if action == 0 or k >= count[r]:
             return
-        if what == wp.static(RELAG):
+        if action == wp.static(RELAG):
             base[k, r] = x[k, r]
             if wp.static(twist):
                 if k < count[r] - 1:
@@ -161,9 +165,9 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
                         frame[c, k, r] = new_frame[c, k, r]
             return
         shift = V()
-        if what == wp.static(PLACE):
-            p = held[0, k, r]
-            q = held[1, k, r]
+        if action == wp.static(PLACE):
+            p = anchors[0, k, r]
+            q = anchors[1, k, r]
             shift = before(prefix, sums, width, k, r)
             amount = scalars[STEP_LENGTH, r]
             if p < 0 and q < 0:
@@ -176,8 +180,8 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
                 if q > p:
                     end = added(x, base, direction, amount, q, r) - before(prefix, sums, width, q, r)
                     shift += (end - start) * (real(k - p) / real(q - p))
-        if held[0, k, r] != k:
-            put(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
+        if anchors[0, k, r] != k:
+            put_node(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
         if wp.static(twist):
             theta[k, r] = theta[k, r] + scalars[ANGLE_CHANGE, r] * real(direction[wp.static(dim), k, r])
 
@@ -186,8 +190,12 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
 
 @cache
 def predict_kernels(kind: ChainKind, real, linear):
-    """`aim`: bent rods step along their velocity, with edges turned; `renew`: every rod that moves takes new frames; `again`:
-    bent ones step once more."""
+    """Build the kernels of the predictor.
+
+    `aim`: set the velocity step of rods with rotated edges as direction.
+    `renew`: request a frame update of every moving rod.
+    `again`: request the step of rods with rotated edges again.
+    """
     dim, nb = kind.dim, kind.block
     V = wp.types.vector(dim, real)
     predicted = predicted_function(dim, real)

@@ -1,7 +1,7 @@
-"""The line search of few, long rods: what `judge` and `pcg.take` do with one thread a rod, spread over its nodes.
+"""Line search of few, long rods, one thread a node; `judge` and `pcg.take` use one thread a rod.
 
-Sums over a rod run over fixed ranges of about the root of its nodes, a thread a range, then a thread a rod over the ranges: always
-in one order.
+Sums over a rod run over fixed ranges of about the square root of its nodes, one thread a range, then over the ranges, one thread a
+rod. The order of summation is fixed.
 """
 
 from functools import cache
@@ -32,9 +32,12 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def sum_kernels(kind: ChainKind, real, linear):
-    """Partial sums of a range: `weigh` of energy changes, rounding and residuals, `gauge` of a direction.
+    """Build the kernels of partial sums over ranges of nodes.
 
-    Range i of a rod holds its nodes i, i + ranges, ..., so that neighbouring threads read neighbouring nodes.
+    `weigh`: sum energy changes, rounding and residuals.
+    `gauge`: sum r . d and find the largest rotation of a direction.
+
+    Range i of a rod has its nodes i, i + ranges, ..., so that neighbouring threads read neighbouring nodes.
     """
     dim, nb = kind.dim, kind.block
     V = wp.types.vector(dim, real)
@@ -49,7 +52,7 @@ def sum_kernels(kind: ChainKind, real, linear):
         ranges: int,
         partial_out: wp.array3d(dtype=real),
     ):
-        """Sums of energy changes, of their rounding and of squares of the residual, and its largest component."""
+        """Sum energy changes, their rounding and squared residuals; find the largest residual component."""
         i, r = wp.tid()
         if status[r] != 0:
             return
@@ -80,22 +83,22 @@ def sum_kernels(kind: ChainKind, real, linear):
         base_out: wp.array2d(dtype=V),
         partial_out: wp.array3d(dtype=real),
     ):
-        """Share of r . d, and the largest squared turn of an edge; takes the iterate as the positions a step comes from."""
+        """Write partial sums of r . d and the largest squared edge rotation; store the iterate as base of the step."""
         i, r = wp.tid()
         if wanted[r] == 0:
             return
         total = real(0.0)
         rotation = real(0.0)
         for k in range(i, count[r], ranges):
-            here = x[k, r]
-            base_out[k, r] = here
+            x_k = x[k, r]
+            base_out[k, r] = x_k
             for d in range(wp.static(nb)):
                 total += real(residual[d, k, r]) * real(direction[d, k, r])
             if k > 0:
                 bent = V()
                 for d in range(wp.static(dim)):
                     bent[d] = real(direction[d, k, r] - direction[d, k - 1, r])
-                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(here - x[k - 1, r]))
+                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(x_k - x[k - 1, r]))
         partial_out[0, i, r] = total
         partial_out[1, i, r] = rotation
 
@@ -104,7 +107,13 @@ def sum_kernels(kind: ChainKind, real, linear):
 
 @cache
 def decide_kernels(kind: ChainKind, real, linear, exact: bool):
-    """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction; `exact` as of `pcg.repeat_kernel`."""
+    """Build the kernels of decisions from partial sums.
+
+    `judge`: test the iterate of a rod.
+    `take`: set the step length along a direction.
+
+    `exact` as in `pcg.repeat_kernel`.
+    """
     balanced, decide = judge_functions(kind.twist, real)
     out_of_patience = patience_function(real)
 
@@ -136,14 +145,14 @@ def decide_kernels(kind: ChainKind, real, linear, exact: bool):
         if flags[ITERATION, r] == 0:
             flags[LOST, r] = 0
         taken = scalars[STEP_LENGTH, r]
-        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
-        if what == wp.static(STOP):
+        action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
+        if action == wp.static(STOP):
             return
         flags[ACTIVE, 0] = 1
-        if what == wp.static(DIRECT):
+        if action == wp.static(DIRECT):
             flags[WANTED, r] = 1
         else:
-            flags[TODO, r] = what
+            flags[TODO, r] = action
             scalars[ANGLE_CHANGE, r] = scalars[STEP_LENGTH, r] - taken
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -158,7 +167,7 @@ def decide_kernels(kind: ChainKind, real, linear, exact: bool):
         if flags[WANTED, r] == 0:
             return
         if flags[BAD, r] > 0 and flags[CLAMPED, r] == 0:
-            # compression has made the matrix indefinite: the same iterate again, without what compression takes away
+            # The matrix is indefinite: repeat the iterate with compression dropped.
             flags[CLAMPED, r] = 1
             flags[ITERATION, r] = flags[ITERATION, r] - 1
             scalars[STEP_LENGTH, r] = real(0.0)

@@ -1,4 +1,4 @@
-"""What a line search does to a rod: turn edges along a step, shorten it, take the frames of an iterate as lagged ones."""
+"""Moves of a line search on a rod: rotate edges along a step, shorten the step, update frames."""
 
 from functools import cache
 
@@ -10,14 +10,19 @@ from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
 from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.turns import FURTHER, edge_functions, place_function
 
-PLACE, RELAG, STRAIGHT = 1, 2, 4  # what is left to be done with an iterate: turn edges, renew frames, move straight
+PLACE, RELAG, STRAIGHT = 1, 2, 4  # actions on an iterate: edge-rotation update, frame update, straight update
 
 
 @cache
 def move_functions(kind: ChainKind, real, linear, split: bool = False):
-    """What happens to one node or edge: excess(...) of a turned edge, put(...) a node, carry(...) a frame to the iterate.
+    """Return the device functions `step_of`, `excess`, `put_at` and `carry` of one node or edge.
 
-    With `split`, directions end with what edges lengthen by; see `kernels.solve.sweep`.
+    `step_of`: step of a node.
+    `excess`: excess of a rotated edge.
+    `put_at`: write the end position of a node.
+    `carry`: transport a frame to the iterate.
+
+    If `split`, directions end with the lengthening of edges; see `kernels.solve.sweep`.
     """
     dim, block = kind.dim, kind.block
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
@@ -35,30 +40,31 @@ def move_functions(kind: ChainKind, real, linear, split: bool = False):
     @wp.func
     def excess(
         base: wp.array2d(dtype=V),
-        now: wp.array2d(dtype=V),
+        positions: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         amount: real,
-        onward: int,
+        extrapolation: int,
         j: int,
         n: int,
         r: int,
     ):
-        """Edge j turned and lengthened by its step, less the same edge with its step added; `onward`: see `kernels.turns`.
+        """Return edge j rotated and lengthened by the step, minus the edge plus the step.
 
-        `now`: where nodes are before the step whose predictor the base is, where that goes further; else anything.
+        `extrapolation`: see `kernels.turns`. `positions`: nodes before the step whose predictor is the base, if extrapolated
+        `FURTHER`; else any array.
         """
-        ahead = along(j + 1, n)
-        e = base[ahead, r] - base[j, r]
-        de = (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
-        if onward == wp.static(FURTHER):
-            return further_of(e, now[ahead, r] - now[j, r], de)
+        next_node = along(j + 1, n)
+        e = base[next_node, r] - base[j, r]
+        de = (step_of(direction, next_node, r) - step_of(direction, j, r)) * amount
+        if extrapolation == wp.static(FURTHER):
+            return further_of(e, positions[next_node, r] - positions[j, r], de)
         if wp.static(split):
-            return excess_of(e, de, real(direction[wp.static(block), j, r]) * amount, onward)
+            return excess_of(e, de, real(direction[wp.static(block), j, r]) * amount, extrapolation)
         else:
-            return excess_of(e, de, along_edge(e, de), onward)
+            return excess_of(e, de, along_edge(e, de), extrapolation)
 
     @wp.func
-    def put(
+    def put_at(
         x: wp.array2d(dtype=V),
         base: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
@@ -76,23 +82,23 @@ def move_functions(kind: ChainKind, real, linear, split: bool = False):
 
     @wp.func
     def carry(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), j: int, n: int, r: int):
-        """Director of edge j carried to its tangent in the iterate, and this tangent."""
+        """Return the director of edge j transported to the iterate, and the tangent there."""
         t = wp.normalize(x[along(j + 1, n), r] - x[j, r])
         u = transport(
             X(frame[0, j, r], frame[1, j, r], frame[2, j, r]), X(frame[3, j, r], frame[4, j, r], frame[5, j, r]), t
         )
         return u, t
 
-    return step_of, excess, put, carry
+    return step_of, excess, put_at, carry
 
 
 @cache
 def shorter_function(real):
-    """shorter(taken, expected, change, finite): length of a step after its rejection."""
+    """Return the device function `shorter(taken, expected, change, finite)`: length of a rejected step."""
 
     @wp.func
     def shorter(taken: real, expected: real, change: real, finite: bool):
-        """Length after a rejected step: minimum of the parabola through energy, slope and new energy, within bounds."""
+        """Return the minimum of the parabola through energy, slope and new energy, within bounds."""
         if not finite:
             return real(0.1) * taken
         bowl = change + expected
@@ -105,11 +111,17 @@ def shorter_function(real):
 
 @cache
 def search_functions(kind: ChainKind, real, linear, split: bool = False):
-    """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
+    """Return the device functions `place`, `turn_angles`, `relag` and `shorter` of a line search on a rod.
+
+    `place`: take an edge-rotation update.
+    `turn_angles`: update twist angles.
+    `relag`: update frames.
+    `shorter`: shorten a step.
+    """
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     _, reference_twist, _ = frames.functions(real)
-    step_of, excess, put, carry = move_functions(kind, real, linear, split)
+    step_of, excess, put_at, carry = move_functions(kind, real, linear, split)
     along, *_ = gather_functions(kind, real)
     closed = kind.closed
 
@@ -129,8 +141,8 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
 
     @wp.func
     def excess_at(rod: Rod, j: int):
-        here = along(j, rod.count)
-        return excess(rod.base, rod.now, rod.direction, rod.amount, rod.onward, here, rod.count, rod.r)
+        node = along(j, rod.count)
+        return excess(rod.base, rod.now, rod.direction, rod.amount, rod.onward, node, rod.count, rod.r)
 
     @wp.func
     def anchored(rod: Rod, j: int):
@@ -143,7 +155,7 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
 
     @wp.func
     def put_node(rod: Rod, j: int, shift: V):
-        put(rod.x, rod.base, rod.direction, rod.fixed, rod.amount, shift, along(j, rod.count), rod.r)
+        put_at(rod.x, rod.base, rod.direction, rod.fixed, rod.amount, shift, along(j, rod.count), rod.r)
 
     place_rod = place_function(dim, real, Rod, excess_at, anchored, added, put_node)
 
@@ -151,27 +163,27 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
     def place(
         x: wp.array2d(dtype=V),
         base: wp.array2d(dtype=V),
-        now: wp.array2d(dtype=V),
+        positions: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         fixed: wp.array2d(dtype=wp.uint8),
         anchor: wp.array(dtype=int),
         amount: real,
-        onward: int,
+        extrapolation: int,
         n: int,
         r: int,
     ):
-        """x = base moved along the direction, with edges turned instead of sheared; `onward` and `now`: see `excess`."""
+        """Write x = base moved along the direction by rotating edges; `extrapolation` and `positions` as in `excess`."""
         rod = Rod()
         rod.x = x
         rod.base = base
-        rod.now = now
+        rod.now = positions
         rod.direction = direction
         rod.fixed = fixed
         rod.amount = amount
         rod.count = n
         rod.closed = wp.static(int(closed))
         rod.anchor = anchor[r]
-        rod.onward = onward
+        rod.onward = extrapolation
         rod.r = r
         place_rod(rod)
 
@@ -183,7 +195,7 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
 
     @wp.func
     def relag(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), n: int, r: int):
-        """Take the frames of the accepted iterate as lagged ones; strains are as before, the transport regular again."""
+        """Update lagged frames to the accepted iterate; strains stay, and transport is regular again."""
         u0 = X()
         t0 = X()
         u_first = X()
@@ -207,7 +219,10 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
 
 @cache
 def adjust_kernel(kind: ChainKind, real, linear, split: bool = False):
-    """What a sweep leaves to do for few rods: put a shortened or far turning step, or take the frames of its iterate."""
+    """Build the kernel that completes a sweep for few rods.
+
+    `adjust`: write a shortened or far-rotating step, or update the frames of its iterate.
+    """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear, split)
@@ -228,7 +243,7 @@ def adjust_kernel(kind: ChainKind, real, linear, split: bool = False):
         r = wp.tid()
         if flags[TODO, r] == wp.static(PLACE):
             if flags[PLACED, r] == 0:
-                # the sweep stepped straight; from now on the positions it came from are needed
+                # the sweep took a straight update; its base positions are needed from here on
                 flags[PLACED, r] = 1
                 straight = scalars[STEP_LENGTH, r] - scalars[ANGLE_CHANGE, r]
                 for j in range(count[r]):

@@ -1,4 +1,4 @@
-"""What a step changes of velocities, weighed by mass: by which implicit Euler errs."""
+"""Mass-weighted change of velocities over a step, the local error estimate of implicit Euler."""
 
 from functools import cache
 
@@ -9,7 +9,10 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def differ_kernel(dim: int, real):
-    """Sums of m |v1 - v0|^2 over the rows of columns, world by world, `width` columns each; a column by as many threads as it has."""
+    """Build the kernel of the velocity change.
+
+    `differ`: sum m |v1 - v0|^2 over rows, by world of `width` columns, with `threads` threads a column.
+    """
     V = wp.types.vector(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -1,31 +1,31 @@
-"""Steps that turn edges instead of shearing them.
+"""Edge-rotation update (a retraction): apply a Newton step by rotating and lengthening edges.
 
-A straight step stretches an edge that it turns, to second order. In a nearly inextensible rod the force of that towers over all else,
-and limits steps to small turns: Newton then takes as many iterations as its path is long. Here an edge becomes its rotation, lengthened
-by what the step does along it, and positions follow by summation from anchors: nodes that are held, or already placed. What misses
-between two of them is spread over the edges between. So Newton works in the directions and lengths of edges, in which stiff and soft
-are apart, and the energy of a trial step says what bending and inertia do. Where nodes lie is left to the storage.
+A straight update stretches an edge that it rotates, to second order. In a nearly inextensible rod that force dominates and limits
+steps to small rotations: iterations grow with the length of Newton's path. Here an edge is rotated, and lengthened by the axial
+component of its step. Positions follow by summation from anchors, fixed or already written nodes. The mismatch between two anchors is
+spread over the edges between. So Newton works in directions and lengths of edges, which separates soft and stiff, and the energy of a
+trial step reflects bending and inertia. The storage of nodes is up to the caller.
 """
 
 from functools import cache
 
 import warp as wp
 
-TURNED = (
-    0.1  # largest turn of an edge that any step takes straight [rad]; see `ddg_warp.compile.precision.straight_turns`
-)
-LEAP = 0.5  # cosine of the largest turn of an edge that a predictor goes on with
-ON, FURTHER = 1, 2  # steps of predictors: the last one again, and what the last solve added; see `edge_functions`
+TURNED = 0.1  # largest edge rotation of any straight update [rad]; see `ddg_warp.compile.precision.straight_turns`
+LEAP = 0.5  # cosine of the largest edge rotation that a predictor extrapolates
+ON, FURTHER = 1, 2  # extrapolations: the last step, and the last solve's correction; see `edge_functions`
 
 
 @cache
 def edge_functions(dim: int, real):
-    """along(e, de): what the step de of an edge e does along it; excess(e, de, stretch, onward): the edge turned by its step and
-    lengthened by `stretch`, less the same edge with its step added; further(e, e1, de): the edge e of a predictor, turned and
-    lengthened as the step de has turned and lengthened e1 - de, that of the last predictor, to what it became, less e + de.
+    """Return the device functions `along_edge`, `excess` and `further` of an edge.
 
-    `onward` is `ON` where the step repeats the last one, so that e - de is the edge before: it turns on by the same angle, and its
-    length changes as it did. (Added up, such steps would lengthen an edge that turns by the versine of its turn.)
+    `along_edge(e, de)`: axial component of the step de of the edge e.
+    `excess(e, de, stretch, extrapolation)`: e rotated by its step and lengthened by `stretch`, minus e + de.
+    `further(e, e1, de)`: the predictor's edge e, rotated and lengthened as the last predictor's edge e1 - de became e1, minus e + de.
+
+    With extrapolation `ON` the step repeats the last one, and e - de is the edge before: the rotation angle and the change of length
+    are repeated. (Repeated addition of the step would lengthen a rotating edge by the versine of its rotation.)
     """
     V = wp.types.vector(dim, real)
     tiny = 1e-13 if real == wp.float64 else 1e-6
@@ -35,34 +35,34 @@ def edge_functions(dim: int, real):
         return wp.dot(e, de) / wp.length(e)
 
     @wp.func
-    def excess(e: V, de: V, stretch: real, onward: int):
+    def excess(e: V, de: V, stretch: real, extrapolation: int):
         length = wp.length(e)
         t = e / length
         along = wp.dot(t, de)
         across = de - t * along
-        aside = wp.length(across)
-        grown = length + stretch
+        across_length = wp.length(across)
+        new_length = length + stretch
         cosine = real(1.0)
         sine = real(0.0)
-        if onward == wp.static(ON):
-            before = wp.length(e - de)
-            grown = real(2.0) * length - before
-            if before > real(0.0):
-                cosine = (length - along) / before
-                sine = aside / before
+        if extrapolation == wp.static(ON):
+            last_length = wp.length(e - de)
+            new_length = real(2.0) * length - last_length
+            if last_length > real(0.0):
+                cosine = (length - along) / last_length
+                sine = across_length / last_length
             if cosine < real(LEAP):
                 cosine = real(LEAP)
                 sine = real(wp.static((1.0 - LEAP**2) ** 0.5))
         else:
-            cosine = wp.cos(aside / length)
-            sine = wp.sin(aside / length)
-        if aside > real(wp.static(tiny)) * wp.length(de):
-            sine /= aside
+            cosine = wp.cos(across_length / length)
+            sine = wp.sin(across_length / length)
+        if across_length > real(wp.static(tiny)) * wp.length(de):
+            sine /= across_length
         else:
-            # it kept its direction, or turned over, for which rounding knows no plane
+            # the direction is unchanged or reversed, which leaves no plane of rotation beyond rounding
             sine = real(0.0)
             cosine = real(1.0)
-        return (t * cosine + across * sine) * wp.max(grown, real(0.1) * length) - e - de
+        return (t * cosine + across * sine) * wp.max(new_length, real(0.1) * length) - e - de
 
     @wp.func
     def further(e: V, e1: V, de: V):
@@ -72,7 +72,7 @@ def edge_functions(dim: int, real):
         if before > real(0.0):
             t0, t1 = e0 / before, e1 / length
             cosine = wp.dot(t0, t1)
-            if cosine > real(LEAP):  # else not at all
+            if cosine > real(LEAP):  # else no extrapolation
                 both = t0 + t1
                 end = e - both * (wp.dot(both, e) / (real(1.0) + cosine)) + t1 * (real(2.0) * wp.dot(t0, e))
                 end *= wp.max(real(1.0) + (length - before) / wp.length(e), real(0.1))
@@ -83,7 +83,10 @@ def edge_functions(dim: int, real):
 
 @cache
 def onward_function(real):
-    """onward(straight, wanted): `wanted`, but `ON` for rods alone that always turn their edges; soft ones lengthen as they move."""
+    """Return the device function `onward(straight, wanted)`: `wanted`, but `ON` only for rods that always rotate edges.
+
+    Soft rods lengthen as they move.
+    """
 
     @wp.func
     def onward(straight: real, wanted: int):
@@ -93,15 +96,17 @@ def onward_function(real):
 
 
 @cache
-def place_function(dim: int, real, Rod, excess, anchored, added, put):
-    """place(rod): puts the nodes of a rod where a step ends, with edges turned. What the storage gives:
+def place_function(dim: int, real, Rod, excess, anchored, added, put_node):
+    """Return the device function `place(rod)`: write the nodes of a rod after an edge-rotation update.
 
     Args:
-        Rod: struct of a rod and a step of it; its fields `count`, `closed` and `anchor` say how many nodes it has, 1 where it is
-            closed, and its last anchored node or -1.
-        excess: (rod, j) -> that of the edge from node j on; see `edge_functions`.
-        anchored: (rod, j) -> whether a node is; added: (rod, j) -> what lies between its place now and where the straight step ends.
-        put: (rod, j, shift) puts a node there, and by a shift beyond. Nodes may be counted on past the last one of a closed rod.
+        Rod: struct of a rod and its step, with fields `count` (nodes), `closed` (1 if closed) and `anchor` (last anchored node or
+            -1).
+        excess: (rod, j) -> excess of the edge that starts at node j; see `edge_functions`.
+        anchored: (rod, j) -> True if the node is an anchor.
+        added: (rod, j) -> current position minus the end of the straight update.
+        put_node: (rod, j, shift) writes the end of the straight update plus a shift. Nodes may be counted past the last one of a
+            closed rod.
     """
     V = wp.types.vector(dim, real)
 
@@ -111,7 +116,7 @@ def place_function(dim: int, real, Rod, excess, anchored, added, put):
         free = rod.anchor < 0
         first = int(0)
         if free:
-            put(rod, first, V())
+            put_node(rod, first, V())
         else:
             while not anchored(rod, first):
                 first += 1
@@ -124,7 +129,7 @@ def place_function(dim: int, real, Rod, excess, anchored, added, put):
             stop = int(last)
             slope = V()
             if rod.closed != 0 or i < rod.anchor:
-                # to the next anchor, or around, where the rod has to close
+                # to the next anchor, or around a closed rod
                 stop = i + 1
                 miss = shift + excess(rod, i)
                 while stop < last and not anchored(rod, stop):
@@ -136,29 +141,29 @@ def place_function(dim: int, real, Rod, excess, anchored, added, put):
             for j in range(i + 1, stop + 1):
                 shift += excess(rod, j - 1) - slope
                 if j < first + n and not anchored(rod, j):
-                    put(rod, j, shift)
+                    put_node(rod, j, shift)
             i = stop
         if free:
-            # leave the mean of its nodes where the straight step takes it
+            # keep the mean of the nodes of the straight update
             mean = V()
             for j in range(n):
                 mean += added(rod, j)
             mean /= real(n)
             for j in range(n):
-                put(rod, j, added(rod, j) - mean)
+                put_node(rod, j, added(rod, j) - mean)
         elif rod.closed == 0:
             back = added(rod, first)
             for i in range(first):
                 j = first - 1 - i
                 back -= excess(rod, j)
-                put(rod, j, back)
+                put_node(rod, j, back)
 
     return place
 
 
 @cache
 def loose_function(dim: int, real):
-    """loose(mask, v): what no support holds of a vector of a node with such a mask of held dofs."""
+    """Return the device function `loose(mask, v)`: the components of v at free dofs, given the mask of fixed dofs."""
     V = wp.types.vector(dim, real)
 
     @wp.func

@@ -1,9 +1,9 @@
-"""Variation of an element's energy along a displacement of its local dofs, which Warp's reverse mode differentiates once more.
+"""Variation of an element's energy along a displacement of local dofs, for differentiation in reverse mode.
 
-A column of the Hessian is that of a unit vector. And it is the adjoint of a solve, which makes the residual zero,
-f(q; all else) - dE/dq = 0. With the cotangent g of its solution and w from H^T w = g, the derivative of the loss by all else is that of
-w . (f - dE/dq) with q and w held (the implicit function theorem). Of -w . dE/dq, what elements bring, the reverse gives the derivatives
-by dofs (-H w), lagged data, rest measure and parameters at once.
+A column of the Hessian is the derivative for a unit displacement. The adjoint of a solve, which makes the residual f(q; p) - dE/dq
+zero for inputs p, uses the same function. With the cotangent g of the solution and w from H^T w = g, the derivative of the loss with
+respect to p is that of w . (f - dE/dq) at constant q and w (implicit function theorem). Reverse mode of the element contribution -w .
+dE/dq gives the derivatives with respect to dofs (-H w), lagged data, rest measure and parameters at once.
 """
 
 from functools import cache
@@ -16,8 +16,10 @@ from ddg_warp.kernels.terms import Term
 
 @cache
 def variation_functions(term: Term, real):
-    """along(q, s, w, p, v, extra): the derivative of the energy of an element along v, with stresses `extra` added to those of the
-    law; strained(q, s, w, f): its strains, each times what f says.
+    """Return the device functions `along` and `strained`.
+
+    `along(q, s, w, p, v, extra)`: derivative of an element's energy along v, with stresses `extra` added to the law's.
+    `strained(q, s, w, f)`: scalar product of the strains with f.
     """
     measure, density = term.measure, term.density
     Q, S, E, _ = measure.types(real)
@@ -40,8 +42,9 @@ def variation_functions(term: Term, real):
 
 @cache
 def carried_function(real, unit: bool = True):
-    """carried(e, u, t, du, dt): the reference frame (u, t) of an edge, carried along to the edge e, times (du, dt); `unit`: made
-    orthonormal again.
+    """Return the device function `carried(e, u, t, du, dt)`: scalar product of a transported frame with (du, dt).
+
+    The frame is (u, t), transported to the edge e and, if `unit`, orthonormalised.
     """
     V = wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
@@ -60,7 +63,7 @@ def carried_function(real, unit: bool = True):
 
 @cache
 def angle_function(real):
-    """angle(e, u, t, d): angle about the edge e from its reference director, of the frame (u, t) carried along, to the director d."""
+    """Return the device function `angle(e, u, t, d)`: angle about e from the transported reference director to d."""
     V = wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
 
