@@ -1,1 +1,1 @@
-"""Of nets, everything by index of a block."""
+"""Solvers of the coupled system, with dofs addressed by block index."""

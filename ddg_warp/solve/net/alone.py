@@ -1,12 +1,12 @@
-"""Steps in which the rods of a net touch nothing: each is solved on its own, as a rod of a group.
+"""Decoupled step: rods of the coupled system without contact are stepped as uncoupled rods.
 
-Where rods are coupled by contact alone and no pair is within its reach, the equations of a step are those of the rods one by one. So a
-step is tried that way, in worlds in which nothing is near at its start. If nothing came near on the way either, no force of contact and
-no friction act in it, and it is the solution of the whole: else the world is left to the net, from the start of the step. What decides
-depends on the positions at both ends alone, not on what was searched for before, so that a run that is resumed takes the same steps.
+Rods that only contact couples obey the equations of uncoupled rods while no pair is within the activation distance. The step is tried
+this way in worlds without pairs in range at its start. If none came in range during the motion either, no contact force and no
+friction act, and the result is the solution of the coupled system. Otherwise the coupled solver repeats the world's step from its
+start. The decision depends only on the positions at both ends, not on earlier searches, so that a resumed run takes the same steps.
 
-As long as rods stay in boxes that do not meet, that is known without a search, which is all below one condition then: the step is tried
-before anything is asked, by boxes first, and where these leave it in doubt once more, by pairs.
+Culling of rods: while rods stay in bounds that do not overlap, no search is needed. The step is therefore tried before any test, then
+tested by bounds, and where these are inconclusive, tried again with a test of pairs. All of that is below one graph condition.
 """
 
 import numpy as np
@@ -24,12 +24,12 @@ from ddg_warp.solve.contact.runs import Runs
 
 
 class Alone:
-    """Rods of a `NetStep` as groups of rods on their own; their states are scratch.
+    """Rods of a `NetStep` as uncoupled rod groups, whose states are scratch.
 
     Attributes:
-        chains: their steps, a group each.
-        runs: boxes that may tell that nothing is near; None where there are things but rods and capsules.
-        left: which worlds of the last step are left to the net (worlds,).
+        `chains`: steps of the rod groups.
+        runs: culling of rods; None if there are primitives other than edges.
+        left: worlds of the last step that the coupled solver takes (worlds,).
     """
 
     def __init__(self, step, groups: list[Group]):
@@ -41,7 +41,7 @@ class Alone:
         self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
         self._search = step.newton.contact.search
         self.runs = Runs(self._search) if len(self._search.lists) == 1 else None
-        # of the worlds, all in doubt, where there are no runs
+        # without culling all worlds are in doubt
         self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
         self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
         self._wait, self._stay, self._follow = kernels.place_kernels(real, arrays.serial(device))
@@ -52,35 +52,43 @@ class Alone:
         self._obstacles = wp.array(obstacles, dtype=int, device=device)
         self._mixed = not all(places.whole for places in self._places)
 
-    def _chain(self, group: Group, **given) -> ChainStep:
-        chain = ChainStep(self.step_of.integrator, self.model, group, **given)
+    def _chain(self, group: Group, **options) -> ChainStep:
+        chain = ChainStep(self.step_of.integrator, self.model, group, **options)
         if chain.motion:
             chain.motion.go_by(self.step_of.motion)
         return chain
 
     @property
     def kernels(self) -> list:
-        """Kernels to load before a capture, without those of the chains."""
-        own = [self._begin, self._hope, self._near, self._judge, *(kernel for each in self._kernels for kernel in each)]
-        own += self.runs.kernels if self.runs else []
-        own += [self._wait] if self.net.worlds > 1 else []
-        return own + ([self._stay, self._follow] if len(self._obstacles) else [])
+        """Kernels to load before a capture, without the kernels of rod groups."""
+        loaded = [
+            self._begin,
+            self._hope,
+            self._near,
+            self._judge,
+            *(kernel for each in self._kernels for kernel in each),
+        ]
+        loaded += self.runs.kernels if self.runs else []
+        loaded += [self._wait] if self.net.worlds > 1 else []
+        return loaded + ([self._stay, self._follow] if len(self._obstacles) else [])
 
-    def adapt(self, s: float, anew: bool = False) -> bool:
-        """As of `NetStep`."""
+    def adapt(self, s: float, parameters_changed: bool = False) -> bool:
+        """Update parameters and solver selection for a step of s [s], as `NetStep.adapt`; return True if graphs are outdated."""
         changed = any([places.take_parameters() for places in self._places])
         for i, chain in enumerate(self.chains):
-            if (means := chain.suited(s, anew)) != chain.means or (anew and chain.newton.outdated):
+            if (means := chain.suited(s, parameters_changed)) != chain.means or (
+                parameters_changed and chain.newton.outdated
+            ):
                 self.chains[i], changed = self._chain(chain.group, means=means, counts_of=chain), True
         return changed
 
     def renew(self) -> None:
-        """Make the tree of runs anew, where looks do not make their own."""
+        """Rebuild the BVH of runs, on devices where tests only refit."""
         if self.runs and self.model.wp_device.is_cuda:
             self.runs.build()
 
     def step(self, before, after) -> None:
-        """Launch the step, of worlds in which anything is near by the net."""
+        """Launch the step; worlds with pairs in range are solved by the coupled system."""
         step = self.step_of
         inputs = [*step.islands.arrays, self._told, self._known]
         self._launch(self._begin, self.net.worlds, inputs, [step.remaining, self._again])
@@ -93,7 +101,7 @@ class Alone:
         wp.capture_if(step.remaining, lambda: self._ask(before, after))
 
     def _ask(self, before, after) -> None:
-        """Of worlds that are not done: whether other boxes tell that nothing came near, else whether pairs did."""
+        """Test open worlds with new bounds of runs, then by pairs; leave the remainder to the coupled system."""
         step = self.step_of
         wp.capture_if(self._again, lambda: self._look(before, after))
         wp.capture_if(step.remaining, lambda: self._by_pairs(before, after))
@@ -105,7 +113,7 @@ class Alone:
         self._judge_by(0)
 
     def _by_pairs(self, before, after) -> None:
-        """The step in worlds that are not done and in which no pair is near, at its start, on the way and at its end."""
+        """Try the step in open worlds without pairs in range at the start, during the motion and at the end."""
         step, search = self.step_of, self._search
         for signal in (step.remaining, self._any_tried, self._some):
             signal.zero_()
@@ -128,43 +136,52 @@ class Alone:
         if self.runs:
             self.runs.look(before.q, after.q, self._tried)
 
-    def _try(self, before, after, then=None) -> None:
-        """One solve of the rods of worlds that are tried; `then` reads positions alone, and is launched beside what makes all else."""
-        rods = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))
-        for each in rods:
-            self._solve(before, after, *each)
+    def _try(self, before, after, test_runs=None) -> None:
+        """Solve the rods of tried worlds once; `test_runs` reads positions only and runs in parallel with the remaining launches."""
+        rod_steps = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))
+        for rod_step in rod_steps:
+            self._solve(before, after, *rod_step)
         self._move(before, after)
 
         def complete() -> None:
-            for each in rods:
-                self._complete(after, *each)
+            for rod_step in rod_steps:
+                self._complete(after, *rod_step)
 
-        arrays.side_by_side([then, complete] if then else [complete], self.model.wp_device)
+        arrays.side_by_side([test_runs, complete] if test_runs else [complete], self.model.wp_device)
         if self._mixed:
             self.net.update_strains(after)
 
-    def _solve(self, before, after, chain, state, places, own) -> None:
-        """One solve of the rods of a group, and their positions."""
-        gather, put, _ = own
-        group, told = chain.group, self._told
+    def _solve(self, before, after, chain, state, places, rod_kernels) -> None:
+        """Solve the rods of a group once, and write their positions."""
+        gather, scatter_positions, _ = rod_kernels
+        group, world_status = chain.group, self._told
         lists = [places.rows, group.count]
-        of_rods = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
-        inputs = [*lists, told, places.sizes, self.net.host.nodes, before.q, before.v, before.a, *places.lagged(before)]
-        self._launch(gather, group.node_threads, inputs, [*of_rods, *chain.islands.arrays])
+        rod_arrays = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
+        inputs = [
+            *lists,
+            world_status,
+            places.sizes,
+            self.net.host.nodes,
+            before.q,
+            before.v,
+            before.a,
+            *places.lagged(before),
+        ]
+        self._launch(gather, group.node_threads, inputs, [*rod_arrays, *chain.islands.arrays])
         chain.move(state, state)
         inputs = [*lists, places.sizes, state.x, state.theta, chain.islands.arrays[0]]
-        self._launch(put, group.node_threads, inputs, [told, after.q])
+        self._launch(scatter_positions, group.node_threads, inputs, [world_status, after.q])
 
-    def _complete(self, after, chain, state, places, own) -> None:
-        """All but positions of the rods of a group after a solve."""
-        *_, scatter = own
+    def _complete(self, after, chain, state, places, rod_kernels) -> None:
+        """Write all results of a rod group but positions."""
+        *_, scatter = rod_kernels
         chain.complete(state, state)
         group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.net.host.nodes]
         inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
         self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])
 
     def _move(self, before, after) -> None:
-        """Put obstacles where they are after the step."""
+        """Move obstacles to the end of the step."""
         step, blocks = self.step_of, self.net.blocks
         if not len(self._obstacles):
             return
@@ -175,7 +192,7 @@ class Alone:
         self._launch(self._follow, dim, [*inputs, after.q, step.integrator._dt], [after.v, after.a])
 
     def _judge_by(self, searched: int) -> None:
-        """End the step of worlds in which nothing came near, as far as boxes tell or what was searched for."""
+        """End the step of worlds without pairs in range, tested by bounds (`searched` 0) or by pairs (1)."""
         step, search = self.step_of, self._search
         inputs = [searched, self._some, search.gap, search.reach, search.crossed, search.overflow, step.rounded]
         inputs += [self._known, self._told, *step.islands.arrays, step.newton.contact.tally.counts]
@@ -191,11 +208,11 @@ class Alone:
 
 
 class Places:
-    """Where a net has the rods of a group.
+    """Dof map of a rod group within the coupled system.
 
     Attributes:
-        rows (8, R): see `kernels.net.alone`; sizes: blocks, edges of rods, and elements of both sets in a world.
-        whole: whether strains that the net keeps of these rods are those that the group keeps.
+        rows (8, R): see `kernels.net.alone`; sizes: numbers of blocks, rod edges, and elements of both element sets in a world.
+        whole: True if the coupled system lags the same strains of these rods as the group.
     """
 
     def __init__(self, net, group: Group):
@@ -216,18 +233,18 @@ class Places:
         )
 
     def take_parameters(self) -> bool:
-        """Give the group the parameters that the net has by now; return whether memory was made anew."""
+        """Copy changed parameters of the coupled system to the group; return True if arrays were reallocated."""
         changed = self._elements.parameters(self._taken)
         return bool(changed) and self._group.parameters.set(**changed)
 
     def lagged(self, state) -> list[wp.array]:
-        """Lagged data of a net's state: frames, own rows of bending, strains of bending and of stretch."""
+        """Return the lagged data of a coupled state: frames, bending data, bending strains and stretch strains."""
         bending, stretch = self._sets.get(2, self._sets[1]), self._sets[1]
         return [state.frame, state.lag[bending], state.last[bending], state.last[stretch]]
 
 
 def uncoupled(model) -> bool:
-    """Whether the net of a model has open rods, and obstacles, that are coupled by contact alone."""
+    """Return True if only contact couples the rods of a model, and all rods are open."""
     host, scene = model.net.host, model.scene
     if not host.touching or not host.rods or any(rod.piece.kind.closed for rod in host.rods):
         return False
@@ -235,23 +252,22 @@ def uncoupled(model) -> bool:
 
 
 def suits(integrator) -> bool:
-    """Whether an integrator can step what is `uncoupled` rod by rod: by loads that no controls give, and solvers about which nothing is
-    said."""
+    """Return True if an integrator allows decoupled steps: default solver, implicit Euler, no control loads."""
     usual = integrator.solver == "newton" and integrator.linear == "auto" and integrator.scheme == "implicit_euler"
     return usual and integrator.given is None and not integrator.whole
 
 
 def rods_of(model) -> list[Group]:
-    """Rods of the model's net as groups of rods on their own."""
+    """Return the rods of the coupled system as uncoupled rod groups."""
     real, device = model.types.real, model.wp_device
     chains: list[ChainGroup] = compile_chains(model.scene, net_rods(model.scene))
     return [Group(chain, model.scene, model.worlds, device, real) for chain in chains]
 
 
-def _evenly(places: np.ndarray) -> tuple[int, int]:
-    """The first of some places, and how far each is from the one before."""
-    if len(places) < 2:
-        return (int(places[0]) if len(places) else 0), 0
-    apart = np.diff(places)
-    assert (apart == apart[0]).all(), "a net numbers what lies along a rod evenly"
-    return int(places[0]), int(apart[0])
+def _evenly(indices: np.ndarray) -> tuple[int, int]:
+    """Return the first of some indices, and their constant stride."""
+    if len(indices) < 2:
+        return (int(indices[0]) if len(indices) else 0), 0
+    strides = np.diff(indices)
+    assert (strides == strides[0]).all(), "a net numbers what lies along a rod evenly"
+    return int(indices[0]), int(strides[0])

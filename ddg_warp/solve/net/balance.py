@@ -1,4 +1,4 @@
-"""The balance of forces at the blocks of a net on a device; see `kernels.net.balance` and `places`."""
+"""Residuals of the coupled system on a device; see `kernels.net.balance` and `places`."""
 
 import numpy as np
 import warp as wp
@@ -9,33 +9,33 @@ from ddg_warp.kernels.net import balance
 
 
 class Balance:
-    """Residuals of all blocks, what they do to the energy, and the worlds that are out of equilibrium.
+    """Residuals of all blocks, the change of the energy, and the worlds that have not converged.
 
     Args:
-        newton: the `NetNewton` whose iterate, loads and results these are; `drag`, whether its blocks have more than a mass.
+        newton: the `NetNewton` whose iterate, loads and results are used; drag: True if blocks have more than a mass.
     """
 
     def __init__(self, newton, drag: bool):
         self.newton, net, real, linear = newton, newton.net, newton.real, newton.linear
         self.chains = newton.chains if newton.chains and newton.chains.banded else None
-        given, found = balance.given_type(real, drag)(), balance.found_type(real, linear)()
-        given.q = newton.here
+        inputs, outputs = balance.given_type(real, drag)(), balance.found_type(real, linear)()
+        inputs.q = newton.here
         for name in ("base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
-            setattr(given, name, getattr(newton, name))
-        given.settled = SETTLED * net.host.bodies.shortest
-        given.allowed, given.blocks, given.nodes = newton.allowed.blocks, net.blocks, net.host.nodes
-        given.rtol, given.floor = newton.options.rtol, newton.options.floor_factor * newton.eps
+            setattr(inputs, name, getattr(newton, name))
+        inputs.settled = SETTLED * net.host.bodies.shortest
+        inputs.allowed, inputs.blocks, inputs.nodes = newton.allowed.blocks, net.blocks, net.host.nodes
+        inputs.rtol, inputs.floor = newton.options.rtol, newton.options.floor_factor * newton.eps
         for name in ("right", "square", "change", "noise"):
-            setattr(found, name, getattr(newton, name))
+            setattr(outputs, name, getattr(newton, name))
         if newton.contact:
-            given.push, given.pressed = newton.contact.forces, newton.contact.stiffness
-        found.least, found.ratio = newton.allowed.least, newton.allowed.ratio
-        self.given, self.found = given, found
-        self._meetings = list(self._meeting_of_sets())  # an array of structures keeps nothing alive
+            inputs.push, inputs.pressed = newton.contact.forces, newton.contact.stiffness
+        outputs.least, outputs.ratio = newton.allowed.least, newton.allowed.ratio
+        self.given, self.found = inputs, outputs
+        self._meetings = list(self._meeting_of_sets())  # an array of structures keeps no member alive
         self.sets = wp.array(self._meetings, dtype=balance.meeting_type(real, linear), device=net.device)
-        some = self.chains.elsewhere if self.chains else np.arange(0)
-        self.some = wp.array(some.astype(np.int32), dtype=int, device=net.device)
-        self.count = len(some) if self.chains else net.blocks
+        off_path_blocks = self.chains.elsewhere if self.chains else np.arange(0)
+        self.some = wp.array(off_path_blocks.astype(np.int32), dtype=int, device=net.device)
+        self.count = len(off_path_blocks) if self.chains else net.blocks
         if newton.planes:
             self._frames = [newton.planes.of_blocks, newton.planes.frames[real]]
         else:
@@ -46,20 +46,28 @@ class Balance:
         ]
 
     def _meeting_of_sets(self):
-        """What the elements of each set bring to the blocks."""
+        """Yield the contributions of each element set to blocks, with the incidence lists."""
         newton, net = self.newton, self.newton.net
         nothing = [wp.zeros((1, 1), dtype=kind, device=net.device) for kind in (net.vector, newton.real)]
-        for part, own, local, meets in zip(net.sets, newton.parts, newton.local, newton.system.meets, strict=True):
-            meeting, measure = balance.meeting_type(newton.real, newton.linear)(), part.term.measure
-            meeting.gradient, meeting.along = (nothing[0], own["gradient"]) if local else (own["gradient"], nothing[1])
+        for element_set, buffers, local, meets in zip(
+            net.sets, newton.parts, newton.local, newton.system.meets, strict=True
+        ):
+            meeting, measure = balance.meeting_type(newton.real, newton.linear)(), element_set.term.measure
+            meeting.gradient, meeting.along = (
+                (nothing[0], buffers["gradient"]) if local else (buffers["gradient"], nothing[1])
+            )
             ends = np.transpose(measure.ends) if local else np.zeros((0, 2))
             meeting.ends = wp.array(ends.astype(np.int32), dtype=int, device=net.device)
-            meeting.energy, meeting.stiffness, (meeting.starts, meeting.items) = own["energy"], own["stiffness"], meets
-            meeting.nodes, meeting.elements = measure.nodes, part.elements
+            meeting.energy, meeting.stiffness, (meeting.starts, meeting.items) = (
+                buffers["energy"],
+                buffers["stiffness"],
+                meets,
+            )
+            meeting.nodes, meeting.elements = measure.nodes, element_set.elements
             yield meeting
 
     def __call__(self) -> None:
-        """Balance the iterate."""
+        """Assemble the residuals of the iterate."""
         newton, total = self.newton, self.newton.worlds * self.count
         if self.chains:
             self.chains.balance(self.given, newton.islands, self.found)

@@ -1,9 +1,8 @@
-"""Contact within Newton's method on a net; see `kernels.net.touch`, and `solve.contact` for the search and the pairs.
+"""Contact in Newton's method on the coupled system; see `kernels.net.touch` and, for search and pairs, `solve.contact`.
 
-What is proposed, a predictor or a step, is cut rod by rod before anything passes through anything. Supports and obstacles that move
-are part of what is proposed. Worlds in which these, or the predictor, were cut are on their way: their iterate is where they are
-bound for, where all but contact is balanced, and contact is linear about where they have come to. So the next direction begins with
-what is left of the way, whatever holds it up.
+CCD limits every proposed motion, a predictor or a step, rod by rod. Motion of supports and obstacles is included. A world whose
+predictor or support motion was limited has motion pending. Its target `bound` then lies ahead of its positions: all terms but contact
+are evaluated there, and contact is linear about the positions. The next direction begins with the remaining motion.
 """
 
 import math
@@ -23,30 +22,30 @@ from ddg_warp.solve.net.contact_bands import ContactBands
 from ddg_warp.solve.net.system import Sums
 from ddg_warp.solve.net.units import number_bodies, number_units
 
-FAR = 16.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
-# Where pairs would be too many all the same ways are cut to so many margins, and to a part of what they were until they are not.
+FAR = 16.0  # margins that a node moves, from which on a world has a single step fraction: candidates of longer motions are too many
+# Where candidates still do not fit, motions are limited to LONGEST margins, then to a fraction SHORTER until they do.
 LONGEST, SHORTER = 4096.0, 0.25
-STIFFER = 100.0  # times as stiff contact has room where it had none: of five cases of cloth all five, by 10 times four
-# parts of a step that failed at which motions are looked at: ways past each other are short beside the first gap, or beside the step
+STIFFER = 100.0  # suggested stiffness factor where the minimum gap was reached: enough in five of five cases of cloth, 10 in four
+# fractions of a failed step at which motions are tested: short against the first gap, then against the step
 LOOKS = (*(2.0**-k for k in range(12, 3, -1)), *(k / 8 for k in range(1, 9)))
-LEAST = 1e-3  # of the range, the gap from which on a barrier has no room
-ROUNDING = 16.0  # units in the last place within which supports have arrived
+LEAST = 1e-3  # of the activation distance: gap that counts as minimum gap reached for a barrier
+ROUNDING = 16.0  # ulps within which supports count as arrived
 
 
 class NetContact:
     """Contact of a `NetNewton`.
 
     Attributes:
-        search, terms: candidates, and the energy of those that are near.
-        forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
-        diagonal: (W N,) blocks of its matrix at nodes.
-        bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
-        bodies: which each block of a world belongs to (blocks,), -1 for none, and how many there may be.
-        bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
-        rubs: whether there is friction; rate: over what it counts slips (worlds,) [1/s].
-        solutions: where the last step took friction anew, in this order, for its reverse: `lags` - 1 of (W N,) with friction.
-        farthest: [m] that nodes go in worlds of one share, as too many pairs are near along longer ways; see `outgrown`.
-        crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
+        search, terms: candidates; contact potential and friction of active pairs.
+        forces (W N,) [N], stiffness (W N,) [N/m]: contact forces of blocks, and a bound on their stiffness.
+        diagonal: (W N,) diagonal blocks of the contact matrix.
+        bound: (W N,) target positions of worlds with pending motion; positions of all others.
+        bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
+        `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.contact.pair_bend`.
+        `rubs`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
+        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `lags` - 1 of (W N,).
+        farthest: [m] largest motion of nodes in worlds with a single step fraction, while candidates do not fit; see `outgrown`.
+        crossed: (1,) interpenetrating pairs refused in all steps so far; least: (1,) smallest gap [m].
     """
 
     def __init__(self, newton, model):
@@ -62,11 +61,11 @@ class NetContact:
                 "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
             )
         newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
-        # forces on obstacles are asked of states, not here
+        # forces on obstacles are post-processing of states
         self.touch = Touch(net, linear, newton.q, host.of_obstacles)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
         self.rubs, self.rate = host.touching.rubs, newton.islands.rate
-        worlds, again = net.worlds, self.touch.law.lags - 1 if self.rubs else 0
+        worlds, updates = net.worlds, self.touch.law.lags - 1 if self.rubs else 0
         self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
 
         def make(shape, dtype):
@@ -75,7 +74,7 @@ class NetContact:
         self._modes, self._curved, self._projected = (make(worlds, int) for _ in range(3))
         self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
-        self.solutions = [make(newton.all, net.vector) for _ in range(again)]
+        self.solutions = [make(newton.all, net.vector) for _ in range(updates)]
         self._move = make(newton.all, net.vector)
         self.bound = make(newton.all, net.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
@@ -88,10 +87,10 @@ class NetContact:
         self.bodies = number_bodies(host)
         unit, self._units = number_units(*self.bodies, host, model.motions)
         self._unit = wp.array(unit, dtype=int, device=device)
-        places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
-        self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
-        self._aims = make((max(1, len(places)), worlds), net.vector)
-        made = kernels.world_kernels(real)
+        support_blocks = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
+        self._nodes = wp.array(support_blocks.astype(np.int32), dtype=int, device=device)
+        self._aims = make((max(1, len(support_blocks)), worlds), net.vector)
+        built = kernels.world_kernels(real)
         (
             self._account,
             self._find_modes,
@@ -104,9 +103,9 @@ class NetContact:
             self._find_short,
             self._less,
             self._brace,
-        ) = made
-        self._kernels = list(made)
-        made = kernels.block_kernels(real, linear, arrays.serial(device))
+        ) = built
+        self._kernels = list(built)
+        built = kernels.block_kernels(real, linear, arrays.serial(device))
         (
             self._differ_gain,
             self._lessen,
@@ -120,8 +119,8 @@ class NetContact:
             self._find_way,
             self._add,
             self._keep_solution,
-        ) = made
-        self._kernels += made
+        ) = built
+        self._kernels += built
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._bands = None
         self._least = LEAST * float(host.touching.range.min()) if self.touch.keep else -math.inf
@@ -129,57 +128,58 @@ class NetContact:
 
     @property
     def touching_bodies(self) -> int:
-        """How many there are in a world."""
+        """Number of bodies in a world."""
         return len(np.setdiff1d(self.bodies[0], [-1]))
 
     def bind(self, chains) -> None:
-        """Have a part in what chains eliminate, once their plan is made."""
+        """Add contact to the matrix of the substructuring preconditioner, once its plan is made."""
         self._bands = ContactBands(chains, self.shapes)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._kernels, *(self._bands.kernels if self._bands else [])]
-        return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
+        loaded = [*self._kernels, *(self._bands.kernels if self._bands else [])]
+        return [*loaded, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
 
     def renew(self, before: wp.array) -> None:
-        """Make the trees of the search anew at positions `before`, where searches do not build their own."""
+        """Rebuild the BVHs of the search at positions `before`, on devices where searches only refit."""
         if self.newton.device.is_cuda:
             self.search.rebuild(before)
 
     def see(self, x: wp.array) -> None:
-        """Have candidates at positions x, where no motion brings them."""
+        """Update the candidates at positions x, without a motion."""
         self.search.update(x)
 
     def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None) -> None:
-        """What friction takes from positions x, which are on the way that was cut last; slips, unless it does so `again`.
+        """Update the friction lag (normal forces, tangents) at positions x, which belong to the motion that was limited last.
 
-        Where a step begins, `rate` is that of the step before; see `PairTerms.lag`.
+        Slips restart, unless the update is made `again` within a step. At the start of a step, `rate` is the previous step's; see
+        `PairTerms.lag`.
         """
         if self.rubs:
             self.terms.lag(x, again, rate)
 
     def rest(self) -> None:
-        """Nothing is on its way: what is proposed is where it is."""
+        """Clear all pending motion: the target is the iterate itself."""
         wp.copy(self.bound, self.newton.q)
         self.newton.islands.driven.zero_()
         self._going.zero_()
 
     def lag_again(self, solution: wp.array) -> None:
-        """Take friction anew from where the solve has come to, for worlds that have converged; keep that in one of `solutions`."""
+        """Update the friction lag at the iterate of converged worlds, and keep that in one of `solutions`."""
         newton = self.newton
         self._sweep(self._keep_solution, [newton.q, newton.islands.moved, self.net.blocks], [solution])
         self.lag(newton.q, again=True)
         self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
 
     def brace(self, dt: wp.array) -> None:
-        """Have inertia in the stiffness of what a step of dt (worlds,) [s] found no room for, from its next trial to its end."""
+        """Add inertia to the contact stiffness where the last trial reached the minimum gap, in a step of dt (worlds,) [s]."""
         if self.terms.heavy:
             outputs = [self._braced, self.terms.law.rate]
             self._launch(self._brace, self.net.worlds, [*self.newton.islands.arrays, dt], outputs)
 
     def place(self) -> None:
-        """Cut the predictor, once supports are placed, where they have to be."""
+        """Limit the predictor by CCD, once supports are at their prescribed positions."""
         newton = self.newton
         if len(self._nodes):
             inputs = [self._nodes, self.net.blocks, newton.q]
@@ -190,7 +190,7 @@ class NetContact:
         self._let_go()
 
     def evaluate(self) -> None:
-        """Energies, forces and factors at the iterate, to which what was proposed was cut."""
+        """Evaluate energies, forces and factors of contact at the limited iterate."""
         q, islands = self.newton.q, self.newton.islands
         if self.rubs:
             self.terms.evaluate(q, self.rate, iterates=(islands.slot, islands.iteration))
@@ -198,13 +198,13 @@ class NetContact:
             self.terms.evaluate(q)
 
     def account(self, change: wp.array, noise: wp.array) -> None:
-        """Add to the change of the energy of worlds, and to its rounding."""
+        """Add the energy change of contact to worlds, and the rounding floor."""
         inputs = [self.terms.energy, self.terms.gap, self._least, self.search.overflow]
         inputs += [self.newton.islands.arrays[0], self._kept, change, noise]
         self._launch(self._account, self.net.worlds, inputs, [])
 
     def assemble(self) -> None:
-        """What products and the preconditioner take of the last evaluation."""
+        """Prepare the data that products and the preconditioner take from the last evaluation."""
         newton = self.newton
         outputs = [self._curved, self._projected]
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
@@ -215,18 +215,18 @@ class NetContact:
             self.terms.join()
 
     def join(self) -> None:
-        """Its own part in the preconditioner, once it and the matrix are assembled."""
+        """Add contact to the preconditioner, once both are assembled."""
         if self._bands:
             self._bands(self.terms, self.newton.islands.arrays[0])
 
     def direct(self) -> None:
-        """Directions by conjugate gradients, along with what is left of the way."""
+        """Compute directions by conjugate gradients, remaining motion included."""
         wp.capture_if(self._going, self._approach)
         self.newton.krylov.solve()
         wp.capture_if(self._going, self._follow)
 
     def _approach(self) -> None:
-        """Take from the residual what contact has against the rest of the way."""
+        """Subtract the resistance of contact against the remaining motion from the residual."""
         newton, blocks = self.newton, self.net.blocks
         busy = newton.islands.wanted
         self._sweep(self._find_way, [newton.q, self.bound, busy, blocks], [self._way])
@@ -242,16 +242,16 @@ class NetContact:
         self._sweep(self._add, [self._way, newton.islands.wanted, self.net.blocks], [newton.direction])
 
     def spread(self, p: wp.array) -> None:
-        """What pairs bring to H p."""
+        """Write the contributions of pairs to H p."""
         self.terms.place(p, self.newton.q, self._curved if self.bends else None)
 
     def settle(self, p: wp.array, product: wp.array) -> None:
-        """Add it, and write p . H p block by block."""
+        """Add the contributions of pairs to the product, and write p . H p block by block."""
         newton = self.newton
         self.terms.settle(p, product, newton.barred, newton.islands.wanted, newton.krylov_dots)
 
     def hold(self) -> None:
-        """Cut what was moved, and say what that is expected to gain."""
+        """Limit the trial step by CCD, and write its predicted decrease."""
         newton = self.newton
         self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
         self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
@@ -268,7 +268,7 @@ class NetContact:
         self._launch(self._expect, self.net.worlds, inputs, outputs)
 
     def _cut(self) -> None:
-        """Shorten what is proposed, which stays among what is `bound`."""
+        """Limit the proposed motion by CCD; `bound` keeps the proposed target."""
         newton = self.newton
         far = FAR * self.search.margin
         inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
@@ -285,27 +285,27 @@ class NetContact:
             self._launch(self._arrive, (len(self._nodes), self.net.worlds), inputs, [newton.islands.arrays[0]])
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
-        """The part of a motion (3 W N,) of all worlds in which nothing passes through anything. Not in a capture."""
+        """Return the CCD step fraction of a motion (3 W N,) that all worlds have in common. Not in a capture."""
         base = wp.array(before.reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
         self._modes.fill_(kernels.WHOLE)
         move = after - before
         longest = float(np.abs(move).max())
         self.search.fit(base)
         while True:
-            part = min(1.0, self.farthest / longest) if longest > 0.0 else 1.0
-            q = wp.array((before + part * move).reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
+            fraction = min(1.0, self.farthest / longest) if longest > 0.0 else 1.0
+            q = wp.array((before + fraction * move).reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
             self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
-            if not self.search.fit(base, lambda: self._shorten(longest)):  # else nothing has moved
-                return part * float(self.search.time.numpy().min())
+            if not self.search.fit(base, lambda: self._shorten(longest)):  # else the filter moved nothing
+                return fraction * float(self.search.time.numpy().min())
 
     def _let_go(self) -> None:
-        """Let go of what was proposed where nothing is on its way."""
+        """Reset the target to the iterate in worlds without pending motion."""
         self._going.zero_()
         inputs = [self.newton.q, self.newton.islands.arrays[0], self.net.blocks]
         self._sweep(self._part, inputs, [self.bound, self._going])
 
     def finish(self, before: wp.array) -> None:
-        """Take no part of a step in which things passed through each other."""
+        """Refuse substeps with interpenetration."""
         newton = self.newton
         self.search.check_crossings(before, newton.q)
         inputs = [self.search.crossed, self.terms.gap, self.search.overflow, *newton.islands.arrays]
@@ -313,8 +313,10 @@ class NetContact:
         self.tally(newton.islands.arrays[0])
 
     def statistics(self) -> dict:
-        """Over all steps so far: searches, pairs that would have passed through each other, the smallest gap [m], infinite where none
-        was within the range; how many candidates there are now; and what `Tally.statistics` has.
+        """Return the statistics of all steps so far, by name.
+
+        Counts of searches, refused interpenetrations and present candidates. Smallest gap [m], infinite beyond the activation
+        distance. Entries of `Tally.statistics`.
         """
         least = self.least.numpy()[0]
         return {
@@ -324,13 +326,13 @@ class NetContact:
             "candidates": sum(int(pairs.count.numpy()[0]) for pairs in self.search.lists),
         } | self.tally.statistics()
 
-    def go_on(self, other: "NetContact") -> None:
-        """Count on from another one."""
-        for own, found in zip(self._counts, other._counts, strict=True):
-            wp.copy(own, found)
+    def go_on(self, previous: "NetContact") -> None:
+        """Continue the counts of a previous object."""
+        for count, previous_count in zip(self._counts, previous._counts, strict=True):
+            wp.copy(count, previous_count)
 
     def check(self, x: wp.array) -> None:
-        """Refuse to start from positions in which surfaces overlap, or are too close for a barrier. Reads from the device.
+        """Refuse start positions with overlaps, or with gaps too small for a barrier. Reads from the device.
 
         Raises:
             SceneError: names the pair and by how much.
@@ -347,9 +349,9 @@ class NetContact:
             )
 
     def tightest(self, x: wp.array, reason: int) -> str:
-        """The pair that is the closest at positions x, which may be why a solve has failed by an outcome, and what keeps it apart.
+        """Return a message on the closest pair at positions x, a likely cause of the failed `reason`, with a remedy.
 
-        Empty where nothing is near. Reads from the device.
+        Empty where no pair is within range. Reads from the device.
         """
         gap, pair = self.touch.closest(x)
         if gap >= self.search.reach:
@@ -359,28 +361,29 @@ class NetContact:
         )
 
     def blocked(self, tangent, state, start: float, end: float) -> str:
-        """What to do about two things, both held, that motions drive into each other from `start` to `end`; empty where none are seen.
+        """Return the remedy for two fixed objects that motions drive into each other from `start` to `end`.
 
-        Looks at the times `LOOKS` in between, from a state that belongs to the first. Reads from the device.
+        Empty where there are none. Tests the fractions `LOOKS` of the interval, from a state at its start. Reads from the device.
         """
-        for part in LOOKS if self._moves else ():
-            there = state.copy()
-            tangent.move_supports(there, start, start + part * (end - start))
-            if told := self._driven(there.net.q):
-                return told
+        for fraction in LOOKS if self._moves else ():
+            moved_state = state.copy()
+            tangent.move_supports(moved_state, start, start + fraction * (end - start))
+            if remedy := self._driven(moved_state.net.q):
+                return remedy
         return ""
 
     def _driven(self, x: wp.array) -> str:
-        """What to do about two things that overlap at positions x, both held and one moved, so that nothing yields; else empty."""
+        """Return the remedy for two overlapping fixed objects at positions x, at least one of them moved; else empty."""
         gap, pair, nodes = self.touch.closest_nodes(x)
         host, scene = self.net.host, self._scene
-        if gap > max(self._least, 0.0) or not all(host.fixed[of].all() for of in nodes):
+        if gap > max(self._least, 0.0) or not all(host.fixed[pair_nodes].all() for pair_nodes in nodes):
             return ""
         supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
         moved = {
             f"obstacle '{support.name}'" if isinstance(support, Obstacle) else f"support {number} ({support.call})"
-            for number, (support, held) in enumerate(zip(supports, host.held, strict=True))
-            if support.motion is not None and any(np.isin(of, held.places).any() for of in nodes)
+            for number, (support, support_dofs) in enumerate(zip(supports, host.held, strict=True))
+            if support.motion is not None
+            and any(np.isin(pair_nodes, support_dofs.places).any() for pair_nodes in nodes)
         }
         if not moved:
             return ""
@@ -390,7 +393,7 @@ class NetContact:
         )
 
     def _widen(self, gap: float) -> str:
-        """What helps where there is no room, that which helps most first; `gap` [m] is the smallest before."""
+        """Return remedies for a minimum gap reached, the best first; `gap` [m] is the smallest before the step."""
         if gap < self._least:
             return "move them apart, as model.pushed_apart(state) does, "
         if self.terms.heavy:
@@ -401,7 +404,7 @@ class NetContact:
         )
 
     def _shorten(self, longest: float) -> bool:
-        """Go shorter ways than `longest` [m] from now on, if that is long."""
+        """Limit motions to less than `longest` [m] from now on; return False if that is short already."""
         longest, least = min(self.farthest, longest), FAR * self.search.margin
         if longest <= least:
             return False
@@ -409,9 +412,9 @@ class NetContact:
         return True
 
     def outgrown(self, x: wp.array, spare: bool = False) -> bool:
-        """Whether pairs did not fit, for which there is room then, or to `spare` it no need: long ways past a crowd are gone in parts.
+        """Return True if lists of pairs overflowed and have grown. Reads from the device.
 
-        Reads from the device.
+        With `spare`, long motions are limited instead, so that fewer candidates are needed.
         """
 
         def shorten() -> bool:

@@ -1,4 +1,4 @@
-"""Where a net's solve starts, from what the last one added to its predictor; see `kernels.net.foresight`."""
+"""Warm start of the coupled system: extrapolate the last correction of the predictor; see `kernels.net.foresight`."""
 
 import warp as wp
 
@@ -8,10 +8,10 @@ from ddg_warp.solve.net.system import Sums
 
 
 class Foresight:
-    """Starts the solves of a `NetNewton`.
+    """Warm start of the solves of a `NetNewton`.
 
     Attributes:
-        predicted: blocks (W N,) of the predictor; trust: how much of what a solve adds is trusted, of every world.
+        predicted: blocks (W N,) of the predictor; trust: trusted fraction of the correction, of every world.
     """
 
     def __init__(self, newton):
@@ -35,7 +35,7 @@ class Foresight:
         return [self._foresee, self._weigh, self._trust, *self._sum.kernels]
 
     def start(self, before) -> None:
-        """Go on from the predictor of a step from a state `before`, and keep that."""
+        """Extrapolate from the predictor of a step from a state `before`, and keep the predictor."""
         newton, net = self.newton, self.newton.net
         inputs = [before.a, newton.held, *newton.islands.arrays, net.blocks]
         arrays.sweep(
@@ -50,7 +50,7 @@ class Foresight:
             newton.turns.go_further(before, self.predicted)
 
     def weigh(self, before) -> None:
-        """Find what is to be trusted of what the solve has added, in a net with contact."""
+        """Find the trusted fraction of the solve's correction, in systems with contact."""
         if not self._sum:
             return
         newton, net, islands = self.newton, self.newton.net, self.newton.islands

@@ -1,4 +1,4 @@
-"""A matrix that serves a whole step: which worlds of a net still want one."""
+"""Frozen Hessian: one factorisation a step, in the worlds of the coupled system that need a direction."""
 
 import warp as wp
 
@@ -7,12 +7,12 @@ from ddg_warp.kernels.net.newton import freeze_kernel
 
 
 class Frozen:
-    """Of the first direction of a solve the matrix is new, of those after it the same.
+    """Frozen Hessian of modified Newton: new for the first direction of a solve, reused afterwards.
 
-    Compression is left out of it, since it has to be definite wherever the step leads.
+    Compression is dropped, since the matrix has to be definite for all iterates.
 
     Attributes:
-        arrays, wanted: as of the islands, but that worlds want a direction only where their matrix is new.
+        arrays, wanted: as of the islands, but worlds need a direction only while the matrix is new.
     """
 
     def __init__(self, islands: Islands):
@@ -23,11 +23,11 @@ class Frozen:
         self.kernels = [freeze_kernel()]
 
     def begin(self) -> None:
-        """Forget the matrix of the last solve."""
+        """Discard the matrix of the last solve."""
         self._done.zero_()
         self._islands.clamped.fill_(1)
 
     def update(self) -> None:
-        """Find the worlds that want a direction now and have no matrix yet; they are given one."""
+        """Find the worlds that need a direction and have no matrix yet; mark the matrix as made."""
         wp.copy(self._flags, self._islands.arrays[0])
         wp.launch(self.kernels[0], len(self._islands), [self._flags, self._done], device=self._flags.device)

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on all worlds of a net, on a device; see `kernels.solve.krylov`."""
+"""Preconditioned conjugate gradients on all worlds of the coupled system, on a device; see `kernels.solve.krylov`."""
 
 import math
 from functools import partial
@@ -12,11 +12,11 @@ from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.system import Sums
 
-SPARE = 0.5  # of the tolerance, and of those that may be out of it, what the last linear solve of a step may leave
+SPARE = 0.5  # safety factor of the last linear solve of a step: of the tolerance, and of the bodies that may exceed it
 
 
 def natural_scale(net) -> float:
-    """Power of two by which forces and displacements are multiplied so that their products are of the size of one.
+    """Return the power of two that scales products of forces and displacements to the order of one.
 
     Stretching an element of the coupled system by its length takes w k, measure times stiffness [J]. At lengths of 1e-9 m that is
     1e-25 J, and products of residuals and directions at a tolerance of 1e-8 lie beyond float32.
@@ -31,18 +31,21 @@ def natural_scale(net) -> float:
 
 
 class ConjugateGradients:
-    """H d = r in the worlds that want it, to a residual as small as `forcing` says, in the norm of the preconditioner.
+    """Preconditioned conjugate gradients for H d = r, to the forcing term `forcing` in the preconditioner norm.
 
     Args:
-        newton: a `NetNewton`, or what has its names, whose matrix, residual, direction and chains these are.
-        multilevel: whether levels precondition what chains leave, or all; see `kernels.solve.levels`.
-        scale: residuals and directions are multiplied by it on the way, a power of two, so that products of them neither underflow nor
-            overflow in the precision of H; see `natural_scale`.
-        indefinite: whether H may be.
+        newton: a `NetNewton`, or an object with the same names, whose matrix, residual, direction and substructuring are used.
+        multilevel: True to add BPX multilevel corrections, or to use these alone; see `kernels.solve.levels`.
+        scale: power of two by which residuals and directions are scaled, against underflow and overflow of products; see
+            `natural_scale`.
+        indefinite: True if H may be indefinite.
 
     Attributes:
-        rest: the residual, scaled; z: preconditioned; p: the search direction; product: H p; inverse: of the diagonal blocks.
-        rho_first, total: squares of the norm of the first and of the last residual; sum: of values of blocks, world by world.
+        `rest`, `z`: scaled residual, preconditioned residual.
+        `p`, `product`: search direction, H p.
+        `inverse`: inverse diagonal blocks.
+        `rho_first`, `total`: squared norms of the first and the last residual.
+        `sum`: sums of block values over each world.
     """
 
     def __init__(self, newton, multilevel: bool, indefinite: bool = False, scale: float = 1.0):
@@ -69,12 +72,12 @@ class ConjugateGradients:
         return [self._invert, self._start, self._begin, *self._cycle, *self.sum.kernels, *levels]
 
     def solve(self) -> None:
-        """Directions; worlds where H or its preconditioner is not definite are noted, and end with what has been found so far."""
+        """Compute directions. Worlds with an indefinite H or preconditioner are marked and keep the present approximation."""
         newton = self.newton
-        table, blocks, wanted, anew = newton.system, newton.net.blocks, newton.islands.wanted, newton.anew.wanted
+        table, blocks, wanted, outdated = newton.system, newton.net.blocks, newton.islands.wanted, newton.anew.wanted
         self._launch(
             self._invert,
-            [newton.matrix, table.diagonal, newton.barred, anew, blocks, table.positions, self._more],
+            [newton.matrix, table.diagonal, newton.barred, outdated, blocks, table.positions, self._more],
             [self.inverse],
         )
         self._launch(
@@ -83,9 +86,9 @@ class ConjugateGradients:
             [self.rest, newton.direction, self.p, newton.krylov_dots],
         )
         if newton.chains:
-            newton.chains.prepare(newton.matrix, newton.fixed, anew, self._unread[0])
+            newton.chains.prepare(newton.matrix, newton.fixed, outdated, self._unread[0])
         if self.levels:
-            self.levels.prepare(newton.matrix, newton.fixed, anew)
+            self.levels.prepare(newton.matrix, newton.fixed, outdated)
         self.precondition(self.p)
         self.sum(newton.krylov_dots, self.total)
         self.busy.zero_()
@@ -103,7 +106,7 @@ class ConjugateGradients:
         wp.capture_while(self.busy, self.cycle)
 
     def precondition(self, z: wp.array) -> None:
-        """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""
+        """Add preconditioner corrections to z, on entry the residual times inverse diagonal blocks, and write r . z."""
         newton = self.newton
         wanted, dots = newton.islands.wanted, newton.krylov_dots
         if newton.chains:
@@ -112,7 +115,7 @@ class ConjugateGradients:
             self.levels.apply(self.rest, newton.barred, wanted, z, dots)
 
     def cycle(self) -> None:
-        """One iteration."""
+        """Run one iteration."""
         newton = self.newton
         blocks, wanted, dots = newton.net.blocks, newton.islands.wanted, newton.krylov_dots
         _, advance, turn, test = self._cycle
@@ -136,23 +139,23 @@ class ConjugateGradients:
         )
 
     def multiply(self, p: wp.array) -> None:
-        """H p on dofs that are not barred, and p . H p block by block; contact's part is in no matrix."""
+        """Write H p on active dofs, and p . H p block by block; no matrix has the contact terms."""
         newton, contact = self.newton, self.newton.contact
-        own = self.multiply_bands if newton.chains and newton.chains.banded else self.multiply_matrix
+        multiply_elements = self.multiply_bands if newton.chains and newton.chains.banded else self.multiply_matrix
         if not contact:
-            own(p)
+            multiply_elements(p)
             return
-        arrays.side_by_side([partial(own, p), partial(contact.spread, p)], newton.device)
+        arrays.side_by_side([partial(multiply_elements, p), partial(contact.spread, p)], newton.device)
         contact.settle(p, self.product)
 
     def multiply_bands(self, p: wp.array) -> None:
-        """The same without contact, where what lies along rods is in bands."""
+        """Write the product without contact, with elements along rods stored in bands."""
         newton = self.newton
         wanted, dots = newton.islands.wanted, newton.krylov_dots
         newton.chains.product(newton.matrix, p, newton.barred, wanted, self.product, dots)
 
     def multiply_matrix(self, p: wp.array) -> None:
-        """The same without contact, where none of H lies in bands."""
+        """Write the product without contact, with all of H in the sparse matrix."""
         newton = self.newton
         table, wanted = newton.system, newton.islands.wanted
         self._launch(
@@ -162,12 +165,12 @@ class ConjugateGradients:
         )
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        """One thread for each block of every world."""
+        """Launch one thread a block of every world."""
         wp.launch(kernel, self.newton.all, inputs, outputs, device=self.newton.device)
 
 
 class Directions(ConjugateGradients):
-    """Those of a `NetNewton`, as exactly as its `forcing` and `goal` say; `scale` is that of `ConjugateGradients`."""
+    """Directions of a `NetNewton` to the accuracy of `forcing` and `goal`; `scale` as of `ConjugateGradients`."""
 
     def __init__(self, newton, multilevel: bool):
         self.scale = natural_scale(newton.net)
@@ -182,11 +185,11 @@ class Directions(ConjugateGradients):
         return [*super().kernels, self._compare, self._confirm, *self._worst.kernels]
 
     def iterate(self) -> None:
-        """The same, and on where the tolerance says that the residual is not small."""
+        """Iterate until the residual is small in the norm of the preconditioner and by the tolerance."""
         wp.capture_while(self.busy, self.reduce)
 
     def reduce(self) -> None:
-        """Until one of the two says so."""
+        """Iterate until one of the two tests passes."""
         newton, few = self.newton, self.newton.outliers
         super().iterate()
         self.compare()
@@ -203,13 +206,13 @@ class Directions(ConjugateGradients):
         )
 
     def compare(self) -> None:
-        """Ratios of `NetNewton.allowed` by what a solve has left, of worlds that are done."""
+        """Write ratios of `NetNewton.allowed` for linear residuals, in worlds with a finished solve."""
         newton, allowed = self.newton, self.newton.allowed
         inputs = [self.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks, self._unit]
-        self._launch(self._compare, inputs, [self.z, allowed.ratio])  # z is written anew by worlds that go on
+        self._launch(self._compare, inputs, [self.z, allowed.ratio])  # worlds that continue overwrite z
         allowed.sum_up(self.z, newton.options.rtol, newton.islands, *self._unread)
 
     def cycle(self) -> None:
-        """One iteration."""
+        """Run one iteration, and watch the length of directions."""
         super().cycle()
         self.newton.watch()

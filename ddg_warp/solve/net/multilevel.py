@@ -1,4 +1,4 @@
-"""The multilevel preconditioner of a net on a device; see `kernels.solve.levels`."""
+"""Multilevel preconditioner of the coupled system on a device; see `kernels.solve.levels`."""
 
 import numpy as np
 import warp as wp
@@ -8,10 +8,10 @@ from ddg_warp.kernels.solve.levels import GROUP, PIECE
 
 
 class Multilevel:
-    """Groups of nodes on all levels, and the additive preconditioner they make.
+    """Node groups of all levels, and their additive (BPX) preconditioner.
 
     Args:
-        net: `DeviceNet`; table: its `NetSystem`; linear: type of the linear algebra.
+        `net`, `table`: `DeviceNet` and its `NetSystem`; linear: type of the linear algebra.
     """
 
     def __init__(self, net, table, linear):
@@ -31,11 +31,11 @@ class Multilevel:
         both = (a >= 0) & (b >= 0)
         self.lists, size = [], GROUP
         for groups in self.counts:
-            here = both & (a // size == b // size)
-            positions = np.flatnonzero(here)
+            within = both & (a // size == b // size)
+            positions = np.flatnonzero(within)
             target = a[positions] // size
             self.lists.append(self._pieces(positions[np.argsort(target, kind="stable")], target, groups, M))
-            both &= ~here
+            both &= ~within
             size *= GROUP
         self.order = wp.array(order.astype(np.int32), dtype=int, device=self.device)
         self.group = wp.array(np.where(rank >= 0, rank // GROUP, -1).astype(np.int32), dtype=int, device=self.device)
@@ -49,7 +49,7 @@ class Multilevel:
         self._collect, self._gather, self._restrict, self._correct, self._finish = levels.level_kernels(linear)
 
     def _pieces(self, items: np.ndarray, target: np.ndarray, groups: int, M) -> tuple:
-        """Items of all groups in order, starts of their pieces, first piece of each group, and sums of the pieces."""
+        """Return items of all groups in order, offsets of their pieces, first piece of each group, and buffers of piece sums."""
         counts = np.bincount(target, minlength=groups)
         pieces = -(-counts // PIECE)
         first = np.concatenate([[0], np.cumsum(pieces)])
@@ -69,11 +69,13 @@ class Multilevel:
         return [self._collect, self._gather, self._restrict, self._correct, self._finish]
 
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array) -> None:
-        """Diagonal blocks of all levels and their inverses, of the worlds that want a direction."""
+        """Sum and invert the diagonal blocks of all levels, in worlds that need a direction."""
         table, members, count = self.table, self._no_members, 0
         worlds = self.net.worlds
-        for groups, own, block, inverse in zip(self.counts, self.lists, self.blocks, self.inverses, strict=True):
-            items, pieces, starts, sums = own
+        for groups, pieces_of_level, block, inverse in zip(
+            self.counts, self.lists, self.blocks, self.inverses, strict=True
+        ):
+            items, pieces, starts, sums = pieces_of_level
             size = pieces.shape[0] - 1
             wp.launch(
                 self._collect,
@@ -92,7 +94,7 @@ class Multilevel:
             members, count = block, groups
 
     def apply(self, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
-        """Add the corrections of all levels to z, where the finest one has left its own, and r . z block by block."""
+        """Add the corrections of coarse levels to z, which has the finest one, and write r . z block by block."""
         worlds, nodes, blocks = self.net.worlds, self.net.host.nodes, self.net.blocks
         values, order, count, stride = residual, self.order, nodes, blocks
         for groups, sums in zip(self.counts, self.sums, strict=True):
@@ -124,7 +126,7 @@ class Multilevel:
 
 
 def curve_order(points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) in the order of a Morton curve through their bounding box."""
+    """Return the order of points (n, 3) along a Morton curve through their bounding box."""
     low, span = points.min(0), np.ptp(points, axis=0)
     cells = ((points - low) / max(span.max(), 1e-300) * (2**20 - 1)).astype(np.uint64)
     code = np.zeros(len(points), np.uint64)

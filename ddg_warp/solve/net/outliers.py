@@ -1,8 +1,10 @@
-"""A crowd in balance but for a few: what slips off an edge at the time takes Newton's method as many iterations as all else together.
+"""Relaxed convergence: a few bodies in contact may exceed the tolerance by a bounded factor.
 
-A rod that stands on another by its end slides off it, from one step to the next, along a direction in which the energy bends down.
-There the matrix is the projected one and the steps that it makes are short, while ten thousand others wait. What such a rod has left
-of its residual acts on it as a force would for the length of the step; see `NewtonOptions.outliers`.
+A rod that stands on another by its end slides off along a direction in which the energy is concave. There the Hessian is projected
+and its steps are short, while ten thousand other rods wait. The residual left on such a rod acts like an external force for the
+length of the step; see `NewtonOptions.outliers`.
+
+Measured: such slips take Newton's method as many iterations as all other rods together.
 """
 
 import warp as wp
@@ -12,14 +14,14 @@ from ddg_warp.kernels.net.outliers import outlier_kernels
 
 
 class Outliers:
-    """Excuses the few of a `NetNewton` in contact that are out of balance; launches alone.
+    """Relaxed convergence of a `NetNewton` in contact; launches alone.
 
     Args:
-        newton: with its `Resting`, by whose numbers bodies go.
-        most: bodies of a world that may be out of balance.
+        newton: with its `Resting`, which numbers the bodies.
+        most: unconverged bodies that a world may have.
 
     Attributes:
-        most; number: (worlds,) of bodies that are out of balance, as of the last `count`.
+        most; number: (worlds,) unconverged bodies of the last `count`.
     """
 
     def __init__(self, newton, most: int):
@@ -31,13 +33,13 @@ class Outliers:
         self._count, self._excuse = self.kernels = outlier_kernels(newton.real, arrays.serial(device))
 
     def excuse(self) -> None:
-        """Lower the flags of worlds in which so few are out of balance, as was counted, by what was found of residuals."""
+        """Mark worlds with so few unconverged bodies as converged, by the counts and the largest residuals."""
         newton = self.newton
         inputs = [self.number, self.most, newton.worst, newton._weight[2], newton.options.rtol, *newton.islands.arrays]
         wp.launch(self._excuse, newton.worlds, inputs, device=newton.device)
 
     def count(self, rtol: float) -> None:
-        """Those with a ratio of residuals that is above a tolerance, of active worlds."""
+        """Count the bodies of active worlds with a residual ratio above a tolerance."""
         newton = self.newton
         self._out_of_balance.zero_()
         self.number.zero_()

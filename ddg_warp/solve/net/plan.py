@@ -1,4 +1,4 @@
-"""Which dofs of a net make chains, which make joints, and how these couple."""
+"""Plan of the substructuring: rod paths, joints and their couplings."""
 
 import numpy as np
 
@@ -8,35 +8,37 @@ from ddg_warp.solve.net.system import lists
 
 
 class ChainPlan:
-    """Chains, joints and their couplings on the host.
+    """Rod paths, joints and their couplings on the host.
 
-    Place k of a rod has its node k and the angle of the edge ahead of it. Joints take out the nodes where rods meet, the rotations
-    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most; what acts from afar,
-    as dipoles do, is left out. It falls into chains at rigid joints, not at hinged ones, over which a rod bends. Short chains lie
-    behind each other in columns as long as the longest chain, so that little memory is padding. Nodes that are held take no part.
+    Path node k of a rod has node k and the twist angle of the edge after it. Joints take out the nodes where rods meet, the rotations
+    of rigid joints, and the last path nodes of a closed rod. The remainder couples over at most two path nodes; long-range elements
+    (dipoles) are left out. Rods are cut into paths at rigid joints, not at hinges, over which a rod bends. Short paths follow each
+    other in columns as long as the longest path, so that little memory is padding. Fixed nodes are left out.
 
     Args:
-        split: whether places have the tension of the edge behind them; then a chain goes on to the joint where its last edge ends.
+        split: True if path nodes have the tension of the edge before them; a path then extends to the joint where its last edge ends.
 
     Attributes:
-        twist, span: whether chains have angles, and over how many places they couple.
-        chain (longest, columns): number of the chain at a place, -1 in the padding; count (columns,): places of a column.
-        where (blocks,): place * columns + column of a block, -1 for none.
-        pairs (joints, 2): blocks of a joint, -1 for none; joint_row (blocks,): 2 joint + which of them, or -1.
+        `twist`, `span`: whether paths have twist angles; number of path nodes over which they couple.
+        `chain` (longest, columns): number of the path at a path node, -1 in the padding.
+        `count` (columns,): path nodes of a column.
+        `where` (blocks,): path node * columns + column of a block, -1 for none.
+        `pairs` (joints, 2): blocks of a joint, -1 for none.
+        `joint_row` (blocks,): 2 joint + index of the block in the pair, or -1.
 
-    Once it is bound to positions of H:
-        places (rows, longest, columns): node and angle of a place, -1 for none; then positions in H of its blocks with itself and
-            with the next places (node x node, node x angle, angle x node, angle x angle for each; without angles the first), unless
-            there are none.
-        taken: positions that bands take over.
-        complete: whether the elimination is that of all of H: no chain meets two joints, nothing else is free, and nothing acts
-            between joints, or between chains.
-        own (joints, 3): positions of its blocks in H, with each other at last.
-        of_places, of_joints: starts and positions of the couplings of blocks of chains with joints, of rows of joints with chains.
-        colour (joints,); units (solves, 1, 2 joints, 3): movements of joints, of a colour and a dof each, that S is measured with;
-            none where no chain meets a joint.
-        met (colours, longest, columns): the joint of each colour that the chain of a place meets, -1 for none; None where none meets
-            any, or one chain meets two of one colour.
+    After `bind` to positions of H:
+        `places` (rows, longest, columns): node and angle block of a path node, -1 for none. If there are couplings, also positions in
+            H of its blocks with itself and the next path nodes. Each has node x node, node x angle, angle x node, angle x angle;
+            without angles the first alone.
+        `taken`: positions that the bands replace.
+        `complete`: True if the elimination solves all of H. No path meets two joints, all free dofs are on paths or joints, and
+            nothing acts between joints or between paths.
+        `own` (joints, 3): positions of the joint blocks in H, the coupling of the pair last.
+        `of_places`, `of_joints`: couplings of path blocks with joints, of joint rows with paths (offsets, items).
+        `colour` (joints,), `units` (solves, 1, 2 joints, 3): unit vectors of a colour and dof each, which probe the joint Schur
+            complement S. Empty if no path meets a joint.
+        `met` (colours, longest, columns): the joint of each colour that the path at a path node meets, -1 for none. None if no path
+            meets one, or if one path meets two of one colour.
     """
 
     def __init__(self, host, split: bool = False):
@@ -48,38 +50,40 @@ class ChainPlan:
         rod = np.repeat(np.arange(len(lengths)), lengths)
         node = np.concatenate([rod.all_nodes for rod in host.rods])
         edges = [(r.all_edges, len(r.all_nodes) - len(r.all_edges)) for r in host.rods]
-        angle = np.concatenate([np.append(own, np.full(missing, -1)) for own, missing in edges])
-        place, reach = self._joints(host, node, angle, rod)
+        angle = np.concatenate([np.append(edges_of_rod, np.full(missing, -1)) for edges_of_rod, missing in edges])
+        later_node, distance = self._joints(host, node, angle, rod)
         node, angle = (np.where((block >= 0) & ~self._out[block], block, -1) for block in (node, angle))
         kept = (node >= 0) | (angle >= 0)
         if not kept.any():
             raise SceneError("preconditioner 'chain': no rod of the net has a node between its joints")
-        goes_on = np.zeros(len(node), bool)  # a chain from the place before
+        continues = np.zeros(len(node), bool)  # continues the path of the previous path node
         for step in (1, 2):
-            goes_on[place[reach == 2] - step + 1] = True
-        goes_on[place[reach == 1]] = True
+            continues[later_node[distance == 2] - step + 1] = True
+        continues[later_node[distance == 1]] = True
         if split:
-            goes_on[1:] |= (kept | goes_on)[:-1] & (rod[1:] == rod[:-1])
-        kept |= goes_on  # also places without dofs that a chain passes over
-        chain = np.cumsum(~goes_on)[kept]
-        self.twist, self.span = bool((angle >= 0).any()), 2 if (reach == 2).any() else 1
+            continues[1:] |= (kept | continues)[:-1] & (rod[1:] == rod[:-1])
+        kept |= continues  # also path nodes without dofs within a path
+        chain = np.cumsum(~continues)[kept]
+        self.twist, self.span = bool((angle >= 0).any()), 2 if (distance == 2).any() else 1
         self._arrange(kept, node[kept], angle[kept], np.unique(chain, return_inverse=True)[1])
 
     @property
     def block(self) -> int:
-        """Dofs of a place."""
+        """Number of dofs of a path node."""
         return place_dofs(self.twist, self.split)
 
     @property
     def alone(self) -> bool:
-        """Whether the elimination is that of all of H and no chain meets a joint, so that every tension ends in one chain."""
+        """True if the elimination solves all of H and no path meets a joint, so that each tension belongs to one path."""
         return self.complete and not len(self.of_places[1])
 
     def bind(self, host, rows: np.ndarray, columns: np.ndarray, kept: np.ndarray | None) -> None:
-        """Find everything among the rows and columns of positions of H; see `Chains.kept`."""
-        if any(part.term.measure.apart for part in host.sets):
-            slots = [part.slots.astype(np.int64) for part in host.sets if not part.term.measure.apart]
-            near = np.concatenate([(s[:, None] * host.blocks + s[None]).ravel() for s in slots])
+        """Find all positions in H, given its rows and columns; see `Chains.kept`."""
+        if any(element_set.term.measure.apart for element_set in host.sets):
+            nodes = [
+                element_set.slots.astype(np.int64) for element_set in host.sets if not element_set.term.measure.apart
+            ]
+            near = np.concatenate([(s[:, None] * host.blocks + s[None]).ravel() for s in nodes])
             near = np.isin(rows.astype(np.int64) * host.blocks + columns, near)
         else:
             near = rows >= 0
@@ -92,71 +96,77 @@ class ChainPlan:
         self._take(rows, columns, near, kept)
         self.complete &= not (np.bincount(chains) > 1).any()
 
-    def elements(self, host, part) -> np.ndarray:
-        """The element of a set along rods that has its node i at a place (nodes, longest, columns), -1 for none."""
-        rod, k = part.owner
-        first, n = (np.array([of[r] for r in rod.tolist()], int) for of in (self._first, self._length))
-        result = np.full((part.term.measure.nodes, *self.chain.shape), -1)
-        for i, at in enumerate(result):
+    def elements(self, host, element_set) -> np.ndarray:
+        """Return the elements with node i at a path node (nodes, longest, columns), -1 for none."""
+        rod, k = element_set.owner
+        first, n = (np.array([table[r] for r in rod.tolist()], int) for table in (self._first, self._length))
+        result = np.full((element_set.term.measure.nodes, *self.chain.shape), -1)
+        for i, elements in enumerate(result):
             row, column = self._at[:, first + (k + i) % n]
-            there = row >= 0
-            at[row[there], column[there]] = np.flatnonzero(there)
+            present = row >= 0
+            elements[row[present], column[present]] = np.flatnonzero(present)
         return result
 
     def places_ahead(self, rod: np.ndarray) -> np.ndarray:
-        """Place k and column of the next node (2, nodes) of all rods one after the other, given the rod of every node; -1 for none."""
+        """Return path node and column of the next node (2, nodes) of all rods in order, given the rod of every node; -1 for none."""
         result = np.full(self._at.shape, -1)
         result[:, :-1] = np.where(rod[1:] == rod[:-1], self._at[:, 1:], -1)
         return result
 
     def held(self, host) -> np.ndarray:
-        """Bits of the dofs of places that are held, or that they do not have (longest, columns)."""
+        """Return a bit mask of the fixed or absent dofs of path nodes (longest, columns)."""
         result = np.zeros(self.chain.shape, np.uint8)
-        for part, components in zip(self.places[: len(self._dofs)], (3, 1), strict=False):
-            missing = (part < 0)[..., None] | host.fixed[part, :components]
+        for blocks, components in zip(self.places[: len(self._dofs)], (3, 1), strict=False):
+            missing = (blocks < 0)[..., None] | host.fixed[blocks, :components]
             result |= (missing << (3 * (components == 1) + np.arange(components))).sum(-1).astype(np.uint8)
         return result
 
     def find(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Positions of blocks in H, -1 where it has none or one of the two is -1."""
+        """Return positions of blocks in H, -1 for absent blocks or negative rows and columns."""
         if not len(self._keys):
             return np.full(len(row), -1)
         keys = row.astype(np.int64) * self._blocks + column
-        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        return np.where((row >= 0) & (column >= 0) & (self._keys[at] == keys), self._order[at], -1)
+        index = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where((row >= 0) & (column >= 0) & (self._keys[index] == keys), self._order[index], -1)
 
     def _joints(self, host, node, angle, rod) -> tuple[np.ndarray, np.ndarray]:
-        """What is taken out of the rods: `pairs` and `joint_row`. Returns couplings in what is left: later place, distance."""
-        spins = [part.slots[[0, 3]].T for part in host.sets if part.term.measure.spins]
-        turning = np.unique(np.concatenate(spins), axis=0) if spins else np.zeros((0, 2), int)
-        met = np.bincount(node, minlength=host.blocks) > 1
-        met[turning[:, 0]] = True
-        spin = np.full(host.blocks, -1)
-        spin[turning[::-1, 0]] = turning[::-1, 1]
-        others = turning[spin[turning[:, 0]] != turning[:, 1], 1]  # of a second rigid joint at a node
-        place = np.full(host.blocks, -1)
-        at = np.arange(len(node))
-        place[node[~met[node]]] = at[~met[node]]
-        place[angle[angle >= 0]] = at[angle >= 0]
-        a, b = _couplings(host, place, rod)
+        """Take the joints out of the rods: `pairs` and `joint_row`.
+
+        Returns:
+            Couplings of the remaining path nodes: index of the later one, and distance.
+        """
+        spins = [element_set.slots[[0, 3]].T for element_set in host.sets if element_set.term.measure.spins]
+        rotations = np.unique(np.concatenate(spins), axis=0) if spins else np.zeros((0, 2), int)
+        is_joint = np.bincount(node, minlength=host.blocks) > 1
+        is_joint[rotations[:, 0]] = True
+        rotation = np.full(host.blocks, -1)
+        rotation[rotations[::-1, 0]] = rotations[::-1, 1]
+        further_rotations = rotations[
+            rotation[rotations[:, 0]] != rotations[:, 1], 1
+        ]  # of second rigid joints at a node
+        path_node = np.full(host.blocks, -1)
+        index = np.arange(len(node))
+        path_node[node[~is_joint[node]]] = index[~is_joint[node]]
+        path_node[angle[angle >= 0]] = index[angle >= 0]
+        a, b = _couplings(host, path_node, rod)
         cut = np.unique(a[a - b > 2])
-        shared = np.flatnonzero(met)
+        shared = np.flatnonzero(is_joint)
         pairs = [
-            np.column_stack([np.where(self._held[shared], -1, shared), spin[shared]]),
-            np.column_stack([np.full(len(others), -1), others]),
-            np.column_stack([np.where(met[node[cut]], -1, node[cut]), angle[cut]]),
+            np.column_stack([np.where(self._held[shared], -1, shared), rotation[shared]]),
+            np.column_stack([np.full(len(further_rotations), -1), further_rotations]),
+            np.column_stack([np.where(is_joint[node[cut]], -1, node[cut]), angle[cut]]),
         ]
         pairs = np.concatenate(pairs)
         self.pairs = pairs[(pairs >= 0).any(1)]
         self.joint_row = np.full(host.blocks, -1)
         taken = self.pairs.ravel()
         self.joint_row[taken[taken >= 0]] = np.flatnonzero(taken >= 0)
-        self._out = met | (self.joint_row >= 0)
-        left = ~(np.isin(a, cut) | np.isin(b, cut))
-        return a[left], (a - b)[left]
+        self._out = is_joint | (self.joint_row >= 0)
+        remaining = ~(np.isin(a, cut) | np.isin(b, cut))
+        return a[remaining], (a - b)[remaining]
 
     def _arrange(self, kept, node, angle, chain) -> None:
-        """Chains in columns: `chain`, `count` and `where`."""
+        """Arrange paths in columns: `chain`, `count` and `where`."""
         lengths = np.bincount(chain)
         begin, column = np.zeros(len(lengths), int), np.zeros(len(lengths), int)
         filled, longest = [0], lengths.max()
@@ -179,21 +189,21 @@ class ChainPlan:
         self.chain[k, self._c] = chain
 
     def _positions(self) -> None:
-        """Blocks of places and positions of their couplings: `places`."""
-        rows, found = list(self._dofs), []
+        """Find blocks of path nodes and positions of couplings: `places`."""
+        rows, positions = list(self._dofs), []
         for s in range(self.span + 1):
             together = np.append(self._chains[s:] == self._chains[: len(self._chains) - s], np.zeros(s, bool))
             for p in self._dofs:
                 for q in self._dofs:
-                    found.append(self.find(p, np.where(together, np.roll(q, -s), -1)))
-        rows += found if any((at >= 0).any() for at in found) else []
+                    positions.append(self.find(p, np.where(together, np.roll(q, -s), -1)))
+        rows += positions if any((each >= 0).any() for each in positions) else []
         self.places = np.full((len(rows), *self.chain.shape), -1)
         self.places[:, self._k, self._c] = rows
 
     def _take(self, rows, columns, near, kept) -> None:
-        """What bands take over (`taken`), and whether that is all (`complete`)."""
+        """Find the positions that bands replace (`taken`), and whether they solve all of H (`complete`)."""
         k, c = np.divmod(self.where, self.chain.shape[1])
-        a, b = (np.where(rows >= 0, of, 0) for of in (rows, columns))
+        a, b = (np.where(rows >= 0, blocks, 0) for blocks in (rows, columns))
         inside, free = self.where >= 0, ~self._held
         both = inside[a] & inside[b] & (rows >= 0) & free[a] & free[b]
         same = both & near & (c[a] == c[b]) & (np.abs(k[a] - k[b]) <= self.span)
@@ -204,37 +214,43 @@ class ChainPlan:
         self.complete = not (both & ~same).any() and not (free & ~inside & (joint < 0)).any() and not between.any()
 
     def _couple(self, host, rows, columns) -> None:
-        """Couplings of chains and joints, of what is not held."""
+        """Find the couplings of free dofs between paths and joints."""
         real = (rows >= 0) & ~(self._held[rows] | self._held[columns])
-        inside, joint = (np.where(real, of[b], -1) for b, of in ((rows, self.where), (columns, self.joint_row)))
-        there = np.flatnonzero((inside >= 0) & (joint >= 0))
-        starts, items = lists(rows[there], host.blocks)
-        self.of_places = starts, there[items]
-        inside, joint = (np.where(real, of[b], -1) for b, of in ((columns, self.where), (rows, self.joint_row)))
-        there = np.flatnonzero((inside >= 0) & (joint >= 0))
-        starts, items = lists(joint[there], 2 * len(self.pairs))
-        self.of_joints = starts, there[items]
+        inside, joint = (np.where(real, table[b], -1) for b, table in ((rows, self.where), (columns, self.joint_row)))
+        coupled = np.flatnonzero((inside >= 0) & (joint >= 0))
+        starts, items = lists(rows[coupled], host.blocks)
+        self.of_places = starts, coupled[items]
+        inside, joint = (np.where(real, table[b], -1) for b, table in ((columns, self.where), (rows, self.joint_row)))
+        coupled = np.flatnonzero((inside >= 0) & (joint >= 0))
+        starts, items = lists(joint[coupled], 2 * len(self.pairs))
+        self.of_joints = starts, coupled[items]
         a, b = self.pairs.T
         self.own = np.column_stack([self.find(a, a), self.find(b, b), self.find(a, b)])
 
     def _colour(self, host, columns) -> np.ndarray:
-        """Colours of joints, different where they meet at a chain, and the movements to measure with; the chain of every meeting."""
+        """Colour the joints so that two on one path differ, and write the probing vectors.
+
+        Returns:
+            The path of every (path, joint) meeting.
+        """
         joints = len(self.pairs)
         starts, items = self.of_joints
         joint = np.repeat(np.arange(2 * joints), np.diff(starts)) // 2
         k, column = np.divmod(self.where[columns[items]], self.chain.shape[1])
-        touch = np.unique(np.column_stack([column, k, joint]), axis=0)
+        meetings = np.unique(np.column_stack([column, k, joint]), axis=0)
         neighbours = [set() for _ in range(joints)]
         for lag in (1, 2, 3):
-            near = (touch[lag:, 0] == touch[:-lag, 0]) & (touch[lag:, 2] != touch[:-lag, 2])
-            for one, other in zip(touch[:-lag][near, 2], touch[lag:][near, 2], strict=True):
-                neighbours[one].add(other)
-                neighbours[other].add(one)
+            near = (meetings[lag:, 0] == meetings[:-lag, 0]) & (meetings[lag:, 2] != meetings[:-lag, 2])
+            for first, neighbour in zip(meetings[:-lag][near, 2], meetings[lag:][near, 2], strict=True):
+                neighbours[first].add(neighbour)
+                neighbours[neighbour].add(first)
         self.colour = np.full(joints, -1)
         for m in range(joints):
-            taken = {self.colour[other] for other in neighbours[m]}
+            taken = {self.colour[neighbour] for neighbour in neighbours[m]}
             self.colour[m] = next(c for c in range(joints) if c not in taken)
-        chain, joint = np.unique(np.column_stack([self.chain[touch[:, 1], touch[:, 0]], touch[:, 2]]), axis=0).T
+        chain, joint = np.unique(
+            np.column_stack([self.chain[meetings[:, 1], meetings[:, 0]], meetings[:, 2]]), axis=0
+        ).T
         colours = self.colour.max(initial=-1) + 1
         joints_of = np.full((colours, self.chain.max() + 1), -1)
         joints_of[self.colour[joint], chain] = joint
@@ -251,19 +267,22 @@ class ChainPlan:
         return chain
 
 
-def _couplings(host, place: np.ndarray, rod: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places of one rod that elements couple, the later one first; `place` is that of a block, -1 for none."""
-    late, early = [np.zeros(0, int)], [np.zeros(0, int)]
-    for part in host.sets:
-        if part.term.measure.apart:
+def _couplings(host, path_node: np.ndarray, rod: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of path nodes of one rod that elements couple, the later one first.
+
+    `path_node` is the index of each block, -1 for none.
+    """
+    later, earlier = [np.zeros(0, int)], [np.zeros(0, int)]
+    for element_set in host.sets:
+        if element_set.term.measure.apart:
             continue
-        at = place[part.slots]
-        at = at[:, (at >= 0).sum(0) > 1]
-        for i, one in enumerate(at):
-            for other in at[:i]:
-                high, low = np.maximum(one, other), np.minimum(one, other)
+        nodes = path_node[element_set.slots]
+        nodes = nodes[:, (nodes >= 0).sum(0) > 1]
+        for i, first in enumerate(nodes):
+            for second in nodes[:i]:
+                high, low = np.maximum(first, second), np.minimum(first, second)
                 both = (low >= 0) & (high > low)
                 both[both] = rod[high[both]] == rod[low[both]]
-                late.append(high[both])
-                early.append(low[both])
-    return np.concatenate(late), np.concatenate(early)
+                later.append(high[both])
+                earlier.append(low[both])
+    return np.concatenate(later), np.concatenate(earlier)

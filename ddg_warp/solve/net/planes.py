@@ -1,4 +1,4 @@
-"""Dofs, forces and tangents of nodes on oblique planes, in the frames of `ddg_warp.compile.net.planes`."""
+"""Skew supports: dofs, forces and tangents in the nodal frames of `ddg_warp.compile.net.planes`."""
 
 import numpy as np
 import warp as wp
@@ -7,48 +7,48 @@ from ddg_warp.kernels.matrix import planes
 
 
 class HostPlanes:
-    """The frames of a net's nodes as one orthogonal matrix, for all worlds."""
+    """Nodal frames of the coupled system as one orthogonal matrix, for all worlds."""
 
     def __init__(self, net, worlds: int):
         from scipy import sparse
 
-        place, blocks = np.array(list(net.frames)), net.blocks
-        turn = np.tile(np.eye(3), (blocks, 1, 1))
-        turn[place] = list(net.frames.values())
-        one = sparse.bsr_matrix((turn, np.arange(blocks), np.arange(blocks + 1)))
-        self._turn = sparse.block_diag([one] * worlds, format="csr")
+        index, blocks = np.array(list(net.frames)), net.blocks
+        frames = np.tile(np.eye(3), (blocks, 1, 1))
+        frames[index] = list(net.frames.values())
+        of_world = sparse.bsr_matrix((frames, np.arange(blocks), np.arange(blocks + 1)))
+        self._turn = sparse.block_diag([of_world] * worlds, format="csr")
 
     def into(self, values: np.ndarray) -> np.ndarray:
-        """Dofs, forces or steps in space as components in the frames."""
+        """Return dofs, forces or steps in components of the frames."""
         return self._turn @ values
 
     def back(self, values: np.ndarray) -> np.ndarray:
-        """Components in the frames as vectors in space."""
+        """Return vectors in space, given components in the frames."""
         return self._turn.T @ values
 
     def matrix(self, values):
-        """A matrix of dofs in space as one of components in the frames."""
+        """Return a matrix of spatial dofs in components of the frames."""
         return (self._turn @ values @ self._turn.T).tocsc()
 
 
 class DevicePlanes:
-    """The same on the device, for the linear algebra of `NetNewton`."""
+    """Nodal frames on the device, for the linear algebra of `NetNewton`."""
 
     def __init__(self, net, table, real, linear):
         host, device = net.host, net.device
         self.net, self.positions = net, table.positions
-        place = np.array(list(host.frames))
+        index = np.array(list(host.frames))
         frames = np.array(list(host.frames.values()))
         rows, columns = table.rows.numpy(), table.columns.numpy()
-        frame = np.full(host.blocks + 1, -1)  # the last for padding
-        frame[place] = np.arange(len(place))
+        frame = np.full(host.blocks + 1, -1)  # the last entry is for padding
+        frame[index] = np.arange(len(index))
         entries = np.column_stack([np.arange(len(rows)), frame[rows], frame[columns]])
         entries = entries[(entries[:, 1:] >= 0).any(1)]
 
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        self.where, self.entries = put(place.astype(np.int32), int), put(entries.astype(np.int32), int)
+        self.where, self.entries = put(index.astype(np.int32), int), put(entries.astype(np.int32), int)
         self.of_blocks = put(frame[:-1].astype(np.int32), int)
         self.frames = {kind: put(frames, wp.types.matrix((3, 3), kind)) for kind in {real, linear}}
         self._matrix = planes.matrix_kernel(linear)
@@ -61,15 +61,15 @@ class DevicePlanes:
         return [self._matrix, self._into, self._back]
 
     def into(self, direction: wp.array, wanted: wp.array) -> None:
-        """Turn the directions of the worlds that want one into the frames."""
+        """Rotate the directions of worlds that need one into the frames."""
         self._turn(self._into, self.linear, wanted, direction)
 
     def back(self, direction: wp.array, wanted: wp.array) -> None:
-        """Turn them back into space."""
+        """Rotate directions back into space."""
         self._turn(self._back, self.linear, wanted, direction)
 
     def matrix(self, matrix: wp.array, wanted: wp.array) -> None:
-        """Turn H of the worlds that want it."""
+        """Rotate H into the frames, in worlds that need it."""
         inputs = [self.entries, self.frames[self.linear], wanted, self.positions]
         dim = (len(self.entries), self.net.worlds)
         wp.launch(self._matrix, dim, inputs, [matrix], device=self.net.device)

@@ -1,4 +1,4 @@
-"""What is prescribed of a net from outside: motion of supports and of the normals that these turn, and a magnetic field."""
+"""Prescribed data of the coupled system: motion of supports and clamped normals, and the magnetic field."""
 
 import warp as wp
 
@@ -10,10 +10,10 @@ from ddg_warp.solve.motion import Motion
 
 
 class NetMotion(Motion):
-    """Motion of a net's supports, and of the normals at clamped mesh edges that these turn.
+    """Prescribed motion of supports, and of the normals at clamped mesh edges.
 
     Attributes:
-        data: of the sets with such normals, by index, with those that a solve is about.
+        data: data with normals that a solve uses, by index of the element set.
     """
 
     def __init__(self, model, midpoint: bool = False):
@@ -30,11 +30,11 @@ class NetMotion(Motion):
         return [*super().kernels, *([self._normals, self._turn] if self.normals else [])]
 
     def place(self, islands, q: wp.array) -> None:
-        """Put nodes, among the blocks q."""
+        """Move supported nodes among the blocks q."""
         super().place(islands, self.part.points(q))
 
     def direct(self, islands, q: wp.array, frame: wp.array) -> None:
-        """Put angles, among the blocks q, and normals."""
+        """Set prescribed twist angles, among the blocks q, and normals."""
         net = self.part
         super().direct(islands, net.points(q), net.frames(frame), net.angles(q))
         for index, (where, rest) in self.normals.items():
@@ -42,24 +42,24 @@ class NetMotion(Motion):
             self._launch(self._normals, where, inputs, [self.data[index]])
 
     def turn(self, islands, before: NetState, after: NetState) -> None:
-        """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
+        """Rotate the normals in the end state of a substep, in worlds that accepted one."""
         for index, (where, rest) in self.normals.items():
             inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, self.part.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
 
 
 class NetField:
-    """The magnetic field among the data of magnetised edges, at the time that the scheme balances forces at and at the end of a step.
+    """Magnetic field in the data of magnetised edges, at the time of the balance and at the end of a step.
 
     Args:
-        given: the uniform field that a step is given on top of the scene's, in every world (3, worlds) [T]; None where none acts.
+        control_field: uniform field of a step added to the scene's, in every world (3, worlds) [T]; None without.
 
     Attributes:
-        data: of those sets by index, with the field that a solve is about.
+        data: data with the field that a solve uses, by index of the element set.
     """
 
-    def __init__(self, model, midpoint: bool, given: wp.array | None):
-        self.model, self.net, self.midpoint, self.given = model, model.net, midpoint, given
+    def __init__(self, model, midpoint: bool, control_field: wp.array | None):
+        self.model, self.net, self.midpoint, self.given = model, model.net, midpoint, control_field
         self.data = model.net.field_data()
         self._kernel = field_kernel(model.types.real)
         self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
@@ -70,7 +70,7 @@ class NetField:
         return [self._kernel] if self.data else []
 
     def upload(self, t0: float, t1: float) -> None:
-        """The field of a step."""
+        """Upload the field of a step from t0 to t1 [s]."""
         if not self.data:
             return
         field = self.model.scene.applied_field
@@ -80,12 +80,12 @@ class NetField:
             self._launch(index, self._now, self.net.every, data, data)
 
     def finish(self, moved: wp.array, before: NetState, after: NetState) -> None:
-        """Put the worlds that `moved` into the field at the end of the step."""
+        """Set the field at the end of the step, in worlds that `moved`."""
         for index in self.data:
             self._launch(index, self._end, moved, before.data[index], after.data[index])
 
     def _launch(self, index: int, field: wp.array, moved: wp.array, before: wp.array, after: wp.array) -> None:
-        part, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
-        inputs = [field, self.given, first, part.elements, moved, before]
-        dim = part.elements * self.model.worlds
+        element_set, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
+        inputs = [field, self.given, first, element_set.elements, moved, before]
+        dim = element_set.elements * self.model.worlds
         wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)

@@ -1,13 +1,13 @@
-"""Islands of a world in contact, found anew for each direction: those in balance rest while Newton's method goes on elsewhere.
+"""Sleeping islands: recompute contact islands for every direction, and fix the dofs of converged ones.
 
-Rods and shells that push each other, by contact or friction, are in one island with all that these push. What obstacles are pushed by
-is not joined by them. A direction is one of the islands with a residual that is still too large; all others stay where they are, as if
-they were held, to the bit. What comes to push one of them wakes it. An island rests at `REST` of the tolerance: what Newton's method
-leaves of a residual is mostly far below it, and so it stays where others take longer.
+An island has all rods and shells that contact or friction connects; obstacles do not connect. Directions are computed for islands
+with a residual above the tolerance. All others sleep: their dofs stay unchanged, bit for bit, until a moving body contacts one of
+them. An island falls asleep at `REST` of the tolerance: Newton residuals are mostly far smaller, and so it stays converged while
+others iterate.
 
-(More may rest: rods in balance that touch others which are not. With the neighbours of those awake, 10,000 strands took as long on a
-GPU, whose memory has the rods of a group side by side, and 300 rods of a pile up to twice the iterations: what is barely balanced wakes
-again and again.)
+Alternative: more bodies may sleep, such as converged rods in contact with unconverged ones.
+Measured: with only unconverged rods and their neighbours awake, 10,000 strands took as long on a GPU. 300 rods of a pile took up to
+twice the iterations, since barely converged rods wake repeatedly.
 """
 
 import numpy as np
@@ -20,21 +20,21 @@ REST = 0.1
 
 
 class Resting:
-    """What rests of a `NetNewton` in contact: it writes `NetNewton.barred` and `Chains.idle`.
+    """Sleeping islands of a `NetNewton` in contact; writes `NetNewton.barred` and `Chains.idle`.
 
     Args:
-        newton: once its contact and what residuals may be are there.
-        body: which rod, shell, or what is joined of them, each block belongs to (blocks,), -1 for none; bodies: how many there may be.
+        newton: with its contact and residual tolerances made.
+        body: body (rod, shell, or several joined) of each block (blocks,), -1 for none; bodies: largest possible number of bodies.
 
     Attributes:
-        owner: the body of every ratio of `NetNewton.allowed`, -1 for none.
+        owner: body of every ratio of `NetNewton.allowed`, -1 for none.
     """
 
     def __init__(self, newton, body: np.ndarray, bodies: int):
         self.newton, net, device = newton, newton.net, newton.device
         self._worlds, self.bodies = net.worlds, bodies
         owner = [body]
-        for level in newton.allowed.bodies.levels:  # sums over parts belong to what their blocks do
+        for level in newton.allowed.bodies.levels:  # sums over clusters belong to the body of their blocks
             owner.append(owner[-1][level.items[level.starts[:-1]]])
 
         def put(values):
@@ -51,7 +51,7 @@ class Resting:
         self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 
     def __call__(self, products) -> None:
-        """Find what rests, by the residuals of the iterate and the pairs of a `PairProduct`."""
+        """Find sleeping islands by the residuals of the iterate and the pairs of a `PairProduct`."""
         newton, device = self.newton, self.newton.device
         arrays.sweep(self._begin, len(self._link), [], [self._link, self._awake, self._any], device)
         inputs = [newton.allowed.ratio, self.owner, self.bodies, REST * newton.options.rtol, *newton.islands.arrays]
@@ -63,11 +63,11 @@ class Resting:
         self.leave(products)
 
     def leave(self, products) -> None:
-        """Have products leave out pairs between what rests, of those that there are by now."""
+        """Exclude pairs between sleeping bodies from products, among the present pairs."""
         arrays.take_turns(self._leave, products.most, [products.sets, self.newton.barred], [], self.newton.device)
 
     def wake(self) -> None:
-        """Nothing rests; see `leave` for the pairs."""
+        """Wake all islands; see `leave` for the pairs."""
         self._any.zero_()
         self._bar()
 

@@ -1,15 +1,15 @@
-"""Equilibria of large nets: Newton by preconditioned conjugate gradients on the device, without any factorisation.
+"""Equilibria of large coupled systems: static Newton with PCG on the device, without factorisation.
 
-The loop is that of a time step without its inertia: energies fall, and the matrix is Gauss-Newton's with the stiffness of the
-stresses; in contact with second derivatives, too, as in a time step. Loads follow every iterate and do the work of their mean along a
-step; their own stiffness is left out of the matrix, which costs iterations and no accuracy. No pivot is seen, so that a saddle on which
-nothing pushes off is not told from a minimum: `ddg_warp.solve.stability` tells.
+The loop is the loop of a time step without inertia: energies decrease. The matrix is the Gauss-Newton matrix with the geometric
+stiffness; in contact it has exact second derivatives, as in a time step. Follower loads act on every iterate and do their mean work
+along a step. Their load stiffness is left out of the matrix, which costs iterations and no accuracy. PCG sees no pivots, so that a
+saddle without a perturbation passes for a minimum; `ddg_warp.solve.stability` tests.
 
-Friction is that of a step in time without inertia, as long as the increment of the load parameter: it acts against slips since the
-equilibrium before, and what sticks creeps by less than `velocity` times the increment. Normal forces are lagged, at first those of the
-equilibrium before, and taken anew from what is found until that is in equilibrium with its own. Where something has slid, that may be
-as normal forces were those of a smaller load: then they are taken anew after every iteration. What swings about an equilibrium, as
-normal forces come of friction elsewhere and that of theirs, goes less than the whole way. Once ways are short `polish` goes the rest.
+Friction is the friction of a quasi-static time step as long as the increment of the load parameter. It acts against slips since the
+previous equilibrium; sticking contacts creep by less than `velocity` times the increment. Normal forces are lagged, at first from the
+previous equilibrium, and updated until the equilibrium is consistent with its own. Slips may stem from the normal forces of a smaller
+load; then these are updated after every iteration. Oscillation of this fixed point is damped by Aitken relaxation. Once updates are
+small, `polish` finishes.
 """
 
 import math
@@ -35,36 +35,36 @@ from ddg_warp.solve.net.arcs import Arcs
 from ddg_warp.solve.net.newton import NetNewton
 from ddg_warp.solve.net.polish import Polish
 
-FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
-ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
-FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
-POLISH = 2  # iterations of a solve that begins within rounding, at most
-LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken, and the longest one over the one before
-# Iterations with the same normal forces. By too small ones what would stick slides far off: a wary search takes one. In a crowd that
-# falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
+FORCING = 1e-4  # forcing term of directions: Gauss-Newton errs by more
+ADRIFT = 1e3  # sizes of the system: displacement of a body that drifts away
+FAR = 4.0  # rotation of a direction over the step cap at which PCG stops
+POLISH = 2  # iterations of a solve that begins below the rounding floor, at most
+LEAST, LEAP = 0.1, 10.0  # Aitken relaxation: smallest factor; largest growth of an update
+# Iterations between updates of normal forces. Too small ones let sticking contacts slide far: `wary` solves update each time. In a
+# settling pile, bodies lose contact for an iteration and friction of others carries them far: several are needed.
 LAGGED = 5
-NEAR = 0.01  # of the range of contact: ways on which normal forces hardly change
-TRIED = 4  # solves after which Newton's method with consistent normal forces is tried wherever the iterate is
-STUCK = 30  # iterations in which what meets for the first time sticks, at most
-SETTLED = 1e-4  # residuals over all loads, of what has
-UNSETTLED = "unsettled"  # outcome where forces do not balance with the friction that the state has
+NEAR = 0.01  # activation distances: displacement over which normal forces hardly change
+TRIED = 4  # solves after which the monolithic friction Newton is tried from any iterate
+STUCK = 30  # iterations in which new contacts stick, at most
+SETTLED = 1e-4  # settled: residual over the sum of loads
+UNSETTLED = "unsettled"  # outcome: no balance with the friction of the state
 
 
 class StaticNewton(NetNewton):
-    """`NetNewton` without inertia, in the precision of the state: no mass bounds the condition of its matrix."""
+    """`NetNewton` without inertia, in the precision of the state: no mass bounds the condition number."""
 
-    banded = False  # also what held dofs do to others is asked for
+    banded = False  # products with fixed dofs are needed, too
 
     def __init__(self, model, options: NewtonOptions):
         super().__init__(model, options, net_preconditioner(model.net), model.types.real)
-        self._whole = False  # whether directions may go as far as they like
-        self.gravity.zero_()  # a load like others: `begin` scales them all
+        self._whole = False  # True if directions are not cut at FAR step caps
+        self.gravity.zero_()  # gravity is a load like others: `begin` scales all
         self.loads = StaticLoads(model, self.net, midpoint=False) if self.net.host.followers else None
         self._there, self._before = wp.zeros_like(self.load), wp.zeros_like(self.q)
         self.islands.moved.fill_(1)
         self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
         self.rubs = self.contact is not None and self.contact.rubs
-        if self.rubs:  # another than that of strain-rate damping, which counts at rest
+        if self.rubs:  # not the rate of strain-rate damping, which acts at rest
             self.contact.rate = wp.zeros_like(self.islands.rate)
             self.slid = wp.zeros_like(self.q)
 
@@ -77,16 +77,16 @@ class StaticNewton(NetNewton):
         self,
         q: np.ndarray,
         dead: np.ndarray,
-        at: float,
+        load_factor: float,
         scale: np.ndarray,
         before: np.ndarray | None = None,
         slid: np.ndarray | None = None,
         rate: float = 0.0,
     ) -> None:
-        """Set out from dofs `q` under dead loads (worlds, 3 blocks), with those that follow at `at`; load scales of bodies.
+        """Start from dofs `q` under dead loads (worlds, 3 blocks) and follower loads at `load_factor`, given load scales of bodies.
 
-        In contact q is what is proposed to what is at dofs `before`; friction counts slips from blocks `slid` on over `rate`, without
-        which there is none.
+        In contact, q is the proposed motion from dofs `before`. Friction counts slips from blocks `slid` over `rate`; without `slid`
+        there is none.
         """
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
@@ -102,12 +102,12 @@ class StaticNewton(NetNewton):
         for load in (self.load, self._there):
             load.assign(dead.reshape(-1, 3))
         if self.loads:
-            self.loads.scale(dead.reshape(self.worlds, -1, 3), at)
+            self.loads.scale(dead.reshape(self.worlds, -1, 3), load_factor)
         wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
         self.islands.active.fill_(1)
 
     def balance(self) -> None:
-        """Residuals under the loads on the iterate, which do the work of their mean along a step."""
+        """Assemble residuals under the loads on the iterate, which do their mean work along a step."""
         if self.loads:
             for q, load in ((self.here, self.load), (self.base, self._there)):
                 self.loads.apply(self.net.points(q), self.net.points(load), self.net.angles(load))
@@ -122,7 +122,7 @@ class StaticNewton(NetNewton):
             )
 
     def search(self, state, again: bool = False) -> None:
-        """From where `begin` has set out, with the lagged data of `state`; can be captured. Slips of one `again` go on."""
+        """Solve from the start of `begin`, with the lagged data of `state`. With `again`, slips continue. Can be captured."""
         if self.contact:
             self.contact.renew(self._before)
             self.contact.place()
@@ -132,16 +132,17 @@ class StaticNewton(NetNewton):
         self.solve(state)
 
     def outgrown(self) -> bool:
-        """Whether pairs did not fit, so that all is to be done again, with room or by shorter ways. Reads from the device.
+        """Return True if lists of pairs overflowed: the solve repeats with larger lists or shorter motions. Reads from the device.
 
-        Without inertia what nothing holds goes as far as it likes, past all else; steps in time end somewhere.
+        Without inertia a free body moves without bound, past all others. Motions of time steps are bounded.
         """
         return self.contact is not None and self.contact.outgrown(self._before, spare=True)
 
     def watch(self) -> None:
-        """Directions grow with every iteration: one that would be cut to a fraction is far enough.
+        """Stop PCG where the direction exceeds `FAR` step caps, since directions grow with every iteration.
 
-        (Steihaug, SIAM J. Numer. Anal. 20, 1983.) Else a flat sheet's first direction, which knows bending alone, costs the most.
+        (Steihaug, SIAM J. Numer. Anal. 20, 1983.) Otherwise the first direction of a flat sheet, against bending alone, costs the
+        most.
         """
         if self._whole:
             return
@@ -157,7 +158,7 @@ class StaticNewton(NetNewton):
         )
 
     def follow(self, state, step: wp.array) -> None:
-        """The direction of the free dofs where held ones make a `step`: H d = r - H step, in worlds that want it."""
+        """Compute the direction of free dofs for a `step` of fixed dofs, H d = r - H step, in worlds that need it."""
         if self.resting:
             self.resting.wake()
         if self.contact:
@@ -176,34 +177,38 @@ class StaticNewton(NetNewton):
 
 
 class Relaxation:
-    """Aitken's relaxation of a fixed point, at most 1 (Irons and Tuck, Int. J. Numer. Meth. Eng. 1, 1969, 275), with no leaps.
+    """Aitken relaxation of a fixed point, at most 1, with bounded growth (Irons and Tuck, Int. J. Numer. Meth. Eng. 1, 1969, 275).
 
-    What is held by friction alone has no stiffness where all of it slides, by normal forces that are not yet those of its equilibrium.
+    A body that only friction supports has no stiffness while all its contacts slide, under normal forces that are not yet consistent.
     """
 
     def __init__(self, worlds: int):
         self._part, self._last = np.ones(worlds), np.zeros((worlds, 0))
 
-    def __call__(self, way: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        """Part (worlds,) of a way (worlds, n) that is to be taken; all of it where it is to be `whole`, after which all begins anew."""
+    def __call__(self, increment: np.ndarray, whole: np.ndarray) -> np.ndarray:
+        """Return the relaxation factor (worlds,) of an increment (worlds, n); 1 where it is to be `whole`, which restarts the
+        relaxation.
+        """
         if self._last.size:
-            size, last = (np.sqrt((each**2).sum(1)) for each in (way, self._last))
-            turn = way - self._last
-            square = (turn**2).sum(1)
+            size, last = (np.sqrt((each**2).sum(1)) for each in (increment, self._last))
+            change = increment - self._last
+            square = (change**2).sum(1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                part = -self._part * (self._last * turn).sum(1) / square
-                part = np.minimum(np.where(part > 0.0, np.clip(part, LEAST, 1.0), 1.0), LEAP * self._part * last / size)
-            self._part = np.where(whole | (last == 0.0) | (size == 0.0), 1.0, part)
-        self._last = np.where(whole[:, None], 0.0, way)
+                factor = -self._part * (self._last * change).sum(1) / square
+                factor = np.minimum(
+                    np.where(factor > 0.0, np.clip(factor, LEAST, 1.0), 1.0), LEAP * self._part * last / size
+                )
+            self._part = np.where(whole | (last == 0.0) | (size == 0.0), 1.0, factor)
+        self._last = np.where(whole[:, None], 0.0, increment)
         return self._part
 
 
 class NetEquilibrium:
-    """Equilibria of a model that is a net alone, for `Equilibrium`, whose tangent and load scale it uses.
+    """Equilibria of a model with a coupled system alone, for `Equilibrium`, whose tangent and load scale it uses.
 
     Attributes:
-        wary: whether what has slid is searched for again with normal forces that are taken anew after every iteration.
-        polish: what finds the last part of the way with friction; None without, or where factors are too large.
+        wary: True if slipped contacts are solved again with normal forces updated after every iteration.
+        polish: monolithic friction Newton; None without friction, or where factors are too large.
     """
 
     def __init__(self, owner):
@@ -233,11 +238,11 @@ class NetEquilibrium:
         self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
-        """Iterations of conjugate gradients so far, without those that let the free dofs follow supports."""
+        """Return the number of PCG iterations so far, without the iterations of `following`."""
         return self.newton.pcg_iterations()
 
     def count(self, state: State, increment: float) -> None:
-        """Count what touches in an equilibrium that was found, and what friction took on its way, in the time `increment`."""
+        """Count contacts of an equilibrium, and its friction work over the time `increment`."""
         touch = self.model.touch
         touch.at(state.net.q)
         gap = float(touch.terms.gap.numpy().min())
@@ -248,7 +253,10 @@ class NetEquilibrium:
             self._friction_work += increment * float(touch.terms.dissipated.numpy().sum())
 
     def contact_statistics(self) -> dict:
-        """Of the equilibria that were counted, as of `NetContact.statistics`; no straight way leads to them for pairs to cross on."""
+        """Return statistics of the counted equilibria, as `NetContact.statistics`.
+
+        Without interpenetrations: iterates do not lead to an equilibrium along a straight motion.
+        """
         pairs = self._touching or [0]
         result = {
             "searches": int(self.newton.contact.search.searches.numpy()[0]),
@@ -257,11 +265,11 @@ class NetEquilibrium:
         }
         return result | ({"friction_work": self._friction_work} if self.newton.rubs else {})
 
-    def following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
-        """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
+    def following(self, state: State, step: np.ndarray, load_factor: float) -> np.ndarray | None:
+        """Return the tangent displacement of free dofs for a `step` (size,) of fixed dofs; None if there is no answer."""
 
         def begin():
-            self._begin(state, at)
+            self._begin(state, load_factor)
             self.newton.islands.wanted.fill_(1)
             self.newton.forcing.fill_(FORCING)
             self.newton.goal.fill_(math.inf)
@@ -271,53 +279,66 @@ class NetEquilibrium:
         direction = self.newton.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None
 
-    def solve(self, state: State, at: float, before: State, increment: float) -> State:
-        """The equilibrium at load parameter `at` from a state with its supports in place.
+    def solve(self, state: State, load_factor: float, before: State, increment: float) -> State:
+        """Return the equilibrium at `load_factor` from a state with the supports in position.
 
-        In contact things go there from the state `before`, as far as nothing is in their way; with friction in the time `increment`.
+        In contact, bodies move there from the state `before`, as far as CCD allows; with friction in the time `increment`.
 
         Raises:
-            SolverError: it was not found; names the outcome.
+            SolverError: no equilibrium was found; names the outcome.
         """
         if self.newton.rubs and self._untouched(before):
-            with suppress(SolverError):  # that of what can not stick
-                found, certain = self._search(state, at, before, increment, sticking=True)
+            with suppress(SolverError):  # contacts that can not stick
+                equilibrium, certain = self._search(state, load_factor, before, increment, sticking=True)
                 if certain:
-                    return found
+                    return equilibrium
         try:
-            found, certain = self._search(state, at, before, increment)
+            equilibrium, certain = self._search(state, load_factor, before, increment)
         except SolverError:
             if not (self.newton.rubs and self.wary):
                 raise
         else:
             if certain or not self.wary:
-                return found
-        return self._search(state, at, before, increment, warily=True)[0]
+                return equilibrium
+        return self._search(state, load_factor, before, increment, warily=True)[0]
 
     def _search(
-        self, state: State, at: float, before: State, increment: float, warily: bool = False, sticking: bool = False
+        self,
+        state: State,
+        load_factor: float,
+        before: State,
+        increment: float,
+        warily: bool = False,
+        sticking: bool = False,
     ) -> tuple[State, bool]:
-        """See `solve`; `warily` with normal forces that are taken anew after every iteration; `sticking`: what meets does so at first,
-        until it is known what pushes it.
+        """Search the equilibrium of `solve`.
+
+        Args:
+            `warily`: True to update normal forces after every iteration.
+            sticking: True if new contacts stick at first, until their normal forces are known.
 
         Returns:
-            The equilibrium; and whether it is one however normal forces were taken: forces balance with friction of their own normal
-            forces, and not only to what rounding leaves of a search, and all sticks, or has not moved so far that they would change.
+            The equilibrium; and True if the history of normal forces does not matter. That is: forces balance with friction of
+            consistent normal forces, to more than the rounding floor, and all contacts stick, or nodes have hardly moved.
         """
         state, owner, first = state.copy(), self.owner, before
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
-        again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
-        held = self.tangent.dofs(state)
+        repeats = (
+            self.net.edges or self.model.motions
+        )  # the result is tested with its own frames and forces on supports
+        start = self.tangent.dofs(state)
         relaxation, settled = Relaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
         if rubs:
-            loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(at, held)).reshape(self.net.worlds, -1)
+            loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(load_factor, start)).reshape(
+                self.net.worlds, -1
+            )
             self.newton.contact.terms.more.assign(sticking * np.abs(loads).sum(1))
-        later = 0  # when to polish next
-        for solves in range(owner.options.max_iterations if rubs else 1 + bool(again)):
+        later = 0  # next solve to polish
+        for solves in range(owner.options.max_iterations if rubs else 1 + bool(repeats)):
             on = solves > 0 and rubs
             if on and not self.arrived:
                 state = state.copy()
-                self.tangent.assign(state, np.where(self.tangent.free, self.tangent.dofs(state), held))
+                self.tangent.assign(state, np.where(self.tangent.free, self.tangent.dofs(state), start))
             name = "slide on" if on else "solve"
             if rubs:
                 often = warily or sticking
@@ -325,7 +346,7 @@ class NetEquilibrium:
                 name += " warily" if often else ""
             self._replay(
                 name,
-                partial(self._begin, state, at, before, self._slid(first, state) if rubs else None, rate),
+                partial(self._begin, state, load_factor, before, self._slid(first, state) if rubs else None, rate),
                 partial(self.newton.search, self._start, on),
             )
             before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
@@ -336,13 +357,13 @@ class NetEquilibrium:
             if on:
                 self._relax(relaxation, state, begun)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
-                wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # renewed on the way, perhaps
+                wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # the solve may have updated these
             self.model.carry_frames(state)
-            # in equilibrium with the friction of its own normal forces; what comes later moves such a world within rounding
+            # Converged with the friction of its own normal forces; later solves move such a world within rounding.
             settled |= on and iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)
             q = self.tangent.dofs(state)
             if self.newton.contact:
-                self._refuse_drifting(state, q, at)
+                self._refuse_drifting(state, q, load_factor)
             if sticking:
                 sticking = solves < STUCK and not settled.all()
                 if not sticking:
@@ -353,15 +374,15 @@ class NetEquilibrium:
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
             if (near or solves >= TRIED) and solves >= later and self.polish and not settled.all():
-                if found := self.polish(state, at, partial(self._slides, first, increment)):
-                    status = next(k for k, name in outcome.NAMES.items() if name == found)
+                if polished := self.polish(state, load_factor, partial(self._slides, first, increment)):
+                    status = next(k for k, name in outcome.NAMES.items() if name == polished)
                     break
                 later = 2 * solves
             if settled.all():
                 break
         else:
             status = outcome.MAX_ITERATIONS if rubs else status
-        outer = self.tangent.loads(at, self.tangent.dofs(state))
+        outer = self.tangent.loads(load_factor, self.tangent.dofs(state))
         residual = outer - self.tangent.gradient(state)
         certain, name = True, outcome.NAMES[status]
         if rubs:
@@ -369,89 +390,91 @@ class NetEquilibrium:
             residual += self.tangent.friction(state)
             free, points = self.tangent.free, ~self.tangent.angle
             unbalanced = np.abs(residual[free & points]).max(initial=0.0)
-            loads, supports = (np.abs(of).sum() for of in (outer[free & points], (outer - residual)[~free & points]))
+            loads, supports = (
+                np.abs(forces).sum() for forces in (outer[free & points], (outer - residual)[~free & points])
+            )
             certain = unbalanced <= SETTLED * loads
             certain &= self._near(first.net.q.numpy(), state) or not self.model.touch.slides()
             if warily and unbalanced > SETTLED * (loads + supports):
                 name = UNSETTLED
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
-            told = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
+            remedy = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
             if rubs:
-                told += "what slides may come to no rest"
-            message = owner.residuals.where(name, residual, at, told)
+                remedy += "what slides may come to no rest"
+            message = owner.residuals.where(name, residual, load_factor, remedy)
             raise SolverError(message, state=state, outcome=name, gaining=name == "max_iterations")
-        # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
+        # In contact the last matrix may be projected without a trial of the exact one, which is no sign of instability.
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
         state.stable = False if indefinite else None
         small = (ends == outcome.CONVERGED) | (status == outcome.CONVERGED)
-        return owner.found(state, outer, residual, at, small), certain
+        return owner.found(state, outer, residual, load_factor, small), certain
 
     def _near(self, begun: np.ndarray, state: State) -> bool:
-        """Whether nodes have moved from blocks (W N, 3) by so little that normal forces have hardly changed."""
-        way = np.abs(state.net.q.numpy() - begun).reshape(self.net.worlds, -1, 3)[:, : self.net.host.nodes]
-        return bool(way.max() <= NEAR * self.newton.contact.search.reach)
+        """Return True if nodes moved so little from blocks (W N, 3) that normal forces hardly changed."""
+        displacement = np.abs(state.net.q.numpy() - begun).reshape(self.net.worlds, -1, 3)[:, : self.net.host.nodes]
+        return bool(displacement.max() <= NEAR * self.newton.contact.search.reach)
 
     def _slides(self, first: State, increment: float, state: State) -> None:
-        """Write the way of a state from the first one."""
+        """Write the slip of a state since the first one."""
         velocity = (state.net.q.numpy() - self._slid(first, state)) / increment
         state.sliding = Sliding(wp.array(velocity, dtype=self.net.vector, device=self.net.device), increment)
 
     def _untouched(self, before: State) -> bool:
-        """Whether nothing pushed anything in the equilibrium before, so that normal forces are not known."""
+        """Return True if the previous equilibrium had no contact forces, so that normal forces are unknown."""
         self.model.touch.at(before.net.q)
         return not self.model.touch.terms.touching.numpy().any()
 
     def _slid(self, first: State, state: State) -> np.ndarray:
-        """Blocks (W N, 3) that slips of a state count from: those of the `first` one, its angles about the frames that this has.
+        """Return blocks (W N, 3) from which slips of a state count: the `first` ones, twist angles about the frames of the state.
 
-        Frames came here by way of iterates, and turned on it about their tangents beside ones that come straight.
+        Frames were transported by way of iterates, and so rotated about their tangents against directly transported ones.
         """
         q, net = first.net.q.numpy().copy(), self.net
         if self.newton.contact.terms.rolls:
             (u, t), (v, end) = (
-                np.split(np.moveaxis(of.net.frame.numpy().reshape(6, net.worlds, -1), 0, -1), 2, axis=-1)
-                for of in (first, state)
+                np.split(np.moveaxis(each.net.frame.numpy().reshape(6, net.worlds, -1), 0, -1), 2, axis=-1)
+                for each in (first, state)
             )
             turned = polyline.signed_angle(polyline.transport(u, t, end), v, end)
             q.reshape(net.worlds, -1, 3)[:, net.angle_start :][:, : net.edges, 0] -= turned
         return q
 
-    def _refuse_drifting(self, state: State, q: np.ndarray, at: float) -> None:
-        """Refuse what loads carry away, as neither supports nor contact hold it."""
-        way = np.where(self.tangent.angle, 0.0, np.abs(q - self._rest))
-        farthest = int(np.argmax(way))
-        if way[farthest] > ADRIFT * self._size:
+    def _refuse_drifting(self, state: State, q: np.ndarray, load_factor: float) -> None:
+        """Refuse bodies that loads carry away, since neither supports nor contact stop them."""
+        displacement = np.where(self.tangent.angle, 0.0, np.abs(q - self._rest))
+        farthest = int(np.argmax(displacement))
+        if displacement[farthest] > ADRIFT * self._size:
             raise SolverError(
-                f"no equilibrium at load parameter {at:g}: adrift, {self.tangent.where(farthest)} is carried away, as neither "
+                f"no equilibrium at load parameter {load_factor:g}: adrift, {self.tangent.where(farthest)} is carried away, as neither "
                 "supports nor contact hold it; hold it, or put something in its way",
                 state=state,
                 outcome="adrift",
             )
 
     def _relax(self, relaxation, state: State, begun: np.ndarray) -> None:
-        """Take less of a way with other normal forces, of worlds whose supports have not moved on it.
+        """Relax the displacement under new normal forces, in worlds whose supports did not move.
 
-        All of it where less would be in the way of something: iterates do not go straight.
+        The full displacement is kept if the relaxed one would collide: iterates do not move straight.
         """
-        way = (state.net.q.numpy() - begun).reshape(self.net.worlds, -1)
-        held = ~self.tangent.free.reshape(self.net.worlds, -1)
-        part = relaxation(way, (way * held).any(1))
-        if (part < 1.0).any():
-            less = begun + (part[:, None] * way).reshape(begun.shape)
-            if self.newton.contact.share(begun, less) == 1.0:
-                state.net.q.assign(less)
+        displacement = (state.net.q.numpy() - begun).reshape(self.net.worlds, -1)
+        fixed = ~self.tangent.free.reshape(self.net.worlds, -1)
+        factor = relaxation(displacement, (displacement * fixed).any(1))
+        if (factor < 1.0).any():
+            relaxed = begun + (factor[:, None] * displacement).reshape(begun.shape)
+            if self.newton.contact.share(begun, relaxed) == 1.0:
+                state.net.q.assign(relaxed)
 
     @property
     def arrived(self) -> bool:
-        """Whether the supports of all worlds are where the last solve was to put them."""
+        """True if all supports have arrived at the end of the prescribed motion."""
         return not self.newton.islands.driven.numpy().any()
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
-        """The part of a motion from dofs `before` to `after` in which nothing passes through anything."""
+        """Return the CCD step fraction of the motion from dofs `before` to `after`."""
         return self.newton.contact.share(self.tangent.back(before), self.tangent.back(self._beside(before, after)))
 
     def _replay(self, name: str, begin: Callable[[], None], launch: Callable[[], None]) -> None:
-        """Launch what is captured under a name, again from its beginning while there is no room for what touches."""
+        """Replay the launches captured under a name, again from the beginning while lists of pairs overflow."""
         while True:
             begin()
             self._graphs.replay(name, launch)
@@ -460,17 +483,19 @@ class NetEquilibrium:
             self._graphs.clear()
 
     def _begin(
-        self, state: State, at: float, before: State | None = None, slid: np.ndarray | None = None, rate=0.0
+        self, state: State, load_factor: float, before: State | None = None, slid: np.ndarray | None = None, rate=0.0
     ) -> None:
-        tangent, part = self.tangent, self.tangent.parts[-1]
+        tangent, tangent_block = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         start = q if before is None else self._beside(q, tangent.dofs(before))
-        outer, gradient = tangent.loads(at, q), part.elastic_gradient(state)
+        outer, gradient = tangent.loads(load_factor, q), tangent_block.elastic_gradient(state)
         scale = self.owner.residuals.load_scale(outer, gradient)
-        self.newton.begin(tangent.back(q), part.dead_loads(at), at, scale, tangent.back(start), slid, rate)
+        self.newton.begin(
+            tangent.back(q), tangent_block.dead_loads(load_factor), load_factor, scale, tangent.back(start), slid, rate
+        )
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
 
-    def _beside(self, q: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Dofs q with the positions of `other` ones: angles, which are about other frames, take no way."""
-        return np.where(self.tangent.angle, q, other)
+    def _beside(self, q: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """Return dofs q with the positions of `source`; twist angles, which are about other frames, stay."""
+        return np.where(self.tangent.angle, q, source)

@@ -1,4 +1,4 @@
-"""Surfaces that prescribed motions sweep in contact: those of obstacles, and of rods and shells that supports hold."""
+"""Surfaces that prescribed motions sweep in contact: obstacles, and supported rods and shells."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,9 @@ from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.obstacles import PLANE
 from ddg_warp.solve.net.units import number_bodies
 
-TILT = 0.25  # turn of a half-space in a substep at most [rad]: it may push at any distance
-SPIN = 1.0  # turn of a surface that spins with friction [rad], whose slip goes by the sine of a turn
-DIRECTIONS = 64  # in which the farthest nodes stand for all
+TILT = 0.25  # largest rotation of a half-space in a substep [rad]: it reaches arbitrarily far
+SPIN = 1.0  # largest rotation of a rotating surface with friction [rad]: slips follow the sine of the rotation
+DIRECTIONS = 64  # directions whose farthest nodes represent all nodes
 
 
 @dataclass
@@ -20,10 +20,10 @@ class Swept:
     """Surfaces that one motion moves.
 
     Attributes:
-        motion: of them; label: how messages call them.
-        points: nodes at rest (P, 3) [m], the farthest ones of a motion that is rigid; rows: of their displacements, where each node
-            has its own.
-        groups: of contact that they belong to; most: largest turn in a substep, wherever nodes are [rad].
+        `motion`, `label`: the motion, and its surfaces as messages name them.
+        `points`, `rows`: nodes at rest (P, 3) [m], the farthest ones of a rigid motion; rows of their displacements, if nodes differ.
+        `groups`: contact groups of the surfaces.
+        `most`: largest rotation of a substep, regardless of node positions [rad].
     """
 
     motion: Motion | Grip
@@ -35,28 +35,33 @@ class Swept:
 
     @property
     def arms(self) -> np.ndarray:
-        """Return the nodes beside the pivot (P, 3) [m]."""
+        """Node positions relative to the pivot (P, 3) [m]."""
         return self.points - self.motion.pivot
 
 
 def swept_surfaces(model) -> list[Swept]:
-    """Return the surfaces of every motion of a model with contact that moves some."""
+    """Return the moved surfaces of every motion of a model with contact."""
     host, starts, result = model.net.host, pose_starts(model.motions), []
     unit, units = number_bodies(host)
-    unit, held = unit[: host.nodes], host.holds[: host.nodes].any(1)
+    unit, supported = unit[: host.nodes], host.holds[: host.nodes].any(1)
     for motion, first, stop in zip(model.motions, starts, starts[1:], strict=False):
         poses = host.moving[:, 1:]
         within = (poses >= first) & (poses < stop)
-        own = within.any(1)
+        driven = within.any(1)
         moved, rows = np.zeros(host.nodes, bool), np.zeros(host.nodes, int)
-        moved[host.moving[own, 0]], rows[host.moving[own, 0]] = True, np.where(within, poses - first, 0)[own].max(1)
-        # bodies that this motion alone holds, with all that is joined to them, and at two nodes, go with it as a whole
-        mine, all_held = (np.bincount(unit[some & (unit >= 0)], minlength=units + 1) for some in (held & moved, held))
+        moved[host.moving[driven, 0]], rows[host.moving[driven, 0]] = (
+            True,
+            np.where(within, poses - first, 0)[driven].max(1),
+        )
+        # bodies that this motion alone supports, at two or more nodes, move with it as a whole, joined bodies included
+        mine, all_held = (
+            np.bincount(unit[some & (unit >= 0)], minlength=units + 1) for some in (supported & moved, supported)
+        )
         carried = np.append((mine > 1) & (mine == all_held), False)[unit]
-        parts = [(b, body.nodes[(moved | carried)[body.nodes]]) for b, body in enumerate(host.touching.bodies)]
-        parts = [(b, nodes) for b, nodes in parts if len(nodes)]
-        if parts:
-            result.append(_swept(host, motion, *zip(*parts, strict=True), rows))
+        moved_nodes = [(b, body.nodes[(moved | carried)[body.nodes]]) for b, body in enumerate(host.touching.bodies)]
+        moved_nodes = [(b, nodes) for b, nodes in moved_nodes if len(nodes)]
+        if moved_nodes:
+            result.append(_swept(host, motion, *zip(*moved_nodes, strict=True), rows))
     return result
 
 
@@ -85,7 +90,7 @@ def _foot(nodes: np.ndarray, pivot) -> np.ndarray:
 
 
 def _farthest(points: np.ndarray, motion) -> np.ndarray:
-    """Return the points that are farthest from the axis of a motion, or the pivot of a grip, and farthest out in some directions."""
+    """Return the points farthest from the axis of a motion or the pivot of a grip, overall and in some directions."""
     arms, k = points - motion.pivot, np.arange(DIRECTIONS) + 0.5
     height, azimuth = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * k  # spread evenly over a sphere
     level = np.sqrt(1.0 - height**2)

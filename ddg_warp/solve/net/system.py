@@ -1,4 +1,4 @@
-"""The sparse system of a net on a device: what meets at each block, and H in slices; see `kernels.matrix.sliced`."""
+"""Sparse system of the coupled dofs on a device: incidence lists, and H in sliced ELLPACK; see `kernels.matrix.sliced`."""
 
 import numpy as np
 import warp as wp
@@ -12,27 +12,28 @@ from ddg_warp.kernels.solve import krylov
 
 
 class NetSystem:
-    """Sparsity and lists of a net, once for all worlds.
+    """Sparsity and incidence lists of the coupled system, common to all worlds.
 
     Args:
-        net: `DeviceNet`.
-        kept: blocks (N,) bool between which chains keep what elements along rods add, see `kernels.matrix.bands`; entries of held
-            blocks then are left out. None: all is here.
+        `net`: `DeviceNet`.
+        kept: blocks (N,) bool whose couplings along rods are stored in bands, see `kernels.matrix.bands`. Entries of fixed blocks
+            then are left out. None stores all entries here.
 
     Attributes:
-        positions: entries of H in a world, padding included.
-        rows, columns: block of each position, -1 in the padding; slices: start of each slice; diagonal: position of each H_ii, -1
-            of those that chains keep, and of held ones then.
-        meets: of each set, (starts, items) of the blocks; adds: (starts, items) of the positions.
+        `positions`: number of entries of H in a world, padding included.
+        `rows`, `columns`: block of each position, -1 in the padding.
+        `slices`: offset of each slice.
+        `diagonal`: position of each H_ii, -1 if in bands or left out.
+        `meets`, `adds`: incidence lists (offsets, items) of each element set, by blocks and by positions.
     """
 
     def __init__(self, net, kept: np.ndarray | None = None):
         blocks, device = net.blocks, net.device
         out = None if kept is None else net.host.fixed.all(1)
-        pairs = [_pairs(part.host, kept, out) for part in net.sets]
-        own = np.arange(blocks) if kept is None else np.flatnonzero(~(kept | out))
-        row = np.concatenate([*(rows for rows, *_ in pairs), own]).astype(np.int32)
-        column = np.concatenate([*(columns for _, columns, _ in pairs), own]).astype(np.int32)
+        pairs = [_pairs(element_set.host, kept, out) for element_set in net.sets]
+        diagonal_blocks = np.arange(blocks) if kept is None else np.flatnonzero(~(kept | out))
+        row = np.concatenate([*(rows for rows, *_ in pairs), diagonal_blocks]).astype(np.int32)
+        column = np.concatenate([*(columns for _, columns, _ in pairs), diagonal_blocks]).astype(np.int32)
         order = lists(column, blocks)[1]
         order = order[lists(row[order], blocks)[1]]  # by rows and, of one row, by columns
         row, column = row[order], column[order]
@@ -45,54 +46,58 @@ class NetSystem:
         padded[:blocks] = counts
         slices = np.concatenate([[0], np.cumsum(padded.reshape(-1, SLICE).max(1) * SLICE)])
         rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
-        place = slices[row // SLICE] + rank * SLICE + row % SLICE
+        position = slices[row // SLICE] + rank * SLICE + row % SLICE
         self.positions = int(slices[-1])
         if self.positions * net.worlds >= 2**31:
             raise SceneError("the net is too large: its matrix has more than 2^31 entries; build fewer worlds at once")
         rows, columns = np.full(self.positions, -1), np.full(self.positions, -1)
-        rows[place], columns[place] = row, column
+        rows[position], columns[position] = row, column
 
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
         self.rows, self.columns, self.slices = put(rows), put(columns), put(slices)
         diagonal = np.full(blocks, -1)
-        diagonal[row[row == column]] = place[row == column]
+        diagonal[row[row == column]] = position[row == column]
         self.diagonal, self.entries = put(diagonal), len(row)
-        at, self.adds, self.meets = 0, [], []
-        for part, (rows, _, which) in zip(net.sets, pairs, strict=True):
-            targets, at = place[inverse[at : at + len(rows)]], at + len(rows)
+        begin, self.adds, self.meets = 0, [], []
+        for element_set, (rows, _, pair_indices) in zip(net.sets, pairs, strict=True):
+            targets, begin = position[inverse[begin : begin + len(rows)]], begin + len(rows)
             starts, items = lists(targets, self.positions)
-            self.adds.append((put(starts), put(items if which is None else which[items])))
-            starts, items = lists(part.host.slots.T.ravel(), blocks)
-            element, slot = np.divmod(items, len(part.host.slots))
-            self.meets.append((put(starts), put(element * ITEM + slot)))
+            self.adds.append((put(starts), put(items if pair_indices is None else pair_indices[items])))
+            starts, items = lists(element_set.host.slots.T.ravel(), blocks)
+            element, local = np.divmod(items, len(element_set.host.slots))
+            self.meets.append((put(starts), put(element * ITEM + local)))
 
 
-def _pairs(part, kept, out) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Rows and columns of what the elements of a set add to H, and which of all pairs of slots they are; None: all in order.
+def _pairs(element_set, kept, out) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return rows and columns that the elements of a set add to H, and indices of their node pairs; None for all in order.
 
-    A pair is (element * slots + row's slot) * slots + column's slot.
+    The index of a pair is (element * nodes + row's node) * nodes + column's node, in local node indices.
     """
-    slots = part.slots.T.astype(np.int32)
-    n = slots.shape[1]
+    nodes = element_set.slots.T.astype(np.int32)
+    n = nodes.shape[1]
     if kept is None:
-        return np.repeat(slots, n, axis=1).ravel(), np.tile(slots, n).ravel(), None
-    wanted = ~out[slots]
-    other = wanted & ~kept[slots] if part.along else wanted
-    some = np.flatnonzero(other.any(1))
-    pair = wanted[some, :, None] & wanted[some, None, :] & (other[some, :, None] | other[some, None, :])
+        return np.repeat(nodes, n, axis=1).ravel(), np.tile(nodes, n).ravel(), None
+    wanted = ~out[nodes]
+    off_path = wanted & ~kept[nodes] if element_set.along else wanted
+    elements = np.flatnonzero(off_path.any(1))
+    pair = (
+        wanted[elements, :, None]
+        & wanted[elements, None, :]
+        & (off_path[elements, :, None] | off_path[elements, None, :])
+    )
     element, row, column = np.nonzero(pair)
-    which = (some[element] * n + row) * n + column
-    return slots[some[element], row], slots[some[element], column], which
+    pair_indices = (elements[element] * n + row) * n + column
+    return nodes[elements[element], row], nodes[elements[element], column], pair_indices
 
 
 def lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Items (indices into `target`) of each of `count` targets, in order: starts (count + 1,) and items."""
+    """Return the incidence list of `count` targets: offsets (count + 1,) and items, the indices into `target` in order."""
     from scipy.sparse import csr_array
 
     one = csr_array((np.ones(len(target), bool), target, np.arange(len(target) + 1)), shape=(len(target), count))
-    table = one.tocsc()  # counts, which takes less than a sort
+    table = one.tocsc()  # counting sort, faster than a sort by comparison
     return table.indptr, table.indices
 
 
@@ -100,7 +105,7 @@ class Sums:
     """Sums (or largest entries) of values (worlds, n) over each world.
 
     Attributes:
-        kernels: to load before a capture, with their number of threads a block.
+        kernels: kernels to load before a capture, with their number of threads a block.
     """
 
     def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
@@ -126,13 +131,13 @@ class Sums:
 
 
 class Assembly:
-    """Sums H from what the elements of all sets write, `sliced.SETS` sets a launch.
+    """Assembly of H from element contributions, `sliced.SETS` element sets a launch.
 
     Args:
-        written: of each set, the arrays "factor", "tension" and "second".
-        exact_from: of each set, the iteration from which on second derivatives are written, or None.
-        local: of each set, whether its factor is of the local dofs.
-        drag: whether blocks have more than a mass.
+        written: the arrays "factor", "tension" and "second" of each set.
+        exact_from: first iteration of each set with second derivatives, or None.
+        local: for each set, True if its factor is of the local dofs.
+        drag: True if blocks have more than a mass.
     """
 
     def __init__(
@@ -149,26 +154,30 @@ class Assembly:
         serial = arrays.serial(net.device)
         self.net, self.table, self.kernels, self._own = net, table, [], []
         for first in range(0, len(net.sets), sliced.SETS):
-            sets, late, own_dofs = (of[first : first + sliced.SETS] for of in (net.sets, exact_from, local))
+            sets, from_iteration, local_dofs = (
+                each[first : first + sliced.SETS] for each in (net.sets, exact_from, local)
+            )
             terms = tuple(part.term for part in sets)
-            self.kernels.append(sliced.assemble_kernel(terms, real, linear, first == 0, late, own_dofs, drag, serial))
-            own = []
+            self.kernels.append(
+                sliced.assemble_kernel(terms, real, linear, first == 0, from_iteration, local_dofs, drag, serial)
+            )
+            set_data = []
             for i in range(first, first + len(sets)):
                 data = sliced.contributions(linear, local[i])()
                 data.factor, data.tension, data.second = (written[i][name] for name in ("factor", "tension", "second"))
                 data.starts, data.items = table.adds[i]
                 data.elements = net.sets[i].elements
-                own.append(data)
-            self._own.append(own + [own[-1]] * (sliced.SETS - len(own)))
+                set_data.append(data)
+            self._own.append(set_data + [set_data[-1]] * (sliced.SETS - len(set_data)))
 
     def __call__(self, mass: wp.array, islands, matrix: wp.array) -> None:
-        """Write H (9, positions of all worlds) of the worlds that want it."""
+        """Write H (9, positions of all worlds) in worlds that need a direction."""
         table = self.table
-        for kernel, own in zip(self.kernels, self._own, strict=True):
+        for kernel, set_data in zip(self.kernels, self._own, strict=True):
             arrays.sweep(
                 kernel,
                 self.net.worlds * table.positions,
-                [mass, *islands.arrays, table.rows, table.columns, table.positions, *own],
+                [mass, *islands.arrays, table.rows, table.columns, table.positions, *set_data],
                 [matrix],
                 self.net.device,
             )

@@ -1,4 +1,4 @@
-"""What residuals of a net may be, on the device; see `ddg_warp.compile.tolerance`."""
+"""Residual tolerances of the coupled system on the device; see `ddg_warp.compile.tolerance`."""
 
 import numpy as np
 import warp as wp
@@ -8,12 +8,14 @@ from ddg_warp.kernels.net import parts
 
 
 class Allowed:
-    """What residuals of blocks and their sums over parts may be, over rtol and the load scale; see `ddg_warp.compile.tolerance`.
+    """Tolerances of block residuals and of cluster sums, at rtol and load scale 1.
 
     Attributes:
-        blocks: of every block of all worlds [N, N m]; least: what rounding leaves there, which `settle` writes.
-        limits: of the parts of every level (worlds, parts) [N]; total: loads of all bodies (worlds,) [N].
-        ratio: of residuals of blocks, then of sums over parts, to what they may be.
+        `blocks`: tolerance of every block of all worlds [N, N m].
+        `least`: rounding floor of blocks, which `settle` writes.
+        `limits`: tolerance of the cluster sums of every level (worlds, clusters) [N].
+        `total`: loads of all bodies (worlds,) [N].
+        `ratio`: residuals over tolerances, of blocks, then of cluster sums.
     """
 
     def __init__(self, net, real, linear):
@@ -32,39 +34,39 @@ class Allowed:
         self._levels = []
         for level in self.bodies.levels:
             n = len(level.weight)
-            own = (
+            buffers = (
                 put(level.starts),
                 put(level.items),
                 make((worlds, n)),
                 make(worlds * n, net.vector),
                 make(worlds * n),
             )
-            self._levels.append(own)
+            self._levels.append(buffers)
         self.total = make(worlds)
         self.limits = [limit for _, _, limit, _, _ in self._levels]
 
     def assign(self, loads: np.ndarray) -> wp.array:
-        """Take the loads of bodies (worlds or 1, bodies) [N]; load scales of the worlds: 1, or 0 where there are none."""
+        """Set the loads of bodies (worlds or 1, bodies) [N]; return load scales of worlds: 1, or 0 without loads."""
         loads = np.broadcast_to(loads, (self.net.worlds, self.bodies.count))
-        given = (loads > 0.0).any(1)
-        loads = np.where(given[:, None], loads, 1.0)
+        loaded = (loads > 0.0).any(1)
+        loads = np.where(loaded[:, None], loads, 1.0)
         self.total.assign(loads.sum(1))
-        self.blocks.assign(np.concatenate([self.bodies.limits(own) for own in loads]))
+        self.blocks.assign(np.concatenate([self.bodies.limits(of_world) for of_world in loads]))
         for level, limit in zip(self.bodies.levels, self.limits, strict=True):
             limit.assign(loads[:, level.body] * level.weight)
-        return wp.array(given.astype(float), dtype=self._real, device=self.net.device)
+        return wp.array(loaded.astype(float), dtype=self._real, device=self.net.device)
 
     def sum_up(self, right, rtol: float, islands, unbalanced, drowned, exact: bool = False) -> None:
-        """Raise the flags of worlds with a part whose residuals sum up to too much; `exact` says that directions are."""
+        """Raise the flags of worlds with a cluster sum above the tolerance; `exact`: directions are exact."""
         value, rounding, below, kernel = right, self.least, self.net.blocks, self.kernels[0]
-        place = below
+        first_ratio = below
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
                 (arrays.takers(limit.shape[1], self.net.device), self.net.worlds),
-                [value, rounding, starts, items, below, limit, place, rtol, int(exact), *islands.arrays],
+                [value, rounding, starts, items, below, limit, first_ratio, rtol, int(exact), *islands.arrays],
                 [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,
             )
-            place += limit.shape[1]
+            first_ratio += limit.shape[1]
             value, rounding, below, kernel = sums, squares, limit.shape[1], self.kernels[1]

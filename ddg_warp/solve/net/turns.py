@@ -1,4 +1,4 @@
-"""What the rods of a net need where their edges turn far: steps that turn them, and newer frames; see `kernels.turns`."""
+"""Edge rotations of the coupled system: retraction of Newton steps, and frame updates; see `kernels.turns`."""
 
 import numpy as np
 import warp as wp
@@ -7,11 +7,11 @@ from ddg_warp import arrays
 from ddg_warp.kernels.net.turns import turn_kernels
 from ddg_warp.kernels.turns import FURTHER, ON
 
-BLOCK = 32  # threads in a block, of pieces of rods: few, which read far apart
+BLOCK = 32  # threads a block for pieces of rods: few, since their reads are far apart
 
 
 class Turns:
-    """Turned edges of a `NetNewton`: from what holds them, rods are placed outwards, level by level."""
+    """Edge-rotation update of a `NetNewton`: position rods from their supports outwards, in rod order."""
 
     def __init__(self, newton):
         self.newton, self.net = newton, newton.net
@@ -34,7 +34,7 @@ class Turns:
         between = wp.array(between, dtype=newton.real, device=device)
         self._places = [self._nodes, put(pieces.of), self._starts, put(anchors), between]
         chains = newton.chains
-        self._behind = []  # of every edge, the place that has its tension, and what tensions say
+        self._behind = []  # path node with the tension of every edge, and the lengthening by tensions
         if any(newton.split):
             self._behind = [put(chains.plan.places_ahead(rod)), chains.longer, chains.width]
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
@@ -47,30 +47,30 @@ class Turns:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._bend, self._aim, self._turn, *([self._turn_longer] if self._behind else []), self._put]
-        return [*own, (self._scan, BLOCK), (self._offset, BLOCK)]
+        loaded = [self._bend, self._aim, self._turn, *([self._turn_longer] if self._behind else []), self._put]
+        return [*loaded, (self._scan, BLOCK), (self._offset, BLOCK)]
 
-    def predict(self, v: wp.array, onward: bool) -> None:
-        """Turn the edges of predictors by velocities v that turn them far, instead of stretching them.
+    def predict(self, v: wp.array, extrapolate: bool) -> None:
+        """Rotate the edges of predictors by velocities v, where a straight predictor would stretch them.
 
-        `onward`: whether velocities are what the last step did; see `kernels.turns`.
+        `extrapolate`: True if the velocities are of the last step; see `kernels.turns`.
         """
         newton, net = self.newton, self.net
         islands = newton.islands
         islands.turning.zero_()
         inputs = [newton.q, newton.base, self._ends, net.blocks, *islands.arrays]
         wp.launch(self._bend, (len(self._ends), net.worlds), inputs, [], device=net.device)
-        wp.capture_if(islands.turning, lambda: self._redo(v, onward))
+        wp.capture_if(islands.turning, lambda: self._redo(v, extrapolate))
 
-    def _redo(self, v: wp.array, onward: bool) -> None:
+    def _redo(self, v: wp.array, extrapolate: bool) -> None:
         newton, net = self.newton, self.net
         inputs = [newton.q, newton.base, v, newton.held, *newton.islands.arrays, net.blocks]
         wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
-        self.place(ON if onward else 0)
-        newton.direction.zero_()  # solvers leave out what is held
+        self.place(ON if extrapolate else 0)
+        newton.direction.zero_()  # solvers skip fixed dofs
 
     def go_further(self, before, predicted: wp.array) -> None:
-        """Start worlds whose predictors turned edges from where accelerations lead from there, the direction, with edges turned."""
+        """Extrapolate accelerations from predictors that rotated edges, by edge rotation; the direction has the displacement."""
         wp.capture_if(self.newton.islands.turning, lambda: self._further(before, predicted))
 
     def _further(self, before, predicted: wp.array) -> None:
@@ -78,27 +78,31 @@ class Turns:
         self.newton.direction.zero_()
 
     def turn(self, state) -> None:
-        """Place the nodes of rods whose edges turn, and renew the frames that `state` lags where that is to be done."""
+        """Position the nodes of rods with edge rotations, and update the frames of `state` where required."""
         self.place()
         if self.net.edges:
             self.net.renew(state, self.newton.q, self.newton.islands.todo)
 
-    def place(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
-        """Nodes of rods, once the straight step has moved everything; arguments as of `PartitionedNewton.move`."""
+    def place(self, mode: int | None = None, base: wp.array | None = None, positions: wp.array | None = None) -> None:
+        """Position rod nodes by edge rotation, after the straight update.
+
+        `mode`: how a predictor continues, see `kernels.turns`; None for a Newton step. `base`, `positions`: as `base`, `now` of
+        `PartitionedNewton.move`.
+        """
         newton, net = self.newton, self.net
         device, worlds, todo = net.device, net.worlds, newton.islands.todo
         base = newton.base if base is None else base
         moved = [base, newton.direction, newton.islands.step_length, todo]
-        turn, inputs = self._turn, [self._nodes, self._ahead, *moved, newton.islands.turn, onward or 0]
-        inputs += [base if now is None else now, net.blocks]
-        if self._behind and onward is None:
-            turn, inputs = self._turn_longer, [self._nodes, self._ahead, *moved, net.blocks, *self._behind]
-        wp.launch(turn, (len(self._nodes), worlds), inputs, [self._sums], device=device)
+        kernel, inputs = self._turn, [self._nodes, self._ahead, *moved, newton.islands.turn, mode or 0]
+        inputs += [base if positions is None else positions, net.blocks]
+        if self._behind and mode is None:
+            kernel, inputs = self._turn_longer, [self._nodes, self._ahead, *moved, net.blocks, *self._behind]
+        wp.launch(kernel, (len(self._nodes), worlds), inputs, [self._sums], device=device)
         pieces = self._offsets.shape[2]
         inputs = [self._nodes, self._ahead, self._starts, todo, self._sums]
         arrays.sweep(self._scan, pieces, inputs, [self._totals], device, BLOCK, worlds)
         inputs = [self._starts, *self._pieces, todo, self._totals]
         arrays.sweep(self._offset, pieces, inputs, [self._offsets], device, BLOCK, worlds)
-        for places in self._levels:
-            inputs = [places, *self._places, newton.held, self._sums, self._offsets, *moved, net.blocks]
-            arrays.sweep(self._put, len(places), inputs, [newton.q], device, worlds=worlds)
+        for nodes in self._levels:
+            inputs = [nodes, *self._places, newton.held, self._sums, self._offsets, *moved, net.blocks]
+            arrays.sweep(self._put, len(nodes), inputs, [newton.q], device, worlds=worlds)

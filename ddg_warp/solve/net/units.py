@@ -1,4 +1,4 @@
-"""Which blocks of a net are cut by one share of their motion: bodies, and what one motion moves."""
+"""CCD bodies of the coupled system: blocks with one step fraction."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ddg_warp.compile.conditions import pose_starts
 
 
 def number_bodies(host) -> tuple[np.ndarray, int]:
-    """Rod or shell that every block belongs to, one for all that are joined, -1 for none; and how many there may be."""
+    """Return the body of every block (a rod or shell, joined ones together; -1 for none), and the largest number of bodies."""
     unit = np.full(host.blocks, -1, np.int32)
     count = 0
     for rod in host.rods:
@@ -19,15 +19,15 @@ def number_bodies(host) -> tuple[np.ndarray, int]:
 
 
 def number_units(body: np.ndarray, count: int, host, motions: list) -> tuple[np.ndarray, int]:
-    """Unit of every block: what is cut together, a body or all that one motion moves; and how many there are."""
+    """Return the CCD body of every block, a body or all blocks that one motion moves, and the number of CCD bodies."""
     unit, starts = body.copy(), pose_starts(motions)
-    for places, poses in ((host.moving[:, 0], host.moving[:, 1:].max(1)), host.turning.T):
-        unit[places] = count + np.searchsorted(starts, poses, side="right") - 1
+    for blocks, poses in ((host.moving[:, 0], host.moving[:, 1:].max(1)), host.turning.T):
+        unit[blocks] = count + np.searchsorted(starts, poses, side="right") - 1
     return unit, count + len(motions)
 
 
 def _joined(unit: np.ndarray, host) -> np.ndarray:
-    """The same with one unit for what shares nodes, so that joints stay whole."""
+    """Return the body numbers with one number for bodies that share nodes, so that joints stay intact."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -36,13 +36,13 @@ def _joined(unit: np.ndarray, host) -> np.ndarray:
     pairs += [(unit[shell.nodes], np.full(len(shell.nodes), first + i)) for i, shell in enumerate(host.shells)]
     if not pairs:
         return unit
-    one, other = (np.concatenate(values) for values in zip(*pairs, strict=True))
+    body, node = (np.concatenate(values) for values in zip(*pairs, strict=True))
     size = int(unit.max()) + 1
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(size, size))
+    graph = coo_array((np.ones(len(body)), (body, node)), shape=(size, size))
     number = connected_components(graph, directed=False)[1]
     joined = np.where(unit >= 0, number[unit], -1).astype(np.int32)
-    for part in host.sets:  # rotations of joints move with what they join
-        rows = np.flatnonzero((unit[part.slots] < 0).any(0))
-        own = part.slots[:, rows]
-        joined[np.where(unit[own] < 0, own, own[:1])] = joined[own[:1]]
+    for element_set in host.sets:  # rotations of joints move with the joined bodies
+        rows = np.flatnonzero((unit[element_set.slots] < 0).any(0))
+        nodes = element_set.slots[:, rows]
+        joined[np.where(unit[nodes] < 0, nodes, nodes[:1])] = joined[nodes[:1]]
     return joined
