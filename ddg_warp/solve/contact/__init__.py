@@ -1,1 +1,1 @@
-"""Which surfaces may touch, and how far they may move: memory and launches of `kernels.contact`."""
+"""Contact search, CCD and contact forces: memory and launches of `kernels.contact`."""

@@ -1,4 +1,4 @@
-"""Candidates of contact on a device, how long they hold, and how far everything may move; see `kernels.contact`."""
+"""Broad phase of contact on a device: candidates, candidate validity and motion limits; see `kernels.contact`."""
 
 import math
 from collections.abc import Callable
@@ -17,43 +17,45 @@ from ddg_warp.solve.contact.pairs import PairList
 from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
-SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
+SLACK = 1e-3  # relative excess of the skin margin in searches, for rounding
 NONE = np.iinfo(np.int64).max
-MORE = 16  # numbers of others that are read along
+MORE = 16  # counters of other objects that are read in the same transfer
 
 
 class BroadPhase:
-    """Pairs of `shapes` that are near, in each of some worlds.
+    """Candidates: pairs of `shapes` that may come within range, in each of some worlds.
 
-    All that is within thickness + `reach` is among the candidates as long as every node is within half of `margin` of where it was when
-    they were found or, of a search for a motion, of its way, each anywhere along it, the nodes of a half-space alike; where a world
-    goes by one share, of the place that it has come to.
-    `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured, `update`, `filter` and `search` in
-    conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there a step should begin with it,
-    every few at least where trees were used since. `fit` and `check` read, between launches of graphs; what is not finite touches
-    nothing, until they name it.
+    All pairs within thickness + `reach` are candidates while every node is within half of `margin` of its position at the search.
+    After a search for a motion, the path replaces the position. Each node may be anywhere along its path, the nodes of a half-space
+    alike. In a world with a single step fraction, all nodes are at that fraction.
+
+    `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured; `update`, `filter` and `search`
+    also in conditional graph nodes. `rebuild` can be captured, on CUDA outside of conditional nodes only. There it should begin a
+    step, at least every few steps with searches. `fit` and `check` read from the device, between graph launches. Nodes that are not
+    finite are in no pair until these report them.
 
     Args:
-        shapes: what may touch in one world.
-        x: positions (worlds times nodes,), vectors of 3 [m], one world after the other.
-        reach: gap [m] within which surfaces matter, positive.
-        margin: by how much farther candidates may be apart when they are found [m], positive: large ones are more pairs, small ones
-            more searches.
-        radius: of every object in every world (worlds, objects) [m], in place of those of `shapes`.
+        shapes: collision mesh of one world.
+        x: positions (worlds times nodes,), vectors of 3 [m], world by world.
+        reach: search distance: largest gap of interest [m], positive.
+        margin: skin margin added to the search distance [m], positive. Large ones give more pairs, small ones more searches.
+        radius: radius of every object in every world (worlds, objects) [m], in place of the radii of `shapes`.
 
     Attributes:
-        lists: a `PairList` for each kind of pairs that there can be.
-        overflow: (1,), not zero once pairs did not fit, `impact` and `crossings` among them: `fit` has to follow, and whatever came of
-            the pairs is to be done again.
-        searches: (1,) how many there were; looks: (1,), see `Runs`; sought: both as of the last `fit` or `check`.
-        more: (MORE,) numbers that others count, which these read along; more_read: what they have read.
-        gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
-        shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
-        every: (worlds,) ones, of motions in which all nodes of every world go by one share.
-        version: grows whenever arrays were replaced by larger ones, and graphs that hold them have to be captured anew.
+        lists: a `PairList` for each kind of pairs in the mesh.
+        overflow: (1,), nonzero after a capacity overflow, also in `impact` and `crossings`. Then call `fit`, and redo all that used
+            the pairs.
+        `searches`: (1,) number of searches.
+        `looks`: (1,) counter of `Runs`.
+        `sought`: both, as of the last `fit` or `check`.
+        `more`, `more_read`: (MORE,) counters of other objects, and the values of the last `fit` or `check`.
+        `gap`, `time`, `crossed`: [m], step fraction, count of each world; see `measure`, `impact` and `crossings`.
+        `shares`, `limited`: CCD step fractions (worlds times CCD bodies,), and the number below 1 of each world; see `filter`.
+        `every`: (worlds,) ones, for motions with a single step fraction in every world.
+        `version`: grows whenever arrays were reallocated, and graphs with these have to be captured again.
 
     Raises:
-        SceneError: if x, reach or margin are not as they should be.
+        SceneError: x, reach or margin are invalid.
     """
 
     def __init__(
@@ -79,41 +81,41 @@ class BroadPhase:
         self.real = real
         if radius is None:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
-        things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
-        self._things = list(things.values())
+        primitives = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
+        self._things = list(primitives.values())
         self._still, self._move, self._way = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
-        self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # ways that pairs were found for
-        placed = np.zeros(nodes, np.uint8)  # what no thing has may be no place, as blocks of edges are not
+        self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # motion of the last search
+        used = np.zeros(nodes, np.uint8)  # nodes of no primitive may be no positions, as edge blocks
         for size in shapes.sizes:
-            placed[shapes.things(size)[0]] = 1
-        self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
+            used[shapes.things(size)[0]] = 1
+        self._placed = wp.array(used, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        # at once, after every step: a reading takes as long as a kernel or two
+        # one transfer after every step: each takes as long as a kernel or two
         self._memory = wp.zeros(2 + MORE, dtype=wp.int64, device=self.device)
-        own = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
-        self.overflow, self._lost, self.searches, self.looks = (own[k : k + 1] for k in range(4))
+        counters = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
+        self.overflow, self._lost, self.searches, self.looks = (counters[k : k + 1] for k in range(4))
         self._reading = arrays.Reading(self._memory)
         self.more, self.more_read = self._memory[2:], np.zeros(MORE, np.int64)
         self.sought = (0, 0)
-        # whether pairs are out of date, or were for the check of a whole step; whether the last `update` found them anew
+        # candidates outdated, outdated for the check of a whole step, searched by the last `update`
         self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
-        self._edges = things[2]
+        self._edges = primitives[2]
         self._walked = [part for part in self._things if part.walked]
         self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
-        grouped = worlds > 1
+        several_worlds = worlds > 1
         sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
         self.lists = [
-            PairList(kind, things[first], things[second], shapes, grouped, real, self.overflow)
+            PairList(kind, primitives[first], primitives[second], shapes, several_worlds, real, self.overflow)
             for kind, first, second in sides
-            if second in things
+            if second in primitives
         ]
         self._impacts, self._passes = (
             [impact_kernel(pairs.kind, passing, real, pairs.single) for pairs in self.lists]
             for passing in (False, True)
         )
-        # what kernels of impacts have no use for
+        # unused outputs of impact kernels
         self._unused = [wp.zeros(worlds, dtype=dtype, device=self.device) for dtype in (real, int, wp.int64)]
         self.gap = wp.zeros(worlds, dtype=real, device=self.device)
         self.time = wp.zeros(worlds, dtype=real, device=self.device)
@@ -140,19 +142,19 @@ class BroadPhase:
         return self._filter.limited
 
     def rebuild(self, x: wp.array) -> None:
-        """Build the trees anew; lists stay as they are. On CUDA searches use them until the next time, on the CPU they build their own.
+        """Rebuild the BVHs, not the lists. On CUDA searches refit these until the next call, on the CPU they build their own.
 
-        Where everything has changed places since, a search takes tens of times as long.
+        After large motions, a search in an old tree takes tens of times as long.
         """
         self._enclose(x, self._still, self._never, 1.0, self._within)
-        for part in self._things:
-            part.build()
+        for primitives in self._things:
+            primitives.build()
 
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
-        """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from its way.
+        """Search again along the motion from `base` to q if candidates are outdated at either end.
 
-        By default q is `base`: nothing moves. Else ways go on beyond q, see `kernels.contact.motion`, but in worlds that move by one
-        share; there the candidates of a motion that is not filtered hold from q on.
+        Without q nothing moves. Otherwise the path extends beyond q, see `kernels.contact.motion`, but in worlds with a single step
+        fraction; there the candidates of an unfiltered motion hold from q on.
         """
         together = self._never if together is None else together
         _, lengthen, *_ = self._motion
@@ -169,15 +171,15 @@ class BroadPhase:
         wp.capture_if(self._stale, anew)
 
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
-        """Find all candidates at x or, with `move`, anywhere on the straight motion from x by it.
+        """Find all candidates at x or, with `move`, anywhere on the straight motion from x by `move`.
 
-        Each node may go any share of its own way; in worlds where `together` (worlds,) is not zero, all go by one share.
+        Each node may take any step fraction; in worlds where `together` (worlds,) is not zero, all take the same.
         """
         move = self._still if move is None else move
         together = self._never if together is None else together
         self._enclose(x, move, together, 1.0, self._within)
-        for part in self._walked:
-            part.leaves.renew()
+        for primitives in self._walked:
+            primitives.leaves.renew()
 
         def find(pairs: PairList) -> None:
             pairs.meet()
@@ -189,7 +191,7 @@ class BroadPhase:
         self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
 
     def _watch(self, base: wp.array, q: wp.array, stale: wp.array) -> None:
-        """Note whether pairs are `stale` (1,) for a motion, which this tells of; see the class."""
+        """Mark candidates as `stale` (1,) for a motion, which becomes the present one; see the class."""
         watch, *_ = self._motion
         inputs = [base, q, self._start, self._end, self._placed, 0.5 * self.margin]
         self._sweep(watch, base, inputs, [self._move, stale])
@@ -197,19 +199,19 @@ class BroadPhase:
     def filter(
         self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
     ) -> None:
-        """Shorten the motion from `base` to q so that no two come as near as `keep` of their thickness, in place.
+        """Limit the motion from `base` to `q` in place so that all pairs keep the fraction `keep` of the thickness.
 
-        Each unit of nodes goes by its own share, in `shares`, the smallest of each world in `time`; what all move in common shortens
-        nothing. Candidates are brought up to date. While pairs do not fit, nothing moves.
+        Each CCD body moves by its own step fraction, in `shares`; `time` has the smallest of each world. Common motion of all nodes
+        limits nothing. Candidates are updated. After a capacity overflow nothing moves.
 
         Args:
-            unit: of each node of a world (nodes,), which of its `units` it belongs to; -1 where it is never shortened: if it is a node
-                of an object that moves, others may not get out of its way.
-            together: (worlds,), not zero where all units have one share.
-            units: how many there are in a world.
+            unit: CCD body of each node of a world (nodes,); -1 for nodes that are never limited. If such a node belongs to a moving
+                object, others may not evade it.
+            together: (worlds,), nonzero where all CCD bodies have one step fraction.
+            units: number of CCD bodies of a world.
 
         Raises:
-            SceneError: if not 0 <= keep <= 1, or arrays are not as they should be.
+            SceneError: not 0 <= keep <= 1, or arrays are invalid.
         """
         _checked_keep(keep)
         self._filter.check(unit, together, units)
@@ -218,14 +220,15 @@ class BroadPhase:
         self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
     def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
-        """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.
+        """Grow overflowed lists and search again until all pairs fit; return True if any overflowed. Reads from the device.
 
         Args:
-            x: where to search again.
-            shorten: asked where they are a crowd, see `PairList.crowded`; if it is true, motions will be shorter, and no room is made.
+            x: positions of the search.
+            shorten: called if the pairs are too many to store, see `PairList.crowded`; True means that motions will be shorter, and
+                lists stay.
 
         Raises:
-            SolverError: names a node whose position is not finite; or if there are more pairs than can be counted.
+            SolverError: names a node whose position is not finite; or there are more pairs than can be counted.
         """
         grown = False
         while self._checked():
@@ -239,7 +242,7 @@ class BroadPhase:
         return grown
 
     def check(self) -> None:
-        """Refuse positions that were not finite when boxes were made of them. Reads from the device.
+        """Refuse positions that were not finite when bounds were made. Reads from the device.
 
         Raises:
             SolverError: names the node and its world.
@@ -247,7 +250,7 @@ class BroadPhase:
         self._checked()
 
     def _checked(self) -> bool:
-        """The same; whether pairs did not fit."""
+        """Refuse positions that are not finite; return True after a capacity overflow."""
         memory = self._reading()
         overflow, lost, *sought = memory[:2].view(np.int32).tolist()
         self.sought, self.more_read, node = tuple(sought), memory[2:], lost - 1
@@ -261,47 +264,47 @@ class BroadPhase:
         return overflow != 0
 
     def measure(self, x: wp.array, enough: float = -math.inf) -> None:
-        """The smallest gap of each world in `gap` [m], at most `reach`, or any below `enough`. Candidates have to be up to date."""
+        """Write the smallest gap of each world to `gap` [m], at most `reach`, or any below `enough`. Needs valid candidates."""
         self.gap.fill_(self.reach)
         for pairs in self.lists:
             pairs.measure(x, self.gap, enough)
 
     def impact(self, x: wp.array, move: wp.array, keep: float = 1.0) -> None:
-        """When in the motion from x by `move` two come as near as `keep` of their thickness, in `time` of each world; never late.
+        """Write the first time in the motion from x by `move` when a pair is as near as `keep` of the thickness, by world to `time`.
 
-        1 where that does not happen; 0 where some overlap at x. All pairs are asked for, not only candidates.
+        The time is conservative, 1 without such a pair and 0 if some overlap at x. All pairs are tested, not only candidates.
 
         Raises:
-            SceneError: if not 0 <= keep <= 1.
+            SceneError: not 0 <= keep <= 1.
         """
         _checked_keep(keep)
         self.time.fill_(1.0)
         self._passing(self._impacts, x, move, keep, self._unused[1], [self._unused[2]] * len(self.lists))
 
     def crossings(self, x: wp.array, move: wp.array) -> None:
-        """How many pairs pass through each other, without thickness, in the straight motion from x by `move`, in `crossed` by world."""
+        """Count interpenetrating pairs, without thickness, in the straight motion from x by `move`, by world in `crossed`."""
         self.crossed.zero_()
         for first in self._firsts:
             first.fill_(NONE)
         self._passing(self._passes, x, move, 0.0, self.crossed, self._firsts)
 
     def check_crossings(self, base: wp.array, q: wp.array) -> None:
-        """`crossings` in the motion from `base` to q; of candidates alone where these are all that may, which takes less."""
+        """Count interpenetrating pairs from `base` to q, among candidates alone if these are valid, which is faster."""
         self._beyond.zero_()
         self._watch(base, q, self._beyond)
         wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
 
     def passing(self, base: wp.array, keep: float = 0.0) -> None:
-        """Count candidates alone, which are all that may, in the motion from `base` that was told of last.
+        """Count interpenetrating candidates, which have to be valid, in the present motion from `base`.
 
-        With `keep` those that come as near as that part of their thickness, or a little farther.
+        With `keep`, count pairs that come within that fraction of their thickness, or slightly farther.
         """
         self.crossed.zero_()
         for pairs in self.lists:
             pairs.cross(base, self._move, self.crossed, keep, self.reach)
 
     def first_crossing(self) -> str:
-        """The first of the pairs that passed through each other, by name, or nothing. Reads from the device."""
+        """Return the names of the first interpenetrating pair, or nothing. Reads from the device."""
         for pairs, first in zip(self.lists, self._firsts, strict=True):
             key = int(first.numpy()[0])
             if key != NONE:
@@ -309,34 +312,34 @@ class BroadPhase:
         return ""
 
     def describe(self, pairs: PairList, i: int, j: int) -> str:
-        """A pair as a message has it."""
+        """Return the names of a pair for messages."""
         world, k = divmod(i, pairs.first.count)
-        one, other = (
+        first, second = (
             self.shapes.describe(pairs.first.size, k),
             self.shapes.describe(pairs.second.size, j % pairs.second.count),
         )
-        return f"{one} and {other}" + (f" in world {world}" if self.worlds > 1 else "")
+        return f"{first} and {second}" + (f" in world {world}" if self.worlds > 1 else "")
 
     @property
     def _around(self) -> float:
-        """How far beside its way a node may be, and a little more."""
+        """Allowed distance of a node from the path, with a rounding margin."""
         return 0.5 * (1.0 + SLACK) * self.margin
 
     @property
     def _within(self) -> float:
-        """By what boxes are larger: half of the gap up to which they meet."""
+        """Inflation of AABBs: half of the gap up to which boxes overlap."""
         return 0.5 * self.reach + self._around
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self.every, keep, 0.0)
-        for part in self._walked:
-            part.leaves.tree.refit()
-        for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
+        for primitives in self._walked:
+            primitives.leaves.tree.refit()
+        for kernel, pairs, first in zip(kernels, self.lists, firsts, strict=True):
             pairs.meet()
-            pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, least])
+            pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, first])
 
     def _room(self, keep: float) -> float:
-        """The reach, in which gaps close step by step; none where they may close."""
+        """Return the search distance, within which gaps close step by step; 0 if gaps may close."""
         return self.reach if keep > 0.0 else 0.0
 
     def _find_common(self, move, together) -> None:
@@ -344,10 +347,10 @@ class BroadPhase:
         inputs = [self._edges.surface, self._edges.count, move, together]
         wp.launch(common, self.worlds, inputs, [self._shift], device=self.device)
 
-    def _enclose(self, x, move, together, share: float, more: float) -> None:
+    def _enclose(self, x, move, together, radius_fraction: float, margin: float) -> None:
         self._find_common(move, together)
-        for part in self._things:
-            part.enclose(x, move, self._shift, share, more, self._lost)
+        for primitives in self._things:
+            primitives.enclose(x, move, self._shift, radius_fraction, margin, self._lost)
 
     def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, len(x), inputs, outputs, self.device)

@@ -1,4 +1,4 @@
-"""Contact on the candidates of one list: memory and launches of `kernels.contact.pair_terms`, and which pairs each node is in."""
+"""Contact potential on the pairs of one list: memory and launches of `kernels.contact.pair_terms`, and incidence lists."""
 
 from functools import partial
 
@@ -15,15 +15,15 @@ from ddg_warp.solve.contact.pairs import PairList, RunningSums
 
 
 class ContactElements(PairElements):
-    """Contact of the pairs of one list that push each other; see `PairTerms` and, for arguments, `PairElements`.
+    """Active contact pairs of one list; see `PairTerms` and, for arguments, `PairElements`.
 
     Attributes:
-        density: the law.
+        density: contact potential.
     """
 
     def __init__(
         self,
-        found: PairList,
+        candidates: PairList,
         law: Density,
         nodes: int,
         real,
@@ -31,8 +31,8 @@ class ContactElements(PairElements):
         silent: wp.array,
         exact: bool,
     ):
-        kind = found.kind
-        super().__init__(found, rows_of(kind), nodes, real, linear, silent)
+        kind = candidates.kind
+        super().__init__(candidates, rows_of(kind), nodes, real, linear, silent)
         self.density = law
         serial = arrays.serial(self.device)
         self._sieve, self._pack, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
@@ -51,26 +51,28 @@ class ContactElements(PairElements):
             self.mollified.reserve()
 
     def write(self, x: wp.array, law, gap: wp.array) -> None:
-        """Find the pairs that push each other at x, and write what they do; lower the smallest gaps to those of candidates."""
+        """Find the active pairs at x, write energies, forces and factors; lower the smallest gaps to the candidates'."""
         self._find(x, law, gap)
         self._push(x, law)
 
     def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
-        """The same; and list the pairs of nodes."""
+        """Find and evaluate the active pairs as `write`, and build the incidence lists."""
         self._find(x, law, gap)
         list_pairs = partial(self._items.list, self.count, self.factor)
         arrays.side_by_side([partial(self._push, x, law), list_pairs], self.device)
 
     def _find(self, x: wp.array, law, gap: wp.array) -> None:
-        found, given = self.found, [self.found.sides, law, x]
+        candidates, data = self.found, [self.found.sides, law, x]
         lists = [self.pairs, self.factor.nodes, self.starts, self.partners, self.count]
         if not self._running:
             self.partners.zero_()
-        self._take_turns(self._sieve, found.capacity, [found.pairs, found.count, *given], [self._marks, gap, *lists])
+        self._take_turns(
+            self._sieve, candidates.capacity, [candidates.pairs, candidates.count, *data], [self._marks, gap, *lists]
+        )
         if self._running:
             self._running()
-            inputs = [found.pairs, found.count, found.starts, found.partners, found.sides]
-            room = max(found.capacity, len(found.starts))
+            inputs = [candidates.pairs, candidates.count, candidates.starts, candidates.partners, candidates.sides]
+            room = max(candidates.capacity, len(candidates.starts))
             self._take_turns(self._pack, room, [*inputs, self._marks, self._running.starts], lists)
 
     def _push(self, x: wp.array, law) -> None:
@@ -79,6 +81,6 @@ class ContactElements(PairElements):
         self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
 
     def exact_product(self, v: wp.array, x: wp.array, law) -> None:
-        """Place the product of the exact Hessian at x, those of `evaluate`, with v."""
+        """Write the product of the exact Hessian at x, the position of `evaluate`, with v to `placed`."""
         inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v, self.ranks]
         self._take_turns(self._exact, self.found.capacity, inputs, [self.placed])

@@ -1,4 +1,4 @@
-"""Friction on the pairs that contact had at the start of a step: memory and launches of `kernels.contact.pair_friction`."""
+"""Friction on lagged contact pairs: memory and launches of `kernels.contact.pair_friction`."""
 
 import numpy as np
 import warp as wp
@@ -17,14 +17,14 @@ class FrictionElements(PairElements):
     """Friction of the pairs of one list, with lists of their own, which later searches leave alone; see `PairTerms`.
 
     Args:
-        contact: of the same pairs; nodes, silent: as of `PairElements`.
-        velocity: below which surfaces stick [m/s].
-        ways: by groups coefficients over `friction` forwards, backwards and across (groups, groups, 3), see `lag_kernel`; None: it is
-            the same all ways.
-        shapes: what may touch; spins: how far objects of it have turned since slips started.
+        contact: contact of the same pairs; nodes, silent: as of `PairElements`.
+        velocity: stick threshold [m/s].
+        coefficients: by groups, coefficients over `friction` forwards, backwards and across (groups, groups, 3), see `lag_kernel`.
+            None: isotropic friction.
+        shapes: collision mesh; spins: rotation of its objects since slips started.
 
     Attributes:
-        directions: nodes beside first things (things, 2) and `ways` on the device, where they are asked for, else None.
+        directions: neighbour nodes of first primitives (primitives, 2) and coefficients on the device, if needed, else None.
         work: of each pair (capacity,) [J], by the slip of the last `evaluate`.
     """
 
@@ -33,7 +33,7 @@ class FrictionElements(PairElements):
         contact: ContactElements,
         density: Density,
         velocity: float,
-        ways: np.ndarray | None,
+        coefficients: np.ndarray | None,
         shapes: Shapes,
         spins: Spins,
         nodes: int,
@@ -41,20 +41,20 @@ class FrictionElements(PairElements):
         linear,
         silent: wp.array,
     ):
-        found, kind = contact.found, contact.found.kind
-        angles = [shapes.angles(things.size) for things in (found.first, found.second)]
-        super().__init__(found, ROWS, nodes, real, linear, silent, rolls=any((of >= 0).any() for of in angles))
+        candidates, kind = contact.found, contact.found.kind
+        angles = [shapes.angles(primitives.size) for primitives in (candidates.first, candidates.second)]
+        super().__init__(candidates, ROWS, nodes, real, linear, silent, rolls=any((each >= 0).any() for each in angles))
         self._contact, self._velocity, self._spins = contact, velocity, spins
-        what = ways is not None, spins.any, self.rolls
-        self._lag = lag_kernel(kind, real, linear, *what)
-        self._evaluate = friction_kernel(density, real, linear, *what)
-        self._rows, beside = ROWS + (ways is not None), None
-        if ways is not None:
-            ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
-        if ways is not None or self.rolls:
-            beside = self._upload(shapes.beside(kind.first))
-        self.directions = beside, ways
-        self.angles = [self._upload(of) if self.rolls else None for of in angles]
+        variant = coefficients is not None, spins.any, self.rolls
+        self._lag = lag_kernel(kind, real, linear, *variant)
+        self._evaluate = friction_kernel(density, real, linear, *variant)
+        self._rows, neighbours = ROWS + (coefficients is not None), None
+        if coefficients is not None:
+            coefficients = wp.array(coefficients, dtype=wp.types.vector(3, real), device=self.device)
+        if coefficients is not None or self.rolls:
+            neighbours = self._upload(shapes.beside(kind.first))
+        self.directions = neighbours, coefficients
+        self.angles = [self._upload(each) if self.rolls else None for each in angles]
         self.kernels += [self._lag, self._evaluate]
         self._onward = 0
         self._kept = ("count", "starts", "partners")
@@ -62,7 +62,7 @@ class FrictionElements(PairElements):
         self.reserve()
 
     def reserve(self) -> None:
-        """As it is of `PairElements`; what was lagged is lost."""
+        """Make room as `PairElements.reserve`; lagged data is lost."""
         super().reserve()
         for name in self._kept:
             getattr(self, name).zero_()
@@ -79,22 +79,31 @@ class FrictionElements(PairElements):
         self.lagged.lever = arrays.allocate((ANGLES, capacity if self.rolls else 0), vector, self.device)
 
     def lag(self, law, x: wp.array, again: bool, more: wp.array) -> None:
-        """Take the pairs of contact as it was evaluated last, at x; `again`: of a search that goes on, with the directions of slips.
+        """Copy the active contact pairs as evaluated last, at x; `again`: within a solve, with the directions of slips.
 
-        more: beside normal forces, what friction counts (worlds,) [N].
+        `more`: added to normal forces (worlds,) [N].
         """
         self._onward = int(again)
-        of = self._contact
-        inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions, self._spins.places, *self.angles]
-        inputs += [of.factor, of.gradient, self._onward, more, self.count]
+        contact = self._contact
+        inputs = [
+            contact.pairs,
+            contact.count,
+            self.found.sides,
+            law,
+            x,
+            *self.directions,
+            self._spins.places,
+            *self.angles,
+        ]
+        inputs += [contact.factor, contact.gradient, self._onward, more, self.count]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._take_turns(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:
-            wp.copy(getattr(self, name), getattr(of, name))
+            wp.copy(getattr(self, name), getattr(contact, name))
         self._items.list(self.count, self.factor)
 
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
-        """Write energies, work, gradients and factors at x by the slip since `start`, and by how far objects have turned."""
+        """Write energies, work, gradients and factors at x for the slip since `start` and rotations of objects."""
         inputs = [self.pairs, self.count, self.found.first.count]
         inputs += [self.lagged, self._velocity, rate, *iterates, self._onward, x, start, self._spins.turned.flatten()]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
@@ -104,9 +113,9 @@ class FrictionElements(PairElements):
         return arrays.upload(values.astype(np.int32), wp.vec2i, self.device)
 
     def couples(self) -> np.ndarray:
-        """What pairs turn objects that spin by (worlds, objects, 3) [N m], as evaluated last. Reads from the device."""
+        """Return the torques of pairs on rotating objects (worlds, objects, 3) [N m], as evaluated last. Reads from the device."""
         used, forces = self.forces()
-        of, (worlds, objects) = self.lagged.spinning.numpy()[used], self._spins.turned.shape
-        found = np.zeros((worlds * objects, 3))
-        np.add.at(found, of[of >= 0], np.cross(self.lagged.arm.numpy()[used], forces)[of >= 0])
-        return found.reshape(worlds, objects, 3)
+        spinning, (worlds, objects) = self.lagged.spinning.numpy()[used], self._spins.turned.shape
+        result = np.zeros((worlds * objects, 3))
+        np.add.at(result, spinning[spinning >= 0], np.cross(self.lagged.arm.numpy()[used], forces)[spinning >= 0])
+        return result.reshape(worlds, objects, 3)

@@ -1,4 +1,4 @@
-"""Exact Hessians of edges that are all but parallel, for `PairProduct`; see `kernels.contact.pair_terms`."""
+"""Near-parallel edges: exact Hessians for `PairProduct`; see `kernels.contact.pair_terms`."""
 
 import warp as wp
 
@@ -10,16 +10,18 @@ from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.pairs import RunningSums
 
-ROOM = 4  # one in so many pairs may be such a one; more keep the Gauss-Newton matrix, which takes iterations alone
-LEAST = 256  # pairs that there is room for
-MOST = 2**15  # threads that differentiate: with a thread for all there is room for, most would have nothing to do
+ROOM = 4  # capacity: one in so many pairs; more keep the Gauss-Newton matrix, which only costs iterations
+LEAST = 256  # smallest capacity in pairs
+MOST = (
+    2**15
+)  # largest number of threads that differentiate; a thread for each column of the capacity would mostly do nothing
 
 
 class Mollified:
-    """Those among the `ContactElements` of edges with a law, kept.
+    """Exact Hessians of near-parallel edge pairs among `ContactElements`, stored.
 
     Attributes:
-        keeps: whether they are, so that `PairProduct` multiplies them beside all others.
+        keeps: True: `PairProduct` multiplies the Hessians with all others.
         marks, starts, columns: see `kernels.contact.gather.set_struct`.
     """
 
@@ -33,34 +35,34 @@ class Mollified:
         self._number = wp.zeros(1, dtype=int, device=elements.device)
 
     def reserve(self) -> None:
-        """Make room, as `PairElements` do."""
-        of, capacity = self._of, self._of.found.capacity
+        """Make room for as many pairs as `PairElements`."""
+        elements, capacity = self._of, self._of.found.capacity
         room = max(LEAST, capacity // ROOM)
-        self.marks = wp.zeros(capacity, dtype=int, device=of.device)
+        self.marks = wp.zeros(capacity, dtype=int, device=elements.device)
         self._running = RunningSums(self.marks)
         self.starts = self._running.starts
-        self._chosen = wp.zeros(room, dtype=int, device=of.device)
-        vector = wp.types.vector(3, of.linear)
-        self.columns = arrays.allocate((3 * SLOTS, SLOTS, room), vector, of.device)
+        self._chosen = wp.zeros(room, dtype=int, device=elements.device)
+        vector = wp.types.vector(3, elements.linear)
+        self.columns = arrays.allocate((3 * SLOTS, SLOTS, room), vector, elements.device)
 
     def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
-        """Find them at positions x in worlds that want it, and their Hessians."""
-        of = self._of
-        inputs = [of.pairs, of.count, of.found.first.count, wanted, of.factor]
+        """Find near-parallel pairs at positions x and differentiate, in `wanted` worlds."""
+        elements = self._of
+        inputs = [elements.pairs, elements.count, elements.found.first.count, wanted, elements.factor]
         self._sweep(self._mark, len(self.marks), inputs, [self.marks])
         self._running()
         chosen = [self._chosen, self._number]
-        self._sweep(choose, len(self.marks), [of.count, self.marks, self.starts], chosen)
-        threads = arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), of.device)
-        inputs = [of.pairs, of.found.sides, law, x, of.factor, *chosen, threads]
-        wp.launch(self._differentiate, threads, inputs, [self.columns], device=of.device)
+        self._sweep(choose, len(self.marks), [elements.count, self.marks, self.starts], chosen)
+        threads = arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), elements.device)
+        inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, *chosen, threads]
+        wp.launch(self._differentiate, threads, inputs, [self.columns], device=elements.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.take_turns(kernel, count, inputs, outputs, self._of.device)
 
 
 class Unkept:
-    """The same of all of them, in every world, whose Hessians are not kept but found anew in every product."""
+    """Exact Hessians of near-parallel edge pairs in every world, recomputed in every product."""
 
     keeps = False
 
@@ -70,14 +72,14 @@ class Unkept:
         self.kernels = [self._multiply]
 
     def reserve(self) -> None:
-        """As of `Mollified`: nothing is kept."""
+        """Do nothing: no Hessian is stored."""
 
     def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
-        """From now on those at positions x."""
+        """Set the positions x of the Hessians."""
         self._at = x, law
 
     def multiply(self, v: wp.array) -> None:
-        """Write their products with v."""
-        of, (x, law) = self._of, self._at
-        inputs = [of.pairs, of.count, of.found.sides, law, x, of.factor, v, of.ranks]
-        arrays.take_turns(self._multiply, of.found.capacity, inputs, [of.placed], of.device)
+        """Write products of the Hessians with v."""
+        elements, (x, law) = self._of, self._at
+        inputs = [elements.pairs, elements.count, elements.found.sides, law, x, elements.factor, v, elements.ranks]
+        arrays.take_turns(self._multiply, elements.found.capacity, inputs, [elements.placed], elements.device)

@@ -1,4 +1,4 @@
-"""Shortens a proposed motion on a device so that nothing passes through anything; see `kernels.contact.shares`."""
+"""CCD step fractions of a proposed motion on a device; see `kernels.contact.shares`."""
 
 from functools import partial
 
@@ -10,13 +10,13 @@ from ddg_warp.kernels.contact.shares import limit_kernels, share_kernels
 
 
 class MotionFilter:
-    """Shares of motion for the pairs of some lists; see `BroadPhase.filter`.
+    """CCD step fractions for the pairs of some lists; see `BroadPhase.filter`.
 
     Args:
-        nodes: of one world, the most units that there can be.
+        nodes: nodes of one world, which bounds the number of CCD bodies.
 
     Attributes:
-        shares, limited: see `BroadPhase`.
+        `shares`, `limited`: see `BroadPhase`.
     """
 
     def __init__(self, lists: list, nodes: int, worlds: int, real, device):
@@ -35,7 +35,7 @@ class MotionFilter:
         self.shares = self._all[0]
 
     def check(self, unit: wp.array, together: wp.array, units: int) -> None:
-        """Refuse arrays that do not fit."""
+        """Refuse invalid arrays."""
         if unit.shape != (self._nodes,) or unit.dtype is not wp.int32:
             raise SceneError(
                 f"unit of a motion: one int32 for each of {self._nodes} nodes, not {unit.shape} of {unit.dtype}"
@@ -48,12 +48,12 @@ class MotionFilter:
             raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
 
     def __call__(self, base, move, q, unit, together, units: int, keep: float, reach: float, search) -> None:
-        """Lower shares round by round, and shorten q to them.
+        """Lower step fractions round by round, and limit q accordingly.
 
         Args:
-            reach: gap in which surfaces matter [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
+            reach: search distance [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
         """
-        overflow, time, done, *seen = search
+        overflow, time, done, *motion = search
         shares, before, lowered = (array[: self._worlds * units] for array in self._all)
         self.shares = shares
         self._sweep(self._start, len(shares), [], [shares, before, lowered])
@@ -75,7 +75,7 @@ class MotionFilter:
         def go(times: wp.array, again: bool = True) -> None:
             wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
             of_lists = zip(self._picks, self._limits, self._lists, self._numbers, strict=True)
-            arrays.side_by_side([partial(lower, times, again, *own) for own in of_lists], self._device)
+            arrays.side_by_side([partial(lower, times, again, *list_data) for list_data in of_lists], self._device)
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
 
@@ -83,7 +83,7 @@ class MotionFilter:
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)
-        self._sweep(self._shorten, len(q), [base, move, unit, units, shares, done, together], [q, *seen])
+        self._sweep(self._shorten, len(q), [base, move, unit, units, shares, done, together], [q, *motion])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self._device)

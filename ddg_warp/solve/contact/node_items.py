@@ -1,4 +1,4 @@
-"""Which pairs each node is in; see `kernels.contact.node_items`."""
+"""Incidence lists of nodes and pairs; see `kernels.contact.node_items`."""
 
 import warp as wp
 
@@ -10,15 +10,15 @@ from ddg_warp.solve.contact.pairs import RunningSums
 
 
 class NodeItems:
-    """Items of nodes on pairs of one kind.
+    """Incidence lists of the nodes in pairs of one kind.
 
     Args:
-        nodes: of all worlds.
-        silent: nodes of a world that have none; rolls: whether angles have some, too.
+        nodes: nodes of all worlds.
+        silent: nodes of a world without items; rolls: True if twist angles have items, too.
 
     Attributes:
-        numbers, places: of each node, how many items it has and where they start in `items`.
-        ranks, angle_ranks: of each pair, the places of its items, -1 where it has none.
+        `numbers`, `places`: number of items of each node, and offsets into `items`.
+        ranks, angle_ranks: indices of the items of each pair, -1 for none.
     """
 
     def __init__(self, kind: Kind, nodes: int, silent: wp.array, rolls: bool = False):
@@ -32,14 +32,14 @@ class NodeItems:
         self.kernels = [self._number, self._fill, self._sort, *self._running.kernels]
 
     def reserve(self, capacity: int) -> None:
-        """Make room for the items of so many pairs."""
+        """Make room for the items of `capacity` pairs."""
         self.items = wp.zeros((self._size + self._angles) * capacity, dtype=int, device=self.device)
         self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
         self.ranks = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.angle_ranks = wp.zeros(capacity if self._angles else 0, dtype=wp.vec2i, device=self.device)
 
     def list(self, count: wp.array, factor) -> None:
-        """Of so many pairs, with the nodes and angles of their factors."""
+        """Build the lists of `count` pairs, with the nodes and twist angles of their factors."""
         nodes = factor.nodes
         self._both.zero_()
         inputs = [count, nodes, factor.angles, self._silent]

@@ -1,4 +1,4 @@
-"""Products of the matrix of contact and friction with vectors; see `kernels.contact.pair_product`."""
+"""Products of the contact and friction matrix with vectors; see `kernels.contact.pair_product`."""
 
 import warp as wp
 
@@ -11,73 +11,73 @@ from ddg_warp.solve.contact.contact_elements import ContactElements
 
 
 class PairProduct:
-    """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room.
+    """Product of the matrix of some sets of pair elements with a vector; call `fit` after the sets have grown.
 
     Attributes:
-        sets: the lists, see `kernels.contact.gather.set_struct`; most: the most pairs that one has room for.
+        sets: the sets, see `kernels.contact.gather.set_struct`; most: largest capacity of a set.
     """
 
-    def __init__(self, parts: list, law, real, linear):
-        self._law, self._mollified = law, [part.mollified for part in parts if part.mollified]
-        self._parts, self._real, self._linear, self._device = parts, real, linear, parts[0].device
+    def __init__(self, pair_sets: list, law, real, linear):
+        self._law, self._mollified = law, [pair_set.mollified for pair_set in pair_sets if pair_set.mollified]
+        self._parts, self._real, self._linear, self._device = pair_sets, real, linear, pair_sets[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
-        made = product_kernels(real, linear, arrays.serial(self._device), any(part.rolls for part in parts))
+        made = product_kernels(real, linear, arrays.serial(self._device), any(pair_set.rolls for pair_set in pair_sets))
         self._multiply, self._gather, self._meet, self._settle = made
         self.kernels = [*made]
-        self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
+        self.kernels += [kernel for pair_set in self._mollified for kernel in pair_set.kernels]
         self.fit()
 
     def fit(self) -> None:
-        """Take the arrays that the lists have now."""
-        self._sets = [self._set(part) for part in self._parts]  # an array of structures keeps nothing alive
+        """Take the present arrays of the sets."""
+        self._sets = [self._set(pair_set) for pair_set in self._parts]  # an array of structures keeps no member alive
         self.sets = wp.array(self._sets, dtype=set_struct(self._real, self._linear), device=self._device)
-        self.most = max(part.found.capacity for part in self._parts)
+        self.most = max(pair_set.found.capacity for pair_set in self._parts)
         self._met = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
 
     def meet(self) -> None:
-        """Which nodes are in pairs, for `settle`."""
+        """Mark the nodes in pairs, for `settle`."""
         self._sweep(self._meet, len(self._met), [self.sets], [self._met])
 
     def prepare(self, x: wp.array, wanted: wp.array) -> None:
-        """What products with what turns take at positions x, in the worlds that want it."""
-        for part in self._mollified:
-            part.differentiate(x, self._law, wanted)
+        """Differentiate near-parallel edges at positions x, in `wanted` worlds."""
+        for edges in self._mollified:
+            edges.differentiate(x, self._law, wanted)
 
     def __call__(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
-        """out += H v; with what turns at positions x in the worlds that want it."""
+        """Add H v to `out`; with exact second derivatives at x in `wanted` worlds."""
         self.place(v, x, wanted)
         self.gather(out)
 
     def gather(self, out: wp.array) -> None:
-        """Add what is placed to nodes."""
+        """Add the products of `place` to nodes."""
         self._sweep(self._gather, len(out), [self.sets], [out])
 
     def settle(self, v, out, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """The same on dofs that are not barred in worlds that are busy, and v . out of the nodes to which it adds."""
+        """Add the products to active dofs in `busy` worlds, and write v . out of the nodes in pairs."""
         self._sweep(self._settle, len(out), [self.sets, self._met, v, barred, busy], [out, dots])
 
     def place(self, v, x=None, wanted=None) -> None:
-        """What pairs bring to nodes, of products as above."""
-        given = self._nothing if wanted is None else [wanted, x]
-        arrays.take_turns(self._multiply, self.most, [self.sets, *given, v], [], self._device)
-        for part in self._mollified if wanted is not None else ():
-            if not part.keeps:
-                part.multiply(v)
+        """Write the contributions of pairs to a product; arguments as of `__call__`."""
+        exact_at = self._nothing if wanted is None else [wanted, x]
+        arrays.take_turns(self._multiply, self.most, [self.sets, *exact_at, v], [], self._device)
+        for edges in self._mollified if wanted is not None else ():
+            if not edges.keeps:
+                edges.multiply(v)
 
-    def _set(self, part):
-        own, kind = set_struct(self._real, self._linear)(), part.found.kind
+    def _set(self, pair_set):
+        struct, kind = set_struct(self._real, self._linear)(), pair_set.found.kind
         for name in ("nodes", "used", "row", "bend", "angles", "lever"):
-            setattr(own, name, getattr(part.factor, name))
+            setattr(struct, name, getattr(pair_set.factor, name))
         names = ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks", "angle_ranks", "idle")
         for name in names:
-            setattr(own, name, getattr(part, name))
-        for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
-            setattr(own, name, getattr(part.mollified, name))
-        own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1
-        own.edges = (kind.first == 2) + (kind == EDGES)
-        own.rows, own.things = part.rows, part.found.first.count
-        return own
+            setattr(struct, name, getattr(pair_set, name))
+        for name in ("marks", "starts", "columns") if pair_set.mollified and pair_set.mollified.keeps else ():
+            setattr(struct, name, getattr(pair_set.mollified, name))
+        struct.kind = KINDS.index(kind) if isinstance(pair_set, ContactElements) else -1
+        struct.edges = (kind.first == 2) + (kind == EDGES)
+        struct.rows, struct.things = pair_set.rows, pair_set.found.first.count
+        return struct
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -1,4 +1,4 @@
-"""Lists of pairs on a device, of fixed capacity; see `kernels.contact.candidates`."""
+"""Candidate lists on a device, with fixed capacity; see `kernels.contact.candidates`."""
 
 import numpy as np
 import warp as wp
@@ -14,16 +14,16 @@ from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.solve.contact.shapes import Shapes
 from ddg_warp.solve.contact.tree import Things
 
-# Parts of what meets, where each has as many bundles at least: so they are about as full (64 of 310,000 bundles within 8 %).
+# Lists of overlapping leaves, each for LEAST leaves or more. Measured: 64 lists of 310,000 leaves are equally full within 8 %.
 PARTS, LEAST = 64, 1024
-# Pairs of each of the first things, and at least, from which on they are a crowd: sixty contacts a rod of 50 edges are two, what lies
-# in fifty layers has ten, and a pair takes 1.6 kB with friction in float64.
+# Candidates of each first primitive, and in all, above which motions are limited instead. Sixty contacts a rod of 50 edges are two,
+# fifty layers are ten. A pair takes 1.6 kB with friction in float64.
 CROWD, CROWD_LEAST = 32, 2**16
-LINE = 32  # integers of a line of the cache, in which there is one counter
+LINE = 32  # integers of a cache line, which has one counter
 
 
 class RunningSums:
-    """The sum of those before it for each of some integers, in `starts`."""
+    """Exclusive prefix sum of some integers, in `starts`."""
 
     def __init__(self, values: wp.array):
         self._levels = [values]
@@ -54,14 +54,15 @@ class RunningSums:
 
 
 class PairList:
-    """Pairs of one kind whose distance is at most both radii and a reach, or may be on their way.
+    """Candidates of one kind: distance at most both radii and a search distance, or possibly so during a motion.
 
     Attributes:
-        pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
-        starts, partners: of each first thing (first.all,), where its pairs start and how many they are, where all pairs fit.
-        count: of pairs, zero where they do not fit; picked: room for the numbers of some.
-        single: whether all bundles are of one thing.
-        sides, trees: see `kernels.contact.surfaces` and `boxes`; overflow: shared with other lists; not zero once pairs did not fit.
+        `pairs`: primitives (i, j) of both sides, counted over all worlds, sorted; the first `count` are valid.
+        `starts`, `partners`: offset and number of the pairs of each first primitive (first.all,), without overflow.
+        `count`, `picked`: number of pairs, zero after an overflow; room for indices of some.
+        `single`: True if every leaf has one primitive.
+        `sides`, `trees`: see `kernels.contact.surfaces` and `boxes`.
+        `overflow`: shared with other lists; nonzero after an overflow.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class PairList:
         self._sums = RunningSums(self.partners)
         self.starts = self._sums.starts
         self._wide = wp.vec2i(first.bundle, second.bundle)
-        # two edges of a rod that follow each other have a node in common
+        # successive edges of a rod have a common node
         self._meet = meet_kernel(kind.alike, first.bundle > 2, grouped)
         self.single = self._slots == 1
         self._judge, self._fill = candidate_kernels(kind, real, self.single)
@@ -95,35 +96,35 @@ class PairList:
         parts = 1 if arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
         self._counters = wp.zeros((parts, LINE), dtype=int, device=self.device)
         self._found = self._counters[:, 0]
-        # the most pairs of any search since there was room for so many, and those whose boxes met
+        # largest numbers of pairs and of overlapping leaves since the last reallocation
         self._needed = wp.zeros(2, dtype=int, device=self.device)
         self.kernels = [self._meet, self._judge, self._fill, self._gaps, self._passing, *self._sums.kernels]
-        # kernels have as many threads as there is room: more is made where there are more
+        # kernels have as many threads as capacity, which grows on overflow
         self.reserve(max(1024, first.all), max(4096, 4 * first.leaves.all))
 
     @property
     def _slots(self) -> int:
-        """Pairs of things of two bundles."""
+        """Number of primitive pairs of two leaves."""
         return self._wide[0] * self._wide[1]
 
     @property
     def capacity(self) -> int:
         return len(self.pairs)
 
-    def reserve(self, pairs: int, met: int | None = None) -> None:
-        """Make room for so many pairs, and so many bundles whose boxes meet, by default as many as there is room for."""
-        if met is not None:
-            met = -(-met // len(self._found)) * len(self._found)  # as much for each part
-            self._met = wp.zeros(met, dtype=wp.vec2i, device=self.device)
-            self._links = wp.zeros(met * self._slots, dtype=wp.vec2i, device=self.device)
+    def reserve(self, pairs: int, overlaps: int | None = None) -> None:
+        """Make room for some pairs and `overlaps` overlapping leaves; None keeps the present room for leaves."""
+        if overlaps is not None:
+            overlaps = -(-overlaps // len(self._found)) * len(self._found)  # equal room for each list
+            self._met = wp.zeros(overlaps, dtype=wp.vec2i, device=self.device)
+            self._links = wp.zeros(overlaps * self._slots, dtype=wp.vec2i, device=self.device)
         self.pairs = wp.zeros(pairs, dtype=wp.vec2i, device=self.device)
         self.picked = wp.zeros(pairs, dtype=int, device=self.device)
         self._needed.zero_()
 
     def fit(self) -> None:
-        """Make room for pairs, once those of some list did not fit. Reads from the device.
+        """Grow the list after an overflow of some list. Reads from the device.
 
-        As graphs are captured anew then, which takes longer than many steps, there is room for twice as many as there were.
+        The room is twice the need, since capturing graphs again takes longer than many steps.
 
         Raises:
             SolverError: there are more pairs than can be counted.
@@ -131,28 +132,28 @@ class PairList:
         needed, most = self._needed.numpy().astype(np.int64), np.array([MOST, MOST // self._slots])
         if (needed >= most).any():
             raise SolverError("more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs")
-        now, twice = np.array([self.capacity, len(self._met)]), np.minimum(2 * needed, most)
-        if (twice > now).any():
-            self.reserve(*np.maximum(now, twice).tolist())
+        present, twice = np.array([self.capacity, len(self._met)]), np.minimum(2 * needed, most)
+        if (twice > present).any():
+            self.reserve(*np.maximum(present, twice).tolist())
 
     @property
     def crowded(self) -> bool:
-        """Whether pairs, or bundles that meet, were a crowd in some search for which there was no room. Reads from the device."""
+        """True if an overflowing search had too many pairs or overlapping leaves to store. Reads from the device."""
         most = max(CROWD_LEAST, CROWD * self.first.all)
         return bool((self._needed.numpy() > np.maximum(most, [self.capacity, len(self._met)])).any())
 
     def dismiss(self) -> None:
-        """Forget how many did not fit."""
+        """Clear the need of an overflow."""
         self._needed.zero_()
 
     def meet(self) -> None:
-        """Find the bundles whose boxes meet; see `kernels.contact.candidates`."""
+        """Find leaves with overlapping AABBs; see `kernels.contact.candidates`."""
         self._counters.zero_()
         outputs = [self._found, self._met]
         wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
 
     def judge(self, x, move, together, reach: float, around: float) -> None:
-        """List those of them that are near, or may be on their way."""
+        """Narrow phase: list overlapping primitives that are in range, or may be during the motion."""
         lists, room = [self._links, self._last], [self.overflow, self._needed]
         self.partners.zero_()
         inputs = [self.sides, self.trees, self._wide, x, move, together, reach, around, self._found, self._met]
@@ -162,17 +163,17 @@ class PairList:
         wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
 
     def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
-        """What a kernel of `kernels.contact.impact` makes of the pairs whose boxes around the motion have met."""
+        """Launch a kernel of `kernels.contact.impact` on the pairs with overlapping swept AABBs."""
         inputs = [self.sides, self.trees, self._found, self._met, x, move, keep, room]
         outputs = [*outputs, self.overflow, self._needed]
         arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)
 
     def measure(self, x, gap, enough: float) -> None:
-        """Lower the smallest gaps of worlds to those of pairs, until they are below `enough`."""
+        """Lower the smallest gaps of worlds to the gaps of pairs, until below `enough`."""
         inputs = [self.pairs, self.count, self.sides, x, enough]
         arrays.take_turns(self._gaps, self.capacity, inputs, [gap], self.device)
 
     def cross(self, x, move, crossed, keep: float = 0.0, reach: float = 0.0) -> None:
-        """Count those that pass through each other in the motion from x, by world, or come as near as `keep` of their thickness."""
+        """Count pairs by world that interpenetrate in the motion from x, or come within `keep` of the thickness."""
         inputs = [self.pairs, self.count, self.sides, x, move, keep, reach]
         arrays.take_turns(self._passing, self.capacity, inputs, [crossed], self.device)

@@ -1,4 +1,4 @@
-"""Whether any edges of rods may be near, without a search for pairs; see `kernels.contact.runs`."""
+"""Culling of rods: proof that no edges are in range, without a search for pairs; see `kernels.contact.runs`."""
 
 import numpy as np
 import warp as wp
@@ -8,21 +8,21 @@ from ddg_warp.kernels.contact.motion import motion_kernels
 from ddg_warp.kernels.contact.runs import AHEAD, DOUBT, KNOWN, run_kernels
 from ddg_warp.solve.contact.tree import Boxes
 
-EDGES = 64  # of a run, at most
-LONGER = 1e-5  # of arc lengths, relative, more than the rounding of float32
-SLACK = 1e-3  # of the reach, by which more is asked for than it
-FIRST = 4  # times the motion that the first boxes are for
+EDGES = 64  # largest number of edges of a run
+LONGER = 1e-5  # relative margin of arc lengths, above the rounding of float32
+SLACK = 1e-3  # relative margin of the search distance
+FIRST = 4  # motions that the first bounds cover
 
 
 class Runs:
-    """Runs of edges of rods and capsules with boxes, which serve as long as nothing leaves them, however far that is or how long.
+    """Bounds of runs of edges, for rods and capsules; valid until a node leaves them, after any motion or time.
 
     Args:
-        search: a `BroadPhase`, in which there is nothing but edges.
+        search: a `BroadPhase` with edges as its only primitives.
 
     Attributes:
-        looks: (1,) how many times boxes were made.
-        known (rows, worlds): see `kernels.contact.runs`; doubt: of it, whether anything may be near in a world (worlds,).
+        `looks`: (1,) number of times that bounds were made.
+        known (rows, worlds): see `kernels.contact.runs`; doubt: its row that is nonzero where pairs may be in range (worlds,).
     """
 
     def __init__(self, search):
@@ -35,21 +35,21 @@ class Runs:
         last = [np.append(each[1:], end) for each, end in zip(first, ends, strict=True)]
         runs = np.column_stack([np.concatenate(first), np.concatenate(last)]).astype(np.int32)
         run_of = np.repeat(np.arange(len(runs)), np.diff(runs)[:, 0]).astype(np.int32)
-        ahead = np.repeat(np.column_stack([ends, ends]), ends - starts, axis=0).astype(np.int32)
+        first_partners = np.repeat(np.column_stack([ends, ends]), ends - starts, axis=0).astype(np.int32)
         whole = np.isin(owner[starts], [*shapes.obstacle, *(a for a, b in shapes.ignored_pairs if a == b)])
         for start, end in zip(starts[~whole], ends[~whole], strict=True):
-            apart = (span[start:end, 1] + span[start:end, 3]) * (1.0 - LONGER)
-            ahead[start:end, 0] = start + np.searchsorted(span[start:end, 0], apart)
+            first_allowed = (span[start:end, 1] + span[start:end, 3]) * (1.0 - LONGER)
+            first_partners[start:end, 0] = start + np.searchsorted(span[start:end, 0], first_allowed)
         self._runs, self._run_of, self._ahead = (
-            wp.array(values, dtype=int, device=device) for values in (runs, run_of, ahead)
+            wp.array(values, dtype=int, device=device) for values in (runs, run_of, first_partners)
         )
         self._boxes = Boxes(len(runs), worlds, device)
-        nodes = shapes.points[shapes.things(2)[0]]  # at rest, for a first tree
-        for corner, most, ends in (
+        nodes = shapes.points[shapes.things(2)[0]]  # rest positions, for a first BVH
+        for corner, bound, ends in (
             (self._boxes.lower, np.minimum, nodes.min(1)),
             (self._boxes.upper, np.maximum, nodes.max(1)),
         ):
-            corner.assign(np.tile(most.reduceat(ends, runs[:, 0]), (worlds, 1)))
+            corner.assign(np.tile(bound.reduceat(ends, runs[:, 0]), (worlds, 1)))
         self._boxes.build()
         self._longest = wp.zeros((worlds, len(shapes.names)), dtype=real, device=device)
         vector = wp.types.vector(3, real)
@@ -69,14 +69,14 @@ class Runs:
         self.kernels = [self._common, *made]
 
     def build(self) -> None:
-        """The tree of boxes anew, as of `Boxes.build`."""
+        """Rebuild the BVH of bounds, as `Boxes.build`."""
         self._boxes.build()
 
     def hold(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
-        """Put worlds in doubt in which boxes do not tell that no gap is below the reach anywhere in the straight motion from x to y.
+        """Mark worlds as in doubt where bounds do not prove gaps above the search distance in the straight motion from x to y.
 
         Args:
-            x, y: positions of the nodes of all worlds; tried: (worlds,), not zero for those that are asked for.
+            x, y: positions of the nodes of all worlds; tried: (worlds,), nonzero for the worlds to test.
         """
         boxes, where, about = self._boxes, [x, y, self._near], [tried, self.known]
         inputs = [self._sides, self._run_of, boxes.count, *where, self._drift, boxes.lower, boxes.upper]
@@ -85,7 +85,7 @@ class Runs:
         self._sweep(self._follow, inputs, [self._seen])
 
     def look(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
-        """Make boxes for the motion and as much more of it as can be, in worlds that are in doubt, and see what is in doubt then."""
+        """Make bounds for the motion, and as much more as possible, in worlds in doubt, and test again."""
         for positions, mean in ((x, self._mean), (y, self._mean_after)):
             surface = self._sides.first
             self._launch(self._common, len(mean), [surface, self._edges, positions, self._search.every], [mean])
@@ -106,7 +106,7 @@ class Runs:
         self._launch(self._settle, len(self._drift), [*means, *about], [self._drift, self._again, self.looks])
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        """Over the edges of every world."""
+        """Launch over the edges of every world."""
         arrays.sweep(kernel, self._edges, inputs, outputs, self._boxes.device, worlds=self._search.worlds)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:

@@ -1,26 +1,26 @@
-"""What may touch in one world: edges of rods as capsules, triangles of shells with a thickness, balls, and what is no pair."""
+"""Collision mesh of one world: edges of rods as capsules, triangles of shells, balls and half-spaces, and excluded pairs."""
 
 import numpy as np
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.contact.spins import MARKERS
 
-BALLS, PLANES = 0, -1  # in place of a number of nodes: the points that are balls, the planes of half-spaces
-FLAT = 1e-12  # area of a triangle over the square of its longest edge, below which it has none
+BALLS, PLANES = 0, -1  # sizes of primitives that are balls and half-spaces, which else are numbers of nodes
+FLAT = 1e-12  # area over squared longest edge below which a triangle is degenerate
 
 
 class Shapes:
-    """Rods, shells, balls and half-spaces over the nodes of one world, numbered as they are added.
+    """Collision mesh: rods, shells, balls and half-spaces over the nodes of one world, numbered as added.
 
-    No two objects that are `still` are a pair, nor is such an object with itself: obstacles, at rest or moved from outside.
+    Objects that are `still` (obstacles, fixed or moved from outside) form no pair with each other, nor with themselves.
 
     Args:
-        points: positions (n, 3) at which nothing may be without length or area [m].
+        points: positions (n, 3) at which no primitive may be without length or area [m].
 
     Attributes:
-        names, radii: of all objects [m]; obstacle: numbers of those that are still.
-        ignored_pairs: of objects that pass through each other, the smaller number first.
-        spinning: the first node and the markers of objects whose surfaces turn as these do, by number.
+        names, radii: of all objects [m]; obstacle: numbers of the obstacles.
+        ignored_pairs: pairs of objects without contact, the smaller number first.
+        spinning: first node and markers of objects with rotating surfaces, by number.
     """
 
     def __init__(self, points: np.ndarray):
@@ -46,15 +46,15 @@ class Shapes:
         still: bool = False,
         angles=None,
     ) -> int:
-        """Add a rod along nodes (m,), a row of capsules; returns the number of the object.
+        """Add a rod along nodes (m,), a row of capsules, and return the number of the object.
 
         Args:
             radius: of the capsules [m].
-            closed: whether an edge leads from the last node to the first.
-            apart: edges with less than this between them along the rod [m] are no pair, nor are neighbours; by default pi radius, the
-                arc between opposite sides of the tightest bend that a rod so thick can have.
-            still: whether it is no pair with itself and others that are still.
-            angles: of its edges, points whose first number says how far they have turned about themselves; none by default.
+            closed: True if an edge connects the last node with the first.
+            apart: collision exclusion distance [m]: edges with a smaller arc length in between form no pair, nor do neighbours. By
+                default pi radius, the arc between opposite sides of the tightest possible bend.
+            still: True for an obstacle.
+            angles: blocks with the twist angles of edges as first component; none by default.
 
         Raises:
             SceneError: names the rod, the edge or node, and the remedy.
@@ -80,9 +80,9 @@ class Shapes:
         return self._add(name, radius, {1: nodes[:, None], 2: edges}, span, still)
 
     def shell(self, triangles, thickness: float, *, name: str | None = None, still: bool = False) -> int:
-        """Add a shell of triangles (m, 3) with a thickness [m], half of it on either side; returns the number of the object.
+        """Add a shell of triangles (m, 3) with a thickness [m], half on either side, and return the number of the object.
 
-        What is still may have none, as what touches it has a radius. Triangles, edges and points that share a node are no pairs.
+        An obstacle may have zero thickness, since its partners have a radius. Primitives with a common node form no pair.
 
         Raises:
             SceneError: names the shell, the triangle, and the remedy.
@@ -104,7 +104,7 @@ class Shapes:
         return self._add(name, 0.5 * thickness, parts, span, still)
 
     def ball(self, node: int, radius: float, *, name: str | None = None, still: bool = False) -> int:
-        """Add a ball around a node, which rods and shells touch, balls do not; returns the number of the object.
+        """Add a ball around a node, for contact with rods and shells, not balls; return the number of the object.
 
         Raises:
             SceneError: names the ball and the remedy.
@@ -115,9 +115,9 @@ class Shapes:
         return self._add(name, radius, {1: nodes, BALLS: nodes}, np.zeros((0, 4)), still)
 
     def plane(self, nodes, *, name: str | None = None) -> int:
-        """Add the half-space behind the plane through three nodes, counter-clockwise as seen from outside; returns its number.
+        """Add the half-space behind three nodes, counter-clockwise as seen from outside, and return the number of the object.
 
-        It is still, as `Shapes` says. The second and the third node are 1 m from the first, whatever moves them.
+        A half-space is an obstacle. The second and the third node are 1 m from the first under any motion.
 
         Raises:
             SceneError: names the plane and the remedy.
@@ -132,10 +132,10 @@ class Shapes:
         return self._add(name, 0.0, {PLANES: nodes[None]}, np.zeros((0, 4)), still=True)
 
     def spin(self, number: int, nodes) -> None:
-        """The surface of an object that is still turns as nodes do, markers (3,) about a first one; see `kernels.contact.spins`.
+        """Let the surface of an obstacle rotate with nodes: a first one and markers (3,) about it; see `kernels.contact.spins`.
 
         Raises:
-            SceneError: it is not still, or markers are not at right angles about the first node, each as far from it as the others.
+            SceneError: it is no obstacle, or markers are not at right angles about the first node and equally far from it.
         """
         name, nodes = self.names[number], self._checked(nodes, 1, self.names[number])
         if number not in self.obstacle or len(nodes) != 1 + MARKERS:
@@ -149,10 +149,10 @@ class Shapes:
         self.spinning[number] = nodes
 
     def ignore(self, first: int, second: int) -> None:
-        """Two objects pass through each other; an object and itself: it has no contact with itself.
+        """Exclude contact between two objects, or of an object with itself.
 
         Raises:
-            SceneError: if there is no such object.
+            SceneError: there is no such object.
         """
         for number in (first, second):
             if not 0 <= number < len(self.names):
@@ -168,21 +168,21 @@ class Shapes:
 
     @property
     def sizes(self) -> list[int]:
-        """Numbers of nodes of the things that pairs need: edges, points and triangles where there are triangles, and `BALLS`."""
-        known = self._parts
+        """Sizes of the primitives that pairs need: edges, points and triangles if there are triangles, `BALLS`, `PLANES`."""
+        primitives = self._parts
         return [
-            *[1] * bool(known[3] or known[PLANES]),
+            *[1] * bool(primitives[3] or primitives[PLANES]),
             2,
-            *[3] * bool(known[3]),
-            *[BALLS] * bool(known[BALLS]),
-            *[PLANES] * bool(known[PLANES]),
+            *[3] * bool(primitives[3]),
+            *[BALLS] * bool(primitives[BALLS]),
+            *[PLANES] * bool(primitives[PLANES]),
         ]
 
     def things(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points, edges or triangles by their number of nodes, `BALLS` or `PLANES`: nodes, radius, object (n,), span (n, 4) of edges.
+        """Return nodes, radius, object (n,) and span (n, 4) of the primitives of a size: number of nodes, `BALLS` or `PLANES`.
 
         Raises:
-            SceneError: if neither rods nor shells were added.
+            SceneError: neither rods nor shells were added.
         """
         if not self._parts[2]:
             raise SceneError("a contact search has no objects but balls; add rods or shells")
@@ -192,35 +192,35 @@ class Shapes:
         return np.concatenate([part[0] for part in parts]), radius, number, np.concatenate([part[3] for part in parts])
 
     def beside(self, size: int) -> np.ndarray:
-        """Of edges both nodes, of points on rods the nodes before and after them, where there are any, else themselves (n, 2)."""
+        """Return both nodes of edges; for points on rods the previous and next node, for others the node itself (n, 2)."""
         nodes, _, owner, _ = self.things(size)
         if size == 2:
             return nodes
         ends, _, owners, _ = self.things(2)
-        own, result = owner * len(self.points) + nodes[:, 0], np.repeat(nodes, 2, axis=1)
+        node_keys, result = owner * len(self.points) + nodes[:, 0], np.repeat(nodes, 2, axis=1)
         for side in range(2):
             keys = owners * len(self.points) + ends[:, 1 - side]
             order = np.argsort(keys)
-            at = order[np.minimum(np.searchsorted(keys[order], own), len(keys) - 1)]
-            result[:, side] = np.where(keys[at] == own, ends[at, side], nodes[:, 0])
+            index = order[np.minimum(np.searchsorted(keys[order], node_keys), len(keys) - 1)]
+            result[:, side] = np.where(keys[index] == node_keys, ends[index, side], nodes[:, 0])
         return result
 
     def angles(self, size: int) -> np.ndarray:
-        """Of edges their angle, of points on rods those of the edges before and after them; -1 for none (n, 2)."""
+        """Return the angle blocks (n, 2) of edges, or of the edges before and after points on rods; -1 for none."""
         nodes, _, owner, _ = self.things(size)
         result = np.full((len(nodes), 2), -1)
         for number, angles in self._angles.items():
-            own = np.flatnonzero(owner == number)
+            rows = np.flatnonzero(owner == number)
             if size == 2:
-                result[own, 0] = angles
+                result[rows, 0] = angles
             elif size == 1:
-                closed = len(own) == len(angles)
-                result[own if closed else own[1:], 0] = np.roll(angles, 1) if closed else angles
-                result[own if closed else own[:-1], 1] = angles
+                closed = len(rows) == len(angles)
+                result[rows if closed else rows[1:], 0] = np.roll(angles, 1) if closed else angles
+                result[rows if closed else rows[:-1], 1] = angles
         return result
 
     def describe(self, size: int, index: int) -> str:
-        """A thing of a world as a message has it."""
+        """Return the name of a primitive of a world for messages."""
         for nodes, _, number, _ in self._parts[size]:
             if index < len(nodes):
                 if size <= 0:
@@ -251,10 +251,10 @@ class Shapes:
             raise SceneError(f"{name} has node {nodes[wrong][0]}; nodes are 0 to {len(self.points) - 1}")
         return nodes
 
-    def _positive(self, value: float, what: str, name: str) -> None:
+    def _positive(self, value: float, label: str, name: str) -> None:
         if not 0.0 < value < np.inf:
-            raise SceneError(f"{name}: {what} = {value!r}; it is positive and finite [m]")
+            raise SceneError(f"{name}: {label} = {value!r}; it is positive and finite [m]")
 
-    def _refuse(self, wrong: np.ndarray, what: str, fault: str, name: str) -> None:
+    def _refuse(self, wrong: np.ndarray, label: str, fault: str, name: str) -> None:
         if wrong.any():
-            raise SceneError(f"{what} {np.flatnonzero(wrong)[0]} of {name} {fault}; merge its nodes or leave it out")
+            raise SceneError(f"{label} {np.flatnonzero(wrong)[0]} of {name} {fault}; merge its nodes or leave it out")

@@ -1,4 +1,4 @@
-"""How far objects have turned whose surfaces friction takes along where their nodes stay; see `kernels.contact.spins`."""
+"""Rotating surfaces: rotation of obstacles whose nodes stay, for friction; see `kernels.contact.spins`."""
 
 import numpy as np
 import warp as wp
@@ -7,12 +7,12 @@ from ddg_warp.kernels.contact.spins import MARKERS, spin_kernels
 
 
 class Spins:
-    """Objects of a `BroadPhase` that spin, if any.
+    """Rotating surfaces of a `BroadPhase`, if any.
 
     Attributes:
-        any: whether there are some; places: of each object its first node and its markers, below zero of others (objects,), none
-            without any.
-        turned: of all objects in all worlds (worlds, objects) [rad], zero of those that do not; see `kernels.contact.spins`.
+        any: True if there are some.
+        `places`: first node and markers of each object (objects,), negative for objects at rest; empty without rotating surfaces.
+        `turned`: rotation vectors of all objects (worlds, objects) [rad], zero at rest; see `kernels.contact.spins`.
     """
 
     def __init__(self, search):
@@ -28,26 +28,26 @@ class Spins:
         self.kernels = [self._turn, self._pull] if self.any else []
 
     def __call__(self, start: wp.array, x: wp.array) -> None:
-        """How far they turned from positions at the start to x."""
+        """Write the rotations from positions at the start to x."""
         if self.any:
             self._launch(self._turn, [start, x], [self.turned])
 
-    def pull(self, start: wp.array, x: wp.array, by: wp.array, outputs: list[wp.array]) -> None:
-        """From derivatives `by` components of `turned` and radii (4, worlds, objects) add those by positions, both, and radii."""
-        self._launch(self._pull, [start, x, by], outputs)
+    def pull(self, start: wp.array, x: wp.array, cotangent: wp.array, outputs: list[wp.array]) -> None:
+        """Add cotangents of positions (start, x) and radii, given cotangents of `turned` and radii (4, worlds, objects)."""
+        self._launch(self._pull, [start, x, cotangent], outputs)
 
     def forces(self, x: wp.array, frictions: list) -> np.ndarray:
-        """Forces on nodes (W N, 3) [N] at x that have the couples of `FrictionElements` as evaluated last. Reads from the device."""
+        """Return nodal forces (W N, 3) [N] at x with the torques of `FrictionElements`, as evaluated last. Reads from the device."""
         out = np.zeros((len(x), 3))
         if not self.any:
             return out
-        at = x.numpy().astype(float)
-        couples = sum(part.couples() for part in frictions)
+        positions = x.numpy().astype(float)
+        couples = sum(friction.couples() for friction in frictions)
         for number, nodes in self._spinning.items():
             for world, couple in enumerate(couples[:, number]):
                 first, *markers = nodes + world * self._nodes
-                arms = at[markers] - at[first]
-                # sum of arms x forces is the couple
+                arms = positions[markers] - positions[first]
+                # the sum of arms x forces is the torque
                 pushes = np.cross(couple, arms) * (0.5 * len(arms) / (arms**2).sum())
                 out[markers] += pushes
                 out[first] -= pushes.sum(0)

@@ -1,4 +1,4 @@
-"""What contact comes to over the steps of an integrator; see `kernels.contact.tally`."""
+"""Contact statistics over the steps of an integrator; see `kernels.contact.tally`."""
 
 import warp as wp
 
@@ -7,10 +7,10 @@ from ddg_warp.solve.contact.pair_terms import PairTerms
 
 
 class Tally:
-    """Pairs that push each other, and the work of friction, over all steps so far. Reads nothing back and can be captured.
+    """Counts of active pairs, and friction work, over all steps. Reads nothing back and can be captured.
 
     Attributes:
-        counts: of each world (3, worlds), see `kernels.contact.tally`; work: what friction took (worlds,) [J].
+        counts: of each world (3, worlds), see `kernels.contact.tally`; work: friction work (worlds,) [J].
     """
 
     def __init__(self, terms: PairTerms):
@@ -23,7 +23,7 @@ class Tally:
 
     @property
     def arrays(self) -> list[wp.array]:
-        """What is counted."""
+        """Arrays of the statistics."""
         return [self.counts, self.work]
 
     @property
@@ -32,22 +32,22 @@ class Tally:
         return [self._take]
 
     def begin(self) -> None:
-        """Remember what it is before a step, which may have to be done again."""
+        """Save the statistics before a step that may have to be redone."""
         for kept, array in zip(self._before, self.arrays, strict=True):
             wp.copy(kept, array)
 
     def forget(self) -> None:
-        """Take back the last step."""
+        """Restore the statistics before the last step."""
         for kept, array in zip(self._before, self.arrays, strict=True):
             wp.copy(array, kept)
 
     def __call__(self, flags: wp.array) -> None:
-        """Add the terms as they were evaluated last, in the worlds whose flags say that a part of a step is done."""
+        """Add the terms as evaluated last, in worlds whose flags say that a substep is done."""
         inputs = [self.terms.touching, self.terms.dissipated, flags]
         wp.launch(self._take, self._worlds, inputs, [self.counts, self.work], device=self.device)
 
     def statistics(self) -> dict:
-        """Sums over worlds: "contacts", pairs after the last step and in the mean, and with friction "friction_work" [J]."""
+        """Return sums over worlds by name: "contacts", pairs after the last step and in the mean; with friction "friction_work" [J]."""
         counts = self.counts.numpy()
         mean = (counts[SUM] / counts[PARTS].clip(1)).sum()
         result = {"contacts": {"mean": float(mean), "last": int(counts[LAST].sum())}}

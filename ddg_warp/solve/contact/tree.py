@@ -1,4 +1,4 @@
-"""Things of all worlds on a device, with a tree of their boxes."""
+"""Collision primitives of all worlds on a device, with AABBs and a BVH."""
 
 import numpy as np
 import warp as wp
@@ -9,21 +9,22 @@ from ddg_warp.kernels.contact.boxes import box_kernel, bundle, encode
 from ddg_warp.kernels.contact.surfaces import surface_struct
 from ddg_warp.solve.contact.shapes import PLANES
 
-# Edges that follow each other along a rod, in a leaf of a tree, on a GPU and on the CPU. There a search among 49 noodles took 32 ms
-# with leaves of single edges, 28 of two and 25 of four, among 512 strands of hair 14, 11 and 8; among 10,000 strands an H200 takes 1.5,
-# 2.1 and, of three, 3.3 ms, as what meets is judged edge by edge, and ten times as many meet as are near.
+# Successive edges of a rod in one BVH leaf, on a GPU and on the CPU. Measured: CPU search among 49 noodles 32 ms with leaves of one
+# edge, 28 of two, 25 of four; among 512 strands of hair 14, 11 and 8. H200, 10,000 strands: 1.5 ms with one edge, 2.1 with two, 3.3
+# with three: the narrow phase tests edges, and ten times as many overlap as are in range.
 BUNDLE = 1, 4
-WALKERS = 1, 2  # sizes of what looks for others in their trees: points and edges
+WALKERS = 1, 2  # sizes of primitives that query BVHs: points and edges
 
 
 class Boxes:
-    """Boxes of things, `count` in each of some worlds; `tree` is there once it was built.
+    """AABBs of primitives, `count` in each of some worlds; `tree` exists once built.
 
     Args:
-        corners: their arrays, by default new ones.
+        corners: arrays of the corners; new ones by default.
 
     Attributes:
-        all: number in all worlds; worlds: how many these are; lower, upper: corners (all,).
+        `all`, `worlds`: number in all worlds; number of worlds.
+        `lower`, `upper`: corners (all,).
     """
 
     def __init__(self, count: int, worlds: int, device, corners: tuple | None = None):
@@ -32,7 +33,7 @@ class Boxes:
         self.tree, self.worlds = None, worlds
 
     def build(self) -> None:
-        """The tree anew for boxes as they are; on CUDA not in conditional parts of graphs, which must not allocate."""
+        """Build the BVH of the present AABBs; on CUDA not in conditional graph nodes, which must not allocate."""
         if self.tree is None:
             groups = None
             if self.worlds > 1:
@@ -42,7 +43,7 @@ class Boxes:
             self.tree.rebuild()
 
     def renew(self) -> None:
-        """A tree for boxes that may have moved far: anew on the CPU, as it was built on CUDA; that can be slower by far."""
+        """Update the BVH for AABBs that may have moved far: rebuild on the CPU, refit on CUDA, which may slow queries a lot."""
         if self.device.is_cpu:
             self.build()
         else:
@@ -50,20 +51,22 @@ class Boxes:
 
 
 class WalkOrder:
-    """The order in which walks take boxes, along a Morton curve; see `kernels.contact.candidates`.
+    """Order of BVH queries along a Morton curve; see `kernels.contact.candidates`.
 
     Attributes:
-        numbers: of boxes (2 all,), of which the first half holds.
+        numbers: box indices (2 all,), of which the first half is valid.
     """
 
     def __init__(self, boxes: Boxes):
         self._boxes = boxes
         self._keys, self.numbers = (wp.zeros(2 * boxes.all, dtype=int, device=boxes.device) for _ in range(2))
-        self._dropped = max(0, (boxes.worlds - 1).bit_length() - 1)  # of 30 bits, which with the world have to be 31
+        self._dropped = max(
+            0, (boxes.worlds - 1).bit_length() - 1
+        )  # dropped of 30 bits, which with the world number have to be 31
         self._room = None
 
     def __call__(self) -> None:
-        """Sort them as they are; the room that is divided is that of the first time, and half of it more on all sides."""
+        """Sort the present boxes; the curve divides the bounds of the first call, enlarged by half on all sides."""
         boxes = self._boxes
         if self._room is None:
             lower, upper = boxes.lower.numpy().min(axis=0), boxes.upper.numpy().max(axis=0)
@@ -75,15 +78,19 @@ class WalkOrder:
 
 
 class Things:
-    """Points, edges, triangles, balls or planes of `shapes`, with boxes, and boxes of bundles of them.
+    """Points, edges, triangles, balls or planes of `shapes`, with AABBs and BVH leaves.
 
     Args:
-        radius: of every object in every world (worlds, objects) [m].
+        radius: radius of every object in every world (worlds, objects) [m].
 
     Attributes:
-        count: in one world; all: in all worlds; surface: see `surface_struct`; lower, upper: corners of boxes (all,).
-        bundles: of one world, the things that bundles start with, and how many there are; bundle: things of the largest one.
-        leaves: boxes of bundles, and their tree; walked: whether there is a tree; order: in which walks take them, None if by number.
+        `count`, `all`: number in one world, and in all.
+        `surface`: see `surface_struct`.
+        `lower`, `upper`: corners of AABBs (all,).
+        `bundles`, `bundle`: first primitives of the leaves of one world, then their number; primitives of the largest leaf.
+        `leaves`: AABBs of leaves, and the BVH.
+        `walked`: True if there is a BVH.
+        `order`: order of queries; None for order by number.
     """
 
     def __init__(self, shapes, size: int, worlds: int, real, device, radius: wp.array):
@@ -106,21 +113,21 @@ class Things:
         self._single = self.bundle == 1
         corners = (self.lower, self.upper) if self._single else None
         self.leaves = Boxes(len(starts) - 1, worlds, device, corners)
-        self.walked = size != 1  # points look for others, which do not look for them
+        self.walked = size != 1  # points query other BVHs and are not queried
         self.order = WalkOrder(self.leaves) if size in WALKERS and not arrays.serial(device) else None
         self._enclose = box_kernel(nodes.shape[1], size == PLANES, real)
         self.kernels = [self._enclose] if self._single else [self._enclose, bundle]
         self.kernels += [encode] if self.order else []
 
     def build(self) -> None:
-        """The tree of leaves anew, where there is one, as of `Boxes.build`, and the order of walks."""
+        """Rebuild the BVH of leaves, if any, as `Boxes.build`, and the order of queries."""
         if self.walked:
             self.leaves.build()
         if self.order:
             self.order()
 
     def enclose(self, x, move, shift, share: float, more: float, lost) -> None:
-        """Boxes around x and x + move, the latter less `shift` of the world, inflated by a share of the radius and more [m]."""
+        """Write AABBs around x and x + move, the latter less `shift` of the world, inflated by `share` of the radius and `more` [m]."""
         corners, leaves = [self.lower, self.upper], self.leaves
         inputs = [self.surface, self.count, x, move, shift, share, more]
         wp.launch(self._enclose, self.all, inputs, [*corners, lost], device=self.device)
@@ -130,14 +137,14 @@ class Things:
 
 
 def bundle_starts(owner: np.ndarray, span: np.ndarray | None, most: int) -> np.ndarray:
-    """Things that bundles start with, in a row, and how many things there are: so many edges of a rod (see `surface_struct`) at most.
+    """Return the first primitive of each leaf, then the number of primitives; leaves have `most` successive rod edges or fewer.
 
-    All others are on their own, as is everything without `span`.
+    All other primitives have leaves of their own; without `span` (see `surface_struct`) all do.
     """
     starts = np.ones(len(owner), bool)
     if span is not None:
         of_rod, number = span[:, 3] >= 0.0, np.arange(len(owner))
         first = np.flatnonzero(np.diff(owner, prepend=-1))
-        place = number - np.repeat(first, np.diff(first, append=len(owner)))
-        starts = ~of_rod | (place % most == 0)
+        index = number - np.repeat(first, np.diff(first, append=len(owner)))
+        starts = ~of_rod | (index % most == 0)
     return np.append(np.flatnonzero(starts), len(owner)).astype(np.int32)

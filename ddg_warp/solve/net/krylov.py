@@ -106,7 +106,7 @@ class ConjugateGradients:
         wp.capture_while(self.busy, self.cycle)
 
     def precondition(self, z: wp.array) -> None:
-        """Add preconditioner corrections to z, on entry the residual times inverse diagonal blocks, and write r . z."""
+        """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
         newton = self.newton
         wanted, dots = newton.islands.wanted, newton.krylov_dots
         if newton.chains:

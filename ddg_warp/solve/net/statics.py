@@ -85,8 +85,8 @@ class StaticNewton(NetNewton):
     ) -> None:
         """Start from dofs `q` under dead loads (worlds, 3 blocks) and follower loads at `load_factor`, given load scales of bodies.
 
-        In contact, q is the proposed motion from dofs `before`. Friction counts slips from blocks `slid` over `rate`; without `slid`
-        there is none.
+        In contact, q is the proposed motion from dofs `before`. Friction counts slips from blocks `slid` over `rate`; zero means no
+        friction.
         """
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
