@@ -189,7 +189,7 @@ class Directions(ConjugateGradients):
         wp.capture_while(self.busy, self.reduce)
 
     def reduce(self) -> None:
-        """Iterate until one of the two tests passes."""
+        """Iterate to the forcing term, then test the residual tolerance."""
         newton, few = self.newton, self.newton.outliers
         super().iterate()
         self.compare()

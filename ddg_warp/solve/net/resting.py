@@ -6,7 +6,8 @@ them. An island falls asleep at `REST` of the tolerance: Newton residuals are mo
 others iterate.
 
 Alternative: more bodies may sleep, such as converged rods in contact with unconverged ones.
-Measured: with only unconverged rods and their neighbours awake, 10,000 strands took as long on a GPU. 300 rods of a pile took up to
+
+Measured: with only unconverged rods and their neighbours awake, 10,000 strands took as long on a GPU. A pile of 300 rods took up to
 twice the iterations, since barely converged rods wake repeatedly.
 """
 

@@ -27,7 +27,7 @@ def number_units(body: np.ndarray, count: int, host, motions: list) -> tuple[np.
 
 
 def _joined(unit: np.ndarray, host) -> np.ndarray:
-    """Return the body numbers with one number for bodies that share nodes, so that joints stay intact."""
+    """Return the body numbers with one number for bodies with common nodes, so that joints stay intact."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
