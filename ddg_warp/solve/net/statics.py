@@ -323,9 +323,7 @@ class NetEquilibrium:
         """
         state, owner, first = state.copy(), self.owner, before
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
-        repeats = (
-            self.net.edges or self.model.motions
-        )  # the result is tested with its own frames and forces on supports
+        repeats = self.net.edges or self.model.motions  # test the result with its own frames and support forces
         start = self.tangent.dofs(state)
         relaxation, settled = Relaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
         if rubs:
