@@ -14,7 +14,7 @@ ROOM = 4  # capacity: one in so many pairs; more keep the Gauss-Newton matrix, w
 LEAST = 256  # smallest capacity in pairs
 MOST = (
     2**15
-)  # largest number of threads that differentiate; a thread for each column of the capacity would mostly do nothing
+)  # largest number of threads that differentiate: with one for each column of the capacity, most would do nothing
 
 
 class Mollified:

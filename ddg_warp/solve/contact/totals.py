@@ -31,9 +31,8 @@ class Totals:
 
     def fit(self) -> None:
         """Take the present arrays of the sets."""
-        self._lists = [
-            self._written(pair_set) for pair_set in (*self._contacts, *self._frictions)
-        ]  # keeps the arrays alive
+        # keeps the arrays alive
+        self._lists = [self._written(pair_set) for pair_set in (*self._contacts, *self._frictions)]
         self._written_by = wp.array(self._lists, dtype=written_struct(self._real), device=self._device)
 
     def __call__(self, overflow: wp.array) -> None:

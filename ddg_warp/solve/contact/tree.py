@@ -60,9 +60,8 @@ class WalkOrder:
     def __init__(self, boxes: Boxes):
         self._boxes = boxes
         self._keys, self.numbers = (wp.zeros(2 * boxes.all, dtype=int, device=boxes.device) for _ in range(2))
-        self._dropped = max(
-            0, (boxes.worlds - 1).bit_length() - 1
-        )  # dropped of 30 bits, which with the world number have to be 31
+        # of 30 bits, which with the world number have to be 31
+        self._dropped = max(0, (boxes.worlds - 1).bit_length() - 1)
         self._room = None
 
     def __call__(self) -> None:

@@ -141,9 +141,8 @@ class ChainPlan:
         is_joint[rotations[:, 0]] = True
         rotation = np.full(host.blocks, -1)
         rotation[rotations[::-1, 0]] = rotations[::-1, 1]
-        further_rotations = rotations[
-            rotation[rotations[:, 0]] != rotations[:, 1], 1
-        ]  # of second rigid joints at a node
+        # of second rigid joints at a node
+        further_rotations = rotations[rotation[rotations[:, 0]] != rotations[:, 1], 1]
         path_node = np.full(host.blocks, -1)
         index = np.arange(len(node))
         path_node[node[~is_joint[node]]] = index[~is_joint[node]]
