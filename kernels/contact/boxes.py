@@ -1,4 +1,4 @@
-"""Boxes around what may touch, in float32 and rounded outwards: nothing that reaches into a box in exact numbers is outside of it."""
+"""Conservative float32 AABBs of collision primitives: rounded outwards, so that they contain the exact bounds."""
 
 from functools import cache
 
@@ -8,18 +8,20 @@ import warp as wp
 from ddg_warp.kernels.contact.surfaces import surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-ROUNDING = 3e-7  # more than two roundings of float32, relative: that of a sum and that of the conversion
-FAR = 1e15  # beyond anything [m], squared still a number
+ROUNDING = 3e-7  # relative bound of two float32 roundings, of a sum and of the conversion
+FAR = 1e15  # beyond any scene [m]; its square is finite
 LEAST = float(np.finfo(np.float32).tiny)  # so that zero is rounded outwards, too
 
 
 @wp.struct
 class Trees:
-    """Boxes of two sides whose pairs are asked for, in all worlds, and the tree of the second.
+    """AABBs of two sides in all worlds, and the BVH of the second side.
 
-    lower, upper: of first things; second_lower, second_upper: of second ones; bundle_lower, bundle_upper: of bundles of first ones;
-    bundles: of these in one world, the first things that they start with, and how many there are; leaves: the same of the bundles of
-    second things, whose boxes are those of the tree; order: in which walks take bundles of first ones, by number if empty.
+    `lower`, `upper`: AABBs of first primitives; `second_lower`, `second_upper`: AABBs of second primitives.
+    `bundle_lower`, `bundle_upper`: AABBs of bundles of consecutive first primitives, which traverse the BVH together.
+    `bundles`: offsets of the bundles of one world among its first primitives.
+    `leaves`: offsets of the leaves of the BVH among second primitives.
+    `order`: sequence of bundles in traversals; empty for their own order.
     """
 
     lower: wp.array(dtype=wp.vec3)
@@ -36,7 +38,7 @@ class Trees:
 
 @wp.func
 def overlap(lower: wp.vec3, upper: wp.vec3, other_lower: wp.vec3, other_upper: wp.vec3):
-    """Whether two boxes meet, as trees see it."""
+    """Return True if two AABBs overlap, by the rule of the BVH."""
     x = lower[0] <= other_upper[0] and upper[0] >= other_lower[0]
     y = lower[1] <= other_upper[1] and upper[1] >= other_lower[1]
     return x and y and lower[2] <= other_upper[2] and upper[2] >= other_lower[2]
@@ -51,7 +53,7 @@ def bundle(
     lower_out: wp.array(dtype=wp.vec3),
     upper_out: wp.array(dtype=wp.vec3),
 ):
-    """Boxes of bundles, which start with such things, of `count` in a world."""
+    """Write AABBs of bundles with offsets `starts` among the `count` primitives of a world."""
     tid = wp.tid()
     bundles = starts.shape[0] - 1
     w = tid / bundles
@@ -67,7 +69,7 @@ def bundle(
 
 @wp.func
 def spread(v: int):
-    """Bits of a number of ten, every third."""
+    """Return the ten bits of a number, spread to every third bit."""
     v = (v | (v << 16)) & 0x030000FF
     v = (v | (v << 8)) & 0x0300F00F
     v = (v | (v << 4)) & 0x030C30C3
@@ -85,24 +87,24 @@ def encode(
     keys_out: wp.array(dtype=int),
     numbers_out: wp.array(dtype=int),
 ):
-    """Keys that sort boxes, `count` in a world, by world and along a Morton curve, less some bits of it; and their numbers.
+    """Write indices of AABBs, `count` in a world, and keys that sort them by world and Morton code.
 
     Args:
-        corner, scale: of the room that is divided into 1024 cells along each axis; beyond it boxes are in its outermost cells.
-        dropped: bits of the curve that keys are without.
+        corner, scale: of the grid of 1024 cells along each axis; AABBs beyond it are in its outermost cells.
+        dropped: low bits of the Morton code that keys leave out.
     """
     i = wp.tid()
-    at = (wp.float32(0.5) * (lower[i] + upper[i]) - corner) * scale
+    cell = (wp.float32(0.5) * (lower[i] + upper[i]) - corner) * scale
     key = int(0)
     for d in range(3):
-        key |= spread(int(wp.clamp(at[d], wp.float32(0.0), wp.float32(1023.0)))) << d
+        key |= spread(int(wp.clamp(cell[d], wp.float32(0.0), wp.float32(1023.0)))) << d
     keys_out[i] = (i / count << (30 - dropped)) | (key >> dropped)
     numbers_out[i] = i
 
 
 @cache
 def outward_function(real):
-    """outward(value, sign): in float32, down or up by the sign, no nearer than it is."""
+    """Return the device function `outward(value, sign)`: the value in float32, rounded down or up by the sign."""
 
     @wp.func
     def outward(value: real, sign: float):
@@ -114,13 +116,12 @@ def outward_function(real):
 
 @cache
 def box_kernel(size: int, endless: bool, real):
-    """Boxes of things with `size` nodes, or around all there is if these are `endless`.
+    """Build the kernel of AABBs.
 
-    They are around both x and x + move, inflated by `share` of the radius and `more`.
+    `boxes`: write swept AABBs of primitives with `size` nodes, or unbounded ones if `endless`.
 
-    From x + move the `shift` of the world is taken.
-
-    Nodes that are no numbers are noted in `lost` as node + 1; a box around them is empty, at the origin.
+    An AABB contains x and x + move - shift, inflated by `share` times the radius plus `more` [m]; `shift` is the common motion of the
+    world. A node that is not finite is noted in `lost` as node + 1; its AABB is empty, at the origin.
     """
     Surface, X, outward = surface_struct(real), wp.types.vector(3, real), outward_function(real)
 
@@ -137,7 +138,7 @@ def box_kernel(size: int, endless: bool, real):
         upper: wp.array(dtype=wp.vec3),
         lost: wp.array(dtype=int),
     ):
-        """A thread has a thing of a world."""
+        """Treat one primitive of a world a thread."""
         i = wp.tid()
         w = i / count
         k = i - w * count

@@ -1,36 +1,45 @@
-"""Pairs that are near: those whose boxes meet, by a tree; judged by their distance; and listed in the order of their indices.
+"""Candidate pairs: broad phase by a BVH, narrow phase by distance, and lists sorted by index.
 
-Walking the tree and judging pairs are kernels of their own. A walk waits for memory, and takes so few registers that many threads
-wait at once: with a loop over things and their boxes in it, it took 2.4 times as long on an H200. Bundles of edges that follow each
-other along a rod share a leaf of the tree, and a walk; all pairs of things of two bundles whose boxes meet are judged, a slot each.
-(Larger boxes whose pairs serve several searches were tried: what falls leaves them in a step, and what rests gains nothing, as many
-more of them meet. So was to tell edges apart in float32 before they are judged: 72 of 100 that meet are, among 10,000 strands, but it
-took an H100 0.50 ms to judge them so, and 0.42 without.)
+The broad phase (`meet`) and the narrow phase (`judge`) are separate kernels: a BVH traversal waits for memory, and takes so few
+registers that many threads wait at once. A leaf of the BVH has consecutive edges of a rod, which need one traversal. The narrow
+phase tests all pairs of primitives of two leaves whose AABBs overlap.
 
-Of a motion those are found that may come near anywhere on the way. Whatever its share of its way, each node is between both ends of
-it; so the sides are as far apart as these ends are along any direction. The one asked is that of the closest points in the middle of
-the way, along which what does not move is as far apart as its distance. Where a world moves at one share, ways are what nodes move by
-beside the others of the pair, and boxes move with the world.
+Measured: with a loop over primitives and their AABBs in it, the traversal took 2.4 times as long on an H200.
 
-Nodes may also be beside their ways, by `around`. Along any direction sides are then nearer by no more than twice that, and boxes are
-larger by it. So of what is no pair no two come within reach, wherever in the tubes around their ways their nodes are; and as tubes are
-convex, a straight motion between two places in them does not leave them. Half-spaces have boxes around all there is. Far from its three
-nodes, which go by one share, a plane moves by more than they do, by the weights that they have there: its pairs are judged by a bound
-on how far both sides come towards each other.
+Alternative: larger AABBs whose candidates serve several searches. Falling bodies leave them within a step; bodies at rest gain
+nothing, as many more AABBs overlap.
 
-Of two bundles of things that are alike, the one whose box begins later along an axis finds the other: that side of its box lies between
-both sides of the other's. So walks ask for boxes that meet this side alone, and come to half as many (10,000 strands that fall, an
-H100: 1.55 ms for 2.03; on the CPU two thirds of the time). Capsules around edges in place of their boxes, or trees by the surfaces of
-boxes, gain 7 %.
+Alternative: a float32 test of edges before the narrow phase. It rejects 72 % of the pairs among 10,000 strands, but the narrow phase
+then takes 0.50 ms on an H100 instead of 0.42.
 
-A walk begins at the root, so that threads of a warp wait for each other wherever their ways part: on CUDA they take bundles in the
-order of their places on a Morton curve (10,000 strands of hair, an H200: 0.83 ms for 1.03). What has met lies in parts of the list that
-have counters of their own, as threads wait for a counter, too, and for others in its line of the cache (1024 counters in 32 lines: 0.64
-ms; 64 in two: 0.85).
+A candidate may come within the search distance anywhere in the motion. Whatever fraction of its displacement a node moves, it stays
+between its two end positions. So along any direction the sides are at least as far apart as these positions are. The direction used
+joins the closest points at half the motion; along it motionless sides are separated by their distance. Where a world moves by one
+fraction, displacements are relative to the mean of the pair, and AABBs move with the world.
 
-Each thing notes its partners in a linked list, in which each pair of those whose boxes meet has a place, (partner, place of the next
-one), in any order; running sums then say where its part of the list of pairs starts. So two runs give the same list to the bit,
-whatever order threads run in, and lists that do not fit are left out whole: `overflow` says so, and `needed` how long both would be.
+Nodes may also deviate from these paths by `around`. Along any direction the separation then decreases by at most twice that, and AABBs
+are inflated by it. So no other pair comes within the search distance while its nodes are in the tubes around their paths. Tubes are
+convex: a straight motion between two positions in them does not leave them.
+
+Half-spaces have unbounded AABBs. Away from its three nodes, which move by one fraction, a plane moves by more than its nodes, in
+proportion to their weights. Its pairs are tested by a bound on the approach of both sides.
+
+If both sides are of one type, the leaf whose AABB begins later along an axis finds the other: its lower face lies within the extent of
+the other. So traversals query the lower face alone and visit half as many leaves.
+
+Measured: 1.55 ms instead of 2.03 for 10,000 falling strands on an H100; on the CPU two thirds of the time.
+
+Alternative: capsules around edges instead of AABBs, or BVHs built by surface area, gain 7 %.
+
+A traversal begins at the root, and threads of a warp wait for each other wherever their paths diverge. On CUDA they take leaves in
+Morton order. The list of overlapping leaf pairs has segments with a counter each, as threads wait for a counter and its cache line.
+
+Measured: Morton order takes 0.83 ms instead of 1.03 for hair of 10,000 strands on an H200; 1024 counters in 32 lines 0.64 ms, 64
+counters in two lines 0.85 ms.
+
+Each primitive has a linked list of partners, in any order, with entries (partner, index of the next entry). Prefix sums then give the
+start of its segment in the candidate list. So two runs give the same list bitwise, whatever the order of threads. Lists that overflow
+stay empty: `overflow` is set, and `needed` is the length that both lists need.
 """
 
 from functools import cache
@@ -43,68 +52,74 @@ from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.reading import read_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
+MOST = 2**31 - 1  # largest number of pairs that can be counted
 WARP = 32  # threads that run together
-AXIS = 2  # along which boxes of things that are alike begin one after the other
-AT_ONCE = 8  # pairs of a bundle that are given places together: threads wait for the counter of places
+AXIS = 2  # axis along which leaves of one type are ordered
+AT_ONCE = 8  # pairs of a leaf that are appended together, as threads wait for the counter
 
 
 @wp.func
 def note_needed(
-    found: wp.array(dtype=int),
-    met: wp.array(dtype=wp.vec2i),
+    num_met: wp.array(dtype=int),
+    leaf_pairs: wp.array(dtype=wp.vec2i),
     overflow: wp.array(dtype=int),
     needed: wp.array(dtype=int),
 ):
-    """How much room all parts take that have as much as the fullest, and whether it was there; more than can be counted is below 0."""
-    parts = found.shape[0]
-    for part in range(parts):
-        number = wp.where(found[part] < 0, wp.static(MOST), found[part])
-        if number > met.shape[0] / parts:
+    """Note the capacity that the fullest segment requires of all, and an overflow; counts that wrapped are negative."""
+    segments = num_met.shape[0]
+    for segment in range(segments):
+        number = wp.where(num_met[segment] < 0, wp.static(MOST), num_met[segment])
+        if number > leaf_pairs.shape[0] / segments:
             overflow[0] = 1
-        needed[1] = wp.max(needed[1], wp.where(number > wp.static(MOST) / parts, wp.static(MOST), number * parts))
+        needed[1] = wp.max(needed[1], wp.where(number > wp.static(MOST) / segments, wp.static(MOST), number * segments))
 
 
 @wp.func
-def turns(tid: int, threads: int, found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i)):
-    """Where a thread begins in what has met, where its part ends, and how many threads share that."""
-    parts = found.shape[0]
-    each, room = threads / parts, met.shape[0] / parts
-    part = tid / each
-    if part >= parts:
+def turns(tid: int, threads: int, num_met: wp.array(dtype=int), leaf_pairs: wp.array(dtype=wp.vec2i)):
+    """Return the first leaf pair of a thread, the end of its segment, and the number of threads of that segment."""
+    segments = num_met.shape[0]
+    each, room = threads / segments, leaf_pairs.shape[0] / segments
+    segment = tid / each
+    if segment >= segments:
         return 0, 0, 1
-    first = part * room
-    return first + tid - part * each, first + wp.min(found[part], room), each
+    first = segment * room
+    return first + tid - segment * each, first + wp.min(num_met[segment], room), each
 
 
 @cache
 def meet_kernel(alike: bool, inner: bool, grouped: bool):
-    """meet(...): bundles whose boxes meet, of things that are alike each two once and, if `inner`, each with itself."""
+    """Build the kernel of the broad phase.
+
+    `meet`: list pairs of leaves whose AABBs overlap. If sides are `alike`, each pair is listed once, and with `inner` each leaf with
+    itself.
+    """
     Few, least = wp.types.vector(AT_ONCE, int), 1 - inner
 
     @wp.func
-    def put(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i), part: int, i: int, few: Few, number: int):
-        room = met.shape[0] / found.shape[0]
-        first = wp.atomic_add(found, part, number)
+    def append_pairs(
+        num_met: wp.array(dtype=int), leaf_pairs: wp.array(dtype=wp.vec2i), segment: int, i: int, few: Few, number: int
+    ):
+        room = leaf_pairs.shape[0] / num_met.shape[0]
+        first = wp.atomic_add(num_met, segment, number)
         for n in range(number):
             if first + n < room:
                 both = wp.vec2i(i, few[n])
                 if wp.static(alike):
                     both = wp.vec2i(wp.min(i, few[n]), wp.max(i, few[n]))
-                met[part * room + first + n] = both
+                leaf_pairs[segment * room + first + n] = both
 
     @wp.func
     def finds(trees: Trees, i: int, j: int):
-        """Whether a bundle finds another that its walk has come to; where both begin at the same place, the first does."""
+        """Return True if leaf i lists the pair with leaf j; of leaves that begin at the same coordinate, the first does."""
         if wp.static(alike):
             first = trees.bundle_lower[j][wp.static(AXIS)] < trees.bundle_lower[i][wp.static(AXIS)]
             return first or j >= i + wp.static(least)
         return True
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def meet(trees: Trees, found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i)):
-        """As many as fit, and how many there are. A thread has a bundle of a world."""
-        part = wp.tid() / wp.static(WARP) % found.shape[0]
+    def meet(trees: Trees, num_met: wp.array(dtype=int), leaf_pairs: wp.array(dtype=wp.vec2i)):
+        """Append pairs while there is room, and count all; one thread per leaf of a world."""
+        segment = wp.tid() / wp.static(WARP) % num_met.shape[0]
         i = wp.tid()
         if trees.order.shape[0] > 0:
             i = trees.order[i]
@@ -123,22 +138,23 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
                 few[number] = j
                 number += 1
                 if number == wp.static(AT_ONCE):
-                    put(found, met, part, i, few, number)
+                    append_pairs(num_met, leaf_pairs, segment, i, few, number)
                     number = 0
         if number > 0:
-            put(found, met, part, i, few, number)
+            append_pairs(num_met, leaf_pairs, segment, i, few, number)
 
     return meet
 
 
 @cache
 def asked_functions(kind: Kind, real, single: bool):
-    """ranges_of(trees, both): world of two bundles, where the first and the second begin there and end.
+    """Return the device functions `ranges_of`, `reaches` and `asked`.
 
-    reaches(sides, trees, bundle, l, w): whether the box of a second thing of a world meets that of a bundle.
-    asked(sides, trees, k, l, w): whether boxes of things meet that may touch.
+    `ranges_of(trees, both) -> (w, start, end, first, last)`: world and primitives of two leaves.
+    `reaches(sides, trees, bundle, l, w)`: True if the AABB of second primitive l overlaps that of a leaf.
+    `asked(sides, trees, k, l, w)`: True if the AABBs of two primitives overlap and the two may be a pair.
 
-    Where bundles are all of a `single` thing, boxes are those that have met.
+    Leaves of a `single` primitive have the AABB of the primitive, which has been tested before.
     """
     Sides = sides_struct(real)
     _, may_touch, *_ = pair_functions(kind, real)
@@ -146,10 +162,10 @@ def asked_functions(kind: Kind, real, single: bool):
     @wp.func
     def ranges_of(trees: Trees, both: wp.vec2i):
         w = both[0] / (trees.bundles.shape[0] - 1)
-        one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
+        first, second = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
         if wp.static(single):
-            return w, one, one + 1, other, other + 1
-        return w, trees.bundles[one], trees.bundles[one + 1], trees.leaves[other], trees.leaves[other + 1]
+            return w, first, first + 1, second, second + 1
+        return w, trees.bundles[first], trees.bundles[first + 1], trees.leaves[second], trees.leaves[second + 1]
 
     @wp.func
     def reaches(sides: Sides, trees: Trees, bundle: int, l: int, w: int):
@@ -173,33 +189,42 @@ def asked_functions(kind: Kind, real, single: bool):
 
 @cache
 def candidate_kernels(kind: Kind, real, single: bool):
-    """judge(...) by distance, and fill(...) the list of pairs; `single` as of `asked_functions`."""
+    """Build the kernels of the narrow phase.
+
+    `judge`: link and count the candidates among primitives of leaf pairs.
+    `fill`: write the candidate list.
+
+    `single`: see `asked_functions`.
+    """
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
-    slots, _, thickness, closest = pair_functions(kind, real)
+    pair_nodes, _, thickness, closest = pair_functions(kind, real)
     ranges_of, reaches, asked = asked_functions(kind, real, single)
     corners, relative = corners_function(real), relative_function(kind, real)
     link_of = read_function(wp.vec2i)
     half, two = wp.constant(real(0.5)), wp.constant(real(2.0))
 
     @wp.func
-    def apart(x: Y, p: Y, around: real):
-        """Distance that two keep whose nodes go any share of p, those of a half-space one, and then anywhere within `around`."""
+    def separation(x: Y, p: Y, around: real):
+        """Return a lower bound of the distance [m] if nodes move by any fractions of p and deviate by `around`.
+
+        Nodes of a half-space move by one fraction.
+        """
         y = x + half * p
         r, w = closest(y)
         if wp.static(kind.endless):
             near = half * (wp.length(p[0]) + wp.length(w[1] * p[1] + w[2] * p[2] + w[3] * p[3]))
             near += around * (real(1.0) + wp.abs(w[1]) + wp.abs(w[2]) + wp.abs(w[3]))
-            turn = half * wp.max(wp.length(p[2] - p[1]), wp.length(p[3] - p[1])) + two * around
-            beside = half * (wp.length(p[0]) + wp.length(p[1])) + two * around
-            return wp.length(r) - near - two * turn * (beside + turn)
+            rotation = half * wp.max(wp.length(p[2] - p[1]), wp.length(p[3] - p[1])) + two * around
+            lever = half * (wp.length(p[0]) + wp.length(p[1])) + two * around
+            return wp.length(r) - near - two * rotation * (lever + rotation)
         n = wp.normalize(r)
         first, second = real(wp.inf), real(-wp.inf)
         for k in range(4):
-            at, off = wp.dot(n, y[k] - y[0]), half * wp.abs(wp.dot(n, p[k]))
+            projection, off = wp.dot(n, y[k] - y[0]), half * wp.abs(wp.dot(n, p[k]))
             if k < wp.static(kind.first):
-                first = wp.min(first, at - off)
+                first = wp.min(first, projection - off)
             else:
-                second = wp.max(second, at + off)
+                second = wp.max(second, projection + off)
         return first - second - two * around
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -213,39 +238,41 @@ def candidate_kernels(kind: Kind, real, single: bool):
         together: wp.array(dtype=int),
         reach: real,
         around: real,
-        found: wp.array(dtype=int),
-        met: wp.array(dtype=wp.vec2i),
+        num_met: wp.array(dtype=int),
+        leaf_pairs: wp.array(dtype=wp.vec2i),
         links: wp.array(dtype=wp.vec2i),
-        last_slot: wp.array(dtype=int),
+        last_link: wp.array(dtype=int),
         partners: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
         needed: wp.array(dtype=int),
     ):
-        """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
+        """Link and count, by first primitive, the pairs whose gap may fall below `reach` [m] within `around` [m] of their paths."""
         if wp.tid() == 0:
-            note_needed(found, met, overflow, needed)
-        begin, stop, step = turns(wp.tid(), threads, found, met)
+            note_needed(num_met, leaf_pairs, overflow, needed)
+        begin, stop, step = turns(wp.tid(), threads, num_met, leaf_pairs)
         for n in range(begin, stop, step):
-            w, start, end, first, last = ranges_of(trees, met[n])
+            w, start, end, first, last = ranges_of(trees, leaf_pairs[n])
             for l in range(first, last):
-                if not reaches(sides, trees, met[n][0], l, w):
+                if not reaches(sides, trees, leaf_pairs[n][0], l, w):
                     continue
                 for k in range(start, end):
                     if asked(sides, trees, k, l, w):
-                        nodes = slots(sides, k, l, w)
+                        nodes = pair_nodes(sides, k, l, w)
                         y, p = corners(x, nodes), corners(move, nodes)
                         if together[w] != 0:
                             p, _speed = relative(y, p)
-                        if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
+                        if separation(y, p, around) <= thickness(sides, k, l, w) + reach:
                             i = k + w * sides.counts[0]
-                            slot = (n * wide[0] + k - start) * wide[1] + l - first
-                            links[slot] = wp.vec2i(l + w * sides.counts[1], wp.atomic_exch(last_slot, i, slot))
+                            link_index = (n * wide[0] + k - start) * wide[1] + l - first
+                            links[link_index] = wp.vec2i(
+                                l + w * sides.counts[1], wp.atomic_exch(last_link, i, link_index)
+                            )
                             wp.atomic_add(partners, i, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
         links: wp.array(dtype=wp.vec2i),
-        last_slot: wp.array(dtype=int),
+        last_link: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         partners: wp.array(dtype=int),
         pairs: wp.array(dtype=wp.vec2i),
@@ -253,7 +280,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
         overflow: wp.array(dtype=int),
         needed: wp.array(dtype=int),
     ):
-        """The pairs of a thing, sorted by insertion; lists are short."""
+        """Write the pairs of a first primitive, in order, by insertion sort; lists are short."""
         i = wp.tid()
         end = starts.shape[0] - 1
         total = starts[end] + partners[end]
@@ -266,15 +293,15 @@ def candidate_kernels(kind: Kind, real, single: bool):
         if fits:
             start = starts[i]
             end = start
-            at = last_slot[i]
+            entry = last_link[i]
             for _partner in range(partners[i]):
-                link = link_of(links, at)
+                link = link_of(links, entry)
                 k = end
                 while k > start and pairs[wp.max(k - 1, 0)][1] > link[0]:
                     pairs[k] = pairs[k - 1]
                     k -= 1
                 pairs[k] = wp.vec2i(i, link[0])
                 end += 1
-                at = link[1]
+                entry = link[1]
 
     return judge, fill

@@ -1,7 +1,7 @@
-"""What pairs bring to nodes, gathered in one order: sums over the pairs that each node is in.
+"""Assembly of contact: sum the contributions of pairs to their nodes in a fixed order.
 
-An item is 6 pair + slot. Slots are of the four nodes of a pair and, where friction turns rods, of two angles of their edges, the x of
-blocks of their own. `node_items` lists those of each node.
+An item is 6 pair + local index. Local indices 0-3 are the nodes of a pair; if friction rolls rods, 4 and 5 are twist angles of its
+edges, the x of dof blocks of their own. `node_items` lists the items of each node.
 """
 
 from functools import cache
@@ -14,22 +14,22 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLOTS, ANGLES = 4, 2  # nodes of a pair, and angles
 ITEMS = SLOTS + ANGLES
-ROW, WEIGHT = 8, 4  # numbers of a row of a factor, and where its weights begin
-PLACED = 4  # numbers of what is placed, the last of no use
+ROW, WEIGHT = 8, 4  # numbers of a factor row, and index of its first weight
+PLACED = 4  # numbers of a placed contribution, of which the last is unused
 
 
 @wp.func
 def taken_apart(item: int):
-    """The pair of an item, and the slot."""
+    """Return the pair and the local index of an item."""
     p = item / wp.static(ITEMS)
     return p, item - wp.static(ITEMS) * p
 
 
 @cache
 def row_functions(linear):
-    """row_of(rows, k, p) of a factor, direction_of(row) and weight_of(row).
+    """Return the device functions `row_of(rows, k, p)`, `direction_of(row)` and `weight_of(row)` of a factor.
 
-    It is as long as what a GPU takes from memory at once: gathering one of a pair takes 32 bytes in float32, of two arrays twice that.
+    A row has the size of a memory transaction of a GPU, 32 bytes in float32; two arrays would take twice that.
     """
     R, V, W = (wp.types.vector(size, linear) for size in (ROW, 3, SLOTS))
     row_of = read_function(R, 2)
@@ -52,9 +52,9 @@ def row_functions(linear):
 
 @cache
 def lay_functions(real, linear):
-    """aim(rows, k, p, direction) and weigh(rows, k, p, weight), which write a row of a factor.
+    """Return the device functions `aim(rows, k, p, v)` and `weigh(rows, k, p, w)`: write direction and weights of a factor row.
 
-    In two parts: of one of eight numbers the CPU's compiler makes kernels that take four times as long.
+    Measured: kernels that write all eight numbers at once take four times as long on the CPU.
     """
     R, V, W = wp.types.vector(ROW, linear), wp.types.vector(3, real), wp.types.vector(SLOTS, real)
 
@@ -73,25 +73,35 @@ def lay_functions(real, linear):
 
 @cache
 def ahead_function(real, linear):
-    """ahead(own, p) -> used and the first two rows of pair p of a `set_struct`, or one twice: read at once, used or not."""
+    """Return the device function `prefetch(pair_set, p) -> (used, first, second)`: flags and first rows of a pair.
+
+    A single row is returned twice. Rows are read at once, whether used or not.
+    """
     PairSet, used_of = set_struct(real, linear), read_function(wp.int32)
     row_of, *_ = row_functions(linear)
 
     @wp.func
-    def ahead(own: PairSet, p: int):
-        return used_of(own.used, p), row_of(own.row, 0, p), row_of(own.row, wp.min(1, own.rows - 1), p)
+    def prefetch(pair_set: PairSet, p: int):
+        return (
+            used_of(pair_set.used, p),
+            row_of(pair_set.row, 0, p),
+            row_of(pair_set.row, wp.min(1, pair_set.rows - 1), p),
+        )
 
-    return ahead
+    return prefetch
 
 
 @cache
 def place_functions(linear):
-    """put(placed, rank, value): what a pair brings to a node, if any; placed_at(placed, rank)."""
+    """Return the device functions `store(placed, rank, value)` and `placed_at(placed, rank)` of contributions of pairs to nodes.
+
+    A negative rank stores nothing.
+    """
     V, W = wp.types.vector(3, linear), wp.types.vector(PLACED, linear)
     read, write = read_function(W), write_function(W)
 
     @wp.func
-    def put(placed: wp.array(dtype=W), rank: int, value: V):
+    def store(placed: wp.array(dtype=W), rank: int, value: V):
         if rank >= 0:
             write(placed, rank, W(value[0], value[1], value[2], linear(0.0)))
 
@@ -100,17 +110,19 @@ def place_functions(linear):
         value = read(placed, rank)
         return V(value[0], value[1], value[2])
 
-    return put, placed_at
+    return store, placed_at
 
 
 @cache
 def factor_struct(linear):
-    """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row[k, p] has a weight times its direction for each node, and
-    lever[k, p][i] is for the x of its block angles[p][i]; see `row_functions`.
+    """Gauss-Newton factors of pairs; see `row_functions`.
 
-    nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs that add nothing, else bit 0 is set; bend
-    (capacity,): see `pair_bend`, zero where a pair has none; angles (capacity,): below zero for none, empty where friction rolls
-    nothing.
+    `row` (rows, capacity): row k of pair p is a weight times the direction for each node, if bit k + 1 of used[p] is set.
+    `lever` (rows, capacity): entries of the row for the twist angles of the pair.
+    `nodes` (capacity,): indices in all worlds.
+    `used` (capacity,): 0 for pairs that contribute nothing, else bit 0 is set.
+    `bend` (capacity,): coefficient of the geometric stiffness, see `pair_bend`, or 0.
+    `angles` (capacity,): dof blocks of twist angles, negative for none; empty without rolling friction.
     """
     R, A = wp.types.vector(ROW, linear), wp.types.vector(ANGLES, linear)
 
@@ -128,14 +140,18 @@ def factor_struct(linear):
 
 @cache
 def set_struct(real, linear):
-    """A list of pairs: its factor (see `factor_struct`) and gradients, the items of nodes, and what products write.
+    """List of pairs with factors (see `factor_struct`), gradients, items of nodes and products.
 
-    ranks, angle_ranks: of each pair, the places of its items among all of the list, -1 where it has none; `placed` by these is what
-    products bring to nodes, which read it one after the other.
-    marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
-    idle: of each pair, not zero where products leave out what it brings to nodes, which nobody reads then.
-    count (1,): how many pairs there are; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
-    first ones, are edges; rows: of its factor; things: first things of pairs in one world.
+    `ranks`, `angle_ranks`: positions of the items of a pair in the list of all items, -1 for none.
+    `placed`: contributions of products, by rank, so that nodes read consecutive entries.
+    `places`, `numbers`, `items`: incidence list of the nodes.
+    `marks`, `starts`, `columns`: stored Hessians, see `pair_terms.mollified_kernels`; empty if there are none.
+    `idle`: not zero for inactive pairs, which products skip.
+    `count` (1,): number of pairs.
+    `kind`: index in `pair_bend.KINDS`, -1 without `bend`.
+    `edges`: number of leading primitives of a pair that are edges.
+    `rows`: number of factor rows.
+    `things`: number of first primitives in one world.
     """
     X, V, R = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(ROW, linear)
     A, W = wp.types.vector(ANGLES, linear), wp.types.vector(PLACED, linear)
@@ -171,12 +187,15 @@ def set_struct(real, linear):
 
 @cache
 def sum_kernel(real, serial: bool):
-    """gather(...) to nodes what pairs have written by slot."""
+    """Build the kernel of assembly.
+
+    `gather`: add values of pairs by local index (local, pairs) to their nodes.
+    """
     V, until = wp.types.vector(3, real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(
-        parts: wp.array2d(dtype=V),
+        values: wp.array2d(dtype=V),
         used: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         numbers: wp.array(dtype=int),
@@ -188,9 +207,9 @@ def sum_kernel(real, serial: bool):
             if numbers[node] > 0:
                 total = V()
                 for k in range(starts[node], starts[node] + numbers[node]):
-                    p, slot = taken_apart(items[k])
+                    p, local = taken_apart(items[k])
                     if used[p] != 0:
-                        total += parts[slot, p]
+                        total += values[local, p]
                 out[node] = out[node] + total
 
     return gather
@@ -198,50 +217,52 @@ def sum_kernel(real, serial: bool):
 
 @cache
 def collect_kernels(real, linear, serial: bool, rolls: bool):
-    """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges.
+    """Build the kernels of forces and of matrix blocks along rods.
 
-    If friction `rolls` rods, blocks of angles are among those of nodes, and roll(...) finds what is between these and nodes.
+    `collect`: write forces of all lists and the diagonal blocks of H.
+    `join`: write the blocks of H between the nodes of edges.
+    `roll`: write the couplings of twist angles, if friction `rolls` rods; their diagonal blocks are with the nodes.
 
-    One thread alone adds pair by pair, in the order in which others gather node by node.
+    A `serial` thread adds pair by pair, in the order in which parallel threads gather node by node.
     """
     PairSet, Surface = set_struct(real, linear), surface_struct(real)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
     L, R, until = wp.types.vector(3, linear), wp.types.vector(ROW, linear), until_function(serial)
     row_of, direction_of, weight_of = row_functions(linear)
-    ahead, slope_of, pair_of = ahead_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
+    prefetch, slope_of, pair_of = ahead_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
 
     @wp.func
     def product(row: R, a: int, b: int):
-        """What a row of a factor makes of its nodes in slots a and b [N/m], symmetric, by its six entries."""
+        """Return the symmetric 3 x 3 block of one Gauss-Newton row between nodes a and b [N/m], as six entries."""
         v, w = direction_of(row), weight_of(row)
         return B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
 
     @wp.func
-    def block(own: PairSet, p: int, used: int, first: R, second: R, a: int, b: int):
-        """What pair p adds to the matrix between its nodes in slots a and b, by what is used of it and its first rows."""
+    def block(pair_set: PairSet, p: int, used: int, first: R, second: R, a: int, b: int):
+        """Return the block of pair p between nodes a and b, given its flags and first two rows."""
         m = B()
         if used & 2 != 0:
             m += product(first, a, b)
         if used & 4 != 0:
             m += product(second, a, b)
         if used >= 8:
-            for k in range(2, own.rows):
+            for k in range(2, pair_set.rows):
                 if (used >> (k + 1)) & 1 != 0:
-                    m += product(row_of(own.row, k, p), a, b)
+                    m += product(row_of(pair_set.row, k, p), a, b)
         return m
 
     @wp.func
-    def block_of(own: PairSet, p: int, used: int, first: R, second: R, slot: int):
-        """What it adds to the matrix of the block in a slot with itself."""
+    def block_of(pair_set: PairSet, p: int, used: int, first: R, second: R, local: int):
+        """Return the diagonal block of pair p at a node or, in xx alone, a twist angle."""
         if wp.static(rolls):
-            if slot >= wp.static(SLOTS):
+            if local >= wp.static(SLOTS):
                 m = B()
-                for k in range(own.rows):
+                for k in range(pair_set.rows):
                     if (used >> (k + 1)) & 1 != 0:
-                        a = own.lever[k, p][slot - wp.static(SLOTS)]
+                        a = pair_set.lever[k, p][local - wp.static(SLOTS)]
                         m[0] += a * a
                 return m
-        return block(own, p, used, first, second, slot, slot)
+        return block(pair_set, p, used, first, second, local, local)
 
     @wp.func
     def whole(b: B):
@@ -265,24 +286,26 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
             forces[node] = V()
             diagonal[node] = M()
         for s in range(sets.shape[0]):
-            own = sets[s]
-            for p in range(own.count[0]):
-                used, first, second = ahead(own, p)
+            pair_set = sets[s]
+            for p in range(pair_set.count[0]):
+                used, first, second = prefetch(pair_set, p)
                 if used != 0:
-                    for slot in range(wp.static(SLOTS)):
-                        if own.ranks[p][slot] >= 0:
-                            node = own.nodes[p][slot]
-                            forces[node] = forces[node] - own.gradient[slot, p]
-                            diagonal[node] = diagonal[node] + whole(block(own, p, used, first, second, slot, slot))
+                    for local in range(wp.static(SLOTS)):
+                        if pair_set.ranks[p][local] >= 0:
+                            node = pair_set.nodes[p][local]
+                            forces[node] = forces[node] - pair_set.gradient[local, p]
+                            diagonal[node] = diagonal[node] + whole(
+                                block(pair_set, p, used, first, second, local, local)
+                            )
                     if wp.static(rolls):
-                        if own.angles.shape[0] > 0:
+                        if pair_set.angles.shape[0] > 0:
                             for side in range(wp.static(ANGLES)):
-                                angle = own.angles[p][side]
-                                if own.angle_ranks[p][side] >= 0:
-                                    slot = wp.static(SLOTS) + side
-                                    forces[angle] = forces[angle] - own.gradient[slot, p]
+                                angle = pair_set.angles[p][side]
+                                if pair_set.angle_ranks[p][side] >= 0:
+                                    local = wp.static(SLOTS) + side
+                                    forces[angle] = forces[angle] - pair_set.gradient[local, p]
                                     diagonal[angle] = diagonal[angle] + whole(
-                                        block_of(own, p, used, first, second, slot)
+                                        block_of(pair_set, p, used, first, second, local)
                                     )
         for node in range(forces.shape[0]):
             stiffness[node] = real(wp.trace(diagonal[node]))
@@ -292,14 +315,14 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         for i in range(between.shape[0]):
             between[i] = M()
         for s in range(sets.shape[0]):
-            own = sets[s]
-            for p in range(own.count[0]):
-                used, first, second = ahead(own, p)
+            pair_set = sets[s]
+            for p in range(pair_set.count[0]):
+                used, first, second = prefetch(pair_set, p)
                 if used != 0:
-                    for side in range(own.edges):
-                        if own.ranks[p][2 * side] >= 0:
-                            edge, a = own.pairs[p][side], 2 * side
-                            between[edge] = between[edge] + whole(block(own, p, used, first, second, a, a + 1))
+                    for side in range(pair_set.edges):
+                        if pair_set.ranks[p][2 * side] >= 0:
+                            edge, a = pair_set.pairs[p][side], 2 * side
+                            between[edge] = between[edge] + whole(block(pair_set, p, used, first, second, a, a + 1))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
@@ -307,29 +330,32 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         forces: wp.array(dtype=V),
         diagonal: wp.array(dtype=M),
         stiffness: wp.array(dtype=real),
-        told: wp.array(dtype=wp.uint8),
+        had_items: wp.array(dtype=wp.uint8),
     ):
-        """`stiffness` are the traces of the blocks; `told` are nodes that had items, of which most never have any, or else are zero."""
+        """Write forces, diagonal blocks and their traces, `stiffness`.
+
+        `had_items`: 0 for nodes whose outputs are zero; most nodes never have items.
+        """
         node = wp.tid()
         if wp.static(serial):
             add_all(sets, forces, diagonal, stiffness)
             return
         every = items_of(sets, node)
-        if every == 0 and told[node] == wp.uint8(0):
+        if every == 0 and had_items[node] == wp.uint8(0):
             return
-        told[node] = wp.uint8(wp.min(every, 1))
+        had_items[node] = wp.uint8(wp.min(every, 1))
         force, total = V(), B()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]
             if number > 0:
-                own = sets[s]
-                for k in range(own.places[node], own.places[node] + number):
-                    p, slot = taken_apart(own.items[k])
-                    used, first, second = ahead(own, p)
-                    slope = slope_of(own.gradient, slot, p)
+                pair_set = sets[s]
+                for k in range(pair_set.places[node], pair_set.places[node] + number):
+                    p, local = taken_apart(pair_set.items[k])
+                    used, first, second = prefetch(pair_set, p)
+                    slope = slope_of(pair_set.gradient, local, p)
                     if used != 0:
                         force -= slope
-                        total += block_of(own, p, used, first, second, slot)
+                        total += block_of(pair_set, p, used, first, second, local)
         forces[node] = force
         diagonal[node] = whole(total)
         stiffness[node] = real(total[0] + total[3] + total[5])
@@ -340,9 +366,9 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         edges: Surface,
         count: int,
         between: wp.array(dtype=M),
-        told: wp.array(dtype=wp.uint8),
+        had_items: wp.array(dtype=wp.uint8),
     ):
-        """Items of the first node that come from this edge, not from another one that begins there; `told`: as above, of edges."""
+        """Sum the items of the first node that belong to this edge; `had_items`: 0 for edges whose block is zero."""
         i = wp.tid()
         if wp.static(serial):
             join_all(sets, between)
@@ -350,21 +376,21 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         w = i / count
         node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
         every = items_of(sets, node)
-        if every == 0 and told[i] == wp.uint8(0):
+        if every == 0 and had_items[i] == wp.uint8(0):
             return
-        told[i] = wp.uint8(wp.min(every, 1))
+        had_items[i] = wp.uint8(wp.min(every, 1))
         total = B()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]
             if number > 0:
-                own = sets[s]
-                for k in range(own.places[node], own.places[node] + number):
-                    p, slot = taken_apart(own.items[k])
-                    if slot % 2 == 0 and slot / 2 < own.edges:
-                        used, first, second = ahead(own, p)
-                        pair = pair_of(own.pairs, p)
-                        if used != 0 and pair[slot / 2] == i:
-                            total += block(own, p, used, first, second, slot, slot + 1)
+                pair_set = sets[s]
+                for k in range(pair_set.places[node], pair_set.places[node] + number):
+                    p, local = taken_apart(pair_set.items[k])
+                    if local % 2 == 0 and local / 2 < pair_set.edges:
+                        used, first, second = prefetch(pair_set, p)
+                        pair = pair_of(pair_set.pairs, p)
+                        if used != 0 and pair[local / 2] == i:
+                            total += block(pair_set, p, used, first, second, local, local + 1)
         between[i] = whole(total)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -374,9 +400,9 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         blocks: int,
         first: wp.array(dtype=L),
         second: wp.array(dtype=L),
-        ahead: wp.array(dtype=linear),
+        next_angle: wp.array(dtype=linear),
     ):
-        """What the angle of each edge, of those of a world, has with both of its nodes and with the angle of the next edge."""
+        """Write the couplings of the twist angle of each edge with both nodes and with the angle of the next edge."""
         tid = wp.tid()
         for i in range(tid, until(tid, first.shape[0])):
             w = i / angles.shape[0]
@@ -385,16 +411,16 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                 block = angles[i - w * angles.shape[0]] + w * blocks
                 for s in range(sets.shape[0]):
                     if sets[s].numbers[block] > 0:
-                        own = sets[s]
-                        for k in range(own.places[block], own.places[block] + own.numbers[block]):
-                            p, slot = taken_apart(own.items[k])
-                            side = slot - wp.static(SLOTS)
-                            for m in range(own.rows):
-                                if own.used[p] != 0 and (own.used[p] >> (m + 1)) & 1 != 0:
-                                    row, lever = row_of(own.row, m, p), own.lever[m, p]
+                        pair_set = sets[s]
+                        for k in range(pair_set.places[block], pair_set.places[block] + pair_set.numbers[block]):
+                            p, local = taken_apart(pair_set.items[k])
+                            side = local - wp.static(SLOTS)
+                            for m in range(pair_set.rows):
+                                if pair_set.used[p] != 0 and (pair_set.used[p] >> (m + 1)) & 1 != 0:
+                                    row, lever = row_of(pair_set.row, m, p), pair_set.lever[m, p]
                                     weight = weight_of(row)
                                     v = direction_of(row) * lever[side]
-                                    if own.edges > 0:
+                                    if pair_set.edges > 0:
                                         a += v * weight[2 * side]
                                         b += v * weight[2 * side + 1]
                                     elif side == 0:  # the edge before a point
@@ -404,6 +430,6 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                                         a += v * weight[0]
             first[i] = a
             second[i] = b
-            ahead[i] = c
+            next_angle[i] = c
 
     return collect, join, roll

@@ -1,9 +1,9 @@
-"""When things that move straight come as near as their thickness, and which have passed through each other.
+"""Additive CCD: time of impact of linearly moving primitives with a minimum separation, and a crossing test.
 
-Additive continuous collision detection after Li, Kaufman and Jiang, "Codimensional incremental potential contact", ACM ToG 40(4),
-2021, algorithm 1: the distance of a pair falls at most as fast as its fastest nodes of both sides approach, less what all move in
-common. Time goes on by the part of the gap that is safe at that speed, until the gap is `REST` of what it was or, in reach, as much as
-`NEAR` of that and of the reach: the time found is never late.
+Source: Li, Kaufman and Jiang, "Codimensional incremental potential contact", ACM ToG 40(4), 2021, algorithm 1. The distance of a
+pair decreases at most as fast as the fastest nodes of both sides approach, less their common motion. Time advances by the fraction
+of the gap that is safe at that speed. It ends when the gap is `REST` of its initial value or, within the search distance, `NEAR` of
+it or of the search distance. The time found is never late.
 """
 
 from functools import cache
@@ -16,23 +16,23 @@ from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-REST, NEAR = 0.1, 0.2  # of the gap: what is left of wide ones; of narrow ones, and of the reach
-PARTS = 1000  # in which a motion is followed; where that does not do, the time reached so far is safe, too
-PATIENCE = 100_000  # the same for what is to be told apart from passing
-BESIDE = 0.1  # of the reach, by which two that pass beside each other have to do so for certain
-TOUCHING = 1e-9  # distance of two that pass, over the size of the pair
+REST, NEAR = 0.1, 0.2  # remaining fraction of wide gaps; of narrow gaps, and of the search distance
+PARTS = 1000  # largest number of advances; the time reached by then is safe, too
+PATIENCE = 100_000  # largest number of advances of the crossing test
+BESIDE = 0.1  # clearance that proves a pair separate, over the search distance
+TOUCHING = 1e-9  # distance at which a pair crosses, over its size
 
 
 @cache
 def impact_functions(kind: Kind, real):
-    """impact(x, p, thickness, reach) -> time; meet(x, p, thickness) -> whether two come as near as their thickness.
+    """Return the device functions `impact(x, p, thickness, reach) -> t` and `meet(x, p, thickness) -> bool`.
 
-    x, p: positions and displacements of the nodes.
+    `impact`: time of impact; `meet`: True if the distance falls to the thickness [m]. x, p (4, 3): positions and displacements [m].
     """
     Y = wp.types.matrix((4, 3), real)
     *_, closest = pair_functions(kind, real)
     relative = relative_function(kind, real)
-    # of eight digits or sixteen, those that a distance keeps
+    # rounding of a distance in this precision
     touching = TOUCHING if real is wp.float64 else 1e3 * TOUCHING
 
     @wp.func
@@ -42,7 +42,7 @@ def impact_functions(kind: Kind, real):
 
     @wp.func
     def impact(x: Y, p: Y, thickness: real, reach: real):
-        """In [0, 1], or 2 where there is none; zero where the pair overlaps at the start."""
+        """Return the time of impact in [0, 1], 2 for none, or 0 if the pair overlaps at the start."""
         q, speed = relative(x, p)
         gap = distance(x, q, real(0.0)) - thickness
         if gap <= real(0.0):
@@ -56,7 +56,7 @@ def impact_functions(kind: Kind, real):
             if t + step > real(1.0):
                 return real(2.0)
             gap = distance(x, q, t + step) - thickness
-            # the first step is safe, also where it ends at the least gap but for rounding
+            # the first step is safe, even if rounding puts it at the least gap
             if gap <= wp.where(t > real(0.0), least, real(0.0)):
                 return t
             t += step
@@ -65,19 +65,19 @@ def impact_functions(kind: Kind, real):
 
     @wp.func
     def meet(x: Y, p: Y, thickness: real):
-        """Whether two come together on their way, or can not be told to stay apart."""
+        """Return True if the pair collides during the motion, or if separation can not be proved."""
         q, speed = relative(x, p)
         size = speed
-        if wp.static(kind.endless):  # whose nodes are 1 m apart, whatever size the others have
+        if wp.static(kind.endless):  # nodes of a half-space are 1 m apart, whatever the size of other primitives
             size += distance(x, q, real(0.0))
         else:
             size += wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
         least, t = thickness + real(touching) * size, real(0.0)
         for _ in range(wp.static(PATIENCE)):
-            apart = distance(x, q, t)
-            if apart <= least:
+            separation = distance(x, q, t)
+            if separation <= least:
                 return True
-            t += (apart - thickness) / speed
+            t += (separation - thickness) / speed
             if t > real(1.0):
                 return False
         return True
@@ -87,13 +87,14 @@ def impact_functions(kind: Kind, real):
 
 @cache
 def impact_kernel(kind: Kind, passing: bool, real, single: bool):
-    """The earliest time of impact of each world or, if `passing`, how many pairs pass through each other and the first of them.
+    """Build the kernel of CCD over leaf pairs.
 
-    Pairs are numbered i times the second things of all worlds + j. They are those of bundles whose boxes around the motion have met,
-    all of a `single` thing or not.
+    `impacts`: write the earliest time of impact of each world or, if `passing`, the number of crossing pairs and the first of them.
+
+    The key of a pair is i times the number of second primitives in all worlds, plus j. `single`: see `asked_functions`.
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    slots, _, thickness, _ = pair_functions(kind, real)
+    pair_nodes, _, thickness, _ = pair_functions(kind, real)
     ranges_of, reaches, asked = asked_functions(kind, real, single)
     impact, meet = impact_functions(kind, real)
     corners = corners_function(real)
@@ -103,8 +104,8 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
         threads: int,
         sides: Sides,
         trees: Trees,
-        found: wp.array(dtype=int),
-        met: wp.array(dtype=wp.vec2i),
+        num_met: wp.array(dtype=int),
+        leaf_pairs: wp.array(dtype=wp.vec2i),
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
         keep: real,
@@ -116,17 +117,17 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
         needed: wp.array(dtype=int),
     ):
         if wp.tid() == 0:
-            note_needed(found, met, overflow, needed)
-        begin, stop, step = turns(wp.tid(), threads, found, met)
+            note_needed(num_met, leaf_pairs, overflow, needed)
+        begin, stop, step = turns(wp.tid(), threads, num_met, leaf_pairs)
         for n in range(begin, stop, step):
-            w, start, end, first, last = ranges_of(trees, met[n])
+            w, start, end, first, last = ranges_of(trees, leaf_pairs[n])
             for l in range(first, last):
-                if not reaches(sides, trees, met[n][0], l, w):
+                if not reaches(sides, trees, leaf_pairs[n][0], l, w):
                     continue
                 for k in range(start, end):
                     if not asked(sides, trees, k, l, w):
                         continue
-                    nodes = slots(sides, k, l, w)
+                    nodes = pair_nodes(sides, k, l, w)
                     y, p = corners(x, nodes), corners(move, nodes)
                     if wp.static(passing):
                         if meet(y, p, real(0.0)):
@@ -144,11 +145,15 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
 
 @cache
 def passing_kernel(kind: Kind, real):
-    """How many of the pairs of a list pass through each other, or as near as `keep` of their thickness and of a part of the reach."""
+    """Build the kernel of the crossing test.
+
+    `passing`: count the pairs of a list that cross or, with `keep`, whose distance falls below `keep` of the thickness plus `BESIDE` of
+    `reach` [m].
+    """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    slots, _, thickness, _ = pair_functions(kind, real)
+    pair_nodes, _, thickness, _ = pair_functions(kind, real)
     _, meet = impact_functions(kind, real)
-    corners, things = corners_function(real), things_function(real)
+    corners, locate = corners_function(real), things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def passing(
@@ -163,8 +168,8 @@ def passing_kernel(kind: Kind, real):
         number: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
-            w, i, j = things(sides, pairs[p])
-            nodes = slots(sides, i, j, w)
+            w, i, j = locate(sides, pairs[p])
+            nodes = pair_nodes(sides, i, j, w)
             near = real(0.0)
             if keep > real(0.0):
                 near = keep * (thickness(sides, i, j, w) + real(wp.static(BESIDE)) * reach)

@@ -1,4 +1,4 @@
-"""What pairs in contact look like: gaps and places, for whoever asks."""
+"""Contact query: gaps, contact points, offsets and weights of pairs, on request."""
 
 from functools import cache
 
@@ -11,10 +11,13 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def look_kernel(kind: Kind, real):
-    """Gap [m] of each pair, and the place between its closest points [m]."""
+    """Build the kernel of gaps and contact points.
+
+    `look`: write the gap [m] of each pair, and the midpoint of its closest points [m].
+    """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
-    things = things_function(real)
+    (pair_nodes, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
+    locate = things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def look(
@@ -25,8 +28,8 @@ def look_kernel(kind: Kind, real):
         point_out: wp.array(dtype=X),
     ):
         p = wp.tid()
-        w, i, j = things(sides, pairs[p])
-        nodes = slots(sides, i, j, w)
+        w, i, j = locate(sides, pairs[p])
+        nodes = pair_nodes(sides, i, j, w)
         r, weights = closest(corners(x, nodes))
         gap_out[p] = wp.length(r) - thickness(sides, i, j, w)
         point = real(-0.5) * r
@@ -39,28 +42,32 @@ def look_kernel(kind: Kind, real):
 
 @cache
 def closest_kernel(kind: Kind, real):
-    """Of each pair the way from the second thing to the first between their closest points [m], the nodes, their shares of these
-    points, negative on the second, and the thickness [m]."""
+    """Build the kernel of closest points.
+
+    `closest_points`: write the offset from the second to the first closest point [m], nodes, weights and thickness [m] of each pair.
+
+    Weights of nodes of the second primitive are negative.
+    """
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
-    (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
-    things = things_function(real)
+    (pair_nodes, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
+    locate = things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def closest_points(
         pairs: wp.array(dtype=wp.vec2i),
         sides: Sides,
         x: wp.array(dtype=X),
-        way_out: wp.array(dtype=X),
+        offset_out: wp.array(dtype=X),
         nodes_out: wp.array(dtype=wp.vec4i),
-        shares_out: wp.array(dtype=W),
+        weights_out: wp.array(dtype=W),
         thickness_out: wp.array(dtype=real),
     ):
         p = wp.tid()
-        w, i, j = things(sides, pairs[p])
-        nodes = slots(sides, i, j, w)
-        way, shares = closest(corners(x, nodes))
-        way_out[p] = way
-        shares_out[p] = shares
+        w, i, j = locate(sides, pairs[p])
+        nodes = pair_nodes(sides, i, j, w)
+        offset, weights = closest(corners(x, nodes))
+        offset_out[p] = offset
+        weights_out[p] = weights
         nodes_out[p] = nodes
         thickness_out[p] = thickness(sides, i, j, w)
 

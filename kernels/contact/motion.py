@@ -1,4 +1,4 @@
-"""How far nodes are from the ways a search was made for, what of their motion is common, and the smallest gaps of pairs."""
+"""Candidate validity: deviation of nodes from the searched paths, common motion of worlds, smallest gaps."""
 
 from functools import cache
 
@@ -8,15 +8,16 @@ from ddg_warp.kernels.contact.distance import distance_functions
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
-SAMPLES = 16  # edges of a world whose motion says what is common
-# Motions that ways of searches are long: what goes on as it went is found once for two. There are a third more pairs then, and searches
-# take 16 % of the time of hair that falls on a head, not 23 (10,000 strands, an H100).
+SAMPLES = 16  # edges of a world whose mean motion is the common motion
+# Length of searched paths, in motions: a steady motion needs one search for two steps.
+#
+# Measured: a third more pairs, but searches take 16 % instead of 23 % of the time of 10,000 strands of hair falling on a head, an H100.
 AHEAD = 2.0
 
 
 @cache
 def corners_function(real):
-    """corners(x, nodes) -> what four nodes have (4, 3)."""
+    """Return the device function `corners(x, nodes) -> y`: the values (4, 3) of four nodes."""
     X, N = wp.types.vector(3, real), wp.types.vector(4, int)
 
     @wp.func
@@ -28,10 +29,12 @@ def corners_function(real):
 
 @cache
 def relative_function(kind: Kind, real):
-    """relative(x, p) -> displacements p (4, 3) of nodes at x less their mean, and how far the sides may approach by them.
+    """Return the device function `relative(x, p) -> (q, approach)` of displacements p (4, 3) of nodes at x.
 
-    Where a half-space turns, its plane moves by more than its nodes, which are 1 m apart: for each metre by S more, S what they move by
-    beside each other.
+    `q`: p less its mean; `approach`: bound of the decrease of the distance [m].
+
+    The plane of a rotating half-space moves by more than its nodes, which are 1 m apart: by their relative displacement per metre of
+    distance.
     """
     Y, first = wp.types.matrix((4, 3), real), kind.first
     *_, closest = pair_functions(kind, real)
@@ -40,17 +43,17 @@ def relative_function(kind: Kind, real):
     def approach(x: Y, q: Y):
         if wp.static(kind.endless):
             _r, w = closest(x)
-            turn = wp.max(wp.length(q[2] - q[1]), wp.length(q[3] - q[1]))
+            rotation = wp.max(wp.length(q[2] - q[1]), wp.length(q[3] - q[1]))
             near = wp.length(q[0] * w[0] + q[1] * w[1] + q[2] * w[2] + q[3] * w[3])
-            return near + real(2.0) * turn * (wp.length(q[0] - q[1]) + turn)
+            return near + real(2.0) * rotation * (wp.length(q[0] - q[1]) + rotation)
         else:
-            one, other = real(0.0), real(0.0)
+            first_most, second_most = real(0.0), real(0.0)
             for k in range(4):
                 if k < wp.static(first):
-                    one = wp.max(one, wp.length(q[k]))
+                    first_most = wp.max(first_most, wp.length(q[k]))
                 else:
-                    other = wp.max(other, wp.length(q[k]))
-            return one + other
+                    second_most = wp.max(second_most, wp.length(q[k]))
+            return first_most + second_most
 
     @wp.func
     def relative(x: Y, p: Y):
@@ -63,10 +66,15 @@ def relative_function(kind: Kind, real):
 
 @cache
 def motion_kernels(real, serial: bool):
-    """watch(...) whether a search is out of date, lengthen(...) the ways of the next, mark(...) it, common(...) what of a motion is
-    common."""
+    """Build the kernels of candidate validity.
+
+    `watch`: test whether a search is out of date.
+    `lengthen`: write the displacements that the next search covers.
+    `mark`: store the paths that a search has covered.
+    `common`: write the common motion of each world.
+    """
     X, Surface, until = wp.types.vector(3, real), surface_struct(real), until_function(serial)
-    _, _, beside, _ = distance_functions(real)
+    _, _, path_offset, _ = distance_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def watch(
@@ -79,23 +87,29 @@ def motion_kernels(real, serial: bool):
         move: wp.array(dtype=X),
         stale: wp.array(dtype=int),
     ):
-        """Whether a node that is a place is farther than allowed from the way it was seen on; one that is no number is."""
+        """Write the displacement of nodes, and set `stale` if one is farther than allowed from its searched path, or not finite.
+
+        Only nodes in `placed` have positions.
+        """
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
             if placed[i % placed.shape[0]] != wp.uint8(0):
-                before, _b = beside(start[i], end[i], base[i], base[i])
-                now, _n = beside(start[i], end[i], q[i], q[i])
-                if not (wp.dot(before, before) <= allowed * allowed and wp.dot(now, now) <= allowed * allowed):
+                start_offset, _b = path_offset(start[i], end[i], base[i], base[i])
+                end_offset, _n = path_offset(start[i], end[i], q[i], q[i])
+                if not (
+                    wp.dot(start_offset, start_offset) <= allowed * allowed
+                    and wp.dot(end_offset, end_offset) <= allowed * allowed
+                ):
                     stale[0] = 1
             move[i] = q[i] - base[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def lengthen(move: wp.array(dtype=X), together: wp.array(dtype=int), way: wp.array(dtype=X)):
-        """`AHEAD` motions, but of worlds that go by one share: what is seen of these is where they come to."""
+    def lengthen(move: wp.array(dtype=X), together: wp.array(dtype=int), path: wp.array(dtype=X)):
+        """Write `AHEAD` motions, or the motion itself in worlds that move by one fraction: these search around their end."""
         tid = wp.tid()
         for i in range(tid, until(tid, move.shape[0])):
-            one = together[i / (move.shape[0] / together.shape[0])] != 0
-            way[i] = move[i] * wp.where(one, real(1.0), real(AHEAD))
+            single_fraction = together[i / (move.shape[0] / together.shape[0])] != 0
+            path[i] = move[i] * wp.where(single_fraction, real(1.0), real(AHEAD))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def mark(
@@ -110,8 +124,7 @@ def motion_kernels(real, serial: bool):
         done: wp.array(dtype=int),
         number: wp.array(dtype=int),
     ):
-        """Notes the ways that something was found for, of worlds that go by one share their ends; it is out of date at once if not
-        all of it fitted."""
+        """Store the searched paths, or their ends in worlds that move by one fraction; a search that overflowed is out of date."""
         tid = wp.tid()
         if tid == 0:
             stale[0] = overflow[0]
@@ -126,7 +139,7 @@ def motion_kernels(real, serial: bool):
     def common(
         edges: Surface, count: int, move: wp.array(dtype=X), together: wp.array(dtype=int), shift: wp.array(dtype=X)
     ):
-        """The mean motion of some edges, spread over them, where a world moves at one share; else zero."""
+        """Write the mean motion of a sample of edges if the world moves by one fraction, else zero."""
         w = wp.tid()
         mean, number = X(), wp.min(count, wp.static(SAMPLES))
         if together[w] != 0:
@@ -142,9 +155,12 @@ def motion_kernels(real, serial: bool):
 
 @cache
 def gap_kernel(kind: Kind, real):
-    """The smallest gap [m] of each world; or one below `enough`, where there is any: others are not looked for then."""
+    """Build the kernel of smallest gaps.
+
+    `gaps`: write the smallest gap [m] of each world, or, once one below `enough` is known, any such gap.
+    """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    slots, _, thickness, closest = pair_functions(kind, real)
+    pair_nodes, _, thickness, closest = pair_functions(kind, real)
     corners = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -161,7 +177,7 @@ def gap_kernel(kind: Kind, real):
             w = pairs[p][0] / sides.counts[0]
             if gap[w] >= enough:
                 i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
-                r, _ = closest(corners(x, slots(sides, i, j, w)))
+                r, _ = closest(corners(x, pair_nodes(sides, i, j, w)))
                 wp.atomic_min(gap, w, wp.length(r) - thickness(sides, i, j, w))
 
     return gaps

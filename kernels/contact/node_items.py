@@ -1,7 +1,7 @@
-"""Which pairs each node is in, by items (see `gather`).
+"""Incidence list of contact: the pairs of each node, as items (see `gather`).
 
-One thread alone lists items in order. Many threads list them in any order, and then put each one where as many of its list as are
-smaller come before it, so that sums of two runs agree to the bit.
+A serial thread lists items in order. Parallel threads list them in any order and then sort each list by rank, so that sums of two runs
+agree bitwise.
 """
 
 from functools import cache
@@ -15,13 +15,17 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
-    """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
+    """Build the kernels of incidence lists.
 
-    Items are of as many pairs as `count` says, of their nodes and, if friction `rolls` rods, of `angles`; and of none of the nodes of a
-    world that are `silent`, not zero.
+    `number`: count the items of nodes.
+    `fill`: list the items of nodes.
+    `sort`: sort each list into `ordered`.
+
+    Items are the nodes of the first `count` pairs and, if friction `rolls` rods, their `angles`. Nodes of a world with non-zero
+    `silent` have none.
     """
     size, R = kind.first + kind.second, wp.types.vector(ITEMS, int)
-    slots = ITEMS if rolls else size
+    locals_per_pair = ITEMS if rolls else size
 
     @wp.func
     def node_of(
@@ -29,15 +33,15 @@ def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
         angles: wp.array(dtype=wp.vec2i),
         silent: wp.array(dtype=wp.uint8),
         p: int,
-        slot: int,
+        local: int,
     ):
-        """Which block has the item of a slot, -1 for none."""
+        """Return the dof block of a local index of a pair, -1 for none."""
         node = int(-1)
-        if slot < wp.static(size):
-            node = nodes[p][slot]
+        if local < wp.static(size):
+            node = nodes[p][local]
         if wp.static(rolls):
-            if slot >= wp.static(SLOTS):
-                node = angles[p][slot - wp.static(SLOTS)]
+            if local >= wp.static(SLOTS):
+                node = angles[p][local - wp.static(SLOTS)]
         if node >= 0:
             if silent[node % silent.shape[0]] != wp.uint8(0):
                 node = -1
@@ -64,8 +68,8 @@ def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
         numbers: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
-            for slot in range(wp.static(slots)):
-                node = node_of(nodes, angles, silent, p, slot)
+            for local in range(wp.static(locals_per_pair)):
+                node = node_of(nodes, angles, silent, p, local)
                 if node >= 0:
                     wp.atomic_add(numbers, node, 1)
 
@@ -82,14 +86,14 @@ def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
         ranks: wp.array(dtype=wp.vec4i),
         angle_ranks: wp.array(dtype=wp.vec2i),
     ):
-        """One thread alone fills them in order: these are the ranks then."""
+        """List items; a serial thread lists them in order, which gives the ranks."""
         for p in range(wp.tid(), count[0], threads):
             rank = R(-1, -1, -1, -1, -1, -1)
-            for slot in range(wp.static(slots)):
-                node = node_of(nodes, angles, silent, p, slot)
+            for local in range(wp.static(locals_per_pair)):
+                node = node_of(nodes, angles, silent, p, local)
                 if node >= 0:
-                    rank[slot] = starts[node] + wp.atomic_add(filled, node, 1)
-                    items[rank[slot]] = wp.static(ITEMS) * p + slot
+                    rank[local] = starts[node] + wp.atomic_add(filled, node, 1)
+                    items[rank[local]] = wp.static(ITEMS) * p + local
             if wp.static(serial):
                 note(ranks, angle_ranks, p, rank)
 
@@ -107,19 +111,22 @@ def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
         ranks: wp.array(dtype=wp.vec4i),
         angle_ranks: wp.array(dtype=wp.vec2i),
     ):
-        """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
+        """Sort items by rank, the number of smaller items.
+
+        Alternative: one thread a node takes thousands of steps for a node in thousands of pairs.
+        """
         for p in range(wp.tid(), count[0], threads):
             rank = R(-1, -1, -1, -1, -1, -1)
-            for slot in range(wp.static(slots)):
-                node = node_of(nodes, angles, silent, p, slot)
+            for local in range(wp.static(locals_per_pair)):
+                node = node_of(nodes, angles, silent, p, local)
                 if node >= 0:
                     start = starts[node]
-                    item = wp.static(ITEMS) * p + slot
+                    item = wp.static(ITEMS) * p + local
                     smaller = int(0)
                     for k in range(start, start + numbers[node]):
                         smaller += wp.where(items[k] < item, 1, 0)
                     ordered[start + smaller] = item
-                    rank[slot] = start + smaller
+                    rank[local] = start + smaller
             note(ranks, angle_ranks, p, rank)
 
     return number, fill, sort

@@ -1,4 +1,4 @@
-"""Products of the matrix of contact and friction with a vector: of all lists of pairs at once, then gathered to nodes."""
+"""Product of the contact and friction Hessian with a vector: by pairs of all lists, then assembled at nodes."""
 
 from functools import cache
 
@@ -13,56 +13,61 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS, until_function
 
 @cache
 def product_kernels(real, linear, serial: bool, rolls: bool):
-    """multiply(...) pairs; gather(...) to nodes; settle(...), which does so on dofs that are not barred, with dot products, for nodes
-    in pairs, which meet(...) finds."""
+    """Build the kernels of the product.
+
+    `multiply`: write the product of each pair.
+    `gather`: add products to all nodes.
+    `meet`: mark nodes of pairs.
+    `settle`: add products to active dofs of marked nodes, and update dot products.
+    """
     PairSet, until = set_struct(real, linear), until_function(serial)
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     A = wp.types.vector(ANGLES, linear)
     bend = bend_function(linear)
     row_of, direction_of, weight_of = row_functions(linear)
-    put, placed_at = place_functions(linear)
-    ahead, four_of = ahead_function(real, linear), read_function(wp.vec4i)
+    store, placed_at = place_functions(linear)
+    prefetch, four_of = ahead_function(real, linear), read_function(wp.vec4i)
     _, free = product_functions(linear)
 
     @wp.func
-    def beside(x: X, y: X):
-        """One position beside another, before digits are lost."""
+    def difference(x: X, y: X):
+        """Return x - y, subtracted before conversion to the lower precision."""
         u = x - y
         return V(linear(u[0]), linear(u[1]), linear(u[2]))
 
     @wp.func
-    def kept(own: PairSet, p: int):
-        """Place of the Hessian that is kept of a pair, -1 without."""
+    def kept(pair_set: PairSet, p: int):
+        """Return the index of the stored Hessian of a pair, -1 for none."""
         m = int(-1)
-        if own.marks.shape[0] > 0:
-            if own.marks[p] != 0 and own.starts[p] < own.columns.shape[2]:
-                m = own.starts[p]
+        if pair_set.marks.shape[0] > 0:
+            if pair_set.marks[p] != 0 and pair_set.starts[p] < pair_set.columns.shape[2]:
+                m = pair_set.starts[p]
         return m
 
     @wp.func
     def row(columns: wp.array3d(dtype=V), m: int, i: int, u: Y):
-        """A row of a Hessian that is kept, a column as it is symmetric, times what is at the nodes."""
+        """Return a row of a stored Hessian (a column, by symmetry) times the values at the nodes."""
         total = linear(0.0)
         for k in range(wp.static(SLOTS)):
             total += wp.dot(columns[i, k, m], u[k])
         return total
 
     @wp.func
-    def turns_of(own: PairSet, p: int, v: wp.array(dtype=V)):
-        """What is at the angles of a pair, zero where it has none."""
+    def angles_of(pair_set: PairSet, p: int, v: wp.array(dtype=V)):
+        """Return the values at the twist angles of a pair, zero for none."""
         t = A()
-        if own.angles.shape[0] > 0:
+        if pair_set.angles.shape[0] > 0:
             for side in range(wp.static(ANGLES)):
-                if own.angles[p][side] >= 0:
-                    t[side] = v[own.angles[p][side]][0]
+                if pair_set.angles[p][side] >= 0:
+                    t[side] = v[pair_set.angles[p][side]][0]
         return t
 
     @wp.func
-    def put_turns(own: PairSet, p: int, t: A):
-        """What a pair brings to its angles."""
-        if own.angles.shape[0] > 0:
+    def store_angles(pair_set: PairSet, p: int, t: A):
+        """Store the contributions of a pair to twist angles."""
+        if pair_set.angles.shape[0] > 0:
             for side in range(wp.static(ANGLES)):
-                put(own.placed, own.angle_ranks[p][side], V(t[side], linear(0.0), linear(0.0)))
+                store(pair_set.placed, pair_set.angle_ranks[p][side], V(t[side], linear(0.0), linear(0.0)))
 
     @wp.kernel(
         module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
@@ -74,105 +79,107 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         x: wp.array(dtype=X),
         v: wp.array(dtype=V),
     ):
-        """F^T F v of each pair, at its nodes; in the worlds that want it, if given, with that of `pair_bend`, or the Hessian kept."""
+        """Write F^T F v of each pair; in `wanted` worlds, if given, with geometric stiffness or by the stored Hessian."""
         for s in range(sets.shape[0]):
-            own = sets[s]
-            for p in range(wp.tid(), own.count[0], threads):
-                used, first, second = ahead(own, p)
-                n, ranks = four_of(own.nodes, p), four_of(own.ranks, p)
-                if own.idle[p] != wp.uint8(0):
+            pair_set = sets[s]
+            for p in range(wp.tid(), pair_set.count[0], threads):
+                used, first, second = prefetch(pair_set, p)
+                n, ranks = four_of(pair_set.nodes, p), four_of(pair_set.ranks, p)
+                if pair_set.idle[p] != wp.uint8(0):
                     continue
                 if used != 0:
                     u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
                     m = int(-1)
                     if wanted.shape[0] > 0:
-                        m = kept(own, p)
+                        m = kept(pair_set, p)
                     if m >= 0:
-                        for slot in range(own.columns.shape[1]):  # not unrolled, for the sake of registers
+                        for local in range(pair_set.columns.shape[1]):  # not unrolled, for the sake of registers
                             value = V(
-                                row(own.columns, m, 3 * slot, u),
-                                row(own.columns, m, 3 * slot + 1, u),
-                                row(own.columns, m, 3 * slot + 2, u),
+                                row(pair_set.columns, m, 3 * local, u),
+                                row(pair_set.columns, m, 3 * local + 1, u),
+                                row(pair_set.columns, m, 3 * local + 2, u),
                             )
-                            put(own.placed, ranks[slot], value)
+                            store(pair_set.placed, ranks[local], value)
                         continue
-                    y, t, turned = Y(), A(), A()
+                    y, t, z = Y(), A(), A()
                     if wp.static(rolls):
-                        t = turns_of(own, p, v)
-                    for k in range(own.rows):
+                        t = angles_of(pair_set, p, v)
+                    for k in range(pair_set.rows):
                         if (used >> (k + 1)) & 1 != 0:
-                            one = first
+                            entry = first
                             if k == 1:
-                                one = second
+                                entry = second
                             if k > 1:
-                                one = row_of(own.row, k, p)
-                            along, w = direction_of(one), weight_of(one)
+                                entry = row_of(pair_set.row, k, p)
+                            along, w = direction_of(entry), weight_of(entry)
                             moved = wp.dot(along, w * u)
                             if wp.static(rolls):
-                                if own.angles.shape[0] > 0:
-                                    moved += wp.dot(own.lever[k, p], t)
-                                    turned += own.lever[k, p] * moved
+                                if pair_set.angles.shape[0] > 0:
+                                    moved += wp.dot(pair_set.lever[k, p], t)
+                                    z += pair_set.lever[k, p] * moved
                             y += wp.outer(w, along * moved)
                     if wp.static(rolls):
-                        put_turns(own, p, turned)
-                    if wanted.shape[0] > 0 and own.kind >= 0:
-                        c = own.bend[p]
-                        if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
+                        store_angles(pair_set, p, z)
+                    if wanted.shape[0] > 0 and pair_set.kind >= 0:
+                        c = pair_set.bend[p]
+                        if c != linear(0.0) and wanted[pair_set.pairs[p][0] / pair_set.things] != 0:
                             o = x[n[0]]
-                            at = wp.matrix_from_rows(V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o))
-                            y += bend(own.kind, at, weight_of(first), u) * c
-                    for slot in range(wp.static(SLOTS)):
-                        put(own.placed, ranks[slot], y[slot])
-                else:  # nodes that list it read it
-                    for slot in range(wp.static(SLOTS)):
-                        put(own.placed, ranks[slot], V())
+                            y0 = wp.matrix_from_rows(
+                                V(), difference(x[n[1]], o), difference(x[n[2]], o), difference(x[n[3]], o)
+                            )
+                            y += bend(pair_set.kind, y0, weight_of(first), u) * c
+                    for local in range(wp.static(SLOTS)):
+                        store(pair_set.placed, ranks[local], y[local])
+                else:  # nodes that list this pair read its entries
+                    for local in range(wp.static(SLOTS)):
+                        store(pair_set.placed, ranks[local], V())
                     if wp.static(rolls):
-                        put_turns(own, p, A())
+                        store_angles(pair_set, p, A())
 
     @wp.func
     def total(sets: wp.array(dtype=PairSet), node: int):
         y = V()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]
-            if number > 0:  # few nodes are in pairs of a kind: the rest of the structure is not read
-                own = sets[s]
-                start = own.places[node]
+            if number > 0:  # few nodes are in pairs of a kind: other fields are not read
+                pair_set = sets[s]
+                start = pair_set.places[node]
                 for k in range(start, start + number):
-                    y += placed_at(own.placed, k)
+                    y += placed_at(pair_set.placed, k)
         return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
-        """Adds to the nodes."""
+        """Add the products of pairs to all nodes."""
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
             out[node] = out[node] + total(sets, node)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def meet(sets: wp.array(dtype=PairSet), met_out: wp.array(dtype=wp.uint8)):
-        """Which nodes have items."""
+    def meet(sets: wp.array(dtype=PairSet), in_pairs_out: wp.array(dtype=wp.uint8)):
+        """Mark nodes with items."""
         tid = wp.tid()
-        for node in range(tid, until(tid, met_out.shape[0])):
+        for node in range(tid, until(tid, in_pairs_out.shape[0])):
             number = int(0)
             for s in range(sets.shape[0]):
                 number += sets[s].numbers[node]
-            met_out[node] = wp.uint8(wp.min(number, 1))
+            in_pairs_out[node] = wp.uint8(wp.min(number, 1))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
         sets: wp.array(dtype=PairSet),
-        met: wp.array(dtype=wp.uint8),
+        in_pairs: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=V),
         barred: wp.array(dtype=wp.uint8),
         busy: wp.array(dtype=int),
         out: wp.array(dtype=V),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """Adds to dofs that are not barred in worlds that are busy (1), and writes p . out node by node, where that has changed."""
+        """Add products to active dofs of active worlds (`busy` 1), and write p . out of changed nodes."""
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
             w = node / dots_out.shape[1]
-            if met[node] != wp.uint8(0) and barred[node] != BARRED and busy[w] == 1:
+            if in_pairs[node] != wp.uint8(0) and barred[node] != BARRED and busy[w] == 1:
                 y = out[node] + wp.cw_mul(total(sets, node), free(barred[node]))
                 out[node] = y
                 dots_out[w, node - w * dots_out.shape[1]] = wp.dot(p[node], y)

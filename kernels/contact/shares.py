@@ -1,13 +1,14 @@
-"""Shares of a proposed motion that may be taken so that nothing passes through anything, each unit of nodes its own.
+"""CCD step fractions: the largest collision-free fraction of a proposed motion, per CCD body.
 
-A unit is what shortens as one: a rod, a shell or a node. All moves are straight, at one time: where units a, b go by s_a, s_b of
-theirs, the pair is judged by the time of impact t of the motion that is left (`impact`), in which what all move in common does not
-count. The first round is of the whole motion; a pair that hits brings its units to t. What then still hits, as one side was stopped by
-others, is brought to max(t s, the smallest share in the pair), round by round until nothing changes. Pairs whose shares have not
-changed are not asked again: the others are picked by a kernel of its own, as the one that asks takes so many registers that few threads
-of it wait for memory at once. A pair is safe where all of it goes by one share up to its first t; so but for rounding no share falls
-below the earliest time of its world. Where the last round allowed still changes some, the world goes by that time as a whole, which is
-safe.
+A CCD body is a rod, a shell or a node. All motions are straight and simultaneous. Bodies a, b of a pair move by fractions s_a, s_b; the
+time of impact t of their remaining motion (`impact`) is found, in which common motion does not count. The first round takes the whole
+motion; a pair that collides reduces its bodies to t. A pair that collides later, as others have stopped one side, reduces its
+bodies to max(t s, smallest fraction in the pair). Rounds continue until no fraction changes.
+
+Pairs whose fractions have not changed are not tested again. A kernel of its own picks the others, as the test takes so many registers
+that few of its threads wait for memory at once. A pair is safe if all of it moves by one fraction up to its first t. So but for
+rounding no fraction falls below the earliest time of its world. If the last round allowed still changes fractions, the world moves by
+that time as a whole, which is safe.
 """
 
 from functools import cache
@@ -19,16 +20,19 @@ from ddg_warp.kernels.contact.motion import corners_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS, until_function
 
-ROUNDS = 50  # what falls on what has stopped stops layer by layer, one in a round
+ROUNDS = 50  # bodies that fall on stopped ones stop layer by layer, one layer a round
 
 
 @cache
 def limit_kernels(kind: Kind, real):
-    """pick(...) pairs with a share that the last round has changed; limit(...) the shares of units whose pairs hit, and the earliest
-    `time` of their worlds."""
+    """Build the kernels of one round.
+
+    `pick`: list pairs with a fraction that the last round has changed.
+    `limit`: lower the fractions of bodies whose pairs collide, and the earliest `time` of their worlds.
+    """
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
-    slots, _, thickness, _ = pair_functions(kind, real)
-    corners, (impact, _), things = corners_function(real), impact_functions(kind, real), things_function(real)
+    pair_nodes, _, thickness, _ = pair_functions(kind, real)
+    corners, (impact, _), locate = corners_function(real), impact_functions(kind, real), things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pick(
@@ -43,15 +47,15 @@ def limit_kernels(kind: Kind, real):
         picked: wp.array(dtype=int),
         number: wp.array(dtype=int),
     ):
-        """In any order: what they come to is the least of what each does."""
+        """List pairs in any order: results are minima over pairs."""
         for p in range(wp.tid(), count[0], threads):
-            w, i, j = things(sides, pairs[p])
-            nodes = slots(sides, i, j, w)
+            w, i, j = locate(sides, pairs[p])
+            nodes = pair_nodes(sides, i, j, w)
             changed = int(0)
             for k in range(4):
-                of = unit[nodes[k] - w * sides.first.nodes_a_world]
-                if of >= 0:
-                    if shares[of + w * units] != before[of + w * units]:
+                body = unit[nodes[k] - w * sides.first.nodes_a_world]
+                if body >= 0:
+                    if shares[body + w * units] != before[body + w * units]:
                         changed = 1
             if changed != 0:
                 picked[wp.atomic_add(number, 0, 1)] = p
@@ -75,23 +79,23 @@ def limit_kernels(kind: Kind, real):
         lowered: wp.array(dtype=real),
         time: wp.array(dtype=real),
     ):
-        """Of `count` pairs all, or those that are `picked`, if any array of such is given."""
+        """Treat the first `count` entries of `picked`, or the first `count` pairs if `picked` is empty."""
         for n in range(wp.tid(), count[0], threads):
             p = n
             if picked.shape[0] > 0:
                 p = picked[n]
-            w, i, j = things(sides, pairs[p])
-            nodes = slots(sides, i, j, w)
+            w, i, j = locate(sides, pairs[p])
+            nodes = pair_nodes(sides, i, j, w)
             s = W(real(1.0), real(1.0), real(1.0), real(1.0))
-            of = wp.vec4i()
+            body = wp.vec4i()
             least, most = real(1.0), real(-1.0)
             for k in range(4):
-                of[k] = unit[nodes[k] - w * sides.first.nodes_a_world]
-                if of[k] >= 0:
-                    of[k] += w * units
-                    s[k] = shares[of[k]]
+                body[k] = unit[nodes[k] - w * sides.first.nodes_a_world]
+                if body[k] >= 0:
+                    body[k] += w * units
+                    s[k] = shares[body[k]]
                     least, most = wp.min(least, s[k]), wp.max(most, s[k])
-            if most < real(0.0):  # nothing of it is ever shortened
+            if most < real(0.0):  # no node belongs to a CCD body
                 continue
             m = corners(move, nodes)
             m = wp.matrix_from_rows(s[0] * m[0], s[1] * m[1], s[2] * m[2], s[3] * m[3])
@@ -101,20 +105,27 @@ def limit_kernels(kind: Kind, real):
                 if most == least:
                     least = real(0.0)
                 for k in range(4):
-                    if of[k] >= 0:
-                        wp.atomic_min(lowered, of[k], wp.max(t * s[k], least))
+                    if body[k] >= 0:
+                        wp.atomic_min(lowered, body[k], wp.max(t * s[k], least))
 
     return pick, limit
 
 
 @cache
 def share_kernels(real, serial: bool):
-    """start(...) shares, turn(...) to a round, settle(...) its shares, finish(...) with safe ones, shorten(...) the motion."""
+    """Build the kernels of step fractions.
+
+    `start`: initialise fractions with 1.
+    `turn`: begin a round.
+    `settle`: take over the fractions of a round, and find changes.
+    `finish`: replace fractions that still change by safe ones.
+    `shorten`: limit the motion.
+    """
     X, until = wp.types.vector(3, real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(shares: wp.array(dtype=real), before: wp.array(dtype=real), lowered: wp.array(dtype=real)):
-        """The whole motion, and nothing before it."""
+        """Set fractions to the whole motion, with no previous value."""
         tid = wp.tid()
         for i in range(tid, until(tid, shares.shape[0])):
             shares[i] = real(1.0)
@@ -140,7 +151,10 @@ def share_kernels(real, serial: bool):
         open: wp.array(dtype=int),
         changed: wp.array(dtype=int),
     ):
-        """Worlds are open where shares have changed. Of what goes together all go by the earliest time."""
+        """Take over lowered fractions, and mark worlds `open` if one has changed.
+
+        In worlds that move `together` all bodies take the earliest time.
+        """
         tid = wp.tid()
         for i in range(tid, until(tid, shares.shape[0])):
             w = i / (shares.shape[0] / together.shape[0])
@@ -164,7 +178,7 @@ def share_kernels(real, serial: bool):
         time: wp.array(dtype=real),
         limited: wp.array(dtype=int),
     ):
-        """Nothing moves while pairs do not fit."""
+        """Set fractions of open worlds to the earliest time, and of all to 0 if pairs overflowed; count limited bodies."""
         tid = wp.tid()
         for i in range(tid, until(tid, shares.shape[0])):
             w = i / (shares.shape[0] / time.shape[0])
@@ -188,13 +202,13 @@ def share_kernels(real, serial: bool):
         start: wp.array(dtype=X),
         end: wp.array(dtype=X),
     ):
-        """The motion itself and, of worlds that go by one share, where a search that was `done` for it has seen them."""
+        """Limit positions `q`, and the searched paths of worlds that move by one fraction if a search was `done`."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
             w = i / unit.shape[0]
-            of = unit[i - w * unit.shape[0]]
-            if of >= 0:
-                s = shares[w * units + of]
+            body = unit[i - w * unit.shape[0]]
+            if body >= 0:
+                s = shares[w * units + body]
                 if s < real(1.0):
                     q[i] = base[i] + s * move[i]
             if together[w] != 0 and done[0] != 0:

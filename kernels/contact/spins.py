@@ -1,11 +1,11 @@
-"""How far obstacles have turned whose surfaces move where their points stay: balls, capsules and what else is round.
+"""Rotating surfaces: rotation of round obstacles whose surfaces move while their shape stays.
 
-Markers at c + e_k, k = 1, 2, 3, go with a body: e_k are at right angles to each other and as long as its radius R. Where they go to
-c' + e_k', by turning about an axis k of space by an angle a,
+A body of radius R carries markers at c + e_k, k = 1, 2, 3, with orthogonal e_k of length R. If a rotation about an axis k of space
+by an angle a, and a translation, move them to c' + e_k',
 
     phi = sum_k e_k x e_k' / (2 R^2) = sin(a) k ,
 
-and a point of the surface at R n moves by phi x R n beside c. It is linear in what markers move by, as slips are in all positions.
+and the point of the surface at R n moves by phi x R n relative to c. phi is linear in marker displacements, as slips are in positions.
 """
 
 from functools import cache
@@ -19,27 +19,31 @@ MARKERS = 3
 
 @cache
 def spin_kernels(real):
-    """turn(...): phi of each body that spins, in all worlds; pull(...): by phi and R to positions and radii, for the reverse."""
+    """Build the kernels of phi and of the vector-Jacobian product.
+
+    `turn`: write phi of each rotating body in all worlds.
+    `pull`: add the gradients by positions and radii, given the gradients by phi and R.
+    """
     V = wp.types.vector(3, real)
 
     @wp.func
-    def arm(x: wp.array(dtype=V), places: wp.vec4i, shift: int, k: int):
-        return x[places[1 + k] + shift] - x[places[0] + shift]
+    def arm(x: wp.array(dtype=V), indices: wp.vec4i, shift: int, k: int):
+        return x[indices[1 + k] + shift] - x[indices[0] + shift]
 
     @wp.func
-    def share(x: wp.array(dtype=V), places: wp.vec4i, shift: int):
-        """1 / (2 R^2) of a body with nodes x."""
+    def inverse_square(x: wp.array(dtype=V), indices: wp.vec4i, shift: int):
+        """Return 1 / (2 R^2) of a body with nodes x."""
         square = real(0.0)
         for k in range(wp.static(MARKERS)):
-            e = arm(x, places, shift, k)
+            e = arm(x, indices, shift, k)
             square += wp.dot(e, e)
         return real(wp.static(0.5 * MARKERS)) / square
 
     @wp.func
-    def push(by: wp.array(dtype=V), places: wp.vec4i, shift: int, k: int, value: V):
-        m, c = places[1 + k] + shift, places[0] + shift
-        by[m] = by[m] + value
-        by[c] = by[c] - value
+    def add_arm_gradient(gradient: wp.array(dtype=V), indices: wp.vec4i, shift: int, k: int, value: V):
+        m, c = indices[1 + k] + shift, indices[0] + shift
+        gradient[m] = gradient[m] + value
+        gradient[c] = gradient[c] - value
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
@@ -49,13 +53,16 @@ def spin_kernels(real):
         x: wp.array(dtype=V),
         phi: wp.array2d(dtype=V),
     ):
-        """`spinning` are the first node and the markers of bodies, below zero of others, among so many `nodes` a world."""
+        """Write phi of bodies.
+
+        `spinning`: centre and markers of each body among the `nodes` of a world, negative for bodies that do not rotate.
+        """
         w, body = wp.tid()
-        places, shift, total = spinning[body], w * nodes, V()
-        if places[0] >= 0:
+        indices, shift, total = spinning[body], w * nodes, V()
+        if indices[0] >= 0:
             for k in range(wp.static(MARKERS)):
-                total += wp.cross(arm(start, places, shift, k), arm(x, places, shift, k))
-            phi[w, body] = total * share(x, places, shift)
+                total += wp.cross(arm(start, indices, shift, k), arm(x, indices, shift, k))
+            phi[w, body] = total * inverse_square(x, indices, shift)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
@@ -63,19 +70,25 @@ def spin_kernels(real):
         nodes: int,
         start: wp.array(dtype=V),
         x: wp.array(dtype=V),
-        by: wp.array3d(dtype=real),
+        by_phi_radius: wp.array3d(dtype=real),
         by_start: wp.array(dtype=V),
         by_x: wp.array(dtype=V),
         by_radius: wp.array2d(dtype=real),
     ):
-        """`by` are derivatives by the components of phi and by R (4, worlds, bodies). Markers stay as far from the first node."""
+        """Add gradients by positions and radii.
+
+        `by_phi_radius` (4, worlds, bodies): gradients by the components of phi and by R. Distances of markers from the centre are
+        constant.
+        """
         w, body = wp.tid()
-        places, shift = spinning[body], w * nodes
-        if places[0] >= 0:
-            by_phi = V(by[0, w, body], by[1, w, body], by[2, w, body]) * share(x, places, shift)
-            by_radius[w, body] = by_radius[w, body] + by[3, w, body]
+        indices, shift = spinning[body], w * nodes
+        if indices[0] >= 0:
+            by_phi = V(
+                by_phi_radius[0, w, body], by_phi_radius[1, w, body], by_phi_radius[2, w, body]
+            ) * inverse_square(x, indices, shift)
+            by_radius[w, body] = by_radius[w, body] + by_phi_radius[3, w, body]
             for k in range(wp.static(MARKERS)):
-                push(by_start, places, shift, k, wp.cross(arm(x, places, shift, k), by_phi))
-                push(by_x, places, shift, k, wp.cross(by_phi, arm(start, places, shift, k)))
+                add_arm_gradient(by_start, indices, shift, k, wp.cross(arm(x, indices, shift, k), by_phi))
+                add_arm_gradient(by_x, indices, shift, k, wp.cross(by_phi, arm(start, indices, shift, k)))
 
     return turn, pull

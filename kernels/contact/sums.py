@@ -1,16 +1,16 @@
-"""Running sums of integers, level by level: kernels only, so that conditional parts of CUDA graphs may have them."""
+"""Prefix sums of integers, level by level, by kernels alone, which conditional nodes of CUDA graphs may contain."""
 
 import warp as wp
 
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 TILE = 1024  # entries that a block of threads adds up
-THREADS = 256  # of it
+THREADS = 256  # threads of that block
 
 
 @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
 def add_tiles(values: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
-    """Sums of `TILE` entries each."""
+    """Write the sum of each tile of `TILE` entries."""
     b = wp.tid()
     tile = wp.tile_load(values, shape=wp.static(TILE), offset=b * wp.static(TILE))
     wp.tile_store(sums_out, wp.tile_sum(tile), offset=b)
@@ -18,7 +18,7 @@ def add_tiles(values: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
 
 @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
 def run_tiles(values: wp.array(dtype=int), starts: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
-    """The sum of all entries before each one, from those before each tile; of one tile `starts` is a zero."""
+    """Write the exclusive prefix sum of entries, given `starts`, the sum before each tile."""
     b = wp.tid()
     tile = wp.tile_scan_exclusive(wp.tile_load(values, shape=wp.static(TILE), offset=b * wp.static(TILE)))
     before = wp.tile_full(shape=wp.static(TILE), value=starts[b], dtype=int)
@@ -27,7 +27,7 @@ def run_tiles(values: wp.array(dtype=int), starts: wp.array(dtype=int), sums_out
 
 @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
 def run(values: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
-    """The same by one thread, for the CPU, which has one."""
+    """Write the exclusive prefix sum by one thread, for the CPU."""
     total = int(0)
     for k in range(values.shape[0]):
         value = values[k]
@@ -44,9 +44,9 @@ def choose(
     chosen: wp.array(dtype=int),
     number: wp.array(dtype=int),
 ):
-    """Which of the first `count` are marked (0 or 1), in order, as many as there is room for, and how many these are.
+    """Write the indices of the marked (1, else 0) among the first `count` entries, up to the capacity, and their number.
 
-    `starts` are how many are marked before each.
+    `starts`: prefix sum of the marks.
     """
     if wp.tid() == 0 and count[0] == 0:
         number[0] = 0

@@ -1,10 +1,9 @@
-"""What may touch: points, edges and triangles with a radius, and the kinds of pairs that suffice.
+"""Collision primitives: points, edges and triangles with a radius, and the kinds of pairs that suffice.
 
-Two surfaces that are piecewise straight and flat meet for the first time where an edge meets an edge or a point meets a triangle. So
-edges are paired with edges and points with triangles; the edges of rods are among the edges beside those of triangles, the nodes of
-rods among the points. Balls are points with a radius of their own, which edges of rods are paired with; triangles meet them as they
-meet all points. Half-spaces are met by points alone. Indices of things and nodes count all worlds, one world after the other, each
-alike.
+Two piecewise linear surfaces first meet where an edge meets an edge or a point meets a triangle. So edges are paired with edges and
+points with triangles. Edges of rods and of triangles are one list; nodes of rods are among the points. Balls are points with their own
+radius, which are paired with edges of rods and, as all points, with triangles. Half-spaces are paired with points alone. Indices of
+primitives and nodes count all worlds, one after the other, each alike.
 """
 
 from dataclasses import dataclass
@@ -17,10 +16,11 @@ from ddg_warp.kernels.contact.distance import distance_functions
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of pairs: nodes of the first and of the second thing. Of equal things each pair is taken once, the smaller index first.
+    """Type of collision pairs: numbers of nodes of the first and of the second primitive.
 
-    Pairs have four slots for nodes; where there are fewer, the last one is repeated, without weight. The second thing may be
-    `endless`: the half-space behind the plane through three nodes, each 1 m from the first.
+    Pairs of one type are listed once, the smaller index first. A pair has four nodes; the last one is repeated, without weight, if
+    there are fewer. The second primitive may be `endless`: the half-space behind the plane through three nodes, each 1 m from the
+    first.
     """
 
     first: int
@@ -39,9 +39,9 @@ EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE = Kind(2, 2), Kind(1, 3), Kind(2,
 def surface_struct(real):
     """Points, edges or triangles of one world.
 
-    nodes (count, 1 to 3); object: who they belong to; radius: of all objects in all worlds (worlds, objects) [m]; span (start, end,
-    loop, apart) of edges of rods: arc lengths of the ends, of the whole rod where it is closed (else 0), and that within which edges
-    of a rod are no pair (-1: of no rod) [m].
+    `nodes` (count, 1 to 3); `object` (count,): index of the object of a primitive. `radius` (worlds, objects) [m].
+    `span` (count,): (start, end, loop, apart) of edges of rods [m]. These are arc lengths of the ends, of the whole rod if it is closed
+    (else 0), and the collision exclusion distance (-1 for edges of no rod).
     """
     span_type = wp.types.vector(4, real)
 
@@ -58,10 +58,11 @@ def surface_struct(real):
 
 @cache
 def sides_struct(real):
-    """Two surfaces whose pairs are asked for.
+    """Two surfaces that form pairs.
 
-    first, second: see `surface_struct`; counts: of both in one world; ignored: keys of pairs of objects that pass through each other,
-    sorted (smaller number times `objects` + larger); obstacle (objects,): not zero of those of which no two are a pair.
+    `first`, `second`: see `surface_struct`; `counts`: their primitives in one world.
+    `ignored`: sorted keys of pairs of objects without contact, smaller index times `objects` + larger one.
+    `obstacle` (objects,): not zero for obstacles, of which no two form a pair.
     """
     surface = surface_struct(real)
 
@@ -79,22 +80,27 @@ def sides_struct(real):
 
 @cache
 def things_function(real):
-    """things(sides, pair) -> world w of a pair of all worlds, and both things in it."""
+    """Return the device function `locate(sides, pair) -> (w, i, j)`: world of a pair, and its primitives in it."""
     Sides = sides_struct(real)
 
     @wp.func
-    def things(sides: Sides, pair: wp.vec2i):
+    def locate(sides: Sides, pair: wp.vec2i):
         w = pair[0] / sides.counts[0]
         return w, pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
 
-    return things
+    return locate
 
 
 @cache
 def pair_functions(kind: Kind, real):
-    """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j, w); closest(y) -> r, w.
+    """Return the device functions `pair_nodes`, `may_touch`, `thickness` and `closest`.
 
-    Here i and j count the things of one world, w; y (4, 3) are positions of the nodes.
+    `pair_nodes(sides, i, j, w)`: the four nodes.
+    `may_touch(sides, i, j)`: True if two primitives form a pair.
+    `thickness(sides, i, j, w)`: sum of the radii [m].
+    `closest(y) -> (r, w)`: offset of the closest points [m] and weights of the nodes at y (4, 3).
+
+    i and j count the primitives of one world, w.
     """
     Sides, N, Y = sides_struct(real), wp.types.vector(4, int), wp.types.matrix((4, 3), real)
     S, count = wp.types.vector(4, real), kind.first
@@ -102,7 +108,7 @@ def pair_functions(kind: Kind, real):
     measure = dict(zip((EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE), distance_functions(real), strict=True))[kind]
 
     @wp.func
-    def slots(sides: Sides, i: int, j: int, w: int):
+    def pair_nodes(sides: Sides, i: int, j: int, w: int):
         nodes, offset = N(), w * sides.first.nodes_a_world
         for k in range(wp.static(kind.first)):
             nodes[k] = sides.first.nodes[i, k] + offset
@@ -114,7 +120,7 @@ def pair_functions(kind: Kind, real):
 
     @wp.func
     def within(a: S, b: S):
-        """Whether edges of a rod are as close along it as to be no pair."""
+        """Return True if two edges of a rod are within the collision exclusion distance."""
         gap = wp.max(a[0], b[0]) - wp.min(a[1], b[1])
         if a[2] > real(0.0):
             gap = wp.min(gap, a[2] - (wp.max(a[1], b[1]) - wp.min(a[0], b[0])))
@@ -140,8 +146,8 @@ def pair_functions(kind: Kind, real):
                 return False
         if sides.ignored.shape[0] > 0:
             key = wp.int64(wp.min(a, b)) * wp.int64(sides.objects) + wp.int64(wp.max(a, b))
-            at = wp.lower_bound(sides.ignored, key)
-            if at < sides.ignored.shape[0] and sides.ignored[at] == key:
+            index = wp.lower_bound(sides.ignored, key)
+            if index < sides.ignored.shape[0] and sides.ignored[index] == key:
                 return False
         return True
 
@@ -153,4 +159,4 @@ def pair_functions(kind: Kind, real):
     def closest(y: Y):
         return measure(y[0], y[1], y[2], y[3])
 
-    return slots, may_touch, thickness, closest
+    return pair_nodes, may_touch, thickness, closest

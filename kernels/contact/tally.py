@@ -1,4 +1,4 @@
-"""What contact comes to over steps: pairs that push each other, and the work of friction, counted on the device."""
+"""Contact statistics over steps: numbers of active pairs and the work of friction, counted on the device."""
 
 from functools import cache
 
@@ -12,12 +12,15 @@ SUM, PARTS, LAST = (
     0,
     1,
     2,
-)  # of the counts of each world: pairs over all parts of steps, how many these are, pairs of the last one
+)  # rows of counts: pairs over all substeps, number of substeps, pairs of the last one
 
 
 @cache
 def take_kernel(real):
-    """take(...): add what a part of a step came to, in the worlds that took it."""
+    """Build the kernel of statistics.
+
+    `take`: add the pairs and the friction work of a substep, in worlds that accepted it.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(

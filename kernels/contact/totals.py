@@ -1,4 +1,4 @@
-"""What pairs come to in each world: energies, how many push each other, and what friction takes, added up in one order."""
+"""Sum contact energy, number of active pairs and friction work per world, in a fixed order."""
 
 from functools import cache
 
@@ -12,9 +12,9 @@ ROWS = 3
 
 @cache
 def written_struct(real):
-    """A list of pairs by first things (see `PairList`), `things` of them in a world, and what it has written of each pair.
+    """List of pairs by first primitives (see `PairList`), `things` of them in a world, with the energy of each pair.
 
-    used: not zero where it has; work: of friction, empty of contact.
+    `used`: not zero for active pairs; `work`: work of friction, empty for contact.
     """
 
     @wp.struct
@@ -32,24 +32,28 @@ def written_struct(real):
 
 @cache
 def total_kernels(real, serial: bool):
-    """add(...) over pairs of first things, tell(...) the sums over these of each world."""
+    """Build the kernels of sums per world.
+
+    `add`: sum over the pairs of each first primitive.
+    `tell`: write the results of each world.
+    """
     Written, share, until = written_struct(real), share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(lists: wp.array(dtype=Written), worlds: int, sums: wp.array2d(dtype=real)):
-        """Row by row of what is added up (ROWS worlds, things), the k-th first things of all lists together."""
+        """Write sums (ROWS worlds, primitives); column k adds the k-th first primitives of all lists."""
         w, start = share(wp.tid(), sums.shape[1])
         for k in range(start, until(start, sums.shape[1])):
             energy, work, touching = real(0.0), real(0.0), int(0)
             for s in range(lists.shape[0]):
                 if k < lists[s].things and lists[s].count[0] > 0:
-                    own = lists[s]
-                    first = own.starts[k + w * own.things]
-                    for p in range(first, first + own.partners[k + w * own.things]):
-                        if own.used[p] != 0:
-                            energy += own.energy[p]
-                            if own.work.shape[0] > 0:
-                                work += own.work[p]
+                    pair_list = lists[s]
+                    first = pair_list.starts[k + w * pair_list.things]
+                    for p in range(first, first + pair_list.partners[k + w * pair_list.things]):
+                        if pair_list.used[p] != 0:
+                            energy += pair_list.energy[p]
+                            if pair_list.work.shape[0] > 0:
+                                work += pair_list.work[p]
                             else:
                                 touching += 1
             sums[wp.static(ENERGY) * worlds + w, k] = energy
@@ -64,7 +68,7 @@ def total_kernels(real, serial: bool):
         touching: wp.array(dtype=int),
         dissipated: wp.array(dtype=real),
     ):
-        """Energies are infinite while pairs do not fit."""
+        """Write the results of each world; energies are infinite if pairs overflowed."""
         w = wp.tid()
         energy[w] = wp.where(overflow[0] == 0, sums[wp.static(ENERGY), w], real(wp.inf))
         touching[w] = int(sums[wp.static(TOUCHING), w])
