@@ -1,1 +1,1 @@
-"""Kernels of nets: elements of any kind on shared dof blocks, gathered by index, and their sparse system."""
+"""Kernels of the coupled system: elements of any kind on shared dof blocks, gathered by index, and the sparse system."""

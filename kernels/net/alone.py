@@ -1,9 +1,9 @@
-"""Rods of a net that touch nothing, stepped as rods on their own: to their arrays, back to the net's, and what becomes of the worlds.
+"""Decoupled step: rods of the coupled system without contact, stepped as uncoupled rods.
 
-A net numbers nodes, angles and elements of a rod evenly: the first one, and how far the next is from it, say where all are. These are
-the rows of `places` (8, R): of nodes, of angles among all blocks, of elements that span two edges, of those that span one.
+The coupled system numbers nodes, twist angles and elements of a rod evenly. The dof map (8, R) has the first index and the stride of
+nodes, twist angles (among all blocks), elements that span two edges, and elements that span one.
 
-`told` (rows, worlds) is what is known of each world, its rows named here.
+Rows of the status array (rows, worlds) are named here.
 """
 
 from functools import cache
@@ -27,19 +27,22 @@ from ddg_warp.kernels.islands import (
 from ddg_warp.kernels.step import start_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, share_function, until_function
 
-# whether the world was tried; the largest outcome, iterations and lost pivots of its rods; whether it is left to the net
+# whether the world is stepped so; worst outcome, most iterations and lost pivots of rods, and whether the step is still to be done
 TRIED, WORST, MOST, PIVOTS, LEFT = range(5)
 TOLD = 5
-NODE, ANGLE, VERTEX, EDGE = 0, 2, 4, 6  # of `places`, where the two rows of each start
+NODE, ANGLE, VERTEX, EDGE = 0, 2, 4, 6  # first of two rows of the dof map
 
 
 @cache
 def rod_kernels(kind: ChainKind, real):
-    """gather(...) the rods of worlds that are tried from the blocks of a net, put(...) their positions back and what became of them,
-    scatter(...) all else; columns as of `Group`.
+    """Build the kernels that copy rods between the coupled storage and a rod group; columns as in `Group`.
 
-    Of `last`, strains of the last step, those of elements that span two edges, then those that span one; of no term of this kind that
-    is damped, any array stands for them.
+    `gather`: copy rods of tried worlds to the rod group, and start their step.
+    `put`: copy positions back, and collect outcomes per world.
+    `scatter`: copy velocities, frames and history back.
+
+    `last` has strains of the last step: of elements that span two edges, then of elements that span one. Without a damped term of that
+    span any array will do.
     """
     V, twist = wp.types.vector(3, real), kind.twist
     until = until_function(kind.serial)
@@ -49,20 +52,20 @@ def rod_kernels(kind: ChainKind, real):
     Frame, Strains = wp.types.vector(6, real), wp.types.vector(max(vertex_rows + edge_rows, 1), real)
 
     @wp.func
-    def owner(places: wp.array2d(dtype=int), c: int):
-        """World and rod of a column."""
-        w = c / places.shape[1]
-        return w, c - w * places.shape[1]
+    def owner(dof_map: wp.array2d(dtype=int), c: int):
+        """Return world and rod of a column."""
+        w = c / dof_map.shape[1]
+        return w, c - w * dof_map.shape[1]
 
     @wp.func
-    def place(places: wp.array2d(dtype=int), what: int, r: int, k: int, shift: int):
-        return wp.max(places[what, r] + k * places[what + 1, r] + shift, 0)
+    def index_of(dof_map: wp.array2d(dtype=int), row: int, r: int, k: int, shift: int):
+        return wp.max(dof_map[row, r] + k * dof_map[row + 1, r] + shift, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(
-        places: wp.array2d(dtype=int),
+        dof_map: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
-        told: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         sizes: wp.vec4i,
         nodes: int,
         q: wp.array(dtype=V),
@@ -83,11 +86,11 @@ def rod_kernels(kind: ChainKind, real):
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
     ):
-        """Starts the step of every rod: worlds that are not tried have nothing to do."""
+        """Copy rods and start steps, which are complete at once in worlds that are not tried."""
         start, c = wp.tid()
-        w, r = owner(places, c)
+        w, r = owner(dof_map, c)
         n = count[c]
-        tried = told[wp.static(TRIED), w] != 0
+        tried = status[wp.static(TRIED), w] != 0
         if start == 0:
             flags[CAUTIOUS, c] = 0
             flags[RETRIES, c] = 0
@@ -98,25 +101,25 @@ def rod_kernels(kind: ChainKind, real):
         if not tried or start >= n:
             return
         for k in range(start, until(start, n)):
-            # all is read before anything is written: what may be one array the compiler keeps in order, one wait after the other
-            i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
+            # read all before any write: the compiler keeps the order of accesses to arrays that may alias
+            i = index_of(dof_map, wp.static(NODE), r, k, first_of(w, sizes[0]))
             x, speed, change = q[i], v[i], a[i]
-            angle, directors, own, strains = V(), Frame(), real(0.0), Strains()
+            angle, directors, twist_lag, strains = V(), Frame(), real(0.0), Strains()
             if k < n - 1:
                 if wp.static(twist):
-                    j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
+                    j = index_of(dof_map, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
                     angle = V(q[j][0], v[j][0], a[j][0])
-                    f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
+                    f = index_of(dof_map, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
                         directors[d] = frame[d, f]
                 if wp.static(edge_rows > 0):
-                    e = place(places, wp.static(EDGE), r, k, first_of(w, sizes[3]))
+                    e = index_of(dof_map, wp.static(EDGE), r, k, first_of(w, sizes[3]))
                     for d in range(wp.static(edge_rows)):
                         strains[wp.static(vertex_rows) + d] = edge_last[d, e]
             if k < n - 2:
-                e = place(places, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
+                e = index_of(dof_map, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
                 if wp.static(twist):
-                    own = lag[0, e]
+                    twist_lag = lag[0, e]
                 for d in range(wp.static(vertex_rows)):
                     strains[d] = vertex_last[d, e]
             x_out[k, c] = x
@@ -133,44 +136,44 @@ def rod_kernels(kind: ChainKind, real):
                     last_out[wp.static(edge_row) + d, k, c] = strains[wp.static(vertex_rows) + d]
             if k < n - 2:
                 if wp.static(twist):
-                    frame_out[6, k, c] = own
+                    frame_out[6, k, c] = twist_lag
                 for d in range(wp.static(vertex_rows)):
                     last_out[wp.static(vertex_row) + d, k, c] = strains[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(
-        places: wp.array2d(dtype=int),
+        dof_map: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
         sizes: wp.vec4i,
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         flags: wp.array2d(dtype=int),
-        told: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         q_out: wp.array(dtype=V),
     ):
         start, c = wp.tid()
-        w, r = owner(places, c)
+        w, r = owner(dof_map, c)
         n = count[c]
-        if told[wp.static(TRIED), w] == 0 or start >= n:
+        if status[wp.static(TRIED), w] == 0 or start >= n:
             return
         if start == 0:
-            # few of many rods change what is known already
-            if told[wp.static(WORST), w] < flags[STATUS, c]:
-                wp.atomic_max(told, wp.static(WORST), w, flags[STATUS, c])
-            if told[wp.static(MOST), w] < flags[ITERATION, c]:
-                wp.atomic_max(told, wp.static(MOST), w, flags[ITERATION, c])
+            # few of many rods change the maximum
+            if status[wp.static(WORST), w] < flags[STATUS, c]:
+                wp.atomic_max(status, wp.static(WORST), w, flags[STATUS, c])
+            if status[wp.static(MOST), w] < flags[ITERATION, c]:
+                wp.atomic_max(status, wp.static(MOST), w, flags[ITERATION, c])
             if flags[LOST, c] > 0:
-                wp.atomic_add(told, wp.static(PIVOTS), w, flags[LOST, c])
+                wp.atomic_add(status, wp.static(PIVOTS), w, flags[LOST, c])
         for k in range(start, until(start, n)):
-            q_out[place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))] = x[k, c]
+            q_out[index_of(dof_map, wp.static(NODE), r, k, first_of(w, sizes[0]))] = x[k, c]
             if wp.static(twist):
                 if k < n - 1:
                     angle = V(theta[k, c], real(0.0), real(0.0))
-                    q_out[place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))] = angle
+                    q_out[index_of(dof_map, wp.static(ANGLE), r, k, first_of(w, sizes[0]))] = angle
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def scatter(
-        places: wp.array2d(dtype=int),
+        dof_map: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
         sizes: wp.vec4i,
         nodes: int,
@@ -180,7 +183,7 @@ def rod_kernels(kind: ChainKind, real):
         last: wp.array3d(dtype=real),
         a: wp.array2d(dtype=V),
         alpha: wp.array2d(dtype=real),
-        told: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         v_out: wp.array(dtype=V),
         a_out: wp.array(dtype=V),
         frame_out: wp.array2d(dtype=real),
@@ -189,14 +192,14 @@ def rod_kernels(kind: ChainKind, real):
         edge_last: wp.array2d(dtype=real),
     ):
         start, c = wp.tid()
-        w, r = owner(places, c)
+        w, r = owner(dof_map, c)
         n = count[c]
-        if told[wp.static(TRIED), w] == 0 or start >= n:
+        if status[wp.static(TRIED), w] == 0 or start >= n:
             return
         for k in range(start, until(start, n)):
-            # read before anything is written, as above
+            # read all before any write, as in `gather`
             speed, change = v[k, c], a[k, c]
-            angle, directors, own, strains = V(), Frame(), real(0.0), Strains()
+            angle, directors, twist_lag, strains = V(), Frame(), real(0.0), Strains()
             if k < n - 1:
                 if wp.static(twist):
                     angle[0] = omega[k, c]
@@ -207,28 +210,28 @@ def rod_kernels(kind: ChainKind, real):
                     strains[wp.static(vertex_rows) + d] = last[wp.static(edge_row) + d, k, c]
             if k < n - 2:
                 if wp.static(twist):
-                    own = frame[6, k, c]
+                    twist_lag = frame[6, k, c]
                 for d in range(wp.static(vertex_rows)):
                     strains[d] = last[wp.static(vertex_row) + d, k, c]
-            i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
+            i = index_of(dof_map, wp.static(NODE), r, k, first_of(w, sizes[0]))
             v_out[i] = speed
             a_out[i] = change
             if k < n - 1:
                 if wp.static(twist):
-                    j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
+                    j = index_of(dof_map, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
                     v_out[j] = V(angle[0], real(0.0), real(0.0))
                     a_out[j] = V(angle[1], real(0.0), real(0.0))
-                    f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
+                    f = index_of(dof_map, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
                         frame_out[d, f] = directors[d]
                 if wp.static(edge_rows > 0):
-                    e = place(places, wp.static(EDGE), r, k, first_of(w, sizes[3]))
+                    e = index_of(dof_map, wp.static(EDGE), r, k, first_of(w, sizes[3]))
                     for d in range(wp.static(edge_rows)):
                         edge_last[d, e] = strains[wp.static(vertex_rows) + d]
             if k < n - 2:
-                e = place(places, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
+                e = index_of(dof_map, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
                 if wp.static(twist):
-                    lag_out[0, e] = own
+                    lag_out[0, e] = twist_lag
                 for d in range(wp.static(vertex_rows)):
                     vertex_last[d, e] = strains[d]
 
@@ -237,40 +240,45 @@ def rod_kernels(kind: ChainKind, real):
 
 @cache
 def world_kernels(real):
-    """begin(...) a step, in worlds that are in no doubt, hope(...) for others in which nothing is near, near(...) where pairs may be,
-    judge(...) of what was tried; a thread a world, but of near. Where a world is not done, `remaining` says so."""
+    """Build the kernels of decisions, with one thread per world but for `near`.
+
+    `begin`: begin a step; try worlds without doubt.
+    `hope`: try other worlds without pairs in range.
+    `near`: mark if a list has pairs.
+    `judge`: accept the step of tried worlds, or leave it to the coupled system and set `remaining`.
+    """
     restart = start_function(real)
 
     @wp.func
     def whole(scalars: wp.array2d(dtype=real), w: int):
-        """Whether a step is tried at once: what is met on arcs is not near the straight ways of all of it."""
+        """Return True if the step is undivided: contacts along arcs are not near the straight motion of a full step."""
         return scalars[PROGRESS, w] < real(1.0) and scalars[PORTION, w] == real(1.0)
 
     @wp.func
-    def enter(told: wp.array2d(dtype=int), w: int, tried: bool):
-        told[wp.static(TRIED), w] = wp.where(tried, 1, 0)
-        told[wp.static(WORST), w] = 0
-        told[wp.static(MOST), w] = 0
-        told[wp.static(PIVOTS), w] = 0
+    def enter(status: wp.array2d(dtype=int), w: int, tried: bool):
+        status[wp.static(TRIED), w] = wp.where(tried, 1, 0)
+        status[wp.static(WORST), w] = 0
+        status[wp.static(MOST), w] = 0
+        status[wp.static(PIVOTS), w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        told: wp.array2d(dtype=int),
-        known: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
+        culling: wp.array2d(dtype=int),
         remaining: wp.array(dtype=int),
         again: wp.array(dtype=int),
     ):
-        """`known` as of `kernels.contact.runs`."""
+        """Begin a step; try worlds that rod culling proves free of contact (`culling`: see `kernels.contact.runs`)."""
         w = wp.tid()
         remaining[0] = 0
         again[0] = 0
         restart(flags, scalars, w)
         for row in range(wp.static(STEPS), wp.static(TICK + 1)):
-            known[row, w] = known[row, w] + 1
-        enter(told, w, whole(scalars, w) and known[DOUBT, w] == 0)
-        told[wp.static(LEFT), w] = 1
+            culling[row, w] = culling[row, w] + 1
+        enter(status, w, whole(scalars, w) and culling[DOUBT, w] == 0)
+        status[wp.static(LEFT), w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def hope(
@@ -278,22 +286,22 @@ def world_kernels(real):
         reach: real,
         overflow: wp.array(dtype=int),
         scalars: wp.array2d(dtype=real),
-        told: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         any_tried: wp.array(dtype=int),
         remaining: wp.array(dtype=int),
     ):
-        """`any_tried` and `remaining` are zero before."""
+        """Try worlds with no gap below `reach` [m]; `any_tried` and `remaining` are zero before."""
         w = wp.tid()
         tried = whole(scalars, w) and gap[w] >= reach and overflow[0] == 0
-        enter(told, w, tried)
+        enter(status, w, tried)
         if tried:
             any_tried[0] = 1
-        elif told[wp.static(LEFT), w] != 0:
+        elif status[wp.static(LEFT), w] != 0:
             remaining[0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def near(count: wp.array(dtype=int), some: wp.array(dtype=int)):
-        """Whether a list has any pair."""
+        """Set `some` if a list has any pair."""
         if count[0] > 0:
             some[0] = 1
 
@@ -306,8 +314,8 @@ def world_kernels(real):
         crossed: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
         rounded: int,
-        known: wp.array2d(dtype=int),
-        told: wp.array2d(dtype=int),
+        culling: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         counts: wp.array2d(dtype=wp.int64),
@@ -316,17 +324,17 @@ def world_kernels(real):
         remaining: wp.array(dtype=int),
         again: wp.array(dtype=int),
     ):
-        """Ends the step of worlds in which all rods have converged and nothing came near, as one that the net has solved.
+        """End the step of worlds if all rods have converged and no pair came within range.
 
-        What came near is what is in doubt or, once it was `searched` for, what was found; `again` says that it is not known yet.
-        `counts` as of `kernels.contact.tally`, where nothing touches; `tally`, `work`, `rounded` as of `kernels.step.advance_kernel`.
+        Worlds in doubt set `again`, for a search; once `searched`, its result decides. `counts`: see `kernels.contact.tally`, with no
+        active pairs. `tally`, `work`, `rounded`: see `kernels.step.advance_kernel`.
         """
         w = wp.tid()
-        if told[wp.static(LEFT), w] == 0:
+        if status[wp.static(LEFT), w] == 0:
             return
-        worst = told[wp.static(WORST), w]
-        done = told[wp.static(TRIED), w] != 0 and worst <= wp.static(outcome.CONVERGED_TO_ROUNDING)
-        if done and searched == 0 and known[DOUBT, w] != 0:
+        worst = status[wp.static(WORST), w]
+        done = status[wp.static(TRIED), w] != 0 and worst <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        if done and searched == 0 and culling[DOUBT, w] != 0:
             again[0] = 1
             done = False
         if searched != 0 and (overflow[0] != 0 or (some[0] != 0 and (gap[w] < reach or crossed[w] != 0))):
@@ -334,9 +342,9 @@ def world_kernels(real):
         if not done:
             remaining[0] = 1
             return
-        told[wp.static(LEFT), w] = 0
+        status[wp.static(LEFT), w] = 0
         flags[STATUS, w] = worst
-        flags[ITERATION, w] = told[wp.static(MOST), w]
+        flags[ITERATION, w] = status[wp.static(MOST), w]
         flags[MOVED, w] = 1
         scalars[PROGRESS, w] = real(1.0)
         counts[wp.static(PARTS), w] = counts[wp.static(PARTS), w] + wp.int64(1)
@@ -348,40 +356,44 @@ def world_kernels(real):
         wp.atomic_add(work, 0, wp.int64(flags[ITERATION, w]))
         wp.atomic_max(work, 1, wp.int64(flags[ITERATION, w]))
         wp.atomic_add(work, 2, wp.int64(1))
-        wp.atomic_add(work, 4, wp.int64(told[wp.static(PIVOTS), w]))
+        wp.atomic_add(work, 4, wp.int64(status[wp.static(PIVOTS), w]))
 
     return begin, hope, near, judge
 
 
 @cache
 def place_kernels(real, serial: bool):
-    """wait(...) of worlds that are left and not tried; of those that are, stay(...) of nodes of obstacles, follow(...) at the rate at
-    which these were moved."""
-    V, share, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
+    """Build the kernels of positions.
+
+    `wait`: copy blocks of worlds whose step remains and is not tried.
+    `stay`: copy nodes of obstacles of tried worlds.
+    `follow`: write velocities of such nodes from their displacements.
+    """
+    V, first_item, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def wait(told: wp.array2d(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):
-        w, start = share(wp.tid(), blocks)
-        if told[wp.static(TRIED), w] == 0 and told[wp.static(LEFT), w] != 0:
+    def wait(status: wp.array2d(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):
+        w, start = first_item(wp.tid(), blocks)
+        if status[wp.static(TRIED), w] == 0 and status[wp.static(LEFT), w] != 0:
             for k in range(start, until(start, blocks)):
                 q_out[k + w * blocks] = q[k + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def stay(
         nodes: wp.array(dtype=int),
-        told: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         blocks: int,
         q: wp.array(dtype=V),
         q_out: wp.array(dtype=V),
     ):
         i, w = wp.tid()
-        if told[wp.static(TRIED), w] != 0:
+        if status[wp.static(TRIED), w] != 0:
             q_out[nodes[i] + w * blocks] = q[nodes[i] + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         nodes: wp.array(dtype=int),
-        told: wp.array2d(dtype=int),
+        status: wp.array2d(dtype=int),
         blocks: int,
         q0: wp.array(dtype=V),
         q: wp.array(dtype=V),
@@ -391,7 +403,7 @@ def place_kernels(real, serial: bool):
     ):
         i, w = wp.tid()
         k = nodes[i] + w * blocks
-        if told[wp.static(TRIED), w] != 0:
+        if status[wp.static(TRIED), w] != 0:
             v_out[k] = (q[k] - q0[k]) * (real(1.0) / dt[w])
             a_out[k] = V()
 

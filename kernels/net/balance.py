@@ -1,6 +1,6 @@
-"""The balance of forces at the blocks of a net, and what a step does to its energy; see `kernels.balance` for rods on their own.
+"""Residual at the dof blocks of the coupled system, and the energy change of a step; see `kernels.balance` for rods.
 
-What meets at a block is listed once, so sums come in one order, without atomics.
+Incidence lists give sums a fixed order, without atomics.
 """
 
 from functools import cache
@@ -15,9 +15,9 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def meeting_type(real, linear):
-    """What the elements of a set bring to the blocks that they meet at; an item is element * `ITEM` + slot.
+    """Return the struct of contributions of an element set, with its incidence list; an item is element * `ITEM` + local node index.
 
-    The gradient is that of the slots; or `along`, of the local dofs, of which the `ends` (`Measure.ends`) belong to a slot.
+    `gradient`: by local nodes. Without it, `along` is the gradient by local dofs; `ends` (`Measure.ends`) are the dofs of a local node.
     """
     V = wp.types.vector(3, real)
 
@@ -38,12 +38,13 @@ def meeting_type(real, linear):
 
 @cache
 def given_type(real, drag: bool):
-    """What the balance of blocks reads beside the elements.
+    """Return the struct of inputs of the residual but for elements.
 
-    In contact blocks have forces `push`, and bounds `pressed` on the stiffness of what pushes them. `allowed` is what the residual
-    of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`. Moments are compared over the length `arm`.
-    Nodes that the last step moved by more than `settled` [m] are none that only rounding moves; see `kernels.judge`.
-    What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
+    `push`, `pressed`: contact forces of blocks, and bounds of the contact stiffness.
+    `allowed`: residual tolerance of a block at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`.
+    `arm`: length [m] by which moments are compared with forces.
+    `settled` [m]: a node that an update moves by more is not moved by rounding alone; see `kernels.judge`.
+    `longest` [m]: longest edge, which bounds coordinates of both ends and so the rounding of an edge vector.
     """
     V, Mass = wp.types.vector(3, real), mass_type(real, drag)
 
@@ -72,8 +73,11 @@ def given_type(real, drag: bool):
 
 @cache
 def found_type(real, linear):
-    """What the balance of blocks writes: residuals of free dofs, what rounding leaves there, how often they are what they may be, their
-    squares, the change of the energy along the step from `base`, and its rounding."""
+    """Return the struct of outputs of the residual.
+
+    `right`: residuals of free dofs. `least`: rounding floor. `ratio`, `square`: residual over its tolerance, and squared.
+    `change`, `noise`: change of the energy along the step from `base`, and its rounding.
+    """
     H = wp.types.vector(3, linear)
 
     @wp.struct
@@ -90,9 +94,9 @@ def found_type(real, linear):
 
 @cache
 def largest_function(real, size: int = 3):
-    """largest(v): the largest component by its absolute value, without those that are no numbers.
+    """Return the device function `largest(v)`: the largest absolute component, NaN ignored.
 
-    `wp.max` looks at both of a pair for what is none, which takes the CPU three times as long.
+    Alternative: `wp.max` tests both arguments for NaN, which takes the CPU three times as long.
     """
     V = wp.types.vector(size, real)
 
@@ -109,9 +113,12 @@ def largest_function(real, size: int = 3):
 
 @cache
 def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = False):
-    """outer(...): loads, gravity, inertia, drag and contact of a block; settle(...): its residual, and whether that balances.
+    """Return the device functions `outer` and `settle` of a block.
 
-    Of an `angle` of a rod, known as such, vectors have its one dof.
+    `outer(...) -> (force, size, stiff, change)`: loads, gravity, inertia, drag and contact.
+    `settle(...)`: write the residual and test convergence.
+
+    With `angle` the block is a twist angle, and vectors have one component.
     """
     dofs = 1 if angle else 3
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -120,8 +127,8 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
     largest = largest_function(real, dofs)
 
     @wp.func
-    def own(v: V):
-        """The dofs of a block."""
+    def dofs_of(v: V):
+        """Return the dofs of a block."""
         x = X()
         for d in range(wp.static(dofs)):
             x[d] = v[d]
@@ -129,43 +136,43 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
 
     @wp.func
     def square(m: M):
-        """What acts between them."""
+        """Return the entries of a matrix between dofs of a block."""
         if wp.static(angle):
             return R(m[0, 0])
         else:
             return m
 
     @wp.func
-    def outer(given: Given, i: int, k: int, w: int, c: real):
-        """Force; its size and stiffness, the work along the step, without that of contact, which has an energy."""
-        x = own(given.q[i])
-        force = own(given.load[i])
+    def outer(inputs: Given, i: int, k: int, w: int, c: real):
+        """Return force, size, stiffness, and energy change along the step, without contact energy."""
+        x = dofs_of(inputs.q[i])
+        force = dofs_of(inputs.load[i])
         if wp.static(drag):
-            m = own(given.mass[w, k].mass)
+            m = dofs_of(inputs.mass[w, k].mass)
         else:
-            m = own(given.mass[w, k])
+            m = dofs_of(inputs.mass[w, k])
         if wp.static(not angle):
-            if k < given.nodes:
-                force += wp.cw_mul(m, given.gravity[0])
-        inertia = wp.cw_mul(m, x - own(given.target[i])) * c
-        u = x - own(given.base[i])
+            if k < inputs.nodes:
+                force += wp.cw_mul(m, inputs.gravity[0])
+        inertia = wp.cw_mul(m, x - dofs_of(inputs.target[i])) * c
+        u = x - dofs_of(inputs.base[i])
         change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
         stiff = c * largest(m)
         if wp.static(drag):
-            resistance = square(given.mass[w, k].resistance)
-            held_back = resistance * (x - own(given.mass[w, k].carried))
+            resistance = square(inputs.mass[w, k].resistance)
+            held_back = resistance * (x - dofs_of(inputs.mass[w, k].carried))
             inertia += held_back
             change += wp.dot(u, held_back - resistance * u * real(0.5))
             stiff += wp.max(wp.get_diag(resistance))
         if wp.static(contact):
-            force += own(given.push[i])
-            stiff += given.pressed[i]
+            force += dofs_of(inputs.push[i])
+            stiff += inputs.pressed[i]
         return force - inertia, largest(force), stiff, change
 
     @wp.func
     def settle(
-        given: Given,
-        found: Found,
+        inputs: Given,
+        outputs: Found,
         flags: wp.array2d(dtype=int),
         load_scale: real,
         i: int,
@@ -177,30 +184,30 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
         change: real,
         noise: real,
     ):
-        """See `kernels.balance` for the criterion."""
-        mask = int(given.fixed[k])
-        reach = largest(own(given.q[i])) + given.longest
+        """Write the residual and test convergence by the criterion of `kernels.balance`."""
+        mask = int(inputs.fixed[k])
+        reach = largest(dofs_of(inputs.q[i])) + inputs.longest
         length = real(1.0)
         if wp.static(angle):
             reach += real(1.0)
-            length = given.arm
+            length = inputs.arm
         else:
-            if k >= given.nodes:
+            if k >= inputs.nodes:
                 reach += real(1.0)
-                length = given.arm
-        allowed = given.allowed[i]
-        limit = given.rtol * load_scale * allowed
-        least = given.floor * (stiff * reach + size)
-        found.least[i] = least
+                length = inputs.arm
+        allowed = inputs.allowed[i]
+        limit = inputs.rtol * load_scale * allowed
+        least = inputs.floor * (stiff * reach + size)
+        outputs.least[i] = least
         r = H()
         total = real(0.0)
         worst = real(0.0)
         moved = True
         if wp.static(real is wp.float32):
             settled = real(wp.static(SETTLED))  # rad
-            if k < given.nodes:
-                settled = given.settled
-            moved = not wp.length(given.q[i] - given.base[i]) < settled
+            if k < inputs.nodes:
+                settled = inputs.settled
+            moved = not wp.length(inputs.q[i] - inputs.base[i]) < settled
         for d in range(wp.static(dofs)):
             if ((mask >> d) & 1) == 0:
                 a = wp.abs(force[d])
@@ -214,21 +221,24 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
                     if wp.static(real is wp.float32):
                         if a > real(wp.static(ROUNDED)) * load_scale * allowed and moved:
                             flags[DOUBTFUL, w] = 1
-        found.right[i] = r
-        found.ratio[w, k] = worst / allowed
-        found.square[w, k] = total / (length * length)
-        found.change[w, k] = change
-        found.noise[w, k] = noise + real(0.5) * size * reach
+        outputs.right[i] = r
+        outputs.ratio[w, k] = worst / allowed
+        outputs.square[w, k] = total / (length * length)
+        outputs.change[w, k] = change
+        outputs.noise[w, k] = noise + real(0.5) * size * reach
 
     return outer, settle
 
 
-ITEM = 16  # in an item, an element of a set counts as much, and its slots one each
+ITEM = 16  # an item is element * ITEM + local node index
 
 
 @cache
 def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
-    """balance(...) of the blocks `some`, or, where these are none, of all."""
+    """Build the kernel of the residual.
+
+    `balance`: write residual and energy change of the blocks `some`, or of all if empty.
+    """
     V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
     Given, Found, F = given_type(real, drag), found_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
@@ -236,25 +246,25 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
     largest = largest_function(real)
 
     @wp.func
-    def force_of(own: Meeting, slot: int, e: int):
-        if own.ends.shape[0] == 0:
-            return own.gradient[slot, e]
+    def force_of(element_set: Meeting, local: int, e: int):
+        if element_set.ends.shape[0] == 0:
+            return element_set.gradient[local, e]
         f = V()
-        plus = own.ends[slot, 0]
-        minus = own.ends[slot, 1]
-        if slot >= own.nodes:
-            f[0] = own.along[plus, e]
+        plus = element_set.ends[local, 0]
+        minus = element_set.ends[local, 1]
+        if local >= element_set.nodes:
+            f[0] = element_set.along[plus, e]
         else:
             for d in range(3):
                 if plus >= 0:
-                    f[d] = own.along[plus + d, e]
+                    f[d] = element_set.along[plus + d, e]
                 if minus >= 0:
-                    f[d] = f[d] - own.along[minus + d, e]
+                    f[d] = f[d] - element_set.along[minus + d, e]
         return f
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
-        given: Given,
+        inputs: Given,
         some: wp.array(dtype=int),
         sets: wp.array(dtype=Meeting),
         oblique: wp.array(dtype=int),
@@ -263,11 +273,11 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
         scalars: wp.array2d(dtype=real),
         count: int,
         total: int,
-        found: Found,
+        outputs: Found,
     ):
-        """`count` blocks in each world, in all worlds `total`. The first slot of an element brings its energy.
+        """Treat `count` blocks in each world, `total` in all; the first local node of an element adds its energy.
 
-        `oblique` is the number of a block's frame among `frames`, -1 without; empty where no block has one.
+        `oblique`: index of a block's nodal frame among `frames` (skew supports), -1 for none; empty if no block has one.
         """
         start = wp.tid()
         for j in range(start, until(start, total)):
@@ -277,28 +287,28 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
             k = j - w * count
             if some.shape[0] > 0:
                 k = some[k]
-            i = k + w * given.blocks
-            force, size, stiff, change = outer(given, i, k, w, scalars[COEFFICIENT, w])
+            i = k + w * inputs.blocks
+            force, size, stiff, change = outer(inputs, i, k, w, scalars[COEFFICIENT, w])
             noise = wp.abs(change)
             accepted = flags[SLOT, w]
             for n in range(sets.shape[0]):
-                own = sets[n]
+                element_set = sets[n]
                 f = V()
                 large = real(0.0)
                 stiffness = linear(0.0)
                 more = real(0.0)
                 rounding = real(0.0)
-                for at in range(own.starts[k], own.starts[k + 1]):
-                    item = own.items[at]
-                    slot = item % wp.static(ITEM)
-                    e = item // wp.static(ITEM) + w * own.elements
-                    g = force_of(own, slot, e)
+                for entry in range(element_set.starts[k], element_set.starts[k + 1]):
+                    item = element_set.items[entry]
+                    local = item % wp.static(ITEM)
+                    e = item // wp.static(ITEM) + w * element_set.elements
+                    g = force_of(element_set, local, e)
                     f += g
                     large += largest(g)
-                    stiffness += own.stiffness[e]
-                    if slot == 0:
-                        new = own.energy[1 - accepted, e]
-                        more += new - own.energy[accepted, e]
+                    stiffness += element_set.stiffness[e]
+                    if local == 0:
+                        new = element_set.energy[1 - accepted, e]
+                        more += new - element_set.energy[accepted, e]
                         rounding += wp.abs(new)
                 force -= f
                 size += large
@@ -308,6 +318,6 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
             if oblique.shape[0] > 0:
                 if oblique[k] >= 0:
                     force = frames[oblique[k]] * force
-            settle(given, found, flags, scalars[LOAD_SCALE, w], i, k, w, force, size, stiff, change, noise)
+            settle(inputs, outputs, flags, scalars[LOAD_SCALE, w], i, k, w, force, size, stiff, change, noise)
 
     return balance

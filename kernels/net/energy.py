@@ -1,4 +1,4 @@
-"""The balance of energy of a step of the midpoint rule, of the elements and blocks of a net; see `kernels.energy`."""
+"""Discrete energy balance of a midpoint step, by elements and blocks of the coupled system; see `kernels.energy`."""
 
 from functools import cache
 
@@ -14,7 +14,10 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def element_kernel(term: Term, real, linear):
-    """Rows of the elements of a set; row i of world w is i * worlds + w."""
+    """Build the kernel of an element set.
+
+    `measure`: write the rows of the energy balance of each element; row i of world w is i * worlds + w.
+    """
     Elements = elements_type(real)
     V = wp.types.vector(3, real)
     gather, _ = functions(term, real)
@@ -22,7 +25,7 @@ def element_kernel(term: Term, real, linear):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        given: Elements,
+        elements: Elements,
         q0: wp.array(dtype=V),
         stiffness: wp.array(dtype=linear),
         floor: real,
@@ -31,13 +34,13 @@ def element_kernel(term: Term, real, linear):
         rows_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
-        w = tid / given.elements
+        w = tid / elements.elements
         if scalars[PROGRESS, w] >= real(1.0):
             return
-        e = tid - w * given.elements
-        b, s, weight, p = gather(given, given.q, w, e)
-        a, _s, _w, _p = gather(given, q0, w, e)
-        reach = wp.max(wp.abs(given.q[given.slots[0, e] + w * given.blocks]))
+        e = tid - w * elements.elements
+        b, s, weight, p = gather(elements, elements.q, w, e)
+        a, _s, _w, _p = gather(elements, q0, w, e)
+        reach = wp.max(wp.abs(elements.q[elements.slots[0, e] + w * elements.blocks]))
         rows = balance(a, s, b, s, weight, p, reach, floor)
         least = floor * reach
         worlds = scalars.shape[1]
@@ -51,7 +54,10 @@ def element_kernel(term: Term, real, linear):
 
 @cache
 def block_kernel(real, drag: bool = False):
-    """Rows of the blocks of a net: work of loads that follow, kinetic energy at the end of the step, what damping and drag take in."""
+    """Build the kernel of dof blocks.
+
+    `measure`: write the work of follower loads, the kinetic energy at the end of the step, and dissipation by damping and drag.
+    """
     V, Mass = wp.types.vector(3, real), mass_type(real, drag)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -64,12 +70,12 @@ def block_kernel(real, drag: bool = False):
         scalars: wp.array2d(dtype=real),
         damping: wp.array(dtype=real),
         load: wp.array(dtype=V),
-        load_there: wp.array(dtype=V),
+        load_solved: wp.array(dtype=V),
         floor: real,
         blocks: int,
         rows_out: wp.array2d(dtype=real),
     ):
-        """`load` is that of the iterate, `load_there` what the step was solved with."""
+        """Write rows of blocks; `load` is the load at the iterate, `load_solved` the load of the solve."""
         i = wp.tid()
         w = i / blocks
         if scalars[PROGRESS, w] >= real(1.0):
@@ -78,7 +84,7 @@ def block_kernel(real, drag: bool = False):
         moved = q[i] - q0[i]
         v = moved * (real(2.0) * scalars[RATE, w]) - v0[i]
         worlds = scalars.shape[1]
-        rows_out[wp.static(DRIFT) * worlds + w, k] = real(2.0) * wp.dot(load_there[i] - load[i], moved)
+        rows_out[wp.static(DRIFT) * worlds + w, k] = real(2.0) * wp.dot(load_solved[i] - load[i], moved)
         rows_out[wp.static(ROUNDING) * worlds + w, k] = real(2.0) * floor * wp.abs(wp.dot(load[i], moved))
         if wp.static(drag):
             m = mass[w, k].mass

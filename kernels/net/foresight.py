@@ -1,8 +1,8 @@
-"""From where the solve of a net's step starts, and what is trusted of what it adds; see `kernels.foresight`.
+"""Warm start of the coupled system, and the weight of the extrapolated correction; see `kernels.foresight`.
 
-Among many contacts some of what a solve adds is gone by the next step. What it added is trusted in a world by the cosine of the angle
-between that and what was trusted before, weighed by mass, and less where it has grown by more than `GROWTH`: a shock is not foreseen
-again, and what goes on is, within a few steps. What takes less than what is left out of balance is none of the motion.
+Among many contacts some of a correction is gone by the next step. The weight of a world is the mass-weighted cosine between its
+correction and the last extrapolated one. It is lower if the correction has grown by more than `GROWTH`. So a shock is not repeated,
+and steady accelerations are extrapolated within a few steps. Corrections below the tolerance of the residual have weight zero.
 """
 
 from functools import cache
@@ -15,22 +15,27 @@ from ddg_warp.kernels.search import PLACE
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 from ddg_warp.kernels.turns import loose_function
 
-GROWTH, LEAST = 4.0, 0.05  # of what is trusted from one step to the next; the least of it, from which it grows again
-AGREEING, ADDED, BEFORE, FORCE = range(4)  # rows of sums over nodes: m a.b, m a.a, m b.b, m |a|
+GROWTH, LEAST = 4.0, 0.05  # growth of the correction with full weight; smallest weight, from which it recovers
+AGREEING, ADDED, BEFORE, FORCE = range(4)  # rows of sums over nodes: m a.b, m a.a, m b.b, m |a|; see `weigh`
 SUMS = 4
 
 
 @cache
 def foresight_kernels(real, linear, serial: bool):
-    """foresee(...) where a solve starts, weigh(...) what it added, trust(...) it."""
+    """Build the kernels of the warm start.
+
+    `foresee`: add extrapolated accelerations to the predictor.
+    `weigh`: sum products of the new correction and the last extrapolated one.
+    `trust`: write the weight of the correction.
+    """
     share, until = share_function(serial), until_function(serial)
-    ahead, loose = ahead_function(real), loose_function(3, real)
+    squared_step, free_components = ahead_function(real), loose_function(3, real)
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def foresee(
         a: wp.array(dtype=V),
-        held: wp.array(dtype=wp.uint8),
+        fixed: wp.array(dtype=wp.uint8),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         blocks: int,
@@ -38,20 +43,20 @@ def foresight_kernels(real, linear, serial: bool):
         predicted: wp.array(dtype=V),
         direction: wp.array(dtype=H),
     ):
-        """Keeps the predictor q of worlds that still have to move, and goes on to where their accelerations lead from there.
+        """Store the predictor q of worlds that still have to move, and add extrapolated accelerations.
 
-        These are a `direction`, along which worlds that turn edges are placed; see `ddg_warp.solve.net.turns`.
+        Worlds with edge rotations take them as a `direction`; see `ddg_warp.solve.net.turns`.
         """
         w, start = share(wp.tid(), blocks)
         if scalars[PROGRESS, w] >= real(1.0):
             return
-        weight = ahead(flags, scalars, w)
+        weight = squared_step(flags, scalars, w)
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
-            here = q[i]
-            predicted[i] = here
-            more = loose(int(held[k]), weight * a[i])
-            q[i] = here + more
+            start_q = q[i]
+            predicted[i] = start_q
+            more = free_components(int(fixed[k]), weight * a[i])
+            q[i] = start_q + more
             if flags[TODO, w] == wp.static(PLACE):
                 direction[i] = H(linear(more[0]), linear(more[1]), linear(more[2]))
 
@@ -67,7 +72,7 @@ def foresight_kernels(real, linear, serial: bool):
         blocks: int,
         weights: wp.array3d(dtype=real),
     ):
-        """The sums, of the nodes that a thread takes: a is what the solve added, b what was trusted before."""
+        """Write sums over the nodes of a thread: a is the correction of the solve, b the last extrapolated acceleration."""
         w, start = share(wp.tid(), nodes)
         if moved[w] == 0:
             return
@@ -94,15 +99,15 @@ def foresight_kernels(real, linear, serial: bool):
         scalars: wp.array2d(dtype=real),
         trust_out: wp.array(dtype=real),
     ):
-        """How much of what was added is trusted, of every world."""
+        """Write the weight of the correction of every world, in [0, 1]."""
         w = wp.tid()
-        added, trusted, found = sums[wp.static(ADDED), w], sums[wp.static(BEFORE), w], real(1.0)
+        added, trusted, weight = sums[wp.static(ADDED), w], sums[wp.static(BEFORE), w], real(1.0)
         if added > real(0.0) and trusted > real(0.0):
             cosine = sums[wp.static(AGREEING), w] / wp.sqrt(added * trusted)
             growth = wp.min(real(GROWTH) * wp.sqrt(trusted / added), real(1.0))
-            found = wp.clamp(cosine * growth, real(LEAST), real(1.0))
+            weight = wp.clamp(cosine * growth, real(LEAST), real(1.0))
         if sums[wp.static(FORCE), w] <= rtol * scalars[LOAD_SCALE, w] * total[w]:
-            found = real(0.0)
-        trust_out[w] = found
+            weight = real(0.0)
+        trust_out[w] = weight
 
     return foresee, weigh, trust

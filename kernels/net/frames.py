@@ -1,6 +1,6 @@
-"""Lagged data of a net: frames of rod edges, and what measures lag beside these.
+"""Time-lagged data of the coupled system: frames of rod edges, and lagged rows of measures.
 
-Worlds in which `moved` is not `wanted` take over what is `kept`, untouched.
+Worlds in which `moved` is not `wanted` copy the `kept` data.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 @cache
 def functions(real):
-    """row(a, i, k) -> vector from three rows of an array; put(a, i, k, v)."""
+    """Return the device functions `row(a, i, k) -> v` and `store(a, i, k, v)`: read and write three rows of an array."""
     V = wp.types.vector(3, real)
 
     @wp.func
@@ -23,16 +23,19 @@ def functions(real):
         return V(a[i, k], a[i + 1, k], a[i + 2, k])
 
     @wp.func
-    def put(a: wp.array2d(dtype=real), i: int, k: int, v: V):
+    def store(a: wp.array2d(dtype=real), i: int, k: int, v: V):
         for d in range(3):
             a[i + d, k] = v[d]
 
-    return row, put
+    return row, store
 
 
 @cache
 def take_kernel(real):
-    """Frames of rod edges of worlds that moved; others keep those that their last solve had."""
+    """Build the kernel that stores frames.
+
+    `take`: copy frames of rod edges in worlds that moved; others keep the frames of their last solve.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(moved: wp.array(dtype=int), edges: int, frame: wp.array2d(dtype=real), frame_out: wp.array2d(dtype=real)):
@@ -46,9 +49,12 @@ def take_kernel(real):
 
 @cache
 def edge_kernel(real, serial: bool):
-    """Frames of rod edges, transported to the tangents of positions q and orthonormalised."""
-    V, share, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
-    row, put = functions(real)
+    """Build the kernel of frame updates.
+
+    `edges`: transport frames of rod edges to the tangents at positions q, and orthonormalise.
+    """
+    V, first_item, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
+    row, store = functions(real)
     transport, *_ = frames.functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -62,7 +68,7 @@ def edge_kernel(real, serial: bool):
         frame: wp.array2d(dtype=real),
         frame_out: wp.array2d(dtype=real),
     ):
-        world, start = share(wp.tid(), ends.shape[0])
+        world, start = first_item(wp.tid(), ends.shape[0])
         for i in range(start, until(start, ends.shape[0])):
             f = i + world * ends.shape[0]
             if moved[world] != wanted:
@@ -71,40 +77,42 @@ def edge_kernel(real, serial: bool):
                 continue
             t = wp.normalize(q[ends[i, 1] + world * blocks] - q[ends[i, 0] + world * blocks])
             u = transport(row(frame, 0, f), row(frame, 3, f), t)
-            put(frame_out, 0, f, wp.normalize(u - t * wp.dot(u, t)))
-            put(frame_out, 3, f, t)
+            store(frame_out, 0, f, wp.normalize(u - t * wp.dot(u, t)))
+            store(frame_out, 3, f, t)
 
     return edges
 
 
 @cache
 def lag_kernel(measure: Measure, real, serial: bool):
-    """Own lagged rows of elements of a measure, from frames that are up to date, as the dofs are, and the rows of before.
+    """Build the kernel of lagged rows of a measure.
 
-    Within a solve (`within`), whose joints go on from the rotations they have, ghosts stay as they are.
+    `lag`: write lagged rows of elements from updated frames, dofs and previous rows.
+
+    Within a solve (`within`) rows of ghost nodes are unchanged, as joints continue from their rotations.
     """
-    Elements, share, until = elements_type(real), share_function(serial), until_function(serial)
-    place, advance = place_function(measure, real), measure.advance(real)
+    Elements, first_item, until = elements_type(real), share_function(serial), until_function(serial)
+    gather, advance = place_function(measure, real), measure.advance(real)
     rows = measure.lag_size - FRAME * measure.frames
     ghosts = 3 * len(measure.vectors) if measure.spins else 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lag(
-        given: Elements,
+        elements: Elements,
         moved: wp.array(dtype=int),
         wanted: int,
         within: int,
         kept: wp.array2d(dtype=real),
         lag_out: wp.array2d(dtype=real),
     ):
-        world, start = share(wp.tid(), given.elements)
-        for e in range(start, until(start, given.elements)):
-            tid = e + world * given.elements
+        world, start = first_item(wp.tid(), elements.elements)
+        for e in range(start, until(start, elements.elements)):
+            tid = e + world * elements.elements
             if moved[world] != wanted:
                 for c in range(wp.static(rows)):
                     lag_out[c, tid] = kept[c, tid]
                 continue
-            q, s = place(given, given.q, world, e)
+            q, s = gather(elements, elements.q, world, e)
             new = advance(q, s)
             for c in range(wp.static(rows)):
                 if within == 0 or c >= wp.static(ghosts):
@@ -115,7 +123,10 @@ def lag_kernel(measure: Measure, real, serial: bool):
 
 @cache
 def reset_kernel(real):
-    """Rotations of joints start from zero once their frames have taken them over."""
+    """Build the kernel that resets joint rotations.
+
+    `reset`: zero rotations of joints after a frame update has absorbed them.
+    """
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -1,4 +1,4 @@
-"""What supports and a magnetic field prescribe among the data of a net's elements: normals at clamped mesh edges, the field."""
+"""Prescribed element data of the coupled system: normals at clamped mesh edges, and the magnetic field."""
 
 from functools import cache
 
@@ -11,7 +11,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def normal_kernels(real, midpoint: bool):
-    """normals(...) for the solve, and turn(...) at the end of the step."""
+    """Build the kernels of prescribed normals.
+
+    `normals`: write normals for the solve.
+    `turn`: write normals at the end of the substep.
+    """
     V = wp.types.vector(3, real)
     turned, *_ = motion.functions(real)
     reached, row = motion.reached_function(real, midpoint), motion.row_function(real)
@@ -33,7 +37,7 @@ def normal_kernels(real, midpoint: bool):
         elements: int,
         data_out: wp.array2d(dtype=real),
     ):
-        """`where` is (element, first row of its data, motion), `rest` the normal at rest."""
+        """Write normals for the solve, given `where` (element, first data row, motion) and the normal at `rest`."""
         i, w = wp.tid()
         if scalars[PROGRESS, w] < real(1.0):
             m = where[i, 2] + w * stride + row(scalars, w, rows)
@@ -53,7 +57,7 @@ def normal_kernels(real, midpoint: bool):
         before: wp.array2d(dtype=real),
         data_out: wp.array2d(dtype=real),
     ):
-        """Normals at the end of the part of the step, of the worlds that `moved`; others keep theirs."""
+        """Write normals at the end of the substep, in worlds that moved; others keep previous values."""
         i, w = wp.tid()
         column = where[i, 0] + w * elements
         n = V()
@@ -69,8 +73,12 @@ def normal_kernels(real, midpoint: bool):
 
 @cache
 def field_kernel(real):
-    """Field and gradient among the data of elements, from row `first` on, in worlds that `moved`, with a uniform field of their own
-    on top; others keep theirs."""
+    """Build the kernel of the magnetic field.
+
+    `put`: write field and gradient plus the uniform field of a world (`more`) from data row `first` on.
+
+    Worlds that have not `moved` keep previous values.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(

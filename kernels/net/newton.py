@@ -1,4 +1,4 @@
-"""Newton's method on a net: what becomes of an iterate and of a direction, a thread a world, and the moves, a thread a block."""
+"""Newton's method on the coupled system: decisions, one thread a world, and updates, one thread a block."""
 
 import math
 from functools import cache
@@ -35,24 +35,29 @@ from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
-ON_THE_WAY, THERE = 2, 1  # worlds whose supports or predictor were held up: not there yet, there since the last step
-POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
-FIRST = 1e-2  # to which the first direction of a crowd may be solved
-STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
+ON_THE_WAY, THERE = 2, 1  # supports or predictor obstructed: still moving, arrived in the last update
+POLISH = 1e-3  # largest forcing term of a direction after which a residual may count as rounding
+FIRST = 1e-2  # forcing term of the first direction of many bodies in contact
+STALLED = 8  # allowed iterations without progress if energy changes are below the rounding floor
 
 
 @cache
 def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False, crowd: bool = False):
-    """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks.
+    """Build the kernels of the line search and of updates.
 
-    Args:
-        turns: whether there are rods, whose edges turn; renews: whether there are frames, which may have to be renewed.
-        contact: whether supports may be on their way; see `kernels.net.touch`.
-        crowd: whether a few of what is in a world may be out of balance; see `ddg_warp.solve.net.outliers`.
+    `judge`: test convergence, accept or shorten an update, and set the forcing term.
+    `measure`: write the predicted decrease of a direction.
+    `rotate`: write the largest rotation of a full update.
+    `take`: set the step length of a direction.
+    `move`: apply a straight update.
+
+    `turns`: True if there are rods, so that edges may rotate. `renews`: True if there are frames to update.
+    `contact`: True if supports may be moving; see `kernels.net.touch`.
+    `crowd`: True for relaxed convergence; see `ddg_warp.solve.net.outliers`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(renews, real, contact)
-    share, until = share_function(serial), until_function(serial)
+    first_item, until = share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
@@ -75,30 +80,29 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         goal: wp.array(dtype=real),
         limit: wp.array(dtype=real),
     ):
-        """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
+        """Decide from sums over all blocks; `worst` is the largest residual over its tolerance at rtol = 1.
 
-        How exactly the next direction is solved follows Eisenstat and Walker (1996). Where that leaves less than a fraction `spare`
-        of the tolerance, this fraction is its `goal`. In a crowd it is that wherever contact cuts nothing, and theirs the `limit` to
-        which it is sought: residuals of bodies that count are far smaller than the largest ones, which make up the norm.
+        The forcing term of the next direction follows Eisenstat and Walker (1996). If that aims below a fraction `spare` of the
+        tolerance, this fraction is the `goal`. With relaxed convergence, unless CCD has limited the update, the forcing term is a
+        `limit` instead: residuals of most bodies are far smaller than the largest, which dominate the norm.
 
-        A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in `STALLED` iterations whose
-        directions were solved (see `take`), has converged to rounding: on bad meshes rounding leaves more than the estimate block by
-        block.
+        A world has converged to rounding if its predicted decrease is below the rounding floor and its residual has not halved in
+        `STALLED` iterations with solved directions (see `take`). On bad meshes rounding exceeds the estimate per block.
         """
         w = wp.tid()
         flags[WANTED, w] = 0
         flags[TODO, w] = 0
-        # what an inexact direction leaves is not rounding yet
+        # residuals left by an inexact direction are not rounding yet
         polish = (
             flags[STATUS, w] == 0
             and flags[UNBALANCED, w] == 0
             and flags[DROWNED, w] != 0
-            and forcing[w] > linear(wp.static(POLISH))  # as rounded as it is
+            and forcing[w] > linear(wp.static(POLISH))  # in the same precision
         )
         if polish and flags[ITERATION, w] > 0:
             flags[UNBALANCED, w] = 1
         if wp.static(real is wp.float32):
-            if scalars[STEP_LENGTH, w] < real(1.0):  # which tells little of how far nodes are to go
+            if scalars[STEP_LENGTH, w] < real(1.0):  # a short step does not show how far nodes will move
                 flags[DOUBTFUL, w] = 1
         if wp.static(contact):
             if flags[DRIVEN, w] == wp.static(ON_THE_WAY):
@@ -107,22 +111,24 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             return
         before = scalars[MERIT, w]
         first = flags[ITERATION, w] == 0
-        # by a whole step: a short one says nothing, one that renews frames expects none
+        # zero length: a frame update, which predicts no decrease
         moved = not first and scalars[STEP_LENGTH, w] > real(0.0)
-        drowns = moved and scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
-        what = decide(change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w)
-        if what == wp.static(STOP):
+        below_floor = moved and scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
+        action = decide(
+            change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w
+        )
+        if action == wp.static(STOP):
             return
-        if what == wp.static(DIRECT):
+        if action == wp.static(DIRECT):
             stalled[w] = stalled[w] + 1
-            if not drowns or square[w] < real(0.25) * best[w]:
+            if not below_floor or square[w] < real(0.25) * best[w]:
                 best[w] = square[w]
                 stalled[w] = 0
             if stalled[w] > wp.static(STALLED):
                 flags[STATUS, w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
                 return
         flags[ACTIVE, 0] = 1
-        if what == wp.static(DIRECT):
+        if action == wp.static(DIRECT):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
@@ -142,7 +148,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             flags[WANTED, w] = 1
             flags[WANTING, 0] = 1
             return
-        flags[TODO, w] = what
+        flags[TODO, w] = action
         if wp.static(turns):
             flags[TURNING, 0] = 1
 
@@ -154,8 +160,8 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         blocks: int,
         dots_out: wp.array2d(dtype=real),
     ):
-        """r . d of the blocks that a thread takes."""
-        w, start = share(wp.tid(), blocks)
+        """Write r . d, summed over the blocks of a thread."""
+        w, start = first_item(wp.tid(), blocks)
         if wanted[w] == 0:
             return
         total = real(0.0)
@@ -172,33 +178,33 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         spins: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
-        turn_out: wp.array2d(dtype=real),
+        rotation_out: wp.array2d(dtype=real),
     ):
-        """Largest squared turn, by a whole step, of what a thread takes: edges, then the angles and joints `spins`."""
+        """Write the largest squared rotation by a full update: of edges, then of the twist angles and joints `spins`."""
         count = ends.shape[0] + spins.shape[0]
-        w, start = share(wp.tid(), count)
+        w, start = first_item(wp.tid(), count)
         if wanted[w] == 0:
             return
         shift = w * blocks
         largest = real(0.0)
         for k in range(start, until(start, count)):
-            turn = real(0.0)
+            rotation = real(0.0)
             if k >= ends.shape[0]:
                 angle = direction[spins[k - ends.shape[0]] + shift]
-                turn = real(wp.dot(angle, angle))
+                rotation = real(wp.dot(angle, angle))
             else:
                 a = ends[k, 0] + shift
                 b = ends[k, 1] + shift
                 e = q[b] - q[a]
                 d = direction[b] - direction[a]
-                turn = real(wp.dot(d, d)) / wp.length_sq(e)
-            largest = wp.where(turn > largest, turn, largest)
-        turn_out[w, start] = largest
+                rotation = real(wp.dot(d, d)) / wp.length_sq(e)
+            largest = wp.where(rotation > largest, rotation, largest)
+        rotation_out[w, start] = largest
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(
         decrease: wp.array(dtype=real),
-        turn: wp.array(dtype=real),
+        rotation: wp.array(dtype=real),
         rotation_cap: real,
         iterations: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
@@ -206,11 +212,10 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         stalled: wp.array(dtype=int),
         work: wp.array(dtype=wp.int64),
     ):
-        """Length of the step: whole, or so that nothing turns by more than the cap.
+        """Set the step length: 1, or less so that no rotation exceeds the cap.
 
-        A direction that conjugate gradients have not solved does not tell what a step would gain: no world stalls by it. Where there
-        is none at all, the iterate comes again, without compression in its matrix; if there is none again, the solve ends as
-        indefinite.
+        A direction that PCG has not solved predicts no reliable decrease, so that no world stalls by it. Without any direction the
+        iterate is repeated with dropped compression; if there is none again, the solve ends as indefinite.
         """
         w = wp.tid()
         if flags[WANTED, w] == 0:
@@ -223,14 +228,14 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             if decrease[w] == real(0.0) and scalars[DECREMENT, w] == real(0.0) and flags[ITERATION, w] > 1:
                 flags[STATUS, w] = wp.static(outcome.INDEFINITE)
                 return
-        whole = real(1.0)
-        if turn[w] > rotation_cap * rotation_cap:
-            whole = rotation_cap / wp.sqrt(turn[w])
-        scalars[STEP_LENGTH, w] = whole
+        step_length = real(1.0)
+        if rotation[w] > rotation_cap * rotation_cap:
+            step_length = rotation_cap / wp.sqrt(rotation[w])
+        scalars[STEP_LENGTH, w] = step_length
         scalars[DECREMENT, w] = decrease[w]
         flags[TODO, w] = wp.static(STRAIGHT)
         if wp.static(turns):
-            if turn[w] > scalars[TURN, w] * scalars[TURN, w]:
+            if rotation[w] > scalars[TURN, w] * scalars[TURN, w]:
                 flags[TODO, w] = wp.static(PLACE)
                 flags[TURNING, 0] = 1
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
@@ -245,8 +250,8 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         base: wp.array(dtype=V),
         q: wp.array(dtype=V),
     ):
-        """Straight along the direction: a first step from the iterate, which becomes the base, a shortened one from the base."""
-        w, start = share(wp.tid(), blocks)
+        """Apply a straight update: a first one from the iterate, which becomes the base, a shortened one from the base."""
+        w, start = first_item(wp.tid(), blocks)
         if todo[w] != wp.static(PLACE) and todo[w] != wp.static(STRAIGHT):
             return
         length = step_length[w]
@@ -262,7 +267,10 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
 
 @cache
 def freeze_kernel():
-    """freeze(...): where a direction is wanted of a matrix that is `done`, flags say that none is; others are done now."""
+    """Build the kernel of frozen Hessians.
+
+    `freeze`: clear the request of a matrix in worlds that have one (`done`), and mark others that request one as done.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def freeze(flags: wp.array2d(dtype=int), done: wp.array(dtype=int)):
@@ -277,9 +285,13 @@ def freeze_kernel():
 
 @cache
 def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
-    """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
-    (length, restart), told_of = attempt_functions(real, midpoint), told_function(real, midpoint, contact)
-    share, until = share_function(serial), until_function(serial)
+    """Build the kernels of a time step; see `kernels.step` for the schemes.
+
+    `begin`: start a solve from the predictor.
+    `finish`: write the state at the end of the substep.
+    """
+    (length, restart), extrapolation_of = attempt_functions(real, midpoint), told_function(real, midpoint, contact)
+    first_item, until = share_function(serial), until_function(serial)
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -298,12 +310,12 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
         base_out: wp.array(dtype=V),
         target_out: wp.array(dtype=V),
     ):
-        """Starts a solve from the predictor; dofs without mass, whose rates mean nothing, start from where they are."""
-        w, start = share(wp.tid(), blocks)
-        ahead = scalars[PROGRESS, w] < real(1.0)
+        """Start a solve from the predictor; massless dofs, without meaningful velocities, start from the last state."""
+        w, start = first_item(wp.tid(), blocks)
+        is_active = scalars[PROGRESS, w] < real(1.0)
         if start == 0:
-            flags[MOVED, w] = wp.where(ahead, 1, 0)
-        if not ahead:
+            flags[MOVED, w] = wp.where(is_active, 1, 0)
+        if not is_active:
             return
         s = length(scalars, w, dt[w])
         rate = real(1.0) / s
@@ -313,14 +325,14 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
             mask = int(fixed[k])
-            here = q0[i]
+            start_q = q0[i]
             v = v0[i]
-            target_out[i] = here + v * (rate / coefficient)
+            target_out[i] = start_q + v * (rate / coefficient)
             if flags[CAUTIOUS, w] == 0:
                 for d in range(3):
                     if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
-                        here[d] = here[d] + s * v[d]
-            q_out[i] = here
+                        start_q[d] = start_q[d] + s * v[d]
+            q_out[i] = start_q
             base_out[i] = q0[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -340,24 +352,23 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
         a_out: wp.array(dtype=V),
         rate_out: wp.array(dtype=real),
     ):
-        """Blocks, their velocities and accelerations at the end of the step, of the worlds that converged; and the rates of inertia in
-        contact, where there is room for them."""
-        w, first = share(wp.tid(), blocks)
-        ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        """Write positions, velocities and accelerations of worlds that converged, and rates of inertia in contact if stored."""
+        w, first = first_item(wp.tid(), blocks)
+        is_active = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if first == 0:
-            flags[MOVED, w] = wp.where(ahead, 1, 0)
-            if ahead and rate_out.shape[0] > 0:
+            flags[MOVED, w] = wp.where(is_active, 1, 0)
+            if is_active and rate_out.shape[0] > 0:
                 rate_out[w] = rate[w]
-        told = told_of(flags, scalars, w) * trust[w]
+        extrapolation = extrapolation_of(flags, scalars, w) * trust[w]
         for k in range(first, until(first, blocks)):
             i = k + w * blocks
             start = q0[i]
             v = v0[i]
             a = a0[i]
             end = start
-            if ahead:
+            if is_active:
                 end = q[i]
-                a = (end - predicted[i]) * told
+                a = (end - predicted[i]) * extrapolation
                 change = (end - start) * scalars[RATE, w]
                 if wp.static(midpoint):
                     end = real(2.0) * end - start
@@ -373,37 +384,42 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
 
 @cache
 def static_kernels(real, linear):
-    """follow(...), less(...) and far(...) of an equilibrium; see `ddg_warp.solve.net.statics`."""
+    """Build the kernels of an equilibrium; see `ddg_warp.solve.net.statics`.
+
+    `follow`: take the work of follower loads from the mean load of the update.
+    `less`: subtract a product from the residual.
+    `far`: end solves of directions that exceed the rotation cap.
+    """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
-        here: wp.array(dtype=V),
-        there: wp.array(dtype=V),
+        load: wp.array(dtype=V),
+        load_base: wp.array(dtype=V),
         status: wp.array(dtype=int),
         blocks: int,
         change: wp.array2d(dtype=real),
     ):
-        """Makes the work of the loads `here`, at q, that of their mean with those `there`, at the base."""
+        """Replace the work of loads at q by the work of the mean of loads at q and at the base."""
         i = wp.tid()
         w = i / blocks
         if status[w] == 0:
             k = i - w * blocks
-            change[w, k] = change[w, k] + real(0.5) * wp.dot(q[i] - base[i], here[i] - there[i])
+            change[w, k] = change[w, k] + real(0.5) * wp.dot(q[i] - base[i], load[i] - load_base[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def less(product: wp.array(dtype=H), right: wp.array(dtype=H)):
-        """Takes one vector of blocks from another."""
+        """Subtract the product."""
         i = wp.tid()
         right[i] = right[i] - product[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def far(turn: wp.array(dtype=real), rotation_cap: real, wanted: wp.array(dtype=int)):
-        """Ends the solves of worlds whose direction turns something by more than the cap already."""
+    def far(rotation: wp.array(dtype=real), rotation_cap: real, wanted: wp.array(dtype=int)):
+        """End linear solves of worlds with a direction beyond the rotation cap."""
         w = wp.tid()
-        if wanted[w] == 1 and turn[w] > rotation_cap * rotation_cap:
+        if wanted[w] == 1 and rotation[w] > rotation_cap * rotation_cap:
             wanted[w] = 3
 
     return follow, less, far

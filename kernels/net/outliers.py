@@ -1,4 +1,4 @@
-"""Worlds in which all but a few bodies are in balance, and these few nearly so; see `ddg_warp.solve.net.outliers`."""
+"""Relaxed convergence: a few bodies may exceed the tolerance by a bounded factor; see `ddg_warp.solve.net.outliers`."""
 
 from functools import cache
 
@@ -7,12 +7,16 @@ import warp as wp
 from ddg_warp.kernels.islands import DROWNED, LOAD_SCALE, STATUS, UNBALANCED
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
-FARTHEST = 10.0  # times the tolerance, that residuals of the few may be
+FARTHEST = 10.0  # largest allowed residual of these bodies, over the tolerance
 
 
 @cache
 def outlier_kernels(real, serial: bool):
-    """count(...) bodies out of balance; excuse(...) them where they are few."""
+    """Build the kernels of relaxed convergence.
+
+    `count`: count bodies above the tolerance.
+    `excuse`: accept worlds with few such bodies.
+    """
     share, until = share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -26,7 +30,7 @@ def outlier_kernels(real, serial: bool):
         out_of_balance: wp.array(dtype=int),
         number: wp.array(dtype=int),
     ):
-        """What belongs to no body counts as more than there are."""
+        """Count bodies above the tolerance; a residual of no body counts as more than all."""
         w, start = share(wp.tid(), owner.shape[0])
         if flags[STATUS, w] != 0:
             return
@@ -48,7 +52,7 @@ def outlier_kernels(real, serial: bool):
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
     ):
-        """What is no number is in no ratio, but in the sum of squares."""
+        """Accept worlds with few bodies above the tolerance; only the sum of squares shows values that are not finite."""
         w = wp.tid()
         near = worst[w] <= real(wp.static(FARTHEST)) * rtol * scalars[LOAD_SCALE, w] and wp.isfinite(square[w])
         if flags[STATUS, w] == 0 and number[w] <= most and near:

@@ -1,4 +1,4 @@
-"""Sums of the residual over parts of a net, small to large, against what they may be; see `ddg_warp.compile.tolerance`."""
+"""Subset residual test: sums of residuals over hierarchical clusters, and limits; see `ddg_warp.compile.tolerance`."""
 
 from functools import cache
 
@@ -10,9 +10,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def part_kernel(real, linear, leaf: bool, serial: bool):
-    """Sums of one level from those of the level below, or from blocks (`leaf`); raises the flags of worlds with one too large.
+    """Build the kernel of one level of clusters.
 
-    Rounding of single residuals adds up like that of independent numbers: as the root of the sum of squares.
+    `add`: sum residuals over clusters of the level below, or over blocks (`leaf`), and flag worlds with a sum above its limit.
+
+    Rounding errors of residuals add as independent numbers: as the root of the sum of squares.
     """
     V = wp.types.vector(3, real)
     R = wp.types.vector(3, linear) if leaf else V
@@ -26,7 +28,7 @@ def part_kernel(real, linear, leaf: bool, serial: bool):
         items: wp.array(dtype=int),
         below: int,
         limit: wp.array2d(dtype=real),
-        place: int,
+        offset: int,
         rtol: real,
         exact: int,
         flags: wp.array2d(dtype=int),
@@ -37,34 +39,34 @@ def part_kernel(real, linear, leaf: bool, serial: bool):
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
-        """`below` is how many the level below has in a world; ratios of sums to their limits go to `place` and after.
+        """Sum and test clusters; the level below has `below` entries a world, and `offset` is the index of the first ratio.
 
-        Where directions are `exact`, a whole step sees to sums, of joined rods as of those on their own; see `kernels.balance`.
+        If directions are `exact`, sums after a full step need no test, as for uncoupled rods; see `kernels.balance`.
         """
         start, w = wp.tid()
         if flags[STATUS, w] != 0:
             return
         if exact != 0 and flags[ITERATION, w] > 0 and scalars[STEP_LENGTH, w] == real(1.0):
-            for part in range(start, until(start, limit.shape[1])):
-                ratio_out[w, place + part] = real(0.0)
+            for cluster in range(start, until(start, limit.shape[1])):
+                ratio_out[w, offset + cluster] = real(0.0)
             return
-        for part in range(start, until(start, limit.shape[1])):
+        for cluster in range(start, until(start, limit.shape[1])):
             total = V()
             square = real(0.0)
-            for at in range(starts[part], starts[part + 1]):
-                i = items[at] + w * below
+            for entry in range(starts[cluster], starts[cluster + 1]):
+                i = items[entry] + w * below
                 v = value[i]
                 total += V(real(v[0]), real(v[1]), real(v[2]))
                 noise = rounding[i]
                 if wp.static(leaf):
                     noise *= noise
                 square += noise
-            i = part + w * limit.shape[1]
+            i = cluster + w * limit.shape[1]
             value_out[i] = total
             rounding_out[i] = square
             largest = wp.max(wp.abs(total))
-            ratio_out[w, place + part] = largest / limit[w, part]
-            if not largest <= rtol * scalars[LOAD_SCALE, w] * limit[w, part]:
+            ratio_out[w, offset + cluster] = largest / limit[w, cluster]
+            if not largest <= rtol * scalars[LOAD_SCALE, w] * limit[w, cluster]:
                 drowned_out[w] = 1
                 if not largest <= wp.sqrt(square):
                     unbalanced_out[w] = 1

@@ -1,4 +1,4 @@
-"""Which islands of a net rest while the next direction is found; see `ddg_warp.solve.net.resting`."""
+"""Sleeping islands of the coupled system during the next direction; see `ddg_warp.solve.net.resting`."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 @wp.func
 def first_of(link: wp.array(dtype=int), u: int):
-    """The first body of the island that a body is in, by links to earlier ones."""
+    """Return the first body of the island of a body, following links to earlier bodies."""
     v = link[u]
     while v != u:
         u = v
@@ -23,9 +23,16 @@ def first_of(link: wp.array(dtype=int), u: int):
 
 @cache
 def resting_kernels(real, linear, serial: bool):
-    """begin(...) with bodies on their own; look(...) for those out of balance; join(...) others to what they push; wake(...) islands;
-    settle(...) which blocks rest; leave(...) pairs between such."""
-    PairSet, share, until = set_struct(real, linear), share_function(serial), until_function(serial)
+    """Build the kernels of sleeping islands.
+
+    `begin`: make every body an island, asleep.
+    `look`: mark bodies awake that have not converged.
+    `join`: unite islands of bodies in contact.
+    `wake`: wake islands with an awake body.
+    `settle`: write the active dofs.
+    `leave`: mark pairs without active dofs.
+    """
+    PairSet, first_item, until = set_struct(real, linear), share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(link: wp.array(dtype=int), awake: wp.array(dtype=int), any_awake: wp.array(dtype=int)):
@@ -47,8 +54,8 @@ def resting_kernels(real, linear, serial: bool):
         awake: wp.array(dtype=int),
         any_awake: wp.array(dtype=int),
     ):
-        """Bodies with a residual, or a sum of some, larger than `bound` over the load scale, or no number."""
-        w, start = share(wp.tid(), owner.shape[0])
+        """Mark bodies awake if a scaled residual, or a subset sum, exceeds `bound` or is not finite."""
+        w, start = first_item(wp.tid(), owner.shape[0])
         if flags[WANTED, w] == 0:
             return
         for i in range(start, until(start, owner.shape[0])):
@@ -67,15 +74,15 @@ def resting_kernels(real, linear, serial: bool):
         awake: wp.array(dtype=int),
         link: wp.array(dtype=int),
     ):
-        """Links the first bodies of both islands of a pair, the later one to the earlier one, whatever others link meanwhile.
+        """Link the first bodies of both islands of a pair, the later to the earlier one, under concurrent links.
 
-        Of two that are awake nothing is to be found out.
+        Two awake bodies need no link.
         """
         for s in range(sets.shape[0]):
-            own = sets[s]
-            for p in range(wp.tid(), own.count[0], threads):
-                if own.used[p] != 0:
-                    n = own.nodes[p]  # the first and the third are on either side, whatever the kind
+            pair_set = sets[s]
+            for p in range(wp.tid(), pair_set.count[0], threads):
+                if pair_set.used[p] != 0:
+                    n = pair_set.nodes[p]  # the first and the third node are on different sides in every kind
                     w = n[0] / body.shape[0]
                     a = body[n[0] - w * body.shape[0]]
                     b = body[n[2] - w * body.shape[0]]
@@ -86,18 +93,18 @@ def resting_kernels(real, linear, serial: bool):
                         while a != b and not both:
                             a = first_of(link, a)
                             b = first_of(link, b)
-                            late = wp.max(a, b)
-                            early = wp.min(a, b)
-                            a = late
-                            b = early
-                            if late != early:
-                                a = wp.atomic_min(link, late, early)
-                                if a == late:  # it was the first one still
-                                    a = early
+                            later = wp.max(a, b)
+                            earlier = wp.min(a, b)
+                            a = later
+                            b = earlier
+                            if later != earlier:
+                                a = wp.atomic_min(link, later, earlier)
+                                if a == later:  # it was still the first body
+                                    a = earlier
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def wake(link: wp.array(dtype=int), awake: wp.array(dtype=int)):
-        """The first body of an island tells whether any of it is."""
+        """Mark the first body of an island awake if any body is."""
         tid = wp.tid()
         for u in range(tid, until(tid, link.shape[0])):
             if awake[u] != 0:
@@ -118,18 +125,18 @@ def resting_kernels(real, linear, serial: bool):
         barred: wp.array(dtype=wp.uint8),
         idle: wp.array(dtype=int),
     ):
-        """Blocks of islands that rest are barred; columns of chains that have no others are idle.
+        """Write masks of inactive dofs, all of a sleeping island, and mark columns of rod paths with active dofs.
 
-        None rests in worlds that are on their way, or where energies drown in rounding and nothing gets better.
+        No island sleeps while supports of its world are moving, or if energies are below the rounding floor without progress.
         """
-        w, start = share(wp.tid(), body.shape[0])
+        w, start = first_item(wp.tid(), body.shape[0])
         every = any_awake[w] == 0 or stalled[w] > 0 or flags[DRIVEN, w] == wp.static(ON_THE_WAY)
         for k in range(start, until(start, body.shape[0])):
             bits = fixed[k]
-            rests = False
+            sleeps = False
             if not every and body[k] >= 0:
-                rests = awake[first_of(link, body[k] + w * bodies)] == 0
-            if rests:
+                sleeps = awake[first_of(link, body[k] + w * bodies)] == 0
+            if sleeps:
                 bits = BARRED
             elif where.shape[0] > 0:
                 if where[k] >= 0:
@@ -138,19 +145,19 @@ def resting_kernels(real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def leave(threads: int, sets: wp.array(dtype=PairSet), barred: wp.array(dtype=wp.uint8)):
-        """Pairs none of whose nodes can move, nor angles turn."""
+        """Mark pairs without active dofs."""
         for s in range(sets.shape[0]):
-            own = sets[s]
-            for p in range(wp.tid(), own.count[0], threads):
-                n = own.nodes[p]
+            pair_set = sets[s]
+            for p in range(wp.tid(), pair_set.count[0], threads):
+                n = pair_set.nodes[p]
                 free = int(0)
-                for slot in range(4):
-                    free += wp.where(barred[n[slot]] != BARRED, 1, 0)
-                if own.angles.shape[0] > 0:
+                for local in range(4):
+                    free += wp.where(barred[n[local]] != BARRED, 1, 0)
+                if pair_set.angles.shape[0] > 0:
                     for side in range(2):
-                        angle = own.angles[p][side]
+                        angle = pair_set.angles[p][side]
                         if angle >= 0:
                             free += 1 - int(barred[angle] & wp.uint8(1))
-                own.idle[p] = wp.uint8(wp.where(free > 0, 0, 1))
+                pair_set.idle[p] = wp.uint8(wp.where(free > 0, 0, 1))
 
     return begin, look, join, wake, settle, leave

@@ -1,4 +1,4 @@
-"""Contact within Newton's method on a net: its energy in the search, how far worlds move, and what supports push."""
+"""Contact in Newton's method of the coupled system: energy in the line search, step fractions, and obstructed supports."""
 
 from functools import cache
 
@@ -29,16 +29,26 @@ from ddg_warp.kernels.net.newton import ON_THE_WAY, THERE
 from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
-WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
-UNBRACED = 2  # retries, until the step was halved, after which inertia counts in contact that still has no room
-UNTRIED = 2  # iterates that are not tried with the exact matrix after one in which it was indefinite
+WHOLE, UNITS, NONE = 1, 0, -1  # modes of a world's motion: one fraction, one per CCD body, no motion
+UNBRACED = 2  # retries, until the step is halved, after which inertia stiffens contact at its minimum gap
+UNTRIED = 2  # iterates without the exact matrix after one in which it was indefinite
 
 
 @cache
 def world_kernels(real):
-    """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
-    expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices; again(...) with another friction;
-    short(...) of predictors that were cut; less(...) of motions that were long; brace(...) what has no room."""
+    """Build the kernels with one thread per world.
+
+    `account`: add the contact energy to the change since the accepted iterate.
+    `modes`, `predicted`: choose the motion mode of an update or a predictor.
+    `depart`: advance the state of moving supports.
+    `expect`: correct the predicted decrease of a limited update.
+    `refuse`: reject substeps with crossings.
+    `curve`: choose the exact or the projected matrix.
+    `again`: continue converged worlds with updated friction.
+    `short`: mark worlds with a limited predictor.
+    `less`: correct the fraction of a motion that was shortened before CCD.
+    `brace`: set the rate of inertia in contact stiffness.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -51,10 +61,9 @@ def world_kernels(real):
         change: wp.array(dtype=real),
         noise: wp.array(dtype=real),
     ):
-        """Adds what contact has to the change of the energy since the accepted iterate, and to its rounding.
+        """Add contact energy to the change since the accepted iterate, and to the rounding.
 
-        A world in which a gap is less than `least` does not go on: what goes on there is tried again in shorter steps. Nor does any
-        while pairs do not fit: the step will be done again.
+        A world with a gap below `least` [m] stops, and shorter steps are tried. All stop if pairs overflowed, as the step is repeated.
         """
         w = wp.tid()
         if flags[STATUS, w] == 0 and (gap[w] < least or overflow[0] != 0):
@@ -67,7 +76,7 @@ def world_kernels(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
-        """A step that was shortened by the search moves all with one share: it descends, if short enough. None is long so far."""
+        """Choose modes: one fraction for updates that the line search has shortened, so that short ones descend. Reset `longest`."""
         w = wp.tid()
         longest_out[w] = real(0.0)
         modes_out[w] = wp.static(NONE)
@@ -76,7 +85,7 @@ def world_kernels(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
-        """The same of predictors, which the worlds have that are on their way."""
+        """Choose modes of predictors, in worlds that take the step."""
         w = wp.tid()
         longest_out[w] = real(0.0)
         modes_out[w] = wp.where(flags[MOVED, w] != 0, int(wp.static(UNITS)), int(wp.static(NONE)))
@@ -98,11 +107,11 @@ def world_kernels(real):
         stalled: wp.array(dtype=int),
         projected: wp.array(dtype=int),
     ):
-        """What a step that was cut is expected to gain, over its length. If that drowns in rounding, it is not for being near.
+        """Set the predicted decrease of a limited update, over its length, and keep the world from counting as stalled.
 
-        Where the matrix was indefinite and the step is not whole, things are not yet where the exact one is of use: the next iterate
-        does without it at once, and it was no detour (`kernels.islands.patience_function`). Nor is it tried in the next few: of many
-        things some are always where it is indefinite, and each trial is a whole solve.
+        If the matrix was indefinite and the step is shortened, the exact matrix is of no use yet. The next iterate is projected at
+        once, and does not count as a projected iteration (`kernels.islands.patience_function`). Nor is the exact matrix tried in
+        the next few iterates: some of many bodies are always where it is indefinite, and each trial is a full solve.
         """
         w = wp.tid()
         length = scalars[STEP_LENGTH, w]
@@ -131,9 +140,9 @@ def world_kernels(real):
         total: wp.array(dtype=wp.int64),
         least: wp.array(dtype=real),
     ):
-        """A part of a step in which things passed through each other is not taken; of others the smallest gap is kept.
+        """Reject substeps with crossing pairs; note the smallest gap of others.
 
-        Where pairs did not fit, the step is over: it will be done again from its start.
+        If pairs overflowed, the step ends, as it will be repeated from its start.
         """
         w = wp.tid()
         if overflow[0] != 0:
@@ -147,16 +156,20 @@ def world_kernels(real):
                 wp.atomic_min(least, 0, gap[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def curve(flags: wp.array2d(dtype=int), late: int, curved: wp.array(dtype=int), projected: wp.array(dtype=int)):
-        """Where the matrix has what comes of pairs that turn, and in how many iterates in a row it is the projected one."""
+    def curve(
+        flags: wp.array2d(dtype=int), first_exact: int, curved: wp.array(dtype=int), projected: wp.array(dtype=int)
+    ):
+        """Mark worlds with geometric stiffness of pairs in the matrix; count consecutive projected iterates."""
         w = wp.tid()
         if flags[WANTED, w] != 0:
             projected[w] = wp.where(flags[CLAMPED, w] != 0, projected[w] + 1, int(0))
-        curved[w] = wp.where(flags[WANTED, w] != 0 and flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
+        curved[w] = wp.where(
+            flags[WANTED, w] != 0 and flags[ITERATION, w] > first_exact and flags[CLAMPED, w] == 0, 1, 0
+        )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(flags: wp.array2d(dtype=int)):
-        """Worlds that have converged go on, under another friction: their next iterate is accepted."""
+        """Continue worlds that have converged, with updated friction; the next iterate is accepted."""
         w = wp.tid()
         if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             flags[STATUS, w] = 0
@@ -166,7 +179,7 @@ def world_kernels(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
-        """Worlds whose predictor was cut are on their way."""
+        """Mark worlds with a predictor limited by CCD as moving."""
         w = wp.tid()
         if modes[w] != wp.static(NONE):
             flags[CUT, w] = int(time[w] < real(1.0))
@@ -175,7 +188,7 @@ def world_kernels(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def less(modes: wp.array(dtype=int), longest: wp.array(dtype=real), most: real, time: wp.array(dtype=real)):
-        """The part of a motion that is made, where that was cut to `most` before it was made."""
+        """Correct the fraction of a motion that was shortened to `most` [m] before CCD."""
         w = wp.tid()
         if modes[w] == wp.static(WHOLE) and longest[w] > most:
             time[w] = time[w] * (most / longest[w])
@@ -188,8 +201,7 @@ def world_kernels(real):
         braced: wp.array(dtype=int),
         rate: wp.array(dtype=real),
     ):
-        """Before a part of a step is tried: the rate by which inertia counts in the stiffness of contact, zero until there was no
-        room."""
+        """Write the rate of inertia in contact stiffness of the next substep, 0 until the minimum gap was reached."""
         w = wp.tid()
         if scalars[PROGRESS, w] >= real(1.0):
             return
@@ -204,12 +216,24 @@ def world_kernels(real):
 
 @cache
 def block_kernels(real, linear, serial: bool):
-    """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...), land(...)
-    and arrive(...) of supports; stay(...) of worlds that do not move; near(...) where they would go too
-    far; part(...) with what was proposed; way(...) that is left, and add(...) it; keep(...) a solution."""
+    """Build the kernels over dof blocks.
+
+    `gain`: write the predicted decrease of a motion.
+    `lessen`: subtract a product from the residual.
+    `aim`: store the prescribed positions of supports.
+    `push`: write the remaining motion of supports into the direction.
+    `land`: put supports at the end of a full step.
+    `arrive`: put supports at prescribed positions, or mark the world as moving.
+    `stay`: write starts and proposed ends of motions; choose one fraction for long ones.
+    `near`: shorten long motions.
+    `part`: discard proposed motions that have ended.
+    `way`: write the remainder of a proposed motion.
+    `add`: add that remainder to the direction.
+    `keep`: store the solution.
+    """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
-    share, until = share_function(serial), until_function(serial)
+    first_item, until = share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gain(
@@ -220,8 +244,8 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         dots_out: wp.array2d(dtype=real),
     ):
-        """r . (q - base) of the blocks that a thread takes."""
-        w, start = share(wp.tid(), blocks)
+        """Write r . (q - base), summed over the blocks of a thread."""
+        w, start = first_item(wp.tid(), blocks)
         if modes[w] == wp.static(NONE):
             return
         total = real(0.0)
@@ -239,8 +263,8 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         right: wp.array(dtype=H),
     ):
-        """Takes a product from the residual on free dofs of worlds that want a direction."""
-        w, start = share(wp.tid(), blocks)
+        """Subtract a product from the residual on free dofs of worlds that need a direction."""
+        w, start = first_item(wp.tid(), blocks)
         if wanted[w] != 0:
             for k in range(start, until(start, blocks)):
                 i = k + w * blocks
@@ -261,7 +285,7 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         direction: wp.array(dtype=H),
     ):
-        """What is left of the way of supports: they go to where they have to be."""
+        """Write the remaining motion of supports, to prescribed positions, into the direction."""
         i, w = wp.tid()
         if wanted[w] == 0:
             return
@@ -282,7 +306,7 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         q: wp.array(dtype=V),
     ):
-        """Supports that a whole step was to bring where they have to be are bound for there, though directions are rounded."""
+        """Set supports to prescribed positions after a full step, without the rounding of directions."""
         i, w = wp.tid()
         if modes[w] == wp.static(NONE) or flags[DRIVEN, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
             return
@@ -304,7 +328,7 @@ def block_kernels(real, linear, serial: bool):
         q: wp.array(dtype=V),
         flags: wp.array2d(dtype=int),
     ):
-        """Supports that are where they have to be, up to rounding, are put there."""
+        """Set supports to prescribed positions if only rounding is missing; else mark the world as moving."""
         i, w = wp.tid()
         if modes[w] == wp.static(NONE):
             return
@@ -332,9 +356,11 @@ def block_kernels(real, linear, serial: bool):
         proposed: wp.array(dtype=V),
         longest: wp.array(dtype=real),
     ):
-        """Where motions start: what does not move, from where it is. Worlds in which a node goes `far` have one share; how far the
-        `longest` way is of these."""
-        w, start = share(wp.tid(), blocks)
+        """Write the start of motions and proposed ends; motionless worlds start from `q`.
+
+        Worlds in which a node moves by more than `far` [m] take one fraction; `longest` [m] is the longest displacement of a node.
+        """
+        w, start = first_item(wp.tid(), blocks)
         still = modes[w] == wp.static(NONE)
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
@@ -359,8 +385,8 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         q: wp.array(dtype=V),
     ):
-        """Cuts motions by one share in which a node goes farther than `most` to where the farthest goes so far."""
-        w, start = share(wp.tid(), blocks)
+        """Shorten motions by one fraction so that no node moves by more than `most` [m]."""
+        w, start = first_item(wp.tid(), blocks)
         if modes[w] == wp.static(WHOLE) and longest[w] > most:
             for k in range(start, until(start, blocks)):
                 if unit[k] >= 0:
@@ -375,8 +401,8 @@ def block_kernels(real, linear, serial: bool):
         proposed: wp.array(dtype=V),
         going: wp.array(dtype=int),
     ):
-        """Nothing but where it is remains of worlds that are not on their way, or whose frames are new."""
-        w, start = share(wp.tid(), blocks)
+        """Discard proposed motions of worlds with arrived supports or updated frames."""
+        w, start = first_item(wp.tid(), blocks)
         along = flags[DRIVEN, w] == wp.static(ON_THE_WAY)
         if along and flags[STATUS, w] == 0:
             going[0] = 1
@@ -390,25 +416,25 @@ def block_kernels(real, linear, serial: bool):
         proposed: wp.array(dtype=V),
         wanted: wp.array(dtype=int),
         blocks: int,
-        way_out: wp.array(dtype=H),
+        remainder_out: wp.array(dtype=H),
     ):
-        w, start = share(wp.tid(), blocks)
+        w, start = first_item(wp.tid(), blocks)
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
             d = proposed[i] - q[i]
-            way_out[i] = wp.where(wanted[w] != 0, H(linear(d[0]), linear(d[1]), linear(d[2])), H())
+            remainder_out[i] = wp.where(wanted[w] != 0, H(linear(d[0]), linear(d[1]), linear(d[2])), H())
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def add(way: wp.array(dtype=H), wanted: wp.array(dtype=int), blocks: int, direction: wp.array(dtype=H)):
-        w, start = share(wp.tid(), blocks)
+    def add(remainder: wp.array(dtype=H), wanted: wp.array(dtype=int), blocks: int, direction: wp.array(dtype=H)):
+        w, start = first_item(wp.tid(), blocks)
         if wanted[w] != 0:
             for k in range(start, until(start, blocks)):
-                direction[k + w * blocks] += way[k + w * blocks]
+                direction[k + w * blocks] += remainder[k + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def keep(q: wp.array(dtype=V), moved: wp.array(dtype=int), blocks: int, out: wp.array(dtype=V)):
-        """Of worlds that are solved for: what others have was theirs when they were."""
-        w, start = share(wp.tid(), blocks)
+        """Store positions of worlds that are solved; other entries keep their last solution."""
+        w, start = first_item(wp.tid(), blocks)
         if moved[w] != 0:
             for k in range(start, until(start, blocks)):
                 out[k + w * blocks] = q[k + w * blocks]

@@ -1,6 +1,6 @@
-"""Steps of a net that turn the edges of its rods, and the predictors that need them; see `kernels.turns`.
+"""Edge-rotation update of rods in the coupled system, for Newton steps and predictors; see `kernels.turns`.
 
-Turned edges are summed along pieces of a rod, then over its pieces, then from anchors, so that a long rod has many threads.
+Rotated edges are summed along pieces of a rod, then over its pieces, then from anchors, so that a long rod has many threads.
 """
 
 from functools import cache
@@ -15,14 +15,22 @@ from ddg_warp.kernels.turns import FURTHER, edge_functions, onward_function
 
 @cache
 def turn_kernels(real, linear, serial: bool):
-    """What turns edges: bend(...) finds predictors that have to, aim(...) makes steps of them; turn(...) turns edges, a thread each,
-    turn_longer(...) those whose tensions say how much they lengthen; scan(...) sums them along pieces of rods and offset(...) from
-    piece to piece, a thread a piece; put(...) takes the nodes of one level there, a thread each. `serial`: see `until_function`.
+    """Build the kernels of the edge-rotation update.
+
+    `bend`: mark worlds whose predictor has to rotate edges.
+    `aim`: make predictors of such worlds a direction.
+    `turn`: rotate edges, one thread an edge.
+    `turn_longer`: rotate edges whose axial forces give the lengthening.
+    `scan`: sum excesses along pieces of rods, one thread a piece.
+    `offset`: write the offsets of pieces.
+    `put`: write the nodes of one level of the rod order, one thread a node.
+
+    `serial`: see `until_function`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     along_edge, excess_of, further_of = edge_functions(3, real)
-    onward_of = onward_function(real)
-    share, until = share_function(serial), until_function(serial)
+    extrapolation_of = onward_function(real)
+    first_item, until = share_function(serial), until_function(serial)
 
     @wp.func
     def move_of(direction: wp.array(dtype=H), block: int, amount: real):
@@ -38,7 +46,7 @@ def turn_kernels(real, linear, serial: bool):
         w: int,
         p: int,
     ):
-        """Of all edges of a rod before a place, less the mean over its places; see offset."""
+        """Return the sum over all edges of a rod before node p, less the mean over its nodes; see `offset`."""
         c = piece[p]
         return sums[w, p] + offsets[0, w, c] - offsets[1, w, c] * real(p - starts[c])
 
@@ -51,7 +59,7 @@ def turn_kernels(real, linear, serial: bool):
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
     ):
-        """Asks for the edges of worlds to be turned that a predictor q from `base` turns far; not of those that have finished."""
+        """Mark worlds if a predictor q rotates an edge from `base` too far for a straight update."""
         i, w = wp.tid()
         if flags[MOVED, w] == 0:
             return
@@ -80,92 +88,94 @@ def turn_kernels(real, linear, serial: bool):
         if flags[TODO, w] == wp.static(PLACE):
             d = q[i] - base[i]
             if (int(fixed[i - w * blocks]) & 7) == 7:
-                # where its rod expects a support, which is where it has to be
+                # the motion that the rod predicts for a support, which has its prescribed position
                 d = v[i] * wp.where(flags[CAUTIOUS, w] == 0, real(1.0) / scalars[RATE, w], real(0.0))
             direction_out[i] = H(linear(d[0]), linear(d[1]), linear(d[2]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         nodes: wp.array(dtype=int),
-        ahead: wp.array(dtype=int),
+        next_nodes: wp.array(dtype=int),
         base: wp.array(dtype=V),
         direction: wp.array(dtype=H),
         step_length: wp.array(dtype=real),
         todo: wp.array(dtype=int),
         straight: wp.array(dtype=real),
-        onward: int,
-        now: wp.array(dtype=V),
+        extrapolation: int,
+        predicted: wp.array(dtype=V),
         blocks: int,
         excess_out: wp.array2d(dtype=V),
     ):
-        """Excess of the edge from every place to the one `ahead` of it, of worlds that turn theirs; see `search.move_functions`."""
+        """Write the excess of the edge from every path node to the next; see `search.move_functions`."""
         p, w = wp.tid()
         if todo[w] != wp.static(PLACE):
             return
         a = nodes[p] + w * blocks
-        b = ahead[p] + w * blocks
+        b = next_nodes[p] + w * blocks
         amount = step_length[w]
         step = move_of(direction, b, amount) - move_of(direction, a, amount)
         edge = base[b] - base[a]
-        if onward == wp.static(FURTHER):
-            excess_out[w, p] = further_of(edge, now[b] - now[a], step)
+        if extrapolation == wp.static(FURTHER):
+            excess_out[w, p] = further_of(edge, predicted[b] - predicted[a], step)
         else:
-            excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward_of(straight[w], onward))
+            excess_out[w, p] = excess_of(
+                edge, step, along_edge(edge, step), extrapolation_of(straight[w], extrapolation)
+            )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn_longer(
         nodes: wp.array(dtype=int),
-        ahead: wp.array(dtype=int),
+        next_nodes: wp.array(dtype=int),
         base: wp.array(dtype=V),
         direction: wp.array(dtype=H),
         step_length: wp.array(dtype=real),
         todo: wp.array(dtype=int),
         blocks: int,
-        places: wp.array2d(dtype=int),
+        path_nodes: wp.array2d(dtype=int),
         longer: wp.array3d(dtype=linear),
         columns: int,
         excess_out: wp.array2d(dtype=V),
     ):
-        """The same, with slack and lengthening of edges at the places (k, column) of the nodes ahead; see `solve.net.chains`."""
+        """Write excesses, given slack and lengthening of edges at the next path nodes (k, column); see `solve.net.chains`."""
         p, w = wp.tid()
         if todo[w] != wp.static(PLACE):
             return
         a = nodes[p] + w * blocks
-        b = ahead[p] + w * blocks
+        b = next_nodes[p] + w * blocks
         amount = step_length[w]
         step = move_of(direction, b, amount) - move_of(direction, a, amount)
         edge = base[b] - base[a]
         stretch = along_edge(edge, step)
-        if places[0, p] >= 0:
-            c = places[1, p] + w * columns
-            if longer[0, places[0, p], c] > linear(0.0):
-                stretch = real(longer[1, places[0, p], c]) * amount
+        if path_nodes[0, p] >= 0:
+            c = path_nodes[1, p] + w * columns
+            if longer[0, path_nodes[0, p], c] > linear(0.0):
+                stretch = real(longer[1, path_nodes[0, p], c]) * amount
         excess_out[w, p] = excess_of(edge, step, stretch, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def scan(
         nodes: wp.array(dtype=int),
-        ahead: wp.array(dtype=int),
+        next_nodes: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         todo: wp.array(dtype=int),
         sums: wp.array2d(dtype=V),
         totals_out: wp.array3d(dtype=V),
     ):
-        """Replaces excesses by those summed from the start of their piece; of a piece, its total and that of these sums."""
+        """Replace excesses by sums from the start of a piece; write the total of a piece, and the total of these sums."""
         count = starts.shape[0] - 1
-        w, start = share(wp.tid(), count)
+        w, start = first_item(wp.tid(), count)
         if todo[w] != wp.static(PLACE):
             return
         for c in range(start, until(start, count)):
             running = V()
             area = V()
             for p in range(starts[c], starts[c + 1]):
-                here = V()
-                if ahead[p] != nodes[p]:
-                    here = sums[w, p]
+                excess = V()
+                if next_nodes[p] != nodes[p]:
+                    excess = sums[w, p]
                 sums[w, p] = running
                 area += running
-                running += here
+                running += excess
             totals_out[0, w, c] = running
             totals_out[1, w, c] = area
 
@@ -179,11 +189,12 @@ def turn_kernels(real, linear, serial: bool):
         totals: wp.array3d(dtype=V),
         offsets_out: wp.array3d(dtype=V),
     ):
-        """What to add to the sums of a piece, and what to take off them from place to place, so that those of a rod have no mean and,
-        if it is closed, close. Both are of no account to anchors: sums count from there, and what misses is spread evenly.
+        """Write the offset of a piece and the decrease per node, so that sums of a rod have zero mean and closed rods close.
+
+        Rods with anchors do not depend on either: sums count from anchors, and the mismatch is spread evenly.
         """
         count = rod.shape[0]
-        w, start = share(wp.tid(), count)
+        w, start = first_item(wp.tid(), count)
         if todo[w] != wp.static(PLACE):
             return
         for c in range(start, until(start, count)):
@@ -206,7 +217,7 @@ def turn_kernels(real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(
-        places: wp.array(dtype=int),
+        indices: wp.array(dtype=int),
         nodes: wp.array(dtype=int),
         piece: wp.array(dtype=int),
         starts: wp.array(dtype=int),
@@ -222,13 +233,13 @@ def turn_kernels(real, linear, serial: bool):
         blocks: int,
         q: wp.array(dtype=V),
     ):
-        """The nodes at `places`, of which none is an anchor; of a rod without any the mean goes where the straight step takes it."""
-        w, first = share(wp.tid(), places.shape[0])
+        """Write the nodes `indices`, none an anchor; the mean of a rod without anchors follows the straight update."""
+        w, first = first_item(wp.tid(), indices.shape[0])
         if todo[w] != wp.static(PLACE):
             return
         amount = step_length[w]
-        for i in range(first, until(first, places.shape[0])):
-            p = places[i]
+        for i in range(first, until(first, indices.shape[0])):
+            p = indices[i]
             free = sum_before(sums, offsets, piece, starts, w, p)
             if anchors[0, p] >= 0:
                 for side in range(2):
