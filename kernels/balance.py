@@ -1,11 +1,13 @@
-"""Balance of forces at the nodes of a chain, and where a rod has converged.
+"""Residual at the nodes of a rod, and its convergence test.
 
-`check`, one thread a node (on the CPU a rod), runs before a sweep: it writes the residual, and every node's share of the change of the
-energy since the accepted iterate. It decides where a rod has converged, so that the last iterate costs no sweep: at every free dof
-|residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
-floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod. See `compile.tolerance`:
-that residuals do not add up either is what a whole Newton step sees to, whose remainder is of second order; where none has been
-made, at the start or after a shortened step, the limit is divided by the nodes, so that they can not.
+`check`, one thread a node (on the CPU a rod), runs before a sweep. It writes the residual and the energy change since the accepted
+iterate, by node, and tests convergence, so that the last iterate costs no sweep. A rod has converged if at every free dof
+
+    |residual| <= max(rtol * load scale, floor) ,   floor = floor_factor * eps * (H_ii |x| + sum of |element forces|) ,
+
+where the floor bounds the rounding of coordinates and forces. Moments are compared over the length of the rod. Sums of residuals
+have to be small, too; see `compile.tolerance`. After a full Newton step they are, of second order. At the start, or after a
+shortened step, the limit is divided by the number of nodes instead.
 """
 
 from functools import cache
@@ -31,9 +33,12 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def node_functions(kind: ChainKind, real):
-    """Gathers for one node: force, behind, balance(...) -> residual and what it is judged by, and edge_force.
+    """Return the device functions `force`, `previous`, `balance` and `edge_force` of a node.
 
-    balance returns the residual force and moment, the size of the element forces that meet, and the elastic part of the moment.
+    `force(g, row, k, r)`: three rows of the gradient.
+    `previous(k, n)`: element or edge before k.
+    `balance(...) -> (force, moment, size, elastic)`: residual force and moment, size of element forces, and elastic moment.
+    `edge_force(g, k, n, r)`: dE/de of edge k.
     """
     dim, twist, span, window, closed, drag = kind.dim, kind.twist, kind.span, kind.window, kind.closed, kind.drag
     V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
@@ -46,8 +51,8 @@ def node_functions(kind: ChainKind, real):
         return v
 
     @wp.func
-    def behind(k: int, n: int):
-        """The element or edge before k, of a closed rod the last before the first; -1 where there is none."""
+    def previous(k: int, n: int):
+        """Return the element or edge before k, cyclically in a closed rod; -1 for none."""
         if wp.static(closed):
             if k == 0:
                 return n - 1
@@ -55,10 +60,10 @@ def node_functions(kind: ChainKind, real):
 
     @wp.func
     def edge_force(g: wp.array3d(dtype=real), k: int, n: int, r: int):
-        """dE/de of edge k."""
+        """Return dE/de of edge k."""
         total = force(g, 0, k, r)
         if wp.static(span == 2):
-            b = behind(k, n)
+            b = previous(k, n)
             if b >= 0:
                 total += force(g, wp.static(dim), b, r)
         return total
@@ -94,7 +99,7 @@ def node_functions(kind: ChainKind, real):
             if wp.static(twist):
                 moment = load_angle[k, r]
         size = real(0.0)
-        b = behind(k, n)
+        b = previous(k, n)
         if wp.static(closed) or k < n - 1:
             total = edge_force(g, k, n, r)
             f += total
@@ -112,19 +117,21 @@ def node_functions(kind: ChainKind, real):
             moment -= elastic + c * rotary[k, r] * (theta[k, r] - target_angle[k, r])
         return f, moment, size, elastic
 
-    return force, behind, balance, edge_force
+    return force, previous, balance, edge_force
 
 
 @cache
 def check_kernel(kind: ChainKind, real, linear):
-    """Residual and change of the energy at every node; raises `unbalanced` for a rod with a dof out of equilibrium.
+    """Build the kernel of the residual and of the convergence test.
 
-    `drowned` is raised where only rounding excuses a residual. Residuals of held dofs are written as zero. `noise` bounds the
-    rounding in `change`, which sums the differences of the element energies and the work of inertia and loads along the step.
+    `check`: write residual and energy change at every node, and set `unbalanced` of rods with a residual above tolerance and floor.
+
+    `drowned` is set if a residual is above the tolerance but within the floor. Residuals of fixed dofs are zero. `noise` bounds the
+    rounding of `change`, the sum of element energy differences and of the work of inertia and loads along the step.
     """
     dim, nb, twist, closed, drag = kind.dim, kind.block, kind.twist, kind.closed, kind.drag
     V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
-    _, behind, balance, _ = node_functions(kind, real)
+    _, previous, balance, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind.serial)
 
@@ -174,25 +181,25 @@ def check_kernel(kind: ChainKind, real, linear):
                 g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
             )
             stiff = real(0.0)
-            b = behind(k, n)
+            b = previous(k, n)
             if wp.static(closed) or k < n - 1:
                 stiff = real(stiffness[k, r])
             if b >= 0:
                 stiff = wp.max(stiff, real(stiffness[b, r]))
-            here = x[k, r]
+            position = x[k, r]
             if wp.static(drag):
                 m = mass[k, r].mass
             else:
                 m = mass[k, r]
-            reach = wp.max(wp.abs(here))
+            reach = wp.max(wp.abs(position))
             least = floor * ((real(2.0) * stiff + c * m) * reach + size)
             if wp.static(drag):
                 least += floor * wp.max(wp.get_diag(mass[k, r].resistance)) * reach
             mask = int(fixed[k, r])
             for d in range(wp.static(dim)):
-                held = ((mask >> d) & 1) == 1
-                right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
-                if not held and not wp.abs(f[d]) <= limit:
+                is_fixed = ((mask >> d) & 1) == 1
+                right_out[d, k, r] = linear(wp.where(is_fixed, real(0.0), f[d]))
+                if not is_fixed and not wp.abs(f[d]) <= limit:
                     flags[DROWNED, r] = 1
                     if not wp.abs(f[d]) <= least:
                         flags[UNBALANCED, r] = 1
@@ -200,11 +207,11 @@ def check_kernel(kind: ChainKind, real, linear):
                         if wp.abs(f[d]) > doubtful and not wp.abs(real(direction[d, k, r])) < settled:
                             flags[DOUBTFUL, r] = 1
             if wp.static(twist):
-                held = ((mask >> wp.static(dim)) & 1) == 1
-                right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
-                if not held and not wp.abs(moment) <= limit * length[r]:
+                is_fixed = ((mask >> wp.static(dim)) & 1) == 1
+                right_out[wp.static(nb - 1), k, r] = linear(wp.where(is_fixed, real(0.0), moment))
+                if not is_fixed and not wp.abs(moment) <= limit * length[r]:
                     flags[DROWNED, r] = 1
-                    arm = wp.length(x[along(k + 1, n), r] - here)
+                    arm = wp.length(x[along(k + 1, n), r] - position)
                     least = floor * (
                         real(2.0) * stiff * arm * arm * reach / length[r]
                         + c * rotary[k, r] * (real(1.0) + wp.abs(theta[k, r]))
@@ -213,8 +220,8 @@ def check_kernel(kind: ChainKind, real, linear):
                     if not wp.abs(moment) <= least:
                         flags[UNBALANCED, r] = 1
                     if wp.static(real is wp.float32):
-                        turn = wp.abs(real(direction[wp.static(nb - 1), k, r]))
-                        if wp.abs(moment) > doubtful * length[r] and not turn < real(wp.static(SETTLED)):
+                        rotation = wp.abs(real(direction[wp.static(nb - 1), k, r]))
+                        if wp.abs(moment) > doubtful * length[r] and not rotation < real(wp.static(SETTLED)):
                             flags[DOUBTFUL, r] = 1
             if flags[ITERATION, r] == 0:
                 continue
@@ -224,24 +231,26 @@ def check_kernel(kind: ChainKind, real, linear):
                 new = energy[1 - accepted, k, r]
                 change = new - energy[accepted, k, r]
                 noise += wp.abs(new)
-            # the change of inertia's and loads' energy along the step, in exact products of small numbers
+            # energy change of inertia and loads along the step, from products of small differences
             u = V()
             if moved:
-                u = here - base[k, r]
+                u = position - base[k, r]
             else:
                 for d in range(wp.static(dim)):
                     u[d] = taken * real(direction[d, k, r])
             outer = gravity[0] * m
             if loaded != 0:
                 outer += load[k, r]
-            work = wp.dot(u, (here - target[k, r] - u * real(0.5)) * (c * m) - outer)
+            work = wp.dot(u, (position - target[k, r] - u * real(0.5)) * (c * m) - outer)
             if wp.static(drag):
-                work += wp.dot(u, mass[k, r].resistance * (here - mass[k, r].carried - u * real(0.5)))
+                work += wp.dot(u, mass[k, r].resistance * (position - mass[k, r].carried - u * real(0.5)))
             if wp.static(twist):
-                turned = taken * real(direction[wp.static(nb - 1), k, r])
-                work += turned * c * rotary[k, r] * (theta[k, r] - target_angle[k, r] - real(0.5) * turned)
+                rotation_step = taken * real(direction[wp.static(nb - 1), k, r])
+                work += (
+                    rotation_step * c * rotary[k, r] * (theta[k, r] - target_angle[k, r] - real(0.5) * rotation_step)
+                )
                 if loaded != 0:
-                    work -= turned * load_angle[k, r]
+                    work -= rotation_step * load_angle[k, r]
             change_out[k, r] = change + work
             noise_out[k, r] = linear(noise + wp.abs(work))
 

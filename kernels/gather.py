@@ -1,7 +1,7 @@
-"""How kernels that are written once for all storages find the places of `ddg_warp.compile.storage`.
+"""Dof map of `ddg_warp.compile.storage` for kernels of both rod groups and the coupled system.
 
-Arrays run [node][column], those of angles likewise; a net is a storage of one column in each world. A place is counted within a world
-of so many `columns`: column by column of the first node or angle, then of the second, and so on.
+Arrays of nodes and of twist angles run [node][column]; the coupled system has one column per world. A dof index of a world with
+`columns` counts all columns of the first node or angle, then of the second, and so on.
 """
 
 from functools import cache
@@ -10,37 +10,43 @@ import warp as wp
 
 
 @wp.func
-def column_of(place: int, w: int, columns: int):
-    """The column in which a place lies, in world w."""
-    return place % columns + w * columns
+def column_of(index: int, w: int, columns: int):
+    """Return the column of a dof index in world w."""
+    return index % columns + w * columns
 
 
 @cache
 def point_functions(dim: int, real):
-    """get(x, place, w, columns) and put(x, place, w, columns, v): a point in space; y of a planar rod is zero."""
+    """Return the device functions `get(x, index, w, columns)` and `store(x, index, w, columns, v)` of points in space.
+
+    y of a planar rod is zero.
+    """
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
 
     @wp.func
-    def get(x: wp.array2d(dtype=V), place: int, w: int, columns: int):
-        v = x[place / columns, column_of(place, w, columns)]
+    def get(x: wp.array2d(dtype=V), index: int, w: int, columns: int):
+        v = x[index / columns, column_of(index, w, columns)]
         if wp.static(dim == 2):
             return X(v[0], real(0.0), v[1])
         else:
             return v
 
     @wp.func
-    def put(x: wp.array2d(dtype=V), place: int, w: int, columns: int, v: X):
+    def store(x: wp.array2d(dtype=V), index: int, w: int, columns: int, v: X):
         if wp.static(dim == 2):
-            x[place / columns, column_of(place, w, columns)] = V(v[0], v[2])
+            x[index / columns, column_of(index, w, columns)] = V(v[0], v[2])
         else:
-            x[place / columns, column_of(place, w, columns)] = v
+            x[index / columns, column_of(index, w, columns)] = v
 
-    return get, put
+    return get, store
 
 
 @cache
 def row_functions(dim: int, real):
-    """take(a, k, r) and give(a, k, r, v): the first components of node k of rod r in an array (component, node, rod), as a vector."""
+    """Return the device functions `take(a, k, r)` and `store(a, k, r, v)`: read and write node k of rod r as a vector.
+
+    Arrays are (component, node, rod); a vector has the first components.
+    """
     V = wp.types.vector(dim, real)
 
     @wp.func
@@ -51,8 +57,8 @@ def row_functions(dim: int, real):
         return v
 
     @wp.func
-    def give(a: wp.array3d(dtype=real), k: int, r: int, v: V):
+    def store(a: wp.array3d(dtype=real), k: int, r: int, v: V):
         for d in range(wp.static(dim)):
             a[d, k, r] = v[d]
 
-    return take, give
+    return take, store

@@ -1,9 +1,9 @@
-"""Elements of arrays, read and written as a GPU does that fastest.
+"""Vectorised reads and writes of array elements on a GPU.
 
-Threads that gather wait for memory. They ask for 16 bytes at once where vectors are multiples of that, not number by number as Warp
-does: each of the lines that a warp asks for is looked up on its own, which can take longer than the memory. And they ask where the code
-does, for all that they may need together: compilers put off what is needed only if something else is read first, to wait twice.
-Arrays are whole ones, not parts of others; what is read here, the kernel does not write.
+Threads that gather wait for memory. They request 16 bytes at once if vectors are multiples of that, not number by number as Warp does.
+Every cache line that a warp requests is a separate lookup, which can take longer than the memory. Reads are volatile, so that they are
+issued together: compilers defer a read whose result is used conditionally, and the thread waits twice. Arrays must be contiguous, and
+the kernel must not write to arrays that it reads here.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ WIDEST = 16  # bytes
 
 
 def _chunks(dtype) -> tuple[int, int, tuple]:
-    """How many numbers an element has, how many are read at once, and what CUDA and PTX call them."""
+    """Return the size of an element, the numbers read at once, and names of the scalar type in CUDA and PTX."""
     kind = KINDS[getattr(dtype, "_wp_scalar_type_", dtype)]
     count = getattr(dtype, "_length_", 1)
     return count, next(n for n in (4, 2, 1) if n * kind[3] <= WIDEST and count % n == 0), kind
@@ -23,7 +23,7 @@ def _chunks(dtype) -> tuple[int, int, tuple]:
 
 @cache
 def read_function(dtype, dimensions: int = 1):
-    """read(array, i) or read(array, i, j) -> the element there."""
+    """Return the device function `read(array, i)` or `read(array, i, j)`: the element of that index."""
     count, wide, (name, suffix, register, _) = _chunks(dtype)
     whole = dtype in KINDS
     place, native = "array, i" if dimensions == 1 else "array, i, j", name
@@ -60,17 +60,17 @@ def read_function(dtype, dimensions: int = 1):
 
 @cache
 def write_function(dtype):
-    """write(array, i, value), of a vector."""
+    """Return the device function `write(array, i, value)` of a vector."""
     count, wide, (name, *_) = _chunks(dtype)
     native = f"{name}{wide}"
-    put = (
+    stores = (
         f"to[{first // wide}] = make_{native}({', '.join(f'value.c[{first + k}]' for k in range(wide))});"
         for first in range(0, count, wide)
     )
     snippet = f"""
 #if defined(__CUDA_ARCH__)
     {native}* to = reinterpret_cast<{native}*>(&wp::index(array, i));
-    {" ".join(put)}
+    {" ".join(stores)}
 #else
     wp::index(array, i) = value;
 #endif

@@ -1,17 +1,17 @@
-"""What surrounds the Newton loop of a time step: predictor, end update, retry with a smaller step.
+"""Time step of uncoupled rods around Newton's method: predictor, end update, retry with smaller substeps.
 
 Both schemes solve one implicit Euler step of length s (s = h, or h/2 for the implicit midpoint rule):
 
     m (x - x_n - s v_n) / s^2 + alpha m (x - x_n) / s + dE/dx = 0,
 
-so inertia and mass-proportional damping alpha are one quadratic, coefficient * m |x - target|^2 / 2. The midpoint rule then
+so that inertia and mass-proportional damping alpha are one quadratic, coefficient * m |x - target|^2 / 2. The midpoint rule then
 extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
 
-The search starts from the predictor, x_n + s v_n with edges turned, or beyond: see `kernels.foresight`.
+Newton's method starts from the predictor, x_n + s v_n with rotated edges, plus a warm start: see `kernels.foresight`.
 
-A rod whose solve fails first starts again from x_n instead of the predictor, then takes the step in halves (`portion`); rods
-are uncoupled, so each does so for itself. `progress` is the part of the step already taken; both are powers of two, exact.
-Where prescribed motions turn far, parts are at most `substep`, and each is retried as a step is (`solve.net.arcs`).
+A rod whose solve fails first repeats it with a cold start from x_n, then halves the substep (`portion`), each rod on its own.
+`progress` is the completed fraction of the step; both are multiples of powers of two, and exact. With large rotations of prescribed
+motions, substeps are at most `substep`, and each is retried as a step is (`solve.net.arcs`).
 """
 
 from functools import cache
@@ -46,7 +46,10 @@ from ddg_warp.kernels.turns import ON, onward_function
 
 @cache
 def begin_kernel(kind: ChainKind, real, midpoint: bool):
-    """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
+    """Build the kernel of predictors.
+
+    `begin`: write predictor, target of inertia and lagged frames, and restart the solve of every rod that still has to move.
+    """
     length, restart = attempt_functions(real, midpoint)
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
@@ -84,28 +87,28 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
             if scalars[TURN, r] == real(0.0):
                 flags[BENT, r] = 1
             restart(flags, scalars, r, rate, coefficient, outer[r])
-        ahead = wp.where(flags[CAUTIOUS, r] == 0, s, real(0.0))
+        predict_length = wp.where(flags[CAUTIOUS, r] == 0, s, real(0.0))
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
-            here = x0[k, r]
+            position = x0[k, r]
             v = v0[k, r]
-            target_out[k, r] = here + v * (rate / coefficient)
+            target_out[k, r] = position + v * (rate / coefficient)
             for d in range(wp.static(dim)):
                 if ((mask >> d) & 1) == 0:
-                    here[d] = here[d] + ahead * v[d]
-            x_out[k, r] = here
+                    position[d] = position[d] + predict_length * v[d]
+            x_out[k, r] = position
             if flags[CAUTIOUS, r] == 0 and k + 1 < n:
-                turn = (v0[k + 1, r] - v) * s
+                edge_change = (v0[k + 1, r] - v) * s
                 edge = x0[k + 1, r] - x0[k, r]
                 straight = scalars[TURN, r]
-                if wp.length_sq(turn) > straight * straight * wp.length_sq(edge):
+                if wp.length_sq(edge_change) > straight * straight * wp.length_sq(edge):
                     flags[BENT, r] = 1
             if wp.static(twist):
                 angle = theta0[k, r]
                 spin = omega0[k, r]
                 target_angle_out[k, r] = angle + spin * (rate / coefficient)
                 if ((mask >> wp.static(dim)) & 1) == 0:
-                    angle += ahead * spin
+                    angle += predict_length * spin
                 theta_out[k, r] = angle
                 for c in range(7):
                     frame_out[c, k, r] = frame0[c, k, r]
@@ -115,7 +118,10 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
 
 @cache
 def predicted_function(dim: int, real):
-    """predicted(x, x0, v, mask, cautious, rate): the step of a node at x0 along its velocity, of what supports hold in part theirs."""
+    """Return the device function `predicted(x, x0, v, mask, cautious, rate)`: step of a node from x0 along its velocity.
+
+    Components that a support fixes step to x, unless all are fixed. After a cold start the velocity does not count.
+    """
     V, every = wp.types.vector(dim, real), (1 << dim) - 1
 
     @wp.func
@@ -134,18 +140,20 @@ def predicted_function(dim: int, real):
 
 @cache
 def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
-    """Redo the predictor of a rod whose edges it turns: along its velocity, with edges turned instead of stretched.
+    """Build the kernel of predictors with edge rotations.
 
-    Supports are where they have to be by then, and the rod goes with them; so that no edge is stretched by how far a support has gone
-    from where its velocity leads. By implicit Euler velocities are what the last step did, and edges turn on as they did.
+    `predict`: write the predictor of rods whose edges rotate far, by edge rotations along the velocity instead of stretch.
 
-    For the midpoint rule the lagged frames are carried to the predicted midpoint. Frames lagged at the start of the step spin
-    about their edges by O(h) at the midpoint, which the rotary inertia does not see: it would be of first order there.
+    Supports have prescribed positions by then, and the rod follows them. So no edge is stretched by the deviation of a support from its
+    velocity. With implicit Euler velocities are the displacements of the last step, and edges continue its rotations.
+
+    With the midpoint rule lagged frames are transported to the predicted midpoint. Frames lagged at the start of the step rotate about
+    their edges by O(h) until the midpoint, which rotary inertia does not see: its error would be of first order.
     """
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
-    predicted, onward_of = predicted_function(dim, real), onward_function(real)
+    predicted, extrapolation_of = predicted_function(dim, real), onward_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def predict(
@@ -171,8 +179,8 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
                 base[k, r] = x0[k, r]
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(step[d])
-            onward = onward_of(scalars[TURN, r], wp.static(0 if midpoint else ON))
-            place(x, base, base, direction, fixed, anchor, real(1.0), onward, n, r)
+            extrapolation = extrapolation_of(scalars[TURN, r], wp.static(0 if midpoint else ON))
+            place(x, base, base, direction, fixed, anchor, real(1.0), extrapolation, n, r)
         if wp.static(carried):
             relag(x, frame, n, r)
 
@@ -181,7 +189,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 
 @cache
 def start_function(real):
-    """start(flags, scalars, i): starts a step of an island, which has all of it to do if it has not been given up."""
+    """Return the device function `start(flags, scalars, i)`: start a step of an island, complete at once if it has failed for good."""
 
     @wp.func
     def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
@@ -195,7 +203,7 @@ def start_function(real):
 
 @cache
 def start_kernel(real):
-    """Starts a step of all islands."""
+    """Build the kernel `start`: start a step of all islands."""
     start_one = start_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -207,9 +215,12 @@ def start_kernel(real):
 
 @cache
 def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
-    """Positions, angles, their velocities and accelerations at the end of the step, of the rods that converged."""
+    """Build the kernel of the end update.
+
+    `finish`: write positions, twist angles, velocities and accelerations at the end of the substep of rods that converged.
+    """
     V, twist = wp.types.vector(kind.dim, real), kind.twist
-    until, told_of = until_function(kind.serial), told_function(real, midpoint)
+    until, extrapolation_of = until_function(kind.serial), told_function(real, midpoint)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -240,7 +251,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         moves = scalars[PROGRESS, r] < real(1.0) and flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if start == 0:
             flags[MOVED, r] = wp.where(moves, 1, 0)
-        told = told_of(flags, scalars, r)
+        extrapolation = extrapolation_of(flags, scalars, r)
         for k in range(start, until(start, n)):
             before = x0[k, r]
             v = v0[k, r]
@@ -256,7 +267,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
             angle = angle0
             if moves:
                 end = x[k, r]
-                a = (end - predicted[k, r]) * told
+                a = (end - predicted[k, r]) * extrapolation
                 change = (end - before) * scalars[RATE, r]
                 if wp.static(midpoint):
                     end = real(2.0) * end - before
@@ -265,13 +276,13 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
                     v = change
                 if wp.static(twist):
                     angle = theta[k, r]
-                    alpha = (angle - predicted_angle[k, r]) * told
-                    turn = (angle - angle0) * scalars[RATE, r]
+                    alpha = (angle - predicted_angle[k, r]) * extrapolation
+                    spin_mean = (angle - angle0) * scalars[RATE, r]
                     if wp.static(midpoint):
                         angle = real(2.0) * angle - angle0
-                        spin = real(2.0) * turn - spin
+                        spin = real(2.0) * spin_mean - spin
                     else:
-                        spin = turn
+                        spin = spin_mean
             x_out[k, r] = end
             v_out[k, r] = v
             a_out[k, r] = a
@@ -285,9 +296,11 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
 
 @cache
 def finish_frames_kernel(kind: ChainKind, real):
-    """Reference frames transported to the tangents of the new state, orthonormalised, and the reference twist between them.
+    """Build the kernel of frames at the end of a step.
 
-    Rods that did not move keep theirs: frames that a failed solve has carried along its iterates have turned on the way.
+    `finish`: transport reference frames to the tangents of the new state, orthonormalise, and write reference twists.
+
+    Rods that did not move keep the frames of the start: frames transported along iterates of a failed solve have rotated.
     """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
@@ -336,9 +349,11 @@ def finish_frames_kernel(kind: ChainKind, real):
 
 @cache
 def advance_kernel(real):
-    """After a (partial) step: count its outcome, go on (with longer parts again), retry, or give the rod up.
+    """Build the kernel of step control.
 
-    `tally` counts outcomes by their code, solves that rounding ended as `rounded`. `work` holds Newton iterations (sum, largest),
+    `advance`: count the outcome of a substep, and continue (with longer substeps again), retry, or end as failed.
+
+    `tally`: counts of outcomes by code, with `rounded` for solves that converged to rounding. `work`: Newton iterations (sum, largest),
     solves, retries, lost pivots.
     """
 
@@ -371,7 +386,7 @@ def advance_kernel(real):
             flags[CAUTIOUS, r] = 0
             if scalars[PROGRESS, r] < real(1.0):
                 flags[RETRIES, r] = 0
-            # a step twice as long, where it starts at a multiple of its length, so that all end together
+            # double the substep if it starts at a multiple of its length, so that all islands end together
             longer = real(2.0) * scalars[PORTION, r]
             if (
                 scalars[PROGRESS, r] < real(1.0)
@@ -382,7 +397,7 @@ def advance_kernel(real):
         else:
             wp.atomic_add(work, 3, wp.int64(1))
             flags[RETRIES, r] = flags[RETRIES, r] + 1
-            # another start would lead to the same step, and its energy, or to the same valley
+            # a cold start would lead to the same step with its energy drift, or to the same minimum
             again = result != wp.static(outcome.ENERGY_DRIFT) and flags[DETOURS, r] <= flags[PATIENCE, r]
             if again and flags[CAUTIOUS, r] == 0:
                 flags[CAUTIOUS, r] = 1

@@ -1,1 +1,1 @@
-"""Reverse of what a step or an equilibrium computes: from derivatives of a loss by results to those by inputs."""
+"""Vector-Jacobian products of steps and equilibria: from gradients by results to gradients by inputs."""

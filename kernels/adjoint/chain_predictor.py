@@ -1,4 +1,4 @@
-"""Reverse of the predictors of rods on their own; see `kernels.adjoint.turns`."""
+"""Vector-Jacobian product of predictors of uncoupled rods; see `kernels.adjoint.turns`."""
 
 from functools import cache
 
@@ -15,16 +15,17 @@ from ddg_warp.kernels.turns import loose_function
 
 @cache
 def predict_kernel(kind: ChainKind, real, midpoint: bool):
-    """pull(...): the reverse of the predictors of `step.begin_kernel` and `step.predict_kernel`, a thread a rod.
+    """Build the kernel of predictors of `step.begin_kernel` and `step.predict_kernel`, one thread a rod.
 
-    Adds to the derivatives by where held dofs are, by positions and velocities at the start, and by the rate. `excess_out` and
-    `added_out` are scratch.
+    `pull`: add gradients by fixed dofs, by positions and velocities at the start, and by the rate.
+
+    `excess_out` and `added_out` are scratch.
     """
     dim, closed, every = kind.dim, kind.closed, (1 << kind.dim) - 1
     V = wp.types.vector(dim, real)
     along, *_ = gather_functions(kind, real)
-    turned, predicted = excess_function(dim, real, midpoint), predicted_function(dim, real)
-    loose, (take, give) = loose_function(dim, real), row_functions(dim, real)
+    excess_product, predicted = excess_function(dim, real, midpoint), predicted_function(dim, real)
+    free_components, (row_of, store_row) = loose_function(dim, real), row_functions(dim, real)
 
     @wp.struct
     class Rod:
@@ -47,25 +48,25 @@ def predict_kernel(kind: ChainKind, real, midpoint: bool):
 
     @wp.func
     def by_shift(rod: Rod, j: int):
-        return loose(mask_of(rod, j), take(rod.given, along(j, rod.count), rod.r))
+        return free_components(mask_of(rod, j), row_of(rod.given, along(j, rod.count), rod.r))
 
     @wp.func
     def free_part(rod: Rod, j: int, v: V):
-        return loose(mask_of(rod, j), v)
+        return free_components(mask_of(rod, j), v)
 
     @wp.func
-    def give_excess(rod: Rod, j: int, v: V):
-        give(rod.excess, along(j, rod.count), rod.r, v)
+    def store_excess(rod: Rod, j: int, v: V):
+        store_row(rod.excess, along(j, rod.count), rod.r, v)
 
     @wp.func
-    def give_added(rod: Rod, j: int, v: V):
+    def add_anchor(rod: Rod, j: int, v: V):
         k = along(j, rod.count)
-        give(rod.added, k, rod.r, take(rod.added, k, rod.r) + v)
+        store_row(rod.added, k, rod.r, row_of(rod.added, k, rod.r) + v)
 
-    unplace = unplace_function(dim, real, Rod, anchored, by_shift, free_part, give_excess, give_added)
+    unplace = unplace_function(dim, real, Rod, anchored, by_shift, free_part, store_excess, add_anchor)
 
     @wp.func
-    def turn(
+    def edge_gradient(
         x: wp.array2d(dtype=V),
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -77,12 +78,12 @@ def predict_kernel(kind: ChainKind, real, midpoint: bool):
         n: int,
         r: int,
     ):
-        """What the excess of edge k brings to its base and to its step."""
+        """Return gradients by base and step of edge k, through its excess."""
         b = along(k + 1, n)
         e = x0[b, r] - x0[k, r]
         step = predicted(x[b, r], x0[b, r], v0[b, r], int(fixed[b, r]), 0, rate)
         step -= predicted(x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), 0, rate)
-        by_e, by_step, _f, _straight = wp.grad(turned)(e, step, take(excess, k, r), straight)
+        by_e, by_step, _f, _straight = wp.grad(excess_product)(e, step, row_of(excess, k, r), straight)
         return by_e, by_step
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -95,10 +96,10 @@ def predict_kernel(kind: ChainKind, real, midpoint: bool):
         count: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        given: wp.array3d(dtype=real),
+        cotangent: wp.array3d(dtype=real),
         excess_out: wp.array3d(dtype=real),
         added_out: wp.array3d(dtype=real),
-        held_out: wp.array3d(dtype=real),
+        fixed_out: wp.array3d(dtype=real),
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
         rate_out: wp.array2d(dtype=real),
@@ -110,9 +111,9 @@ def predict_kernel(kind: ChainKind, real, midpoint: bool):
         edges = int(0)
         if bent:
             for k in range(n):
-                give(added_out, k, r, V())
+                store_row(added_out, k, r, V())
             rod = Rod()
-            rod.given = given
+            rod.given = cotangent
             rod.excess = excess_out
             rod.added = added_out
             rod.fixed = fixed
@@ -122,40 +123,42 @@ def predict_kernel(kind: ChainKind, real, midpoint: bool):
             rod.r = r
             unplace(rod)
             edges = n - wp.static(0 if closed else 1)
-        behind = V()
-        behind_step = V()
+        previous = V()
+        previous_step = V()
         if wp.static(closed):
             if bent:
-                behind, behind_step = turn(x, x0, v0, fixed, rate, scalars[TURN, r], excess_out, n - 1, n, r)
+                previous, previous_step = edge_gradient(
+                    x, x0, v0, fixed, rate, scalars[TURN, r], excess_out, n - 1, n, r
+                )
         for k in range(n):
             mask = int(fixed[k, r])
-            held = (mask & wp.static(every)) == wp.static(every)
-            own = take(given, k, r)
-            by_base = own
-            if held:
+            is_fixed = (mask & wp.static(every)) == wp.static(every)
+            gradient = row_of(cotangent, k, r)
+            by_base = gradient
+            if is_fixed:
                 by_base = V()
                 if bent:
-                    by_base = -take(added_out, k, r)
-                own -= by_base
+                    by_base = -row_of(added_out, k, r)
+                gradient -= by_base
             by_step = by_base
             if k < edges:
-                ahead, ahead_step = turn(x, x0, v0, fixed, rate, scalars[TURN, r], excess_out, k, n, r)
-                by_base -= ahead
-                by_step -= ahead_step
-                by_base += behind
-                by_step += behind_step
-                behind = ahead
-                behind_step = ahead_step
+                following, following_step = edge_gradient(x, x0, v0, fixed, rate, scalars[TURN, r], excess_out, k, n, r)
+                by_base -= following
+                by_step -= following_step
+                by_base += previous
+                by_step += previous_step
+                previous = following
+                previous_step = following_step
             elif bent:
-                by_base += behind
-                by_step += behind_step
+                by_base += previous
+                by_step += previous_step
             by_rate = V()
             for d in range(wp.static(dim)):
-                if held:
-                    held_out[d, k, r] = held_out[d, k, r] + own[d]
+                if is_fixed:
+                    fixed_out[d, k, r] = fixed_out[d, k, r] + gradient[d]
                     by_rate[d] = by_step[d]
                 elif ((mask >> d) & 1) == 1:
-                    held_out[d, k, r] = held_out[d, k, r] + by_step[d]
+                    fixed_out[d, k, r] = fixed_out[d, k, r] + by_step[d]
                     by_base[d] = by_base[d] - by_step[d]
                 else:
                     by_rate[d] = by_step[d]

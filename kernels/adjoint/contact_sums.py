@@ -1,4 +1,4 @@
-"""Derivatives by the numbers of pairs in contact, summed to those of what has them, in one order: two groups, or a body."""
+"""Gradients by contact parameters of pairs, summed in a fixed order by pairs of groups or by bodies."""
 
 from functools import cache
 
@@ -13,7 +13,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def group_kernels(real):
-    """pieces(...) sums the pairs of some first things of a world by groups, total(...) adds the pieces of worlds."""
+    """Build the kernels of sums by groups.
+
+    `pieces`: sum the pairs of a run of first primitives by groups.
+    `total`: add the pieces of each world.
+    """
     Law, Sides, groups = law_struct(real), sides_struct(real), groups_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -26,10 +30,10 @@ def group_kernels(real):
         law: Law,
         numbers: wp.array2d(dtype=real),
         number: int,
-        things: int,
+        size: int,
         out: wp.array4d(dtype=real),
     ):
-        """`number` pieces a world, of so many things."""
+        """Sum pairs by groups; a world has `number` pieces of `size` primitives."""
         piece = wp.tid()
         for r in range(out.shape[0]):
             for a in range(out.shape[2]):
@@ -38,8 +42,8 @@ def group_kernels(real):
         if count[0] == 0:
             return
         world = piece / number
-        first = (piece - world * number) * things
-        for k in range(first, wp.min(first + things, sides.counts[0])):
+        first = (piece - world * number) * size
+        for k in range(first, wp.min(first + size, sides.counts[0])):
             i = k + world * sides.counts[0]
             for p in range(starts[i], starts[i] + partners[i]):
                 _w, _i, _j, a, b = groups(law, sides, pairs[p])
@@ -47,20 +51,24 @@ def group_kernels(real):
                     out[r, piece, a, b] = out[r, piece, a, b] + numbers[r, p]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def total(found: wp.array4d(dtype=real), number: int, out: wp.array4d(dtype=real)):
+    def total(piece_sums: wp.array4d(dtype=real), number: int, out: wp.array4d(dtype=real)):
         w, a, b = wp.tid()
         for r in range(wp.static(NUMBERS)):
-            own = real(0.0)
+            value = real(0.0)
             for k in range(w * number, (w + 1) * number):
-                own += found[r, k, a, b]
-            out[r, w, a, b] = out[r, w, a, b] + own
+                value += piece_sums[r, k, a, b]
+            out[r, w, a, b] = out[r, w, a, b] + value
 
     return pieces, total
 
 
 @cache
 def side_kernels(kind: Kind, real):
-    """first(...) and second(...): add derivatives by a number of pairs to the things of either side (things of all worlds,)."""
+    """Build the kernels of sums by primitives (primitives of all worlds,).
+
+    `first`: add gradients by a parameter of pairs to first primitives.
+    `second`: add gradients by a parameter of pairs to second primitives.
+    """
     Sides = sides_struct(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -72,11 +80,11 @@ def side_kernels(kind: Kind, real):
         out: wp.array(dtype=real),
     ):
         i = wp.tid()
-        own = real(0.0)
+        value = real(0.0)
         if count[0] > 0:
             for p in range(starts[i], starts[i] + partners[i]):
-                own += values[p]
-        out[i] = out[i] + own
+                value += values[p]
+        out[i] = out[i] + value
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def second(
@@ -88,23 +96,27 @@ def side_kernels(kind: Kind, real):
         values: wp.array(dtype=real),
         out: wp.array(dtype=real),
     ):
-        """By the items of the first node of things, of all nodes."""
+        """Add gradients to second primitives, by the items of their first node."""
         j = wp.tid()
         w = j / sides.counts[1]
         node = sides.second.nodes[j - w * sides.counts[1], 0] + w * sides.first.nodes_a_world
-        own = real(0.0)
+        value = real(0.0)
         for k in range(places[node], places[node] + number[node]):
-            p, slot = taken_apart(items[k])
-            if slot == wp.static(kind.first) and pairs[p][1] == j:
-                own += values[p]
-        out[j] = out[j] + own
+            p, local = taken_apart(items[k])
+            if local == wp.static(kind.first) and pairs[p][1] == j:
+                value += values[p]
+        out[j] = out[j] + value
 
     return first, second
 
 
 @cache
 def direction_kernels(real):
-    """things(...): sums of derivatives by directions of first things; gather(...) adds them to the nodes that these lead between."""
+    """Build the kernels of gradients by directions of first primitives.
+
+    `things`: sum gradients by the direction of each first primitive.
+    `gather`: add them to the two nodes of each direction.
+    """
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -116,37 +128,43 @@ def direction_kernels(real):
         out: wp.array(dtype=V),
     ):
         i = wp.tid()
-        own = V()
+        value = V()
         if count[0] > 0:
             for p in range(starts[i], starts[i] + partners[i]):
-                own += directions[p]
-        out[i] = own
+                value += directions[p]
+        out[i] = value
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(
-        starts: wp.array(dtype=int), items: wp.array(dtype=int), found: wp.array2d(dtype=V), out: wp.array2d(dtype=V)
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        gradients: wp.array2d(dtype=V),
+        out: wp.array2d(dtype=V),
     ):
-        """An item is twice the number of a thing in its world, and one more where it leads to the node."""
+        """Add gradients to nodes; an item is twice the index of a primitive in its world, plus 1 at the end of its direction."""
         w, k = wp.tid()
-        own = V()
+        value = V()
         for index in range(starts[k], starts[k + 1]):
-            by = found[w, items[index] / 2]
-            own += wp.where(items[index] % 2 == 1, by, -by)
-        out[w, k] = out[w, k] + own
+            gradient = gradients[w, items[index] / 2]
+            value += wp.where(items[index] % 2 == 1, gradient, -gradient)
+        out[w, k] = out[w, k] + value
 
     return things, gather
 
 
 @cache
 def body_kernel(real):
-    """bodies(...): add what the things of each body have, which lie in a row."""
+    """Build the kernel of sums by bodies.
+
+    `bodies`: add the values of the primitives of each body, which are consecutive.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def bodies(found: wp.array(dtype=real), starts: wp.array(dtype=int), things: int, out: wp.array2d(dtype=real)):
+    def bodies(values: wp.array(dtype=real), starts: wp.array(dtype=int), primitives: int, out: wp.array2d(dtype=real)):
         w, body = wp.tid()
-        own = real(0.0)
+        value = real(0.0)
         for k in range(starts[body], starts[body + 1]):
-            own += found[w * things + k]
-        out[w, body] = out[w, body] + own
+            value += values[w * primitives + k]
+        out[w, body] = out[w, body] + value
 
     return bodies

@@ -1,6 +1,7 @@
-"""Reverse of drag, whose resistance a solve takes from velocities and tangents at the start of a step, or at the predicted midpoint.
+"""Vector-Jacobian product of drag, with resistance lagged at the start of a step or at the predicted midpoint.
 
-Of w . f, with the force f = -D (r (x - x_n) - u) on a node of resistance D, over a solve of length 1 / r; see `kernels.drag`.
+Gradients are of w . f, with the force f = -D (r (x - x_n) - u) on a node of resistance D, in a solve of length 1 / r; see
+`kernels.drag`.
 """
 
 from functools import cache
@@ -16,30 +17,33 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def resisted_function(dim: int, real):
-    """resisted(e, v, p, wa, za, wb, zb, turn): w . f of an edge's halves at its nodes, which go at z, and of its angle, `turn` its rate
-    times w.
+    """Return the device function `resisted(e, v, p, wa, za, wb, zb, spin)`: w . f of the halves of an edge and of its twist angle.
+
+    Nodes move at za, zb; `spin` is the rate of the twist angle times its w.
     """
     V, P = wp.types.vector(dim, real), wp.types.vector(ROWS, real)
     half = edge_function(dim, real)
 
     @wp.func
-    def resisted(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, turn: real):
+    def resisted(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, spin: real):
         D = half(e, v, p)
         bodies = p[wp.static(FIRST)] * wp.dot(wa, za) + p[wp.static(LAST)] * wp.dot(wb, zb)
-        return -wp.dot(wa, D * za) - wp.dot(wb, D * zb) - bodies - turn * p[wp.static(ROTATIONAL)] * wp.length(e)
+        return -wp.dot(wa, D * za) - wp.dot(wb, D * zb) - bodies - spin * p[wp.static(ROTATIONAL)] * wp.length(e)
 
     return resisted
 
 
 @cache
 def chain_kernels(kind: ChainKind, real, midpoint: bool):
-    """edges(...): derivatives by the edge vectors of `tangents`, by mean velocities of edges and by coefficients; nodes(...): what
-    they, and the resistance itself, bring to the state before the step, to held dofs and to the rate.
+    """Build the kernels of uncoupled rods.
+
+    `edges`: write gradients by edge vectors of `tangents`, by mean velocities of edges and by coefficients.
+    `nodes`: add gradients by the previous state, by fixed dofs and by the rate, through these and the resistance.
     """
     dim, twist, closed = kind.dim, kind.twist, kind.closed
     V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
     half, resisted = edge_function(dim, real), resisted_function(dim, real)
-    _, behind, *_ = node_functions(kind, real)
+    _, previous, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     row, _ = row_functions(dim, real)
 
@@ -76,11 +80,11 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
         v = (v0[k, r] + v0[b, r]) * real(0.5) - flow[0]
         za = (x[k, r] - x0[k, r]) * rate[r] - flow[0]
         zb = (x[b, r] - x0[b, r]) * rate[r] - flow[0]
-        turn = real(0.0)
+        spin_work = real(0.0)
         if wp.static(twist):
-            turn = w[wp.static(dim), k, r] * rate[r] * (theta[k, r] - theta0[k, r])
+            spin_work = w[wp.static(dim), k, r] * rate[r] * (theta[k, r] - theta0[k, r])
         de, dv, dp, _wa, _za, _wb, _zb, _turn = wp.grad(resisted)(
-            e, v, law(coefficients, k, r), row(w, k, r), za, row(w, b, r), zb, turn
+            e, v, law(coefficients, k, r), row(w, k, r), za, row(w, b, r), zb, spin_work
         )
         for d in range(wp.static(dim)):
             edge_out[d, k, r] = de[d]
@@ -118,13 +122,13 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
         edge_in: wp.array3d(dtype=real),
         velocity_in: wp.array3d(dtype=real),
         tangent_out: wp.array3d(dtype=real),
-        held_out: wp.array3d(dtype=real),
+        fixed_out: wp.array3d(dtype=real),
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
         rate_out: wp.array2d(dtype=real),
     ):
-        """Adds; by tangents to `tangent_out` where these are predicted, else to the positions before the step."""
+        """Add gradients; by tangents to `tangent_out` if these are predicted, else to the previous positions."""
         k, r = wp.tid()
         n = count[r]
         if k >= n:
@@ -133,7 +137,7 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
         one = wp.identity(n=wp.static(dim), dtype=real)
         by_tangent = V()
         by_velocity = V()
-        b = behind(k, n)
+        b = previous(k, n)
         if wp.static(closed) or k < n - 1:
             D += of_edge(tangents, v0, coefficients, flow[0], k, n, r) + one * coefficients[wp.static(FIRST), k, r]
             by_tangent -= row(edge_in, k, r)
@@ -147,7 +151,7 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
         by_start = back * rate[r]
         for d in range(wp.static(dim)):
             if ((mask >> d) & 1) == 1:
-                held_out[d, k, r] = held_out[d, k, r] - by_start[d]
+                fixed_out[d, k, r] = fixed_out[d, k, r] - by_start[d]
         by_rate = -wp.dot(back, x[k, r] - x0[k, r])
         if wp.static(midpoint):
             for d in range(wp.static(dim)):
@@ -169,7 +173,11 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
 
 @cache
 def net_kernels(real, midpoint: bool):
-    """The same of the edges and blocks of a net: edges(...) writes what the two nodes of an edge get, and adds to coefficients."""
+    """Build the kernels of the coupled system.
+
+    `edges`: write gradients by both nodes of an edge, and add gradients by coefficients.
+    `nodes`: add gradients through the resistance by the previous state, by fixed dofs and by the rate.
+    """
     V, P = wp.types.vector(3, real), wp.types.vector(ROWS, real)
     Inertia, resisted = block_inertia(real), resisted_function(3, real)
 
@@ -190,7 +198,7 @@ def net_kernels(real, midpoint: bool):
         velocity_out: wp.array2d(dtype=V),
         coefficient_out: wp.array2d(dtype=real),
     ):
-        """`angles` are those of edges, -1 of none."""
+        """Write gradients of edges; `angles` are dof blocks of their twist angles, -1 for none."""
         tid = wp.tid()
         world = tid / ends.shape[0]
         edge = tid - world * ends.shape[0]
@@ -200,10 +208,10 @@ def net_kernels(real, midpoint: bool):
         for i in range(wp.static(ROWS)):
             p[i] = coefficients[i, tid]
         u = flow[0]
-        turn = real(0.0)
+        spin = real(0.0)
         if angles[edge] >= 0:
             angle = angles[edge] + world * blocks
-            turn = w[angle][0] * rate * (q[angle][0] - q0[angle][0])
+            spin = w[angle][0] * rate * (q[angle][0] - q0[angle][0])
         de, dv, dp, _wa, _za, _wb, _zb, _turn = wp.grad(resisted)(
             tangents[b] - tangents[a],
             (v0[a] + v0[b]) * real(0.5) - u,
@@ -212,7 +220,7 @@ def net_kernels(real, midpoint: bool):
             (q[a] - q0[a]) * rate - u,
             w[b],
             (q[b] - q0[b]) * rate - u,
-            turn,
+            spin,
         )
         tangent_out[0, tid] = -de
         tangent_out[1, tid] = de
@@ -229,16 +237,16 @@ def net_kernels(real, midpoint: bool):
         w: wp.array(dtype=V),
         rate: real,
         blocks: int,
-        held_out: wp.array(dtype=V),
+        fixed_out: wp.array(dtype=V),
         q_out: wp.array(dtype=V),
         rate_out: wp.array(dtype=real),
     ):
-        """What the resistance itself brings; adds. `inertia` has it over the solve."""
+        """Add gradients through the resistance, which `inertia` contains."""
         i = wp.tid()
         world = i / blocks
         node = inertia[world, i - world * blocks]
         back = node.resistance * w[i]
-        held_out[i] = held_out[i] - back
+        fixed_out[i] = fixed_out[i] - back
         q_out[i] = q_out[i] + back
         rate_out[i] = rate_out[i] - wp.dot(back, q[i] - q0[i]) / rate
 

@@ -1,4 +1,4 @@
-"""Reverse of loads that follow what they act on; see `kernels.loads`."""
+"""Vector-Jacobian product of follower loads; see `kernels.loads`."""
 
 from functools import cache
 
@@ -8,19 +8,21 @@ from ddg_warp.kernels.gather import column_of, point_functions
 from ddg_warp.kernels.loads import force_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-ANGLE = {"twist": 2, "bend": 3}  # which of the places of an element is an angle
-POINTS = {"press": 3, "squeeze": 2, "twist": 2, "bend": 3}  # how many of them say where the element is
+ANGLE = {"twist": 2, "bend": 3}  # local index of the twist angle of an element
+POINTS = {"press": 3, "squeeze": 2, "twist": 2, "bend": 3}  # number of points that define the element
 
 
 @cache
 def follower_kernel(name: str, count: int, dim: int, real):
-    """Writes derivatives of w . f by the points of the elements of one kind of load with `count` places, from `first` on among the
-    `total` of a world."""
+    """Build the kernel of one kind of load with `count` dof indices per element.
+
+    `follow`: write gradients of w . f by the points of elements, from `first` on among the `total` of a world.
+    """
     V, P = wp.types.vector(3, real), wp.types.vector(dim, real)
     get, _ = point_functions(dim, real)
     forces = force_functions(real)[name]
     points, angle = POINTS[name], ANGLE.get(name, -1)
-    turns = 0 <= angle < count  # without twist a couple has no angle
+    has_angle = 0 <= angle < count  # couples of rods without twist have no angle
 
     @wp.func
     def worked(a: V, b: V, c: V, value: V, w0: V, w1: V, w2: V, w3: V):
@@ -28,9 +30,9 @@ def follower_kernel(name: str, count: int, dim: int, real):
         return wp.dot(f0, w0) + wp.dot(f1, w1) + wp.dot(f2, w2) + wp.dot(f3, w3)
 
     @wp.func
-    def across(w: wp.array3d(dtype=real), place: int, world: int, columns: int):
-        k = place / columns
-        r = column_of(place, world, columns)
+    def across(w: wp.array3d(dtype=real), index: int, world: int, columns: int):
+        k = index / columns
+        r = column_of(index, world, columns)
         if wp.static(dim == 2):
             return V(w[0, k, r], real(0.0), w[1, k, r])
         else:
@@ -39,7 +41,7 @@ def follower_kernel(name: str, count: int, dim: int, real):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         x: wp.array2d(dtype=P),
-        places: wp.array2d(dtype=int),
+        indices: wp.array2d(dtype=int),
         values: wp.array(dtype=V),
         columns: int,
         first: int,
@@ -49,41 +51,44 @@ def follower_kernel(name: str, count: int, dim: int, real):
         point_out: wp.array(dtype=V),
     ):
         k, world = wp.tid()
-        a = get(x, places[k, 0], world, columns)
-        b = get(x, places[k, 1], world, columns)
+        a = get(x, indices[k, 0], world, columns)
+        b = get(x, indices[k, 1], world, columns)
         c = b
         w2 = V()
         w3 = V()
         if wp.static(points > 2):
-            c = get(x, places[k, 2], world, columns)
-            w2 = across(w, places[k, 2], world, columns)
-        if wp.static(turns):
-            place = places[k, wp.static(angle)]
-            turn = V(w_angle[place / columns, column_of(place, world, columns)], real(0.0), real(0.0))
+            c = get(x, indices[k, 2], world, columns)
+            w2 = across(w, indices[k, 2], world, columns)
+        if wp.static(has_angle):
+            index = indices[k, wp.static(angle)]
+            w_twist = V(w_angle[index / columns, column_of(index, world, columns)], real(0.0), real(0.0))
             if wp.static(angle == 2):
-                w2 = turn
+                w2 = w_twist
             else:
-                w3 = turn
-        w0 = across(w, places[k, 0], world, columns)
-        w1 = across(w, places[k, 1], world, columns)
+                w3 = w_twist
+        w0 = across(w, indices[k, 0], world, columns)
+        w1 = across(w, indices[k, 1], world, columns)
         da, db, dc, _value, _w0, _w1, _w2, _w3 = wp.grad(worked)(a, b, c, values[k], w0, w1, w2, w3)
-        at = first + wp.static(count) * k + world * total
-        point_out[at] = da
-        point_out[at + 1] = db
+        row = first + wp.static(count) * k + world * total
+        point_out[row] = da
+        point_out[row + 1] = db
         if wp.static(points > 2):
-            point_out[at + 2] = dc
+            point_out[row + 2] = dc
 
     return follow
 
 
 @cache
 def gather_kernel(dim: int, real):
-    """Adds what elements bring to the points at places, (component, node, column)."""
+    """Build the kernel of assembly.
+
+    `gather`: add gradients by points of elements to dof indices, as (component, node, column).
+    """
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(
-        places: wp.array(dtype=int),
+        indices: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         point: wp.array(dtype=V),
@@ -93,10 +98,10 @@ def gather_kernel(dim: int, real):
     ):
         i, world = wp.tid()
         f = V()
-        for at in range(starts[i], starts[i + 1]):
-            f += point[items[at] + world * total]
-        k = places[i] / columns
-        r = column_of(places[i], world, columns)
+        for entry in range(starts[i], starts[i + 1]):
+            f += point[items[entry] + world * total]
+        k = indices[i] / columns
+        r = column_of(indices[i], world, columns)
         for d in range(wp.static(dim)):
             x_out[d, k, r] = x_out[d, k, r] + f[wp.static(2 if dim == 2 else 1) * d]
 

@@ -1,4 +1,4 @@
-"""Reverse of the predictors of a net's rods, level by level; see `kernels.adjoint.turns`."""
+"""Vector-Jacobian product of rod predictors in the coupled system, by level; see `kernels.adjoint.turns`."""
 
 from functools import cache
 
@@ -12,11 +12,17 @@ from ddg_warp.kernels.turns import loose_function
 
 @cache
 def net_kernels(real, midpoint: bool):
-    """Of the blocks of a net: unplace(...) of the rods of a level, a thread a rod; pass_on(...) what anchors added, a thread a
-    block; turn(...) of every edge; pull(...) of every block. Levels are taken from the last one on.
+    """Build the kernels of predictors with edge rotations.
+
+    `unplace`: write gradients by excesses, add gradients by anchors, of the rods of one level; one thread a rod.
+    `pass_on`: add the gradients by anchors to their nodes, one thread a block.
+    `turn`: write gradients by base and step of every edge.
+    `pull`: add gradients by the start of every block.
+
+    Levels of the rod order are taken in reverse.
     """
     V = wp.types.vector(3, real)
-    turned, loose = excess_function(3, real, midpoint), loose_function(3, real)
+    excess_product, free_components = excess_function(3, real, midpoint), loose_function(3, real)
 
     @wp.struct
     class Rod:
@@ -34,33 +40,33 @@ def net_kernels(real, midpoint: bool):
         anchor: int
 
     @wp.func
-    def place_of(rod: Rod, j: int):
+    def index_of(rod: Rod, j: int):
         return rod.first + wp.where(j < rod.count, j, j - rod.count)
 
     @wp.func
     def anchored(rod: Rod, j: int):
-        return rod.anchored[place_of(rod, j)] != wp.uint8(0)
+        return rod.anchored[index_of(rod, j)] != wp.uint8(0)
 
     @wp.func
     def by_shift(rod: Rod, j: int):
-        node = rod.nodes[place_of(rod, j)]
-        return loose(int(rod.fixed[node]), rod.given[node + rod.world * rod.blocks])
+        node = rod.nodes[index_of(rod, j)]
+        return free_components(int(rod.fixed[node]), rod.given[node + rod.world * rod.blocks])
 
     @wp.func
     def free_part(rod: Rod, j: int, v: V):
         return v
 
     @wp.func
-    def give_excess(rod: Rod, j: int, v: V):
-        rod.excess[rod.world, place_of(rod, j)] = v
+    def store_excess(rod: Rod, j: int, v: V):
+        rod.excess[rod.world, index_of(rod, j)] = v
 
     @wp.func
-    def give_added(rod: Rod, j: int, v: V):
-        p = place_of(rod, j)
+    def add_anchor(rod: Rod, j: int, v: V):
+        p = index_of(rod, j)
         before = rod.added[rod.world, p]
         rod.added[rod.world, p] = before + v
 
-    unplace_rod = unplace_function(3, real, Rod, anchored, by_shift, free_part, give_excess, give_added)
+    unplace_rod = unplace_function(3, real, Rod, anchored, by_shift, free_part, store_excess, add_anchor)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def unplace(
@@ -73,17 +79,17 @@ def net_kernels(real, midpoint: bool):
         fixed: wp.array(dtype=wp.uint8),
         todo: wp.array(dtype=int),
         blocks: int,
-        given: wp.array(dtype=V),
+        cotangent: wp.array(dtype=V),
         excess_out: wp.array2d(dtype=V),
         added_out: wp.array2d(dtype=V),
     ):
-        """Writes what excesses bring, adds what anchors did, at the places of rods, in worlds that turn their edges."""
+        """Write gradients by excesses and add gradients by anchors, at nodes of rods, in worlds that rotate edges."""
         i, w = wp.tid()
         if todo[w] != wp.static(PLACE):
             return
         r = rods[i]
         rod = Rod()
-        rod.given = given
+        rod.given = cotangent
         rod.excess = excess_out
         rod.added = added_out
         rod.nodes = nodes
@@ -99,22 +105,21 @@ def net_kernels(real, midpoint: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pass_on(
-        meets: wp.array(dtype=int),
+        anchor_nodes: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         blocks: int,
         added: wp.array2d(dtype=V),
-        given: wp.array(dtype=V),
+        cotangent: wp.array(dtype=V),
         along_out: wp.array(dtype=V),
     ):
-        """Of the nodes `meets` where rods of a level are anchored: adds to the derivatives by where they are, and takes from those by
-        base and step alike."""
+        """Add gradients by anchors to cotangents of the nodes, and subtract them from the gradient by base and step."""
         i, w = wp.tid()
         total = V()
-        for at in range(starts[i], starts[i + 1]):
-            total += added[w, items[at]]
-        block = meets[i] + w * blocks
-        given[block] = given[block] + total
+        for entry in range(starts[i], starts[i + 1]):
+            total += added[w, items[entry]]
+        block = anchor_nodes[i] + w * blocks
+        cotangent[block] = cotangent[block] + total
         along_out[block] = along_out[block] - total
 
     @wp.func
@@ -128,21 +133,21 @@ def net_kernels(real, midpoint: bool):
         k: int,
         i: int,
     ):
-        """See `kernels.net.turns.turn_kernels`, aim."""
+        """Return the step of a predictor; see `aim` of `kernels.net.turns.turn_kernels`."""
         mask = int(fixed[k])
-        ahead = v0[i] / rate
+        predicted = v0[i] / rate
         step = q[i] - q0[i]
         for d in range(3):
             if (mask & 7) == 7:
-                step[d] = ahead[d]
+                step[d] = predicted[d]
             elif ((mask >> d) & 1) == 0:
-                step[d] = wp.where(mass[k][d] > real(0.0), ahead[d], real(0.0))
+                step[d] = wp.where(mass[k][d] > real(0.0), predicted[d], real(0.0))
         return step
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         nodes: wp.array(dtype=int),
-        ahead: wp.array(dtype=int),
+        next_nodes: wp.array(dtype=int),
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
@@ -156,26 +161,26 @@ def net_kernels(real, midpoint: bool):
         base_out: wp.array2d(dtype=V),
         step_out: wp.array2d(dtype=V),
     ):
-        """What the excess of the edge from every place brings to its base and to its step."""
+        """Write gradients by base and step of the edge from every rod node, through its excess."""
         p, w = wp.tid()
-        if todo[w] != wp.static(PLACE) or nodes[p] == ahead[p]:
+        if todo[w] != wp.static(PLACE) or nodes[p] == next_nodes[p]:
             return
         a = nodes[p] + w * blocks
-        b = ahead[p] + w * blocks
-        step = step_of(q, q0, v0, fixed, mass, rates[w], ahead[p], b)
+        b = next_nodes[p] + w * blocks
+        step = step_of(q, q0, v0, fixed, mass, rates[w], next_nodes[p], b)
         step -= step_of(q, q0, v0, fixed, mass, rates[w], nodes[p], a)
-        by_base, by_step, _f, _straight = wp.grad(turned)(q0[b] - q0[a], step, excess[w, p], straight[w])
+        by_base, by_step, _f, _straight = wp.grad(excess_product)(q0[b] - q0[a], step, excess[w, p], straight[w])
         base_out[w, p] = by_base
         step_out[w, p] = by_step
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
-        given: wp.array(dtype=V),
+        cotangent: wp.array(dtype=V),
         along: wp.array(dtype=V),
         placed: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
-        places: int,
+        num_places: int,
         base: wp.array2d(dtype=V),
         step: wp.array2d(dtype=V),
         v0: wp.array(dtype=V),
@@ -184,44 +189,46 @@ def net_kernels(real, midpoint: bool):
         todo: wp.array(dtype=int),
         rates: wp.array(dtype=real),
         blocks: int,
-        held_out: wp.array(dtype=V),
+        fixed_out: wp.array(dtype=V),
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
         rate_out: wp.array(dtype=real),
     ):
-        """Adds to the derivatives by held dofs, by the start and by the rate. `along` are those by base and step alike; items of a
-        block are the edges from places on, and behind these all edges to places.
+        """Add gradients by fixed dofs, by the start and by the rate.
+
+        `along`: gradient by base and step alike. Items of a block below `num_places` are edges from its rod nodes; item - `num_places`
+        are edges to them.
         """
         i = wp.tid()
         w = i / blocks
         k = i - w * blocks
         mask = int(fixed[k])
-        here = given[i]
+        by_position = cotangent[i]
         by_base = V()
         by_step = V()
         if todo[w] == wp.static(PLACE):
             by_base = along[i]
             if placed[k] != wp.uint8(0):
-                by_base += here
-                here = V()
+                by_base += by_position
+                by_position = V()
             by_step = by_base
-            for at in range(starts[k], starts[k + 1]):
-                p = items[at]
-                if p < places:
+            for entry in range(starts[k], starts[k + 1]):
+                p = items[entry]
+                if p < num_places:
                     by_base -= base[w, p]
                     by_step -= step[w, p]
                 else:
-                    by_base += base[w, p - places]
-                    by_step += step[w, p - places]
+                    by_base += base[w, p - num_places]
+                    by_step += step[w, p - num_places]
         by_start = by_base
         by_rate = V()
         if (mask & 7) == 7:
-            held_out[i] = held_out[i] + here
+            fixed_out[i] = fixed_out[i] + by_position
             by_rate = by_step
         else:
-            own = here + by_step
-            free = loose(mask, own)
-            held_out[i] = held_out[i] + own - free
+            by_step_of_node = by_position + by_step
+            free = free_components(mask, by_step_of_node)
+            fixed_out[i] = fixed_out[i] + by_step_of_node - free
             by_start += free - by_step
             for d in range(3):
                 if mass[k][d] > real(0.0):

@@ -1,6 +1,4 @@
-"""Shares of slots of elements, gathered by the blocks, edges and data that they belong to: by lists, so that sums come in one order,
-without atomics.
-"""
+"""Assembly of gradients of elements at blocks, edges and data, by incidence lists in a fixed order, without atomics."""
 
 from functools import cache
 
@@ -13,7 +11,10 @@ from ddg_warp.kernels.variation import carried_function
 
 @cache
 def frame_kernel(real):
-    """pull(...): the reverse of `net.frames.edge_kernel`: by the edge vector, and, added, by the frame of before."""
+    """Build the kernel of frame updates, the reverse of `net.frames.edge_kernel`.
+
+    `pull`: write gradients by the edge vector, and add gradients by the previous frame.
+    """
     V = wp.types.vector(3, real)
     carried = carried_function(real)
 
@@ -27,7 +28,7 @@ def frame_kernel(real):
         ends: wp.array2d(dtype=int),
         blocks: int,
         frame: wp.array2d(dtype=real),
-        by: wp.array2d(dtype=real),
+        cotangent: wp.array2d(dtype=real),
         edge_out: wp.array2d(dtype=V),
         frame_out: wp.array2d(dtype=real),
     ):
@@ -36,7 +37,7 @@ def frame_kernel(real):
         i = f - world * ends.shape[0]
         e = q[ends[i, 1] + world * blocks] - q[ends[i, 0] + world * blocks]
         de, du, dt, _u, _t = wp.grad(carried)(
-            e, three(frame, 0, f), three(frame, 3, f), three(by, 0, f), three(by, 3, f)
+            e, three(frame, 0, f), three(frame, 3, f), three(cotangent, 0, f), three(cotangent, 3, f)
         )
         edge_out[0, f] = -de
         edge_out[1, f] = de
@@ -49,10 +50,13 @@ def frame_kernel(real):
 
 @cache
 def gather_kernels(real):
-    """slots(...) adds what slots of elements bring to blocks; frames(...) what their lagged data bring to the frames of edges;
-    rows(...) adds rows of an array, from the `first` on, to those of another one.
+    """Build the kernels of assembly.
 
-    Item i of a list is slot i / `count` of element i % `count`, of which there are `count` in each world.
+    `slots`: add gradients by local nodes of elements to blocks.
+    `frames`: add gradients by lagged data of elements to frames of edges.
+    `rows`: add rows of an array, from `first` on, to the rows of another.
+
+    Item i of a list is local node i / `count` of element i % `count`; a world has `count` elements.
     """
     V = wp.types.vector(3, real)
 
@@ -62,15 +66,15 @@ def gather_kernels(real):
         items: wp.array(dtype=int),
         count: int,
         blocks: int,
-        slot_in: wp.array2d(dtype=V),
+        local_in: wp.array2d(dtype=V),
         out: wp.array(dtype=V),
     ):
         tid = wp.tid()
         world = tid / blocks
         k = tid - world * blocks
         total = out[tid]
-        for at in range(starts[k], starts[k + 1]):
-            total += slot_in[items[at] / count, items[at] % count + world * count]
+        for entry in range(starts[k], starts[k + 1]):
+            total += local_in[items[entry] / count, items[entry] % count + world * count]
         out[tid] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -85,9 +89,9 @@ def gather_kernels(real):
         tid = wp.tid()
         world = tid / edges
         k = tid - world * edges
-        for at in range(starts[k], starts[k + 1]):
-            row = items[at] / count * wp.static(FRAME)
-            e = items[at] % count + world * count
+        for entry in range(starts[k], starts[k + 1]):
+            row = items[entry] / count * wp.static(FRAME)
+            e = items[entry] % count + world * count
             for c in range(wp.static(FRAME)):
                 out[c, tid] = out[c, tid] + lag_in[row + c, e]
 

@@ -1,7 +1,7 @@
-"""What float32 makes of the linear system of a group of rods, by the parameters that the device holds.
+"""Float32 error of the linear system of a rod group, estimated from parameters on the device.
 
-As `ddg_warp.compile.precision` has it of those of the model, and with what bends a node to and fro; maxima, minima and sums are taken
-over parts of a rod, then over these, in one order.
+The estimate is that of `ddg_warp.compile.precision`, plus the bending stiffness of zigzag modes. Maxima, minima and sums are taken over
+segments of a rod, then over segments, in a fixed order.
 """
 
 from functools import cache
@@ -12,16 +12,20 @@ import warp as wp
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-PART = 8  # nodes that a thread goes over
+PART = 8  # nodes of a segment, one thread each
 STIFFEST, SOFTEST, MASS = range(
     3
-)  # rows: largest of an edge or node, least of bending over lengths, sum [N/m, N m^3, kg]
+)  # rows: largest stiffness of an edge or node [N/m], least bending stiffness times length [N m^3], mass [kg]
 ROWS = 3
 
 
 @cache
 def stiffness_kernels(kind: ChainKind, real):
-    """measure(...): of every part of every rod; judge(...): whether a rod's system errs by more than is allowed in float32."""
+    """Build the kernels of the estimate.
+
+    `measure`: write stiffnesses and mass of every segment of every rod.
+    `judge`: set `poor` if the float32 error of a rod exceeds the allowed one.
+    """
     *_, parameter = gather_functions(kind, real)
     rows = []
     for term, (first, *_) in zip(kind.terms, kind.places(), strict=True):
@@ -40,12 +44,12 @@ def stiffness_kernels(kind: ChainKind, real):
         count: wp.array(dtype=int),
         out: wp.array3d(dtype=real),
     ):
-        part, r = wp.tid()
+        segment, r = wp.tid()
         n = count[r]
         stiffest = real(0.0)
         softest = real(wp.inf)
         total = real(0.0)
-        for k in range(part * wp.static(PART), wp.min(n, (part + 1) * wp.static(PART))):
+        for k in range(segment * wp.static(PART), wp.min(n, (segment + 1) * wp.static(PART))):
             total += mass[k, r]
             if wp.static(stretches):
                 if k + 1 < n:
@@ -54,31 +58,31 @@ def stiffness_kernels(kind: ChainKind, real):
             if wp.static(bends):
                 if k + 2 < n:
                     length = parameter(buffer, table, wp.static(bend[0]), k, r)
-                    own = parameter(buffer, table, wp.static(bend[1]), k, r)
-                    stiffest = wp.max(stiffest, real(16.0) * own / (length * length * length))
-                    softest = wp.min(softest, own * length)
-        out[wp.static(STIFFEST), part, r] = stiffest
-        out[wp.static(SOFTEST), part, r] = softest
-        out[wp.static(MASS), part, r] = total
+                    bending = parameter(buffer, table, wp.static(bend[1]), k, r)
+                    stiffest = wp.max(stiffest, real(16.0) * bending / (length * length * length))
+                    softest = wp.min(softest, bending * length)
+        out[wp.static(STIFFEST), segment, r] = stiffest
+        out[wp.static(SOFTEST), segment, r] = softest
+        out[wp.static(MASS), segment, r] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
-        found: wp.array3d(dtype=real),
+        rows: wp.array3d(dtype=real),
         length: wp.array(dtype=real),
         count: wp.array(dtype=int),
         rate: wp.array(dtype=real),
         allowed: real,
         poor: wp.array(dtype=int),
     ):
-        """Raises `poor`."""
+        """Set `poor` if the float32 error of a rod exceeds the allowed one."""
         r = wp.tid()
         stiffest = real(0.0)
         least = real(wp.inf)
         total = real(0.0)
-        for part in range(found.shape[1]):
-            stiffest = wp.max(stiffest, found[wp.static(STIFFEST), part, r])
-            least = wp.min(least, found[wp.static(SOFTEST), part, r])
-            total += found[wp.static(MASS), part, r]
+        for segment in range(rows.shape[1]):
+            stiffest = wp.max(stiffest, rows[wp.static(STIFFEST), segment, r])
+            least = wp.min(least, rows[wp.static(SOFTEST), segment, r])
+            total += rows[wp.static(MASS), segment, r]
         softest = total / real(count[r]) * rate[r] * rate[r]
         if wp.static(bends):
             lowest = real(wp.static(np.pi)) / length[r]

@@ -1,4 +1,4 @@
-"""Around the linear solve of a reverse on a net: vectors of blocks in its precision and frames, and what became of it."""
+"""Adjoint linear solve of the coupled system: conversion of vectors, right-hand sides, and a residual test."""
 
 from functools import cache
 
@@ -10,7 +10,12 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def block_kernels(real, linear):
-    """into(blocks, blocks in `linear`) and back(...); keep(...): zeroes dofs whose bits are set, in every world."""
+    """Build the kernels of vectors.
+
+    `into`: convert a vector to the precision `linear`.
+    `back`: convert a vector back.
+    `keep`: zero dofs with set bits, in every world.
+    """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
 
@@ -36,13 +41,16 @@ def block_kernels(real, linear):
 
 @cache
 def chain_kernel(real):
-    """chain(...): from derivatives by a solution, and by another one that it lags, to the right-hand side of the solve for that."""
+    """Build the kernel of right-hand sides of a solve that uses a lagged solution.
+
+    `chain`: write the gradient by the lagged solution, given the gradient by a later solution.
+    """
     V = wp.types.vector(3, real)
     _, free = product_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def chain(bits: wp.array(dtype=wp.uint8), blocks: int, by_lagged: wp.array(dtype=V), by_q: wp.array(dtype=V)):
-        """What free dofs of a solution still have is balanced by what it does not lag; held ones are where they are in both."""
+        """Replace gradients at free dofs by `by_lagged`, and add it at fixed dofs, which are equal in both solutions."""
         i = wp.tid()
         by_q[i] = by_q[i] - wp.cw_mul(by_q[i], free(bits[i % blocks])) + by_lagged[i]
         by_lagged[i] = V()
@@ -52,7 +60,11 @@ def chain_kernel(real):
 
 @cache
 def check_kernels(linear):
-    """rest(...): the residual that a solution leaves, preconditioned by the diagonal blocks; check(...): whether that is little."""
+    """Build the kernels of the residual test.
+
+    `rest`: write the residual of a solution, and its product with the inverse diagonal blocks.
+    `check`: mark worlds with a large residual.
+    """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -79,9 +91,9 @@ def check_kernels(linear):
         missed: linear,
         failed_out: wp.array(dtype=int),
     ):
-        """Marks worlds whose residual is more than a part `missed` of the right-hand side, or no number; zero is solved by zero.
+        """Mark worlds if the residual exceeds the fraction `missed` of the right-hand side, or is not finite.
 
-        Marks stay: a solve may be one of several.
+        A zero right-hand side passes. Marks stay, since a solve may be one of several.
         """
         w = wp.tid()
         little = wp.abs(total[w]) <= missed * missed * first[w]

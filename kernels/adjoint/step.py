@@ -1,4 +1,4 @@
-"""Reverse of what surrounds the solve of a step on chains: end update, inertia and predictor. See `kernels.step` for the schemes.
+"""Vector-Jacobian product of a rod step around the solve: end update, inertia and predictor; see `kernels.step`.
 
 Both solve m (c (x - x_n) - r v_n) + ... = 0 with r = 1 / s and c = r (r + alpha). Implicit Euler ends at x, with r (x - x_n); the
 midpoint rule at 2 x - x_n, with 2 r (x - x_n) - v_n.
@@ -20,17 +20,19 @@ from ddg_warp.kernels.variation import angle_function
 
 @cache
 def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
-    """solution(...): derivatives by the dofs that a solve has found, from those by the end of the step; start(...): by the start of the
-    step, masses and what all nodes share, from those and from w.
+    """Build the kernels of the end update and of inertia.
 
-    `more` is what came to the dofs of the end through its frames and strains. `more_to_start`: whether other kernels have written
-    derivatives by positions, velocities and angles of the start, to which is added.
+    `solution`: write gradients by the dofs of the solve, given gradients by the end of the step.
+    `start`: write gradients by the start of the step, masses, rate, damping and gravity, given these and the adjoint w.
+
+    `more`: gradients by the dofs of the end through its frames and strains. `more_to_start`: True to add to gradients by the start that
+    other kernels have written.
     """
     dim, twist = kind.dim, kind.twist
-    settles = kind.drag and midpoint  # rates of what has no inertia are means over the step; see `drag.chain_kernels`
+    settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.chain_kernels`
     V = wp.types.vector(dim, real)
-    share = real(2.0 if midpoint else 1.0)  # of the solution in the end
-    kept = real(1.0 if midpoint else 0.0)  # of minus the start in the end
+    end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
+    start_weight = real(1.0 if midpoint else 0.0)  # derivative of the end by minus the start
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
@@ -47,36 +49,36 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         dof_out: wp.array3d(dtype=real),
         right_out: wp.array3d(dtype=real),
     ):
-        """`right_out` are those by free dofs, zero at held ones."""
+        """Write gradients by dofs, and the right-hand side of the adjoint solve, which is zero at fixed dofs."""
         k, r = wp.tid()
         if k >= count[r]:
             return
         mask = int(fixed[k, r])
-        swing = share
+        swing = end_weight
         if wp.static(settles):
-            swing = wp.where(mass[k, r] <= real(0.0), real(1.0), share)
-        total = x[k, r] * share + v[k, r] * (rate[r] * swing)
+            swing = wp.where(mass[k, r] <= real(0.0), real(1.0), end_weight)
+        total = x[k, r] * end_weight + v[k, r] * (rate[r] * swing)
         for d in range(wp.static(dim)):
-            own = total[d] + share * more[d, k, r]
-            dof_out[d, k, r] = own
-            right_out[d, k, r] = wp.where(((mask >> d) & 1) == 0, own, real(0.0))
+            gradient = total[d] + end_weight * more[d, k, r]
+            dof_out[d, k, r] = gradient
+            right_out[d, k, r] = wp.where(((mask >> d) & 1) == 0, gradient, real(0.0))
         if wp.static(twist):
-            swing = share
+            swing = end_weight
             if wp.static(settles):
-                swing = wp.where(rotary[k, r] <= real(0.0), real(1.0), share)
-            turn = share * (theta[k, r] + more[wp.static(dim), k, r]) + swing * omega[k, r] * rate[r]
-            dof_out[wp.static(dim), k, r] = turn
-            right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, turn, real(0.0))
+                swing = wp.where(rotary[k, r] <= real(0.0), real(1.0), end_weight)
+            by_angle = end_weight * (theta[k, r] + more[wp.static(dim), k, r]) + swing * omega[k, r] * rate[r]
+            dof_out[wp.static(dim), k, r] = by_angle
+            right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, by_angle, real(0.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
-        # the end: derivatives by it
+        # gradients by the end
         x: wp.array2d(dtype=V),
         v: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         omega: wp.array2d(dtype=real),
         more: wp.array3d(dtype=real),
-        # the solve: its solution, where it started, w, and what is left at held dofs
+        # the solution, the start, the adjoint w, and cotangents at fixed dofs
         q: wp.array2d(dtype=V),
         angle: wp.array2d(dtype=real),
         x0: wp.array2d(dtype=V),
@@ -84,7 +86,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         theta0: wp.array2d(dtype=real),
         omega0: wp.array2d(dtype=real),
         w: wp.array3d(dtype=real),
-        held: wp.array3d(dtype=real),
+        cotangent_fixed: wp.array3d(dtype=real),
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
@@ -94,7 +96,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         damping: wp.array(dtype=real),
         gravity: wp.array(dtype=V),
         world: wp.array(dtype=int),
-        # derivatives by the start; by masses; by the rate, the damping and gravity, of every node
+        # gradients by the start, by masses, and by rate, damping and gravity per node
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
@@ -105,8 +107,10 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         damping_out: wp.array2d(dtype=real),
         gravity_out: wp.array2d(dtype=V),
     ):
-        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. `gravity` is of worlds, `world`
-        that of a column. Adds to derivatives by the rate."""
+        """Write gradients by the start and by masses; add to gradients by the rate.
+
+        `moved`: mask of dofs with prescribed motion; other fixed dofs stay at the start. `world`: world of a column.
+        """
         k, r = wp.tid()
         if k >= count[r]:
             return
@@ -114,63 +118,63 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         alpha = damping[0]
         c = rho * (rho + alpha)
         mask = int(fixed[k, r])
-        put = int(moved[k, r])
+        prescribed = int(moved[k, r])
         m = mass[k, r]
-        own = V()
-        stays = V()
+        w_free = V()
+        fixed_at_start = V()
         by_end = x[k, r]
         for d in range(wp.static(dim)):
             by_end[d] = by_end[d] + more[d, k, r]
             if ((mask >> d) & 1) == 0:
-                own[d] = w[d, k, r]
-            elif ((put >> d) & 1) == 0:
-                stays[d] = held[d, k, r]
+                w_free[d] = w[d, k, r]
+            elif ((prescribed >> d) & 1) == 0:
+                fixed_at_start[d] = cotangent_fixed[d, k, r]
         step = q[k, r] - x0[k, r]
         before = v0[k, r]
         ended = v[k, r]
-        turned = share
-        before_kept = kept
+        velocity_weight = end_weight
+        before_kept = start_weight
         if wp.static(settles):
             if m <= real(0.0):
-                turned = real(1.0)
+                velocity_weight = real(1.0)
                 before_kept = real(0.0)
-        by_x = own * (c * m) + stays - by_end * kept - ended * (rho * turned)
-        by_v = own * (rho * m) - ended * before_kept
+        by_x = w_free * (c * m) + fixed_at_start - by_end * start_weight - ended * (rho * velocity_weight)
+        by_v = w_free * (rho * m) - ended * before_kept
         if wp.static(more_to_start):
             by_x += x_out[k, r]
             by_v += v_out[k, r]
         x_out[k, r] = by_x
         v_out[k, r] = by_v
-        mass_out[k, r] = wp.dot(own, gravity[world[r]] - step * c + before * rho)
-        gravity_out[k, r] = own * m
-        by_rate = turned * wp.dot(ended, step) - m * wp.dot(own, step * (real(2.0) * rho + alpha) - before)
-        by_damping = -m * rho * wp.dot(own, step)
+        mass_out[k, r] = wp.dot(w_free, gravity[world[r]] - step * c + before * rho)
+        gravity_out[k, r] = w_free * m
+        by_rate = velocity_weight * wp.dot(ended, step) - m * wp.dot(w_free, step * (real(2.0) * rho + alpha) - before)
+        by_damping = -m * rho * wp.dot(w_free, step)
         if wp.static(twist):
             free = real(0.0)
-            rests = real(0.0)
+            angle_at_start = real(0.0)
             if ((mask >> wp.static(dim)) & 1) == 0:
                 free = w[wp.static(dim), k, r]
-            elif ((put >> wp.static(dim)) & 1) == 0:
-                rests = held[wp.static(dim), k, r]
+            elif ((prescribed >> wp.static(dim)) & 1) == 0:
+                angle_at_start = cotangent_fixed[wp.static(dim), k, r]
             j = rotary[k, r]
-            turn = angle[k, r] - theta0[k, r]
+            rotation = angle[k, r] - theta0[k, r]
             spin = omega0[k, r]
             spun = omega[k, r]
-            turned = share
-            before_kept = kept
+            velocity_weight = end_weight
+            before_kept = start_weight
             if wp.static(settles):
                 if j <= real(0.0):
-                    turned = real(1.0)
+                    velocity_weight = real(1.0)
                     before_kept = real(0.0)
-            by_turn = theta[k, r] + more[wp.static(dim), k, r]
-            by_angle = free * c * j + rests - by_turn * kept - spun * (rho * turned)
+            by_end_angle = theta[k, r] + more[wp.static(dim), k, r]
+            by_angle = free * c * j + angle_at_start - by_end_angle * start_weight - spun * (rho * velocity_weight)
             if wp.static(more_to_start):
                 by_angle += theta_out[k, r]
             theta_out[k, r] = by_angle
             omega_out[k, r] = free * rho * j - spun * before_kept
-            rotary_out[k, r] = free * (spin * rho - turn * c)
-            by_rate += turned * spun * turn - j * free * (turn * (real(2.0) * rho + alpha) - spin)
-            by_damping -= j * rho * free * turn
+            rotary_out[k, r] = free * (spin * rho - rotation * c)
+            by_rate += velocity_weight * spun * rotation - j * free * (rotation * (real(2.0) * rho + alpha) - spin)
+            by_damping -= j * rho * free * rotation
         rate_out[k, r] = rate_out[k, r] + by_rate
         damping_out[k, r] = by_damping
 
@@ -179,10 +183,9 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
 
 @cache
 def angle_kernel(dim: int, real, midpoint: bool):
-    """pull(...): of the angles that motions turn, the reverse of `kernels.motion.support_kernels`.
+    """Build the kernel of twist angles with prescribed motion, the reverse of `kernels.motion.support_kernels`.
 
-    Adds to the derivatives by the nodes of their edges (component, node, column) and by the frames that these had; writes those by the
-    directors that the motions put there.
+    `pull`: add gradients by nodes of edges (component, node, column) and by previous frames; write gradients by prescribed directors.
     """
     X, V = wp.types.vector(3, real), wp.types.vector(dim, real)
     get, _ = point_functions(dim, real)
@@ -215,23 +218,26 @@ def angle_kernel(dim: int, real, midpoint: bool):
         u = X(frame[0, k, r], frame[1, k, r], frame[2, k, r])
         t = X(frame[3, k, r], frame[4, k, r], frame[5, k, r])
         de, du, dt, dd = wp.grad(angle)(e, u, t, d)
-        by = by_angle[where[i, 0] / columns, r]
-        director_out[i, w] = dd * by
+        cotangent = by_angle[where[i, 0] / columns, r]
+        director_out[i, w] = dd * cotangent
         for c in range(3):
-            frame_out[c, k, r] = frame_out[c, k, r] + by * du[c]
-            frame_out[3 + c, k, r] = frame_out[3 + c, k, r] + by * dt[c]
+            frame_out[c, k, r] = frame_out[c, k, r] + cotangent * du[c]
+            frame_out[3 + c, k, r] = frame_out[3 + c, k, r] + cotangent * dt[c]
         for c in range(wp.static(dim)):
-            share = by * de[wp.static(2 if planar else 1) * c]
-            wp.atomic_add(node_out, c, where[i, 3] / columns, r, share)
-            wp.atomic_sub(node_out, c, where[i, 2] / columns, r, share)
+            by_node = cotangent * de[wp.static(2 if planar else 1) * c]
+            wp.atomic_add(node_out, c, where[i, 3] / columns, r, by_node)
+            wp.atomic_sub(node_out, c, where[i, 2] / columns, r, by_node)
 
     return pull
 
 
 @cache
 def smooth_kernel(real):
-    """smooth(...): one for islands whose step was one solve in the frames that it began with, else not a number; at the first attempt,
-    where that is asked (`once`). Worlds that have another one, and no outcome yet, get that of no gradient, and are told of.
+    """Build the kernel of differentiable steps.
+
+    `smooth`: write 1 for islands whose step was one solve with unchanged frames (at the first attempt if `once`), else NaN.
+
+    Worlds with another island, and no outcome yet, get the outcome NO_GRADIENT and set a flag.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -241,12 +247,12 @@ def smooth_kernel(real):
         once: int,
         frame: wp.array3d(dtype=real),
         began: wp.array3d(dtype=real),
-        share: int,
+        per_world: int,
         smooth_out: wp.array(dtype=real),
         codes: wp.array(dtype=int),
-        told: wp.array(dtype=int),
+        any_rough: wp.array(dtype=int),
     ):
-        """Frames (component, edge, island) are those of the last solve and of the start; a world has a `share` of the islands."""
+        """Compare frames (component, edge, island) of the last solve and of the start; a world has `per_world` islands."""
         r = wp.tid()
         same = flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING) and scalars[PORTION, r] == real(1.0)
         same = same and (once == 0 or flags[RETRIES, r] == 0)
@@ -255,16 +261,19 @@ def smooth_kernel(real):
                 same = same and frame[c, k, r] == began[c, k, r]
         smooth_out[r] = wp.where(same, real(1.0), real(wp.nan))
         if not same:
-            told[0] = 1
-            wp.atomic_cas(codes, r / share, 0, wp.static(outcome.NO_GRADIENT))
+            any_rough[0] = 1
+            wp.atomic_cas(codes, r / per_world, 0, wp.static(outcome.NO_GRADIENT))
 
     return smooth
 
 
 @cache
 def flag_kernels(real):
-    """solved(...): flags of islands, not numbers where their linear system has failed; excuse(...): one instead where nothing was
-    asked; failed(...): which worlds failed.
+    """Build the kernels of flags.
+
+    `solved`: write flags of islands, NaN if the linear solve has failed.
+    `excuse`: write 1 for islands with zero cotangents.
+    `failed`: mark worlds that failed.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -272,22 +281,22 @@ def flag_kernels(real):
         failed: wp.array(dtype=int),
         flags: wp.array(dtype=real),
         out: wp.array(dtype=real),
-        asked: wp.array(dtype=int),
+        has_cotangent: wp.array(dtype=int),
         lost: wp.array(dtype=int),
-        told: wp.array(dtype=int),
+        any_failed: wp.array(dtype=int),
     ):
         r = wp.tid()
         out[r] = wp.where(failed[r] == 0, flags[r], real(wp.nan))
-        asked[r] = 0
+        has_cotangent[r] = 0
         if wp.isnan(out[r]):
             lost[0] = 1
             if not wp.isnan(flags[r]):
-                told[0] = 1
+                any_failed[0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def excuse(asked: wp.array(dtype=int), out: wp.array(dtype=real)):
+    def excuse(has_cotangent: wp.array(dtype=int), out: wp.array(dtype=real)):
         r = wp.tid()
-        if asked[r] == 0:
+        if has_cotangent[r] == 0:
             out[r] = real(1.0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -302,19 +311,27 @@ def flag_kernels(real):
 
 @cache
 def asked_kernel(dtype, real):
-    """asked(...): whether derivatives by an array are other than zero in an island whose flag is not a number; each has a `share`."""
+    """Build the kernel that finds non-zero cotangents.
+
+    `asked`: mark islands with NaN flags that have a non-zero cotangent; each has `per_island` columns.
+    """
     several = hasattr(dtype, "_wp_scalar_type_")
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def asked(flags: wp.array(dtype=real), given: wp.array3d(dtype=dtype), share: int, asked_out: wp.array(dtype=int)):
+    def asked(
+        flags: wp.array(dtype=real),
+        cotangent: wp.array3d(dtype=dtype),
+        per_island: int,
+        has_cotangent_out: wp.array(dtype=int),
+    ):
         i, j, k = wp.tid()
-        if wp.isnan(flags[k / share]):
-            value = given[i, j, k]
+        if wp.isnan(flags[k / per_island]):
+            value = cotangent[i, j, k]
             if wp.static(several):
                 if wp.length_sq(value) != real(0.0):
-                    asked_out[k / share] = 1
+                    has_cotangent_out[k / per_island] = 1
             else:
                 if value != real(0.0):
-                    asked_out[k / share] = 1
+                    has_cotangent_out[k / per_island] = 1
 
     return asked

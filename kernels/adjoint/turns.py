@@ -1,5 +1,7 @@
-"""Reverse of predictors, where a solve lags what they lead to: loads that follow, and by the midpoint rule frames and drag; see
-`kernels.turns`. What chains and nets do with it is in `chain_predictor` and `net_predictor`.
+"""Vector-Jacobian product of predictors with edge rotations; see `kernels.turns`.
+
+It is needed if a solve lags quantities of its predictor: follower loads and, with the midpoint rule, frames and drag. `chain_predictor`
+and `net_predictor` apply it to uncoupled rods and to the coupled system.
 """
 
 from functools import cache
@@ -11,13 +13,17 @@ from ddg_warp.kernels.turns import edge_functions, onward_function
 
 @cache
 def unplace_function(dim: int, real, Rod, anchored, by_shift, free_part, give_excess, give_added):
-    """unplace(rod): the reverse of `kernels.turns.place_function`, which is linear in excesses and in what anchors add.
+    """Return the device function `unplace(rod)`: the reverse of `kernels.turns.place_function`.
+
+    That function is linear in excesses and in displacements of anchors.
 
     Args:
-        Rod: struct of a rod; its fields `count`, `closed` and `anchor` as there.
-        anchored: as there; by_shift: (rod, j) -> derivative by what node j is put beyond its step, zero of anchors.
-        free_part: (rod, j, v) -> the part of v that the mean of a free rod takes of node j.
-        give_excess: (rod, j, v) puts the derivative by that of edge j; give_added: (rod, j, v) adds to that by what anchor j adds.
+        Rod: struct of a rod; fields `count`, `closed` and `anchor` as in `place_function`.
+        anchored: (rod, j) -> True for anchors.
+        by_shift: (rod, j) -> gradient by the displacement of node j beyond its step; zero for anchors.
+        free_part: (rod, j, v) -> components of v at node j that count in the mean of a free rod.
+        give_excess: (rod, j, v) stores the gradient by the excess of edge j.
+        give_added: (rod, j, v) adds to the gradient by the displacement of anchor j.
     """
     V = wp.types.vector(dim, real)
 
@@ -70,14 +76,14 @@ def unplace_function(dim: int, real, Rod, anchored, by_shift, free_part, give_ex
 
 @cache
 def excess_function(dim: int, real, midpoint: bool):
-    """turned(e, de, f, straight): the excess of an edge that a predictor turns, times f; see `turns.onward_function`."""
+    """Return the device function `excess_product(e, de, f, straight)`: excess of a rotated edge, dot f; see `turns.onward_function`."""
     V = wp.types.vector(dim, real)
     along_edge, excess_of, _ = edge_functions(dim, real)
     onward_of = onward_function(real)
 
     @wp.func
-    def turned(e: V, de: V, f: V, straight: real):
-        onward = onward_of(straight, wp.static(0 if midpoint else 1))
-        return wp.dot(excess_of(e, de, along_edge(e, de), onward), f)
+    def excess_product(e: V, de: V, f: V, straight: real):
+        extrapolation = onward_of(straight, wp.static(0 if midpoint else 1))
+        return wp.dot(excess_of(e, de, along_edge(e, de), extrapolation), f)
 
-    return turned
+    return excess_product
