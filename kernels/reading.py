@@ -15,7 +15,7 @@ WIDEST = 16  # bytes
 
 
 def _chunks(dtype) -> tuple[int, int, tuple]:
-    """Return the size of an element, the numbers read at once, and names of the scalar type in CUDA and PTX."""
+    """Return element size, numbers read at once, and the scalar type in CUDA and PTX."""
     kind = KINDS[getattr(dtype, "_wp_scalar_type_", dtype)]
     count = getattr(dtype, "_length_", 1)
     return count, next(n for n in (4, 2, 1) if n * kind[3] <= WIDEST and count % n == 0), kind

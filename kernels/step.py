@@ -189,7 +189,10 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 
 @cache
 def start_function(real):
-    """Return the device function `start(flags, scalars, i)`: start a step of an island, complete at once if it has failed for good."""
+    """Return the device function `start(flags, scalars, i)`: start a step of an island.
+
+    The step is complete at once if the island has failed for good.
+    """
 
     @wp.func
     def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):

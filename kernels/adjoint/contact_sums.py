@@ -141,7 +141,10 @@ def direction_kernels(real):
         gradients: wp.array2d(dtype=V),
         out: wp.array2d(dtype=V),
     ):
-        """Add gradients to nodes; an item is twice the index of a primitive in its world, plus 1 at the end of its direction."""
+        """Add gradients to nodes.
+
+        An item is twice the index of a primitive in its world, plus 1 at the end of its direction.
+        """
         w, k = wp.tid()
         value = V()
         for index in range(starts[k], starts[k + 1]):

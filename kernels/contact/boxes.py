@@ -138,7 +138,7 @@ def box_kernel(size: int, endless: bool, real):
         upper: wp.array(dtype=wp.vec3),
         lost: wp.array(dtype=int),
     ):
-        """Treat one primitive of a world a thread."""
+        """Write the AABB of one primitive of a world per thread."""
         i = wp.tid()
         w = i / count
         k = i - w * count

@@ -65,7 +65,7 @@ def note_needed(
     overflow: wp.array(dtype=int),
     needed: wp.array(dtype=int),
 ):
-    """Note the capacity that the fullest segment requires of all, and an overflow; counts that wrapped are negative."""
+    """Note required capacity and overflow, by the fullest segment; counts that wrapped are negative."""
     segments = num_met.shape[0]
     for segment in range(segments):
         number = wp.where(num_met[segment] < 0, wp.static(MOST), num_met[segment])
@@ -76,7 +76,7 @@ def note_needed(
 
 @wp.func
 def turns(tid: int, threads: int, num_met: wp.array(dtype=int), leaf_pairs: wp.array(dtype=wp.vec2i)):
-    """Return the first leaf pair of a thread, the end of its segment, and the number of threads of that segment."""
+    """Return the first leaf pair of a thread, and end and number of threads of its segment."""
     segments = num_met.shape[0]
     each, room = threads / segments, leaf_pairs.shape[0] / segments
     segment = tid / each
@@ -110,7 +110,7 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
 
     @wp.func
     def finds(trees: Trees, i: int, j: int):
-        """Return True if leaf i lists the pair with leaf j; of leaves that begin at the same coordinate, the first does."""
+        """Return True if leaf i lists the pair with leaf j; ties go to the first leaf."""
         if wp.static(alike):
             first = trees.bundle_lower[j][wp.static(AXIS)] < trees.bundle_lower[i][wp.static(AXIS)]
             return first or j >= i + wp.static(least)
@@ -205,7 +205,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
 
     @wp.func
     def separation(x: Y, p: Y, around: real):
-        """Return a lower bound of the distance [m] if nodes move by any fractions of p and deviate by `around`.
+        """Return a lower bound of the distance [m] over motions by fractions of p with deviations `around`.
 
         Nodes of a half-space move by one fraction.
         """
@@ -246,7 +246,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
         overflow: wp.array(dtype=int),
         needed: wp.array(dtype=int),
     ):
-        """Link and count, by first primitive, the pairs whose gap may fall below `reach` [m] within `around` [m] of their paths."""
+        """Link and count, by first primitive, pairs whose gap may fall below `reach` [m] in the motion."""
         if wp.tid() == 0:
             note_needed(num_met, leaf_pairs, overflow, needed)
         begin, stop, step = turns(wp.tid(), threads, num_met, leaf_pairs)

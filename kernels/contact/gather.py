@@ -368,7 +368,10 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         between: wp.array(dtype=M),
         had_items: wp.array(dtype=wp.uint8),
     ):
-        """Sum the items of the first node that belong to this edge; `had_items`: 0 for edges whose block is zero."""
+        """Sum items of the first node that belong to this edge.
+
+        `had_items`: 0 for edges whose block is zero.
+        """
         i = wp.tid()
         if wp.static(serial):
             join_all(sets, between)
@@ -402,7 +405,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         second: wp.array(dtype=L),
         next_angle: wp.array(dtype=linear),
     ):
-        """Write the couplings of the twist angle of each edge with both nodes and with the angle of the next edge."""
+        """Write couplings of each twist angle with both nodes of the edge and with the next angle."""
         tid = wp.tid()
         for i in range(tid, until(tid, first.shape[0])):
             w = i / angles.shape[0]

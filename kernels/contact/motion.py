@@ -87,9 +87,9 @@ def motion_kernels(real, serial: bool):
         move: wp.array(dtype=X),
         stale: wp.array(dtype=int),
     ):
-        """Write the displacement of nodes, and set `stale` if one is farther than allowed from its searched path, or not finite.
+        """Write displacements, and set `stale` if a node has left the margin of its searched path.
 
-        Only nodes in `placed` have positions.
+        A node that is not finite has left it. Only nodes in `placed` have positions.
         """
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
@@ -124,7 +124,10 @@ def motion_kernels(real, serial: bool):
         done: wp.array(dtype=int),
         number: wp.array(dtype=int),
     ):
-        """Store the searched paths, or their ends in worlds that move by one fraction; a search that overflowed is out of date."""
+        """Store searched paths, or their ends in worlds that move by one fraction.
+
+        A search that overflowed is out of date.
+        """
         tid = wp.tid()
         if tid == 0:
             stale[0] = overflow[0]

@@ -79,7 +79,10 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         x: wp.array(dtype=X),
         v: wp.array(dtype=V),
     ):
-        """Write F^T F v of each pair; in `wanted` worlds, if given, with geometric stiffness or by the stored Hessian."""
+        """Write F^T F v of each pair.
+
+        In `wanted` worlds, if given, add geometric stiffness or use the stored Hessian.
+        """
         for s in range(sets.shape[0]):
             pair_set = sets[s]
             for p in range(wp.tid(), pair_set.count[0], threads):

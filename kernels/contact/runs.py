@@ -101,7 +101,10 @@ def run_kernels(grouped: bool, real, serial: bool):
         upper: wp.array(dtype=wp.vec3),
         longest: wp.array2d(dtype=real),
     ):
-        """Treat one run (first edge, edge after its last) of a world a thread; `longest` is the longest edge of a rod [m]."""
+        """Write the swept AABB of a run (first edge, edge after its last), one thread each.
+
+        `longest`: longest edge of each rod [m].
+        """
         i = wp.tid()
         w = i / runs.shape[0]
         if not asked(tried, status, w):
@@ -151,7 +154,7 @@ def run_kernels(grouped: bool, real, serial: bool):
         tried: wp.array(dtype=int),
         status: wp.array2d(dtype=int),
     ):
-        """Treat one run of a world a thread; runs of rods that form no pairs are left out."""
+        """Mark worlds if AABBs of two rods overlap that may form pairs; one thread a run."""
         i = wp.tid()
         w = i / runs.shape[0]
         if not asked(tried, status, w) or status[MEET, w] != 0:
@@ -212,7 +215,10 @@ def run_kernels(grouped: bool, real, serial: bool):
         status: wp.array2d(dtype=int),
         loose: wp.array2d(dtype=int),
     ):
-        """Put worlds in doubt if an edge leaves the AABB of the run; mark rods `loose` if an edge differs from `tested_edges`."""
+        """Put worlds in doubt if an edge leaves the AABB of the run.
+
+        Mark rods `loose` if an edge differs from `tested_edges`.
+        """
         w, start = share(wp.tid(), sides.counts[0])
         if tried[w] == 0 or status[DOUBT, w] != 0:
             return
@@ -246,7 +252,9 @@ def run_kernels(grouped: bool, real, serial: bool):
         status: wp.array2d(dtype=int),
         tested_edges: wp.array2d(dtype=X),
     ):
-        """Put worlds in doubt if edges of one rod may be near: of loose rods, or of all if AABBs are new.
+        """Put worlds in doubt if edges of one rod may be near.
+
+        Loose rods are tested, or all if AABBs are new.
 
         `partner_range` (edges, 2): for every edge the first later edge of its rod with which it may form a pair, and the end of the
         rod.

@@ -12,7 +12,7 @@ ROWS = 3
 
 @cache
 def written_struct(real):
-    """List of pairs by first primitives (see `PairList`), `things` of them in a world, with the energy of each pair.
+    """List of pairs with energies, by first primitives, `things` in a world; see `PairList`.
 
     `used`: not zero for active pairs; `work`: work of friction, empty for contact.
     """

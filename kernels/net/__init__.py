@@ -1,1 +1,1 @@
-"""Kernels of the coupled system: elements of any kind on shared dof blocks, gathered by index, and the sparse system."""
+"""Kernels of the coupled system: elements on shared dof blocks, gathered by index, and its matrix."""

@@ -251,7 +251,10 @@ def world_kernels(real):
 
     @wp.func
     def whole(scalars: wp.array2d(dtype=real), w: int):
-        """Return True if the step is undivided: contacts along arcs are not near the straight motion of a full step."""
+        """Return True if the step is undivided.
+
+        Contacts along arcs are not near the straight motion of a full step.
+        """
         return scalars[PROGRESS, w] < real(1.0) and scalars[PORTION, w] == real(1.0)
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Residual at the dof blocks of the coupled system, and the energy change of a step; see `kernels.balance` for rods.
+"""Residual at dof blocks of the coupled system, and energy change of a step; see `kernels.balance`.
 
 Incidence lists give sums a fixed order, without atomics.
 """
@@ -15,7 +15,9 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def meeting_type(real, linear):
-    """Return the struct of contributions of an element set, with its incidence list; an item is element * `ITEM` + local node index.
+    """Return the struct of contributions of an element set.
+
+    Items of its incidence list are element * `ITEM` + local node index.
 
     `gradient`: by local nodes. Without it, `along` is the gradient by local dofs; `ends` (`Measure.ends`) are the dofs of a local node.
     """

@@ -72,7 +72,10 @@ def foresight_kernels(real, linear, serial: bool):
         blocks: int,
         weights: wp.array3d(dtype=real),
     ):
-        """Write sums over the nodes of a thread: a is the correction of the solve, b the last extrapolated acceleration."""
+        """Write sums over the nodes of a thread.
+
+        a is the correction of the solve as an acceleration, b the last extrapolated acceleration.
+        """
         w, start = share(wp.tid(), nodes)
         if moved[w] == 0:
             return

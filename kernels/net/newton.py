@@ -250,7 +250,10 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         base: wp.array(dtype=V),
         q: wp.array(dtype=V),
     ):
-        """Apply a straight update: a first one from the iterate, which becomes the base, a shortened one from the base."""
+        """Apply a straight update.
+
+        A first one starts from the iterate, which becomes the base; a shortened one from the base.
+        """
         w, start = first_item(wp.tid(), blocks)
         if todo[w] != wp.static(PLACE) and todo[w] != wp.static(STRAIGHT):
             return
@@ -402,7 +405,7 @@ def static_kernels(real, linear):
         blocks: int,
         change: wp.array2d(dtype=real),
     ):
-        """Replace the work of loads at q by the work of the mean of loads at q and at the base."""
+        """Replace the work of loads at q by the work of mean loads of q and the base."""
         i = wp.tid()
         w = i / blocks
         if status[w] == 0:

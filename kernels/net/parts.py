@@ -39,7 +39,9 @@ def part_kernel(real, linear, leaf: bool, serial: bool):
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
-        """Sum and test clusters; the level below has `below` entries a world, and `offset` is the index of the first ratio.
+        """Sum residuals over clusters and test the sums.
+
+        The level below has `below` entries a world; `offset` is the index of the first ratio.
 
         If directions are `exact`, sums after a full step need no test, as for uncoupled rods; see `kernels.balance`.
         """

@@ -46,7 +46,7 @@ def turn_kernels(real, linear, serial: bool):
         w: int,
         p: int,
     ):
-        """Return the sum over all edges of a rod before node p, less the mean over its nodes; see `offset`."""
+        """Return the sum over edges of a rod before node p, less its mean; see `offset`."""
         c = piece[p]
         return sums[w, p] + offsets[0, w, c] - offsets[1, w, c] * real(p - starts[c])
 
@@ -161,7 +161,10 @@ def turn_kernels(real, linear, serial: bool):
         sums: wp.array2d(dtype=V),
         totals_out: wp.array3d(dtype=V),
     ):
-        """Replace excesses by sums from the start of a piece; write the total of a piece, and the total of these sums."""
+        """Replace excesses by sums from the start of a piece.
+
+        Write the total of each piece, and the total of these sums.
+        """
         count = starts.shape[0] - 1
         w, start = first_item(wp.tid(), count)
         if todo[w] != wp.static(PLACE):
@@ -189,7 +192,9 @@ def turn_kernels(real, linear, serial: bool):
         totals: wp.array3d(dtype=V),
         offsets_out: wp.array3d(dtype=V),
     ):
-        """Write the offset of a piece and the decrease per node, so that sums of a rod have zero mean and closed rods close.
+        """Write the offset of a piece and the decrease per node.
+
+        With these, sums of a rod have zero mean and closed rods close.
 
         Rods with anchors do not depend on either: sums count from anchors, and the mismatch is spread evenly.
         """
