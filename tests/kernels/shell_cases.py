@@ -1,4 +1,4 @@
-"""What the tests of shells share: a launch of any term on local dofs, meshes of the unit square, and exact shapes."""
+"""Cases for shell tests: launches of any term on local dofs, meshes of the unit square, and exact shapes."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -23,7 +23,7 @@ class Elements:
     p: np.ndarray
 
     def evaluate(self, precision="float64", device="cpu") -> dict[str, np.ndarray]:
-        """energy (N, 1), gradient, strain, stress, jacobian, root and tension of the elements."""
+        """Return energy (N, 1), gradient, strain, stress, jacobian, root and tension of the elements."""
         real = wp.float32 if precision == "float32" else wp.float64
         run, shapes = _kernel(self.name, real), _shapes(self.name)
         out = [wp.zeros((len(self.q), *shape), dtype=real, device=device) for shape in shapes.values()]
@@ -31,7 +31,7 @@ class Elements:
         return {name: array.numpy().astype(float) for name, array in zip(shapes, out, strict=True)}
 
     def changed(self, **changes) -> "Elements":
-        """The same elements with other arrays."""
+        """Return the elements with some arrays replaced."""
         return Elements(**{**vars(self), **changes})
 
     def _inputs(self, real, device):
@@ -54,7 +54,7 @@ def _shapes(name):
 
 @cache
 def _kernel(name, real):
-    """Kernel of a term on arrays of local dofs: everything of first order."""
+    """Build the kernel of a term that evaluates everything of first order on arrays of local dofs."""
     term = SHELLS[name]
     n, size, coupled, tensions = (
         len(term.measure.strains),
@@ -109,7 +109,7 @@ def _kernel(name, real):
 
 
 def gather(elements, positions, angles=None) -> Elements:
-    """The elements of a set at given positions (P, 3) and angles, all zero by default."""
+    """Return the elements of a set at positions (P, 3) and angles, all zero by default."""
     measure = elements.term.measure
     count = len(elements)
     x = positions[elements.nodes]
@@ -122,9 +122,9 @@ def gather(elements, positions, angles=None) -> Elements:
 
 
 def factor(elements, local: Elements, points: int, edges: int, device) -> sparse.csr_matrix:
-    """F with F^T F the Gauss-Newton Hessian of a set: columns 3 a node, then one an edge."""
-    at, measure = local.evaluate(device=device), elements.term.measure
-    rows = at["root"] @ at["jacobian"] * np.sqrt(local.w)[:, None, None]
+    """Return F with F^T F the Gauss-Newton Hessian of a set: columns 3 a node, then one an edge."""
+    first_order, measure = local.evaluate(device=device), elements.term.measure
+    rows = first_order["root"] @ first_order["jacobian"] * np.sqrt(local.w)[:, None, None]
     axes = np.arange(3)
     columns, values = [], []
     for k, pair in enumerate(measure.edges):
@@ -135,13 +135,13 @@ def factor(elements, local: Elements, points: int, edges: int, device) -> sparse
     values.append(rows[:, :, 3 * len(measure.edges) :])
     values, columns = np.concatenate(values, axis=2), np.concatenate(columns, axis=1)
     columns = np.broadcast_to(columns[:, None], values.shape)
-    places = np.broadcast_to(np.arange(rows.shape[0] * rows.shape[1]).reshape(*rows.shape[:2], 1), values.shape)
+    row_indices = np.broadcast_to(np.arange(rows.shape[0] * rows.shape[1]).reshape(*rows.shape[:2], 1), values.shape)
     shape = (rows.shape[0] * rows.shape[1], 3 * points + edges)
-    return sparse.csr_matrix((values.ravel(), (places.ravel(), columns.ravel())), shape)
+    return sparse.csr_matrix((values.ravel(), (row_indices.ravel(), columns.ravel())), shape)
 
 
 def relaxed_angles(elements, positions, active, device) -> np.ndarray:
-    """Angles that minimise the energy at fixed positions, by Gauss and Newton; those not `active` stay zero."""
+    """Return the angles of least energy at fixed positions, by Gauss-Newton; angles outside `active` stay zero."""
     angles, chosen = np.zeros(len(active)), np.flatnonzero(active)
     for _ in range(3):
         local = gather(elements, positions, angles)
@@ -153,10 +153,10 @@ def relaxed_angles(elements, positions, active, device) -> np.ndarray:
 
 
 def square(kind: str, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P, 2) and triangles of a mesh of the unit square with n edges a side.
+    """Return points (P, 2) and triangles of a mesh of the unit square with n edges a side.
 
-    Kinds: "right" (diagonals along 45 degrees), "crossed" (diagonals alternate), "equilateral" (rows sheared to and fro, no
-    square), "jittered" ("right" with random inner points), "delaunay" (random inner points).
+    Kinds: "right" (diagonals along 45 degrees), "crossed" (diagonals alternate), "equilateral" (rows sheared to and fro, no square),
+    "jittered" ("right" with random inner points), "delaunay" (random inner points).
     """
     if kind == "delaunay":
         return _delaunay(n)
@@ -190,7 +190,7 @@ def _delaunay(n):
 
 
 def cylinder(points, angle, radius=2.0):
-    """Isometric image of a plane, bent along a direction in degrees, and its outward normals (P, 3) each."""
+    """Return the isometric image of a plane bent along a direction [deg], and outward normals (P, 3) each."""
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     u, v = points @ [c, s] / radius, points @ [-s, c]
     x, z = radius * np.sin(u), radius * (np.cos(u) - 1.0)
@@ -198,14 +198,14 @@ def cylinder(points, angle, radius=2.0):
 
 
 def sphere(points, radius=2.0):
-    """Cap over the unit square, and its outward normals."""
+    """Return a cap over the unit square, and outward normals."""
     x, y = (points - 0.5).T
     place = np.stack([x, y, np.sqrt(radius**2 - x**2 - y**2)], -1)
     return place, place / radius
 
 
 def saddle(points, k=0.02, angle=0.0):
-    """Shallow graph of curvatures k, -k along a direction in degrees, and its normals."""
+    """Return a shallow graph of curvatures k, -k along a direction [deg], and normals."""
     c, s = np.cos(2.0 * np.radians(angle)), np.sin(2.0 * np.radians(angle))
     x, y = (points - 0.5).T
     normal = np.stack([-k * (c * x + s * y), -k * (s * x - c * y), np.ones(len(x))], -1)

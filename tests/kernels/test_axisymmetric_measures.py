@@ -13,7 +13,7 @@ STATIC = [name for name in AXISYMMETRIC if "damped" not in name]
 
 
 def test_tension_completes_the_hessian(device):
-    """With what stress s around the axis adds, w s / r^2 times the square of d(r^2 / 2), it is exact; y, which is held, left out."""
+    """The hoop stress s adds w s / r^2 times the square of d(r^2 / 2), and makes the Hessian exact; the fixed y is left out."""
     (sample,) = samples_of(AXISYMMETRIC["axisymmetric_stretch"], device=device)
     whole, radial = sample.evaluate(exact=True)[0], [0, 3]  # r is the mean of both nodes'
     whole[np.ix_(radial, radial)] += 0.25 * sample.data["buffer"][0] * sample.strains()[1][2]
@@ -22,7 +22,7 @@ def test_tension_completes_the_hessian(device):
 
 
 def test_curvatures_of_a_sphere(device):
-    """At nodes of a sphere of radius 2, both 1/2 but for the order of the chords: 2 tan(d/2) / chord and cos(d/2) / 2."""
+    """Curvatures of a sphere of radius 2 are 1/2 but for the order of chords: 2 tan(d/2) / chord and cos(d/2) / 2."""
     d, start = 0.1, 0.6
     angle = start + d * np.arange(3)
     x = 2.0 * np.column_stack([np.sin(angle), 0.0 * angle, -np.cos(angle)])
@@ -34,7 +34,10 @@ def test_curvatures_of_a_sphere(device):
 
 
 def cap(reverse, device):
-    """A unit sphere's cap of 1 rad from pole to rim, or from rim to pole, under weight and a pressure of 7 Pa from outside."""
+    """Return the points and the model of a unit sphere's cap of 1 rad, from pole to rim or back.
+
+    Weight and a pressure of 7 Pa from outside act on the cap.
+    """
     angle = np.linspace(0.0, 1.0, 9)
     points = np.column_stack([np.sin(angle), np.cos(angle)])[:: -1 if reverse else 1]
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
@@ -46,8 +49,8 @@ def cap(reverse, device):
 
 
 def test_poles_rims_and_direction(device):
-    """Run from pole to rim or back: curvatures and the side of pressure change sign, energies and forces do not."""
-    seen = []
+    """A reversed meridian changes the sign of curvatures and the side of pressure, not energies and forces."""
+    results = []
     for reverse in (False, True):
         points, model = cap(reverse, device)
         tangent, state = Tangent(model), model.state()
@@ -58,21 +61,21 @@ def test_poles_rims_and_direction(device):
         moved = state.points()
         moved[:, 2] += 0.1 * np.cos(3.0 * moved[:, 0])
         moved[:, 0] *= 1.05
-        other = model.state(points=moved)
-        slope = tangent.gradient(other).reshape(-1, 3)[:: -1 if reverse else 1]
-        seen.append((np.array([model.energies(other)[name] for name in STATIC]), slope))
+        displaced = model.state(points=moved)
+        slope = tangent.gradient(displaced).reshape(-1, 3)[:: -1 if reverse else 1]
+        results.append((np.array([model.energies(displaced)[name] for name in STATIC]), slope))
         # cones of surface A: weight rho g h A; axial force of pressure p on the projected disc, p pi r^2
         forces, r = tangent.loads(1.0, tangent.dofs(state)).reshape(-1, 3), np.sin(1.0)
         surface = np.pi * ((points[1:, 0] + points[:-1, 0]) * np.linalg.norm(np.diff(points, axis=0), axis=1)).sum()
         assert forces[:, 2].sum() == pytest.approx(-98.1 * surface - 7.0 * np.pi * r**2, rel=1e-12)
-    (energy, slope), (same_energy, same_slope) = seen
+    (energy, slope), (same_energy, same_slope) = results
     assert energy.min() > 0.0
     np.testing.assert_allclose(same_energy, energy, rtol=1e-12)
     np.testing.assert_allclose(same_slope, slope, atol=1e-12 * np.abs(slope).max())
 
 
 def test_pressure_follows_with_its_exact_derivative():
-    """d(forces)/dx = central differences; between held rims the forces derive from the enclosed volume of the cones."""
+    """Derivatives of forces equal central differences; forces between fixed rims derive from the enclosed volume of the cones."""
     random = np.random.default_rng(3)
     x = np.column_stack([1.0 + random.random(6), np.zeros(6), np.arange(6.0)]) + 0.1 * random.normal(size=(6, 3))
     ends = np.column_stack([np.arange(5), np.arange(1, 6)])

@@ -1,4 +1,4 @@
-"""The chain sweep against a dense solve, its line search against energies, and three kinds of rod in a plane."""
+"""Block LDL^T sweep of a rod group against a dense solve, line search against energies, and planar rods of three kinds."""
 
 import numpy as np
 import pytest
@@ -23,9 +23,9 @@ class Problem:
     """Two open rods of 7 and 6 nodes in two worlds, at a random state, with supports, loads and rotary inertia."""
 
     def __init__(self, name, device, precision="float64", noise=0.15, inertia=2.0, seed=11, **options):
-        given = {"dimension": 3, "twist": True, "bend": True} | KINDS[name]
+        rod_options = {"dimension": 3, "twist": True, "bend": True} | KINDS[name]
         random = np.random.default_rng(seed)
-        dimension = given.pop("dimension")
+        dimension = rod_options.pop("dimension")
         across = 1.0 if dimension == 3 else 0.0
         self.scene = scene = ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
         section = ddg.Stiffness(EA=9.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
@@ -34,7 +34,7 @@ class Problem:
         for nodes in (7, 6):
             points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.3 * random.normal(size=(nodes, 3)), axis=0)
             points[:, 1] *= across
-            scene.add_rod(points, section=section, natural="straight", **given)
+            scene.add_rod(points, section=section, natural="straight", **rod_options)
         scene.fix(0, [0])
         scene.fix(0, [3, 6], components="z")
         scene.fix(1, [2], components="xy")
@@ -68,7 +68,7 @@ class Problem:
         self.newton.iterate(self.last)
 
     def dofs(self, position, angle) -> np.ndarray:
-        """(columns, n, dofs of a node) of device arrays of nodes and angles."""
+        """Return device arrays of nodes and angles as (columns, n, dofs of a node)."""
         q = np.moveaxis(arrays.download(position), 0, 1)
         return np.concatenate([q, arrays.download(angle).T[..., None]], -1) if self.kind.twist else q
 
@@ -85,16 +85,16 @@ class Problem:
         return arrays.download(self.newton.direction).transpose(2, 1, 0)
 
     def age(self, q: np.ndarray, column: int):
-        """Of a rod at q (n, dofs): cosine between tangents and lagged ones, reference twist less lagged, cosine of bends."""
+        """Return cosines to lagged tangents, twist less lagged twist, and cosines of bends of a rod at q (n, dofs)."""
         n, frame = self.count[column], arrays.download(self.newton.frame)[:, :, column]
-        t, (u0, t0) = polyline.unit(np.diff(q[:n, :3], axis=0)), (frame[at : at + 3, : n - 1].T for at in (0, 3))
+        t, (u0, t0) = polyline.unit(np.diff(q[:n, :3], axis=0)), (frame[row : row + 3, : n - 1].T for row in (0, 3))
         u = polyline.transport(u0, t0, t)
         twist = polyline.signed_angle(polyline.transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:]) - frame[6, : n - 2]
         twist -= 2.0 * np.pi * np.round(twist / (2.0 * np.pi))
         return np.sum(t * t0, -1), twist, np.sum(t[1:] * t[:-1], -1)
 
     def windows(self, k: int, n: int) -> np.ndarray:
-        """Matrix from dofs of a rod to the window of element k; what lies past the end is zero."""
+        """Return the matrix from dofs of a rod to local dofs of element k, zero beyond the end."""
         kind = self.kind
         B = np.zeros((kind.window, n, kind.block))
         for edge in range(kind.span):
@@ -107,7 +107,7 @@ class Problem:
         return B.reshape(kind.window, -1)
 
     def inertia(self, column: int):
-        """Diagonal of inertia, target, and outer force of a rod."""
+        """Return the diagonal of inertia, target, and external force of a rod."""
         host, kind, n = self.group.host, self.kind, self.count[column]
         rod, c = column % 2, float(arrays.download(self.newton.islands.coefficient)[column])
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
@@ -126,7 +126,7 @@ class Problem:
         return (bits & 1 == 0).ravel()
 
     def dense(self, column: int, q: np.ndarray):
-        """Gauss-Newton matrix and residual of a rod at q, from what the evaluate kernel wrote."""
+        """Return Gauss-Newton matrix and residual of a rod at q, from the output of the evaluate kernel."""
         kind, n = self.kind, self.count[column]
         F, g = arrays.download(self.newton.factor), arrays.download(self.newton.gradient)
         diagonal, target, force = self.inertia(column)
@@ -144,7 +144,7 @@ class Problem:
         return H, r
 
     def energy(self, q: np.ndarray) -> np.ndarray:
-        """Total energy of every column at q, elastic part from the terms' own kernels."""
+        """Return the total energy of every column at q, with the elastic energy by the terms' own kernels."""
         kind, group, newton, real = self.kind, self.group, self.newton, self.model.types.real
         kept = self.iterate_dofs()
         self.put(q)
@@ -176,14 +176,14 @@ class Problem:
 
 
 def second_order(x: np.ndarray, step: np.ndarray) -> float:
-    """How far turned edges may be from edges with their step added: turn^2 of every edge, summed along the rod."""
-    edges, turns = np.diff(x, axis=0), np.diff(step, axis=0)
-    return len(x) * (np.sum(turns**2, -1) / np.linalg.norm(edges, axis=-1)).max() + 1e-14
+    """Return a bound of the difference between edge-rotation and straight updates: squared rotations, summed along the rod."""
+    edges, edge_steps = np.diff(x, axis=0), np.diff(step, axis=0)
+    return len(x) * (np.sum(edge_steps**2, -1) / np.linalg.norm(edges, axis=-1)).max() + 1e-14
 
 
 @pytest.mark.parametrize(("name", "precision"), [*((name, "float64") for name in KINDS), ("full", "mixed")])
 def test_sweep_is_a_dense_solve(device, name, precision):
-    """Direction and Newton decrement, from the same factors and forces."""
+    """Direction and predicted decrease agree, from the same factors and forces."""
     problem = Problem(name, device, precision)
     before = problem.iterate_dofs()
     problem.iterate()
@@ -206,16 +206,16 @@ def test_sweep_is_a_dense_solve(device, name, precision):
 @EVERY_KIND
 @pytest.mark.parametrize(("noise", "inertia"), [(0.15, 2.0), (1e-3, 1e4)], ids=["far", "near"])
 def test_step_follows_the_direction(device, name, noise, inertia):
-    """Positions move along the direction to second order in the turn of edges, angles exactly, held dofs not at all."""
+    """Positions move along the direction to second order in edge rotations, angles exactly, fixed dofs not at all."""
     problem = Problem(name, device, noise=noise, inertia=inertia)
     before, dim = problem.iterate_dofs(), problem.kind.dim
     problem.iterate()
     taken = arrays.download(problem.newton.islands.step_length)[:, None, None]
     moved, step = problem.iterate_dofs() - before, problem.direction() * taken
     for column, n in enumerate(problem.count):
-        held = ~problem.free(column).reshape(n, -1)
+        fixed = ~problem.free(column).reshape(n, -1)
         assert np.abs(step[column, :n]).max() > 1e-6
-        assert (moved[column, :n][held] == 0.0).all()
+        assert (moved[column, :n][fixed] == 0.0).all()
         np.testing.assert_allclose(moved[column, :n, dim:], step[column, :n, dim:], rtol=0, atol=1e-14)
         error = np.abs(moved[column, :n] - step[column, :n]).max()
         assert error <= second_order(before[column, :n, :dim], step[column, :n, :dim])
@@ -223,21 +223,21 @@ def test_step_follows_the_direction(device, name, noise, inertia):
 
 @EVERY_KIND
 def test_rotation_cap(device, name):
-    """No edge turns by more than the cap in an update, and only as many are shortened as must be."""
+    """No edge rotates by more than the cap in an update, and no update is shortened needlessly."""
     cap = 0.02
     problem = Problem(name, device, rotation_cap=cap)
     before, dim = problem.iterate_dofs(), problem.kind.dim
     problem.iterate()
     direction, taken = problem.direction(), arrays.download(problem.newton.islands.step_length)
     for column, n in enumerate(problem.count):
-        edges, turns = (np.diff(v[column, :n, :dim], axis=0) for v in (before, direction))
-        worst = (np.linalg.norm(turns, axis=1) / np.linalg.norm(edges, axis=1)).max()
+        edges, edge_steps = (np.diff(v[column, :n, :dim], axis=0) for v in (before, direction))
+        worst = (np.linalg.norm(edge_steps, axis=1) / np.linalg.norm(edges, axis=1)).max()
         np.testing.assert_allclose(taken[column], min(1.0, cap / worst), rtol=1e-12)
 
 
 @EVERY_KIND
 def test_too_long_a_step_is_shortened_by_the_energy(device, name):
-    """Thrice the Newton step overshoots. The sweep goes back to a parabola's minimum, which tells its energy change."""
+    """Thrice the Newton step overshoots. The sweep goes back to the minimum of a parabola, which gives the energy change."""
     problem = Problem(name, device, noise=0.05, inertia=1e3)
     newton, start = problem.newton, problem.iterate_dofs()
     problem.iterate()
@@ -253,8 +253,8 @@ def test_too_long_a_step_is_shortened_by_the_energy(device, name):
     assert (
         (0.31 < shorter) & (shorter < 1.49)
     ).all()  # strictly between a tenth and half, so that the parabola decided
-    found = 3.0 * decrement * (1.5 / shorter - 1.0)  # shorter = -slope / 2 (change - slope) of the step
-    np.testing.assert_allclose(found, change, rtol=1e-10)
+    model_change = 3.0 * decrement * (1.5 / shorter - 1.0)  # shorter = -slope / 2 (change - slope) of the step
+    np.testing.assert_allclose(model_change, change, rtol=1e-10)
     moved, step, dim = problem.iterate_dofs() - start, shorter[:, None, None] * direction, problem.kind.dim
     for column, n in enumerate(problem.count):
         error = np.abs(moved[column, :n] - step[column, :n]).max()
@@ -266,7 +266,7 @@ def test_too_long_a_step_is_shortened_by_the_energy(device, name):
 
 @EVERY_KIND
 def test_accepted_steps_lower_the_energy(device, name):
-    """From far away: rejected steps get shorter, accepted ones decrease the energy, and all rods converge."""
+    """Rejected steps from far away get shorter, accepted steps decrease the energy, and all rods converge."""
     problem = Problem(name, device, noise=0.6, inertia=0.02, rotation_cap=100.0, max_iterations=100)
     newton = problem.newton
     trial = problem.iterate_dofs()
@@ -278,40 +278,40 @@ def test_accepted_steps_lower_the_energy(device, name):
         if not active.any():
             break
         energy, new_length = problem.energy(trial), arrays.download(newton.islands.step_length)
-        now = arrays.download(newton.islands.iteration)
+        current = arrays.download(newton.islands.iteration)
         for column in np.flatnonzero(active):
-            if now[column] > iteration[column]:
+            if current[column] > iteration[column]:
                 assert energy[column] <= lowest[column] + 1e-12 * abs(lowest[column])
                 lowest[column] = energy[column]
             else:
                 assert new_length[column] <= 0.5 * length[column]
                 rejected += 1
-        trial, length, iteration = problem.iterate_dofs(), new_length, now
+        trial, length, iteration = problem.iterate_dofs(), new_length, current
     assert set(arrays.download(newton.islands.status)) <= {outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING}
     assert rejected > 0 or name == "untwisted"  # where every step is a good one
     assert (iteration > 2).all()
 
 
 def aged(problem, aim) -> np.ndarray:
-    """Iterate with the two last edges of every rod turned at random, until aim(cosine, twist) of every rod is met."""
-    random = np.random.default_rng(0)
+    """Return an iterate with the last two edges of every rod rotated at random until aim(cosine, twist) holds."""
+    rng = np.random.default_rng(0)
     start = problem.iterate_dofs()
-    found = start.copy()
+    iterate = start.copy()
     for column, n in enumerate(problem.count):
         for _ in range(20000):
             q = start[column].copy()
             edges = np.diff(q[:n, :3], axis=0)
             length = np.linalg.norm(edges[-2:], axis=-1, keepdims=True)
-            edges[-2:] = length * polyline.unit(edges[-2:] / length + 1.5 * random.normal(size=(2, 3)))
+            edges[-2:] = length * polyline.unit(edges[-2:] / length + 1.5 * rng.normal(size=(2, 3)))
             q[1:n, :3] = q[0, :3] + np.cumsum(edges, axis=0)
             cosine, twist, fold = problem.age(q, column)
             if aim(cosine, twist) and fold.min() > -0.95:
-                found[column] = q
+                iterate[column] = q
                 break
         else:
             raise AssertionError("no such state")
-    problem.put(found)
-    return found
+    problem.put(iterate)
+    return iterate
 
 
 AGED = {
@@ -322,9 +322,9 @@ AGED = {
 
 @pytest.mark.parametrize("case", AGED)
 def test_old_frames_are_lagged_anew(device, case):
-    """Frames are lagged anew where an edge, the last one too, has turned by 90 degrees, or the twist nears its jump at pi.
+    """Frames are updated where an edge, the last one too, has rotated by 90 degrees, or the twist nears the jump at pi.
 
-    Energies stay, and the step goes downhill in the new frames as the decrement promises.
+    Energies stay, and the step goes downhill in the new frames by the predicted decrease.
     """
     problem = Problem("full", device, noise=0.1)
     newton, start = problem.newton, aged(problem, AGED[case])
@@ -343,7 +343,7 @@ def test_old_frames_are_lagged_anew(device, case):
 
 
 def tip(device, **options) -> np.ndarray:
-    """Tip of a cantilever in the plane of x and z after 20 steps."""
+    """Return the tip of a cantilever in the plane of x and z after 20 steps."""
     chosen = dict(options)
     scene = ddg.Scene(gravity=(1.0, 0.0, -9.81), dimension=chosen.pop("dimension", 3))
     points = np.zeros((10, 3))
@@ -368,7 +368,7 @@ def test_planar_untwisted_and_full_rods_agree(device):
 
 
 def test_indefinite_by_compression_is_clamped(device):
-    """A rod pressed past its buckling load in one step: the sweep asks for the matrix without compression, then goes on."""
+    """A rod is loaded beyond the buckling load in one step: the sweep takes the matrix without compression, then goes on."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3))
     points = np.zeros((12, 3))
     points[:, 0] = np.linspace(0.0, 1.0, 12)

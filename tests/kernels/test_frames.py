@@ -1,4 +1,4 @@
-"""Transport, reference twist and rotation of frames against what defines them."""
+"""Parallel transport, reference twist and rotation of frames against defining properties."""
 
 from functools import cache
 
@@ -14,7 +14,7 @@ REALS = pytest.mark.parametrize("real", [wp.float64, wp.float32], ids=["float64"
 
 @cache
 def kernels(real):
-    """Kernels that apply the device functions to arrays."""
+    """Build kernels that apply the device functions to arrays."""
     V = wp.types.vector(3, real)
     transport, reference_twist, rotate = frames.functions(real)
 
@@ -53,7 +53,7 @@ def apply(kernel, real, device, *values):
 
 
 def directions(count=200, seed=1):
-    """Pairs of unit tangents, and vectors of any length and direction."""
+    """Return pairs of unit tangents, and vectors of any length and direction."""
     random = np.random.default_rng(seed)
     t0, t1 = unit(random.normal(size=(2, count, 3)))
     t1[0] = t0[0]  # no rotation at all
@@ -79,7 +79,7 @@ def test_transport_takes_tangent_to_tangent(device, real):
 
 @REALS
 def test_transport_is_a_rotation(device, real):
-    """Lengths and angles stay, and what is perpendicular to both tangents does not move."""
+    """Lengths and angles stay, and a vector perpendicular to both tangents does not move."""
     t0, t1, d = directions()
     carry = kernels(real)[0]
     e = np.random.default_rng(3).normal(size=d.shape)
@@ -106,7 +106,6 @@ def test_transport_there_and_back(device, real):
 
 @REALS
 def test_rotate(device, real):
-    """Against Rodrigues' formula with a matrix."""
     t, _, _ = directions()
     d = perpendicular(t)
     angle = np.linspace(-7.0, 7.0, len(t))
@@ -118,7 +117,7 @@ def test_rotate(device, real):
 
 @REALS
 def test_reference_twist_continues_past_pi(device, real):
-    """A frame that turns steadily: followed in small steps, the twist grows through five turns without a jump."""
+    """A frame rotates steadily: in small steps the twist grows through five revolutions without a jump."""
     carry, twist, spin = kernels(real)
     te, tf, _ = directions(40)
     ue = perpendicular(te)

@@ -1,4 +1,4 @@
-"""L D L^T of a node's block and what follows from it, against NumPy."""
+"""LDL^T of a node's block, triangular solves and congruences, against NumPy."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ COUNT = 100
 
 @cache
 def kernels(size, real):
-    """Kernels that apply the device functions to arrays."""
+    """Build kernels that apply the device functions to arrays."""
     H, M = wp.types.vector(size, real), wp.types.matrix((size, size), real)
     factor, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(size, real)
 
@@ -50,7 +50,7 @@ def kernels(size, real):
 
 
 def solve(A, B, b, real, device):
-    """All results of the kernel by name, in float64; L with its unit diagonal."""
+    """Return all results of the kernel by name, in float64, and L with a unit diagonal."""
     size = A.shape[-1]
     kernel = kernels(size, real)
     names = [argument.label for argument in kernel.adj.args]
@@ -64,7 +64,7 @@ def solve(A, B, b, real, device):
 
 
 def blocks(size, condition, real, seed=0):
-    """Symmetric positive definite blocks, rounded to `real`, and right sides."""
+    """Return symmetric positive definite blocks, rounded to `real`, and right-hand sides."""
     random = np.random.default_rng(seed)
     q, _ = np.linalg.qr(random.normal(size=(COUNT, size, size)))
     spectrum = np.geomspace(1.0, 1.0 / condition, size)
@@ -76,7 +76,7 @@ def blocks(size, condition, real, seed=0):
 
 
 def backward_error(A, x, b):
-    """|A x - b| over |A| |x| + |b|, largest of all blocks."""
+    """Return |A x - b| over |A| |x| + |b|, largest of all blocks."""
     x, b = x.reshape(*A.shape[:2], -1), b.reshape(*A.shape[:2], -1)
     residual = np.linalg.norm(A @ x - b, axis=1)
     scale = np.linalg.norm(A, axis=(1, 2))[:, None] * np.linalg.norm(x, axis=1) + np.linalg.norm(b, axis=1)
@@ -110,7 +110,7 @@ def test_ill_conditioned_blocks_keep_a_small_backward_error(device, size, real, 
     assert (got["lost"] == 0).all()
     assert backward_error(A, got["x"], b) < 20.0 * eps
     assert backward_error(A, got["X"], B) < 20.0 * eps
-    assert np.linalg.cond(A).min() > 0.5 * condition  # the blocks are what they should be
+    assert np.linalg.cond(A).min() > 0.5 * condition  # the blocks are as ill-conditioned as intended
 
 
 @SIZES
@@ -138,15 +138,15 @@ def test_stretching_beside_bending(device, size, real):
 @SIZES
 @REALS
 def test_lost_pivots_are_counted(device, size, real):
-    """One negative, two negative, one zero and one drowned pivot; what comes out stays finite and positive."""
+    """One negative, two negative, one zero and one pivot below the rounding floor; results stay finite and positive."""
     tiny = 0.1 * np.finfo(wp.dtype_to_numpy(real)).eps
-    one, two, zero, drowned = (np.eye(size) for _ in range(4))
+    one, two, zero, rounded = (np.eye(size) for _ in range(4))
     one[-1, -1] = -2.0
     two[0, 0] = two[-1, -1] = -1.0
     zero[0, 0] = 0.0
-    drowned[-1, -1] = 1.0
-    drowned[-1, 0] = drowned[0, -1] = np.sqrt(1.0 - tiny)
-    A = np.array([np.eye(size), one, two, zero, drowned])
+    rounded[-1, -1] = 1.0
+    rounded[-1, 0] = rounded[0, -1] = np.sqrt(1.0 - tiny)
+    A = np.array([np.eye(size), one, two, zero, rounded])
     B, b = np.broadcast_to(np.eye(size), A.shape).copy(), np.ones((len(A), size))
     got = solve(A, B, b, real, device)
     assert got["lost"].tolist() == [0, 1, 2, 1, 1]

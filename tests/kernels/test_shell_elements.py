@@ -1,4 +1,4 @@
-"""Element sets of shells: what the host computes is what the kernels do; rest shapes, supports, materials and refusals."""
+"""Element sets of shells: agreement of host and kernels, rest shapes, supports, materials and refusals."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ UNIT_D = 12.0 * (1.0 - NU**2)  # Young's modulus of a plate of thickness 1 with 
 
 
 def patch(supported=True):
-    """A random surface of 18 triangles with every kind of edge, clamped inside too."""
+    """Return a random surface of 18 triangles with every kind of edge, clamped inside, too."""
     points, triangles = square("jittered", 3)
     surface = Surface(triangles)
     place = np.concatenate([points, points[:, :1] * points[:, 1:]], 1)
@@ -30,12 +30,12 @@ def patch(supported=True):
 
 
 @pytest.mark.parametrize(
-    ("bending", "turn"), [("midedge_dof", (1, 1, 0, 0)), ("midedge_boundary", (1, 0, 0, 0)), ("midedge", (0, 0, 0, 0))]
+    ("bending", "flags"), [("midedge_dof", (1, 1, 0, 0)), ("midedge_boundary", (1, 0, 0, 0)), ("midedge", (0, 0, 0, 0))]
 )
-def test_edges_that_turn(bending, turn):
-    """By kind of the edge: free, with a neighbour, clamped, symmetry."""
+def test_edges_that_turn(bending, flags):
+    """Flags are by kind of edge: free, with a neighbour, clamped, symmetry."""
     *_, kinds = patch()
-    assert np.array_equal(shells.turning(kinds, bending), np.array(turn, bool)[kinds.kind])
+    assert np.array_equal(shells.turning(kinds, bending), np.array(flags, bool)[kinds.kind])
 
 
 def test_second_form_is_the_measure(device):
@@ -66,7 +66,7 @@ def test_second_form_is_the_measure(device):
     ],
 )
 def test_no_force_at_rest(device, bending, membrane, viscosity):
-    """With rest="shape", supports included, the shape itself bears no force; elsewhere it does."""
+    """A shape with rest="shape" bears no force, supports included; a displaced shape does."""
     surface, place, kinds = patch()
     plate = shells.plate(surface, place, 0.3, UNIT_D, NU, kinds, "shape", viscosity)
     moved = place + 0.1 * np.random.default_rng(6).normal(size=place.shape)
@@ -76,7 +76,7 @@ def test_no_force_at_rest(device, bending, membrane, viscosity):
 
 
 def at_rest(elements, place, device):
-    """Local elements; damped ones without change of strain since the last step."""
+    """Return local elements, damped ones without change of strain since the last step."""
     local = gather(elements, place)
     if not elements.term.density.lagged:
         return local
@@ -88,7 +88,7 @@ def at_rest(elements, place, device):
 
 @pytest.mark.parametrize("bending", ["midedge", "midedge_dof", "hinge"])
 def test_symmetry_plane_is_half_of_the_whole(device, bending):
-    """A surface mirrored at x = 0 has twice the energy of its half with that plane as support, and of no other half."""
+    """A surface mirrored at x = 0 has twice the energy of a half with that plane as support; a free half has less."""
     points, triangles = square("delaunay", 4)
     half = np.concatenate([points, 0.3 * np.cos(2.0 * points[:, :1]) + 0.2 * points[:, 1:] ** 2], 1)
     on = points[:, 0] < 1e-12
@@ -143,7 +143,7 @@ def test_explicit_rest_shape_and_material_of_each_triangle(device):
 
 
 def test_damping_is_a_scaled_step(device):
-    """From rest, the dissipation potential of a step of length h adds viscosity / h times the elastic energy."""
+    """A step of length h from rest adds viscosity / h times the elastic energy as dissipation potential."""
     surface, place, kinds = patch()
     moved = place + 0.1 * np.random.default_rng(6).normal(size=place.shape)
     for bending in ("midedge", "hinge"):

@@ -8,24 +8,24 @@ from ddg_warp.kernels.terms import SHELLS
 from ddg_warp.run import derivatives
 
 COUNT = 8
-# Each has kernels of its own, which are those of the derivative table: every day those of its tests of every day.
+# Every term compiles the kernels of the derivative table, so that tests of the same terms are not slow here and there.
 DAILY = ("shell_stretch_damped", "shell_stretch_curved", "shell_hinge_damped", "shell_tilt", "shell_isometric")
 FLAT = {"shell_stretch", "shell_stretch_damped", "shell_isometric", "shell_isometric_damped"}  # without angles
 
 
 def cases(names):
-    """Names of terms, those slow that are not of every day."""
+    """Return names of terms as parameters, slow outside `DAILY`."""
     return [pytest.param(name, marks=() if name in DAILY else pytest.mark.slow) for name in names]
 
 
 def sample_of(name: str, device: str, precision: str = "float64") -> derivatives.Sample:
-    """The random elements of the derivative table."""
+    """Return the random elements of the derivative table."""
     (sample,) = derivatives.samples_of(SHELLS[name], precision, device)
     return sample
 
 
 def strains(name: str, device: str, nodes, angles: int = 0, data=None) -> np.ndarray:
-    """Strains (8, strains) of elements with nodes (8 or 1, nodes, 3), angles of zero and data (8 or 1, data)."""
+    """Return strains (8, strains) of elements with nodes (8 or 1, nodes, 3), angles of zero and data (8 or 1, data)."""
     q = np.broadcast_to(nodes, (COUNT, *np.shape(nodes)[1:])).transpose(1, 0, 2).reshape(-1, 3)
     data = np.broadcast_to([[0.0]] if data is None else data, (COUNT, 1 if data is None else np.shape(data)[1])).T
     q = np.concatenate([q, np.zeros((angles * COUNT, 3))])
@@ -33,7 +33,7 @@ def strains(name: str, device: str, nodes, angles: int = 0, data=None) -> np.nda
 
 
 def folded(name: str, device: str) -> derivatives.Sample:
-    """The sample with edges folded by 90 to 170 degrees, to either side, and clamped normals as far from the triangles'."""
+    """Return the sample with edges folded by 90 to 170 degrees, to either side, and clamped normals as far from the triangles'."""
     sample, random = sample_of(name, device), np.random.default_rng(3)
     q, data = sample.data["q"].copy(), sample.data["constants"].copy()
     x = q[sample.slots]
@@ -54,13 +54,13 @@ def folded(name: str, device: str) -> derivatives.Sample:
 
 
 def turned(vectors, axes, angles):
-    """Vectors square to axes, turned about them."""
+    """Return vectors rotated about perpendicular axes."""
     return vectors * np.cos(angles) + np.cross(axes, vectors) * np.sin(angles)
 
 
 @pytest.mark.parametrize("name", cases(name for name in SHELLS if name not in FLAT))
 def test_derivatives_of_folds(device, name):
-    """At 90 to 170 degrees: reverse mode, differences and the hand-derived Jacobian agree as at small angles."""
+    """Reverse mode, differences and the hand-derived Jacobian agree at folds of 90 to 170 degrees."""
     sample = folded(name, device)
     if sample.measure.name in ("hinge_angle", "edge_tilt"):
         halved = (sample.measure.name == "edge_tilt") & (sample.data["constants"][0] > 2.5)
@@ -83,8 +83,8 @@ def test_curvature_grows_with_the_fold(device, kind):
     normal = np.stack([zero, -np.sin(angles), np.cos(angles)], -1)
     data = np.concatenate([np.tile([0.0, 0.0, kind], (8, 1)), np.zeros((8, 6)), normal, np.ones((8, 3))], 1)
     expected = -2.0 * 0.5 * angles * (0.5 if kind == 1 else 1.0)
-    found = strains("shell_bend_dof", device, nodes, angles=3, data=data)
-    np.testing.assert_allclose(found, np.outer(expected, [0.0, 0.0, 1.0]), atol=1e-14)
+    measured = strains("shell_bend_dof", device, nodes, angles=3, data=data)
+    np.testing.assert_allclose(measured, np.outer(expected, [0.0, 0.0, 1.0]), atol=1e-14)
 
 
 @pytest.mark.parametrize("name", cases(["shell_stretch", "shell_stretch_damped"]))
@@ -99,12 +99,12 @@ def test_tension_completes_the_hessian(device, name):
 def test_degenerate(device, name, precision):
     """Triangles without area, folded onto each other or inverted give finite values; edges keep their length."""
     sample = sample_of(name, device, precision)
-    q, (first, second, corner, *behind) = sample.data["q"].copy(), sample.slots[: sample.measure.nodes]
+    q, (first, second, corner, *opposite) = sample.data["q"].copy(), sample.slots[: sample.measure.nodes]
     q[corner[:2]] = 0.5 * (q[first[:2]] + q[second[:2]])  # on the edge
     q[corner[2:4]] = 2.0 * q[first[2:4]] - q[corner[2:4]]  # inverted
-    if behind:
-        q[behind[-1][4:6]] = q[corner[4:6]]  # folded: the corner behind is the corner
-        q[behind[-1][6:8]] = 0.5 * (q[first[6:8]] + q[second[6:8]])  # a neighbour without area
+    if opposite:
+        q[opposite[-1][4:6]] = q[corner[4:6]]  # folded: both opposite corners coincide
+        q[opposite[-1][6:8]] = 0.5 * (q[first[6:8]] + q[second[6:8]])  # a neighbour without area
     sample = sample.like({**sample.data, "q": q})
     for values in (sample.energy(sample.real), sample.gradient(sample.real), *sample.strains(), *sample.evaluate()):
         assert np.isfinite(values).all()
@@ -112,7 +112,7 @@ def test_degenerate(device, name, precision):
 
 @pytest.mark.parametrize(("kind", "vector"), [(2, (0.0, 0.0, 1.0)), (3, (0.0, 1.0, 0.0))])
 def test_tilt_is_half_the_mirrored_hinge(device, kind, vector):
-    """A triangle that rises by the angle b from its edge along x: alpha = -b at a clamp to z, -b at the plane y = 0."""
+    """A triangle rises by the angle b from an edge along x: alpha = -b at a clamp to z, -b at the plane y = 0."""
     b = 0.3
     nodes = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, np.cos(b), np.sin(b)], [0.4, -np.cos(b), np.sin(b)]]
     tilt = strains("shell_tilt", device, [nodes[:3]], data=[[kind, *vector]])

@@ -1,7 +1,10 @@
 """Energies of exact shapes by every bending model, with observed orders, against closed forms.
 
-Energy per area of a plate that is flat at rest, with D = E h^3 / (12 (1 - nu^2)): D/2 [(tr b)^2 - 2 (1 - nu) det b], so
-D / (2 R^2) on a cylinder, D (1 + nu) / R^2 on a sphere, D (1 - nu) k^2 on a saddle of curvatures k, -k.
+Energy per area of a plate that is flat at rest, with D = E h^3 / (12 (1 - nu^2)):
+
+    D/2 [(tr b)^2 - 2 (1 - nu) det b]
+
+That is D / (2 R^2) on a cylinder, D (1 + nu) / R^2 on a sphere, and D (1 - nu) k^2 on a saddle of curvatures k, -k.
 """
 
 import numpy as np
@@ -29,8 +32,10 @@ def flat_plate(surface, place, kinds):
 
 
 def relative_error(mesh, n, shape, bending, device, supported):
-    """Relative error of the energy per area: of the whole square, clamped to the exact normals all around; or of the triangles
-    inside [0.2, 0.8]^2 of a free one."""
+    """Return the relative error of the energy per area.
+
+    A supported square counts whole, clamped to the exact normals all around; a free one counts by the triangles inside [0.2, 0.8]^2.
+    """
     points, triangles = square(mesh, n)
     surface = Surface(triangles)
     exact, reference = SHAPES[shape]
@@ -49,10 +54,10 @@ def relative_error(mesh, n, shape, bending, device, supported):
 
 
 def chords(mesh, n):
-    """Relative error that the angles between the longest facets of a mesh, as long at rest as they are, make in the energy.
+    """Return the relative error of the energy due to angles between the longest facets of a mesh, undeformed in length.
 
-    Facets of length s along a circle turn by 2 x from one to the next, sin x = s / (2 R). That is the curvature 2 x / s for 1 / R, and
-    its square is too large by (x / sin x)^2 - 1 = s^2 / (12 R^2).
+    Facets of length s along a circle rotate by 2 x from one to the next, sin x = s / (2 R). That is the curvature 2 x / s for 1 / R,
+    and the square is too large by (x / sin x)^2 - 1 = s^2 / (12 R^2).
     """
     points, triangles = square(mesh, n)
     sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
@@ -66,9 +71,10 @@ def order(counts, errors):
 @pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45"])
 @pytest.mark.parametrize("mesh", ["right", "jittered"])
 def test_curved_membrane_bends_without_stretch(device, mesh, shape):
-    """A sheet rolled up isometrically: facets have strains of order 2 in their size, arcs over their sides of order 3 or more.
+    """A sheet is rolled up isometrically: facets have strains of order 2 in the size, arcs over the sides of order 3 or more.
 
-    Energies go with the squares. Free sheets, whose mid-edge normals are those of least bending energy; triangles in the middle.
+    Energies go with the squares. The sheets are free, with mid-edge normals of least bending energy, and triangles in the middle
+    count.
     """
     counts, energies = (8, 16, 32), {"flat": [], "curved": []}
     for n in counts:
@@ -98,7 +104,7 @@ def test_turning_normals_have_order_two(device, mesh, shape):
 
 
 def test_facets_one_behind_the_other(device):
-    """Cells along the cylinder: the error is that of the angles alone, s^2 / (12 R^2) with s the side of a cell."""
+    """Cells lie along the cylinder: the error is that of the angles alone, s^2 / (12 R^2) with s the side of a cell."""
     for n in (6, 12, 24):
         error = relative_error("crossed", n, "cylinder 0", "midedge_dof", device, supported=True)
         assert error == pytest.approx(1.0 / (12.0 * RADIUS**2 * n**2), rel=0.01)
@@ -133,7 +139,7 @@ def test_averaged_normals_do_not_converge_where_diagonals_alternate(device, mesh
 
 
 def conversion(mesh, place, bending, device):
-    """Energy per area of hinges with k = 1 over whole periods of the mesh."""
+    """Return the energy per area of hinges with k = 1 over whole periods of the mesh."""
     points, triangles = square(mesh, 20)
     surface = Surface(triangles)
     place = place(points)
@@ -146,9 +152,9 @@ def conversion(mesh, place, bending, device):
     return gather(bend, place).evaluate(device=device)["energy"][inside, 0].sum() / size.prod()
 
 
-# D_eff = 2 energy / k^2 of cylinders by direction, and energies / k^2 of sphere and saddles, for K_e = 3 |e|^2 / A_e with A_e the
-# area of both triangles: slope jumps of a quadratic patch; the equilateral mesh agrees with Seung and Nelson (1988), who find
-# the Gaussian modulus -(4/3) D, so nu = -1/3: sphere D (1 + nu) = 2, saddle D (1 - nu) = 4.
+# Energies 2 energy / k^2 = D_eff of cylinders by direction, and energy / k^2 of sphere and saddles, for K_e = 3 |e|^2 / A_e. A_e is
+# the area of both triangles; values are slope jumps of a quadratic patch. The equilateral mesh agrees with Seung and Nelson (1988): a
+# Gaussian modulus of -(4/3) D, so nu = -1/3, sphere D (1 + nu) = 2, saddle D (1 - nu) = 4.
 CONVERSION = {
     ("equilateral", 0): 3.0,
     ("equilateral", 45): 3.0,

@@ -16,7 +16,7 @@ CENTRE = {
 
 
 def deflection(mesh, n, case, bending, device):
-    """Relative error of the deflection under unit pressure in the middle, or at the pulled corner of a twisted plate."""
+    """Return the relative error of the deflection in the middle under unit pressure, or at the corner of a twisted plate."""
     points, triangles = square(mesh, n)
     surface, flat = Surface(triangles), np.pad(points, ((0, 0), (0, 1)))
     edges = np.flatnonzero(surface.boundary) if case == "clamped" else []
@@ -27,7 +27,7 @@ def deflection(mesh, n, case, bending, device):
     along = (points < 1e-9) | (points > 1.0 - 1e-9)
     load = np.bincount(triangles.ravel(), np.repeat(plate.area / 3.0, 3))
     free, middle, exact = ~along.any(1), np.argmin(((points - 0.5) ** 2).sum(1)), CENTRE.get(case)
-    if case == "twisted":  # three corners held, the fourth pulled by 1: w = x y / (2 D (1 - nu))
+    if case == "twisted":  # three corners fixed, the fourth pulled by 1: w = x y / (2 D (1 - nu))
         middle = np.argmax(points.sum(1))
         free, load, exact = ~along.all(1), np.zeros(len(points)), 0.5 / (1.0 - NU)
         free[middle], load[middle] = True, 1.0
@@ -79,6 +79,6 @@ def test_twist_is_exact_with_normals_that_turn_at_free_edges(device):
 
 @pytest.mark.parametrize("bending", ["midedge", "hinge"])
 def test_alternating_diagonals_are_too_stiff_in_twist(device, bending):
-    """Averaged normals and hinges twist (1 - nu) / 2 = 0.35 times as far as they should, whatever the size of the mesh."""
+    """Averaged normals and hinges twist (1 - nu) / 2 = 0.35 times as far as exact, at any size of the mesh."""
     for n in (8, 16):
         assert abs(deflection("crossed", n, "twisted", bending, device) + 0.65) < 1e-3
