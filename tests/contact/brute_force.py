@@ -1,11 +1,11 @@
-"""Scenes for the contact search, and what it should find, by all pairs in NumPy."""
+"""Random scenes for the contact search, and the expected pairs by all pairs in NumPy."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp.solve.contact.shapes import BALLS, Shapes
 
-SIDES = ((2, 2), (1, 3))  # numbers of nodes of what is paired, where there are no balls
+SIDES = ((2, 2), (1, 3))  # numbers of nodes of the two primitives of a pair, without balls
 
 
 def upload(x: np.ndarray, device: str, dtype=wp.vec3d) -> wp.array:
@@ -13,24 +13,24 @@ def upload(x: np.ndarray, device: str, dtype=wp.vec3d) -> wp.array:
 
 
 def listed(search) -> list[np.ndarray]:
-    """Pairs of each list (n, 2), as they are ordered."""
+    """Return the pairs (n, 2) of each candidate list, in order."""
     return [pairs.pairs.numpy()[: pairs.count.numpy()[0]] for pairs in search.lists]
 
 
 def curves(rng, rods: int, nodes: int, spread: float, step: float) -> np.ndarray:
-    """Random walks that keep their direction for a while, from starts within a cube (rods * nodes, 3)."""
+    """Return random walks with a persistent direction from starts within a cube (rods * nodes, 3)."""
     steps = rng.normal(size=(rods, nodes, 3)).cumsum(axis=1)
     steps *= step / np.linalg.norm(steps, axis=2, keepdims=True)
     return (rng.uniform(0.0, spread, (rods, 1, 3)) + steps.cumsum(axis=1)).reshape(-1, 3)
 
 
 def soup(rng, triangles: int, spread: float, size: float) -> np.ndarray:
-    """Corners of loose triangles (3 * triangles, 3)."""
+    """Return the corners of disjoint triangles (3 * triangles, 3)."""
     return (rng.uniform(0.0, spread, (triangles, 1, 3)) + rng.uniform(-size, size, (triangles, 3, 3))).reshape(-1, 3)
 
 
 def scene(seed: int, spread: float, rods: int = 50, nodes: int = 21, triangles: int = 500) -> tuple[Shapes, np.ndarray]:
-    """Rods of 1,000 edges and 500 triangles in all, the latter of five shells."""
+    """Return rods of 1,000 edges in all and 500 triangles of five shells, and the points."""
     rng = np.random.default_rng(seed)
     points = np.concatenate([curves(rng, rods, nodes, spread, 0.05), soup(rng, triangles, spread, 0.04)])
     shapes = Shapes(points)
@@ -43,7 +43,7 @@ def scene(seed: int, spread: float, rods: int = 50, nodes: int = 21, triangles: 
 
 
 def point_edge(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distances of points from edges (..., 3)."""
+    """Return the distances of points from edges (..., 3)."""
     u = b - a
     square = np.maximum((u * u).sum(-1), 1e-300)
     s = np.clip(((p - a) * u).sum(-1) / square, 0.0, 1.0)
@@ -51,7 +51,7 @@ def point_edge(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def edge_edge(a0, a1, b0, b1) -> np.ndarray:
-    """Distances of edges (..., 3): the least from an end, or that of the lines where the closest points lie inside of both."""
+    """Return the distances of edges (..., 3): from an end, or between the lines where both closest points are interior."""
     ends = [point_edge(a0, b0, b1), point_edge(a1, b0, b1), point_edge(b0, a0, a1), point_edge(b1, a0, a1)]
     best = np.min(ends, axis=0)
     u, v, w = a1 - a0, b1 - b0, b0 - a0
@@ -68,7 +68,7 @@ def edge_edge(a0, a1, b0, b1) -> np.ndarray:
 
 
 def point_triangle(p, a, b, c) -> np.ndarray:
-    """Distances of points from triangles (..., 3)."""
+    """Return the distances of points from triangles (..., 3)."""
     best = np.min([point_edge(p, a, b), point_edge(p, b, c), point_edge(p, c, a)], axis=0)
     n = np.cross(b - a, c - a)
     length = np.linalg.norm(n, axis=-1)
@@ -82,7 +82,7 @@ def point_triangle(p, a, b, c) -> np.ndarray:
 
 
 def allowed(shapes: Shapes, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of things by their numbers of nodes, none of them excluded: indices (n,), (n,)."""
+    """Return the indices (n,), (n,) of pairs of primitives that are not excluded, by numbers of nodes."""
     nodes_a, _, owner_a, span_a = shapes.things(first)
     nodes_b, _, owner_b, _ = shapes.things(second)
     fits = ~(nodes_a[:, None, :, None] == nodes_b[None, :, None, :]).any((2, 3))
@@ -103,7 +103,7 @@ def allowed(shapes: Shapes, first: int, second: int) -> tuple[np.ndarray, np.nda
 
 
 def distances(shapes: Shapes, x: np.ndarray, first: int, second: int, i, j) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and thicknesses (n,) of pairs."""
+    """Return the distances and thicknesses (n,) of pairs."""
     nodes_a, radius_a, *_ = shapes.things(first)
     nodes_b, radius_b, *_ = shapes.things(second)
     corners = [*np.moveaxis(x[nodes_a[i]], 1, 0), *np.moveaxis(x[nodes_b[j]], 1, 0)]
@@ -113,15 +113,15 @@ def distances(shapes: Shapes, x: np.ndarray, first: int, second: int, i, j) -> t
 
 
 def near(shapes: Shapes, x: np.ndarray, first: int, second: int, reach: float) -> set[tuple[int, int]]:
-    """Pairs with a gap of at most `reach`."""
+    """Return the pairs with a gap of at most `reach`."""
     i, j = allowed(shapes, first, second)
     balls = []
     for size in (first, second):
         nodes, radius, *_ = shapes.things(size)
         middle = x[nodes].mean(1)
         balls.append((middle, np.linalg.norm(x[nodes] - middle[:, None], axis=2).max(1) + radius))
-    (a, at), (b, bt) = balls
-    hit = np.linalg.norm(a[i] - b[j], axis=1) <= at[i] + bt[j] + reach
+    (centre_a, extent_a), (centre_b, extent_b) = balls
+    hit = np.linalg.norm(centre_a[i] - centre_b[j], axis=1) <= extent_a[i] + extent_b[j] + reach
     i, j = i[hit], j[hit]
     d, thickness = distances(shapes, x, first, second, i, j)
     close = d - thickness <= reach

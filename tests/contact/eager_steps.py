@@ -1,13 +1,13 @@
-"""Steps that are not captured, so that what happens in them can be watched."""
+"""Steps without graph capture, so that tests can observe the stages."""
 
 
 def eagerly(integrator, state, dt):
-    """Launch a step, in which all pairs have room; the buffers that it ends in."""
+    """Launch a step without capture and return the buffers of the end; candidate lists must have room."""
     source = integrator._own(state)
     integrator._vacate(1 - source)
     integrator._prepare(dt, state)
-    for part in integrator._parts:
-        part.prescribe(state.time, state.time + dt)
+    for stepper in integrator._parts:
+        stepper.prescribe(state.time, state.time + dt)
     integrator._launch(source)
     assert not integrator._net.outgrown(integrator._buffers[source].own.net)
     return integrator._buffers[1 - source]

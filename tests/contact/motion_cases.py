@@ -1,4 +1,4 @@
-"""Scenes in which nothing overlaps, and motions of them that are filtered."""
+"""Scenes without overlaps, and motions that the CCD filter limits."""
 
 import numpy as np
 import warp as wp
@@ -11,7 +11,7 @@ REACH, MARGIN = 0.004, 0.01
 
 
 def tangle(seed: int, spread: float = 0.6) -> tuple[Shapes, np.ndarray]:
-    """A scene in which nothing overlaps: objects that do are told to ignore each other."""
+    """Return a scene without overlaps: overlapping objects ignore each other."""
     shapes, points = scene(seed, spread, rods=30, triangles=60)
     for first, second in SIDES:
         i, j = np.array(sorted(near(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
@@ -22,7 +22,7 @@ def tangle(seed: int, spread: float = 0.6) -> tuple[Shapes, np.ndarray]:
 
 
 def units_of(shapes: Shapes, kind: str) -> tuple[np.ndarray, int]:
-    """Units of nodes (nodes,), and how many there are."""
+    """Return the CCD body of each node (nodes,), and the number of bodies."""
     n = len(shapes.points)
     if kind == "node":
         return np.arange(n), n
@@ -36,7 +36,7 @@ def units_of(shapes: Shapes, kind: str) -> tuple[np.ndarray, int]:
 
 
 class Motion:
-    """A search at points (worlds times nodes, 3) with a filter of units of a kind."""
+    """Search at points (worlds times nodes, 3) with a filter by CCD bodies of one kind."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Motion:
         self.search.filter(self.base, self.q, self.unit, self.together, self.units, keep)
 
     def __call__(self, move: np.ndarray, keep: float = 1.0) -> np.ndarray:
-        """Where a displacement leads (worlds times nodes, 3)."""
+        """Return the positions (worlds times nodes, 3) to which a displacement is limited."""
         base = self.base.numpy()
         while True:
             self.q.assign(base + move)
@@ -67,7 +67,7 @@ class Motion:
                 return self.q.numpy().copy()
 
     def results(self) -> list[bytes]:
-        """All that a filter writes, but for lists."""
+        """Return all outputs of a filter but the candidate lists, as bytes."""
         search = self.search
-        seen = search._start, search._end
-        return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, *seen)]
+        ends = search._start, search._end
+        return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, *ends)]

@@ -1,4 +1,4 @@
-"""Scenes for contact on pairs, and its energy by all pairs in NumPy."""
+"""Scenes for contact pairs, and the contact energy by all pairs in NumPy."""
 
 import numpy as np
 import warp as wp
@@ -23,9 +23,9 @@ def upload(x: np.ndarray, device, dtype=wp.vec3d) -> wp.array:
 def bundle(
     rods: int = 3, edges: int = 4, jitter: float = 2e-5, seed: int = 1, rolls: bool = False
 ) -> tuple[Shapes, np.ndarray]:
-    """Rods side by side over a strip of triangles, parallel but for 1 part in 500: mollifiers are between 0 and 1.
+    """Return rods side by side over a strip of triangles, parallel to 1 in 500.
 
-    All but the last have angles at the end, if it `rolls`.
+    Mollifiers are between 0 and 1. With `rolls` all rods but the last have twist angles, stored at the end.
     """
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(0.0, 0.2, edges + 1), np.arange(rods) * 0.0062)
@@ -54,74 +54,77 @@ CASES = {
 def terms(
     shapes: Shapes, x: np.ndarray, device, law: str = "penalty", worlds: int = 1, **options
 ) -> tuple[PairTerms, wp.array]:
-    """Terms, evaluated at x, which is returned on the device."""
+    """Return contact terms evaluated at x, and x on the device."""
     density, parameters = LAWS[law]
-    at = upload(x, device)
-    search = BroadPhase(shapes, at, worlds, reach=REACH, margin=MARGIN)
+    positions = upload(x, device)
+    search = BroadPhase(shapes, positions, worlds, reach=REACH, margin=MARGIN)
     result = PairTerms(search, density, **{**parameters, **options})
-    result.evaluate(at)
-    return result, at
+    result.evaluate(positions)
+    return result, positions
 
 
-def move(result: PairTerms, at: wp.array, x: np.ndarray) -> None:
-    """Evaluate at other positions."""
-    at.assign(x)
-    result.search.update(at)
-    result.search.fit(at)
+def move(result: PairTerms, positions: wp.array, x: np.ndarray) -> None:
+    """Evaluate the terms at x."""
+    positions.assign(x)
+    result.search.update(positions)
+    result.search.fit(positions)
     result.fit()
-    result.evaluate(at)
+    result.evaluate(positions)
 
 
 def state(result: PairTerms) -> list[np.ndarray]:
-    """Copies of energies, forces and blocks."""
+    """Return copies of energies, forces and blocks."""
     result.join()
-    return [of.numpy().copy() for of in (result.energy, result.forces, result.diagonal, result.between)]
+    return [array.numpy().copy() for array in (result.energy, result.forces, result.diagonal, result.between)]
 
 
-def times(result: PairTerms, v: np.ndarray, at=None, wanted=None) -> np.ndarray:
-    """H v, of the exact Hessian where positions are given, or with what comes of turning in worlds that want it."""
-    given = upload(v, result.device, wp.types.vector(3, result.linear))
-    out = wp.zeros_like(given)
+def times(result: PairTerms, v: np.ndarray, positions=None, wanted=None) -> np.ndarray:
+    """Return H v, of the exact Hessian where `positions` are given.
+
+    Worlds flagged in `wanted` add the geometric stiffness to the Gauss-Newton matrix instead.
+    """
+    direction = upload(v, result.device, wp.types.vector(3, result.linear))
+    out = wp.zeros_like(direction)
     if wanted is not None:
-        result.prepare(at, wanted)
-    result.product(given, out, at, wanted)
+        result.prepare(positions, wanted)
+    result.product(direction, out, positions, wanted)
     return out.numpy().copy()
 
 
-def assembled(result: PairTerms, n: int, at=None) -> np.ndarray:
-    """H (n, 3, n, 3), a column a product."""
+def assembled(result: PairTerms, n: int, positions=None) -> np.ndarray:
+    """Return H (n, 3, n, 3), one column per product."""
     unit = np.eye(3 * n).reshape(3 * n, n, 3)
-    return np.stack([times(result, v, at) for v in unit], -1).reshape(n, 3, n, 3)
+    return np.stack([times(result, v, positions) for v in unit], -1).reshape(n, 3, n, 3)
 
 
-def used_of(part) -> np.ndarray:
-    """Places of the pairs of an element list that are used."""
-    return np.flatnonzero(part.factor.used.numpy()[: int(part.count.numpy()[0])])
+def used_of(pair_list) -> np.ndarray:
+    """Return the indices of the used pairs of an element list."""
+    return np.flatnonzero(pair_list.factor.used.numpy()[: int(pair_list.count.numpy()[0])])
 
 
 def repeats(run) -> None:
-    """Whether two runs agree to the bit, of what is not all zero."""
+    """Assert that two runs agree bitwise and that no result is all zero."""
     for first, again in zip(run(), run(), strict=True):
         assert np.abs(first).max() > 0.0
         assert (first == again).all()
 
 
 def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
-    """Energies by the gap, or their second derivatives, in the forms of the papers, for one newton a metre."""
+    """Return energies by the gap, or second derivatives, in the forms of the papers, for a stiffness of 1 N/m."""
     within = LAWS[law][1]["range"]
     if law == "penalty":
         K = 15.0 / within
-        s, share = np.logaddexp(0.0, -K * gap) / K, 1.0 / (1.0 + np.exp(np.minimum(K * gap, 100.0)))
-        value = s**2 if order == 0 else 2.0 * share * (share + K * s * (1.0 - share))
+        s, logistic = np.logaddexp(0.0, -K * gap) / K, 1.0 / (1.0 + np.exp(np.minimum(K * gap, 100.0)))
+        value = s**2 if order == 0 else 2.0 * logistic * (logistic + K * s * (1.0 - logistic))
     else:
         g = np.minimum(gap, 0.999 * within)
-        log, rest = np.log(g / within), g - within
-        value = -(rest**2) * log if order == 0 else -2.0 * log - 4.0 * rest / g + rest**2 / g**2
+        log, excess = np.log(g / within), g - within
+        value = -(excess**2) * log if order == 0 else -2.0 * log - 4.0 * excess / g + excess**2 / g**2
     return np.where(gap < within, value, 0.0)
 
 
 def ends(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
-    """Of edges i the ends, against edges j: distances from these and from their two nodes (2, 3, n), and weights (2, 3, n)."""
+    """Return distances and weights (2, 3, n) of the ends of edges i from edges j and both nodes of these."""
     nodes, _, owner, span = shapes.things(2)
     key = owner[:, None] * len(rest) + nodes
     inside = (key[:, :, None] == np.concatenate([key[:, 0], key[:, 1]])).sum(2) > 1
@@ -132,20 +135,23 @@ def ends(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
 
 
 def brute(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) -> float:
-    """Energy [J] of all pairs; with v, v . H v of the Gauss-Newton matrix: psi'' times the square of how distances change along v."""
+    """Return the contact energy of all pairs [J]; with v, v . H v of the Gauss-Newton matrix.
+
+    The latter is psi'' times the squared change of distances along v.
+    """
     rest, k = shapes.points, LAWS[law][1]["stiffness"]
     i, j = allowed(shapes, 2, 2)
     nodes, radius, *_ = shapes.things(2)
     order = 0 if v is None else 2
 
     def corners(x):
-        return [x[nodes[of, end]] for of in (i, j) for end in (0, 1)]
+        return [x[nodes[indices, end]] for indices in (i, j) for end in (0, 1)]
 
     def value(d, both):
         return psi(law, d - (both if law == "penalty" else 0.0), order)
 
     def change(function):
-        """Squares of changes along v of what function(x) gives."""
+        """Return the squared changes of function(x) along v."""
         return 1.0 if v is None else central(lambda s: function(x + s * v), 1e-7) ** 2
 
     a, b, c, e = corners(x)
@@ -153,23 +159,23 @@ def brute(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) 
     y = np.minimum((np.cross(b - a, e - c) ** 2).sum(1) / (1e-3 * length[i] * length[j]), 1.0)
     m, both = y * (2.0 - y), radius[i] + radius[j]
     total = (m * value(edge_edge(a, b, c, e), both) * change(lambda x: edge_edge(*corners(x)))).sum()
-    for one, other in ((i, j), (j, i)):
-        d, weights = ends(shapes, rest, x, one, other)
+    for first, second in ((i, j), (j, i)):
+        d, weights = ends(shapes, rest, x, first, second)
         counted = (weights * value(d, both)).sum(1)
         if v is not None:
             counted = np.maximum(counted, 0.0)
-        total += ((1.0 - m) * counted * change(lambda x, o=one, p=other: ends(shapes, rest, x, o, p)[0][:, 0])).sum()
+        total += ((1.0 - m) * counted * change(lambda x, o=first, p=second: ends(shapes, rest, x, o, p)[0][:, 0])).sum()
     if 3 in shapes.sizes:
         i, j = allowed(shapes, 1, 3)
         (point, thin, *_), (sides, thick, *_) = shapes.things(1), shapes.things(3)
 
-        def apart(x):
+        def separation(x):
             return point_triangle(x[point[i, 0]], *(x[sides[j, k]] for k in range(3)))
 
-        total += (value(apart(x), thin[i] + thick[j]) * change(apart)).sum()
+        total += (value(separation(x), thin[i] + thick[j]) * change(separation)).sum()
     return float(k * total)
 
 
 def central(function, h: float):
-    """Derivative at 0 by central differences of fourth order."""
+    """Return the derivative at 0 by central differences of fourth order."""
     return (8.0 * (function(h) - function(-h)) - (function(2.0 * h) - function(-2.0 * h))) / (12.0 * h)

@@ -1,4 +1,4 @@
-"""Balls and obstacles: what is a pair and what is not, where rods stop, energies and their derivatives."""
+"""Balls and obstacles: candidate pairs, stopping of rods, energies and derivatives."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from ddg_warp.solve.contact.shapes import BALLS, Shapes
 
 
 def balls(seed: int) -> tuple[Shapes, np.ndarray]:
-    """Rods, a shell and thirty balls, of which ten do not touch the rods beside them."""
+    """Return rods, a shell and thirty balls, ten of which ignore a rod."""
     shapes, points = scene(seed, 0.3, rods=30, triangles=30)
     rng = np.random.default_rng(seed)
     n = len(points)
@@ -30,8 +30,8 @@ def test_balls_are_paired_with_edges_of_rods_and_with_triangles(device):
     shapes, points = balls(18)
     search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
     assert [pairs.second.size for pairs in search.lists] == [2, 3, BALLS]
-    for found, side in zip(listed(search), (*SIDES, (2, BALLS)), strict=True):
-        pairs = {tuple(pair) for pair in found.tolist()}
+    for candidates, side in zip(listed(search), (*SIDES, (2, BALLS)), strict=True):
+        pairs = {tuple(pair) for pair in candidates.tolist()}
         assert (
             near(shapes, points, *side, REACH + MARGIN) <= pairs <= near(shapes, points, *side, REACH + 1.002 * MARGIN)
         )
@@ -45,7 +45,7 @@ def test_balls_are_paired_with_edges_of_rods_and_with_triangles(device):
 
 
 def test_a_rod_stops_at_a_ball(device):
-    """By its closed form: of the gap a tenth is left, and of that another one; an end that goes past does not stop."""
+    """The rod keeps between 1 % and 15 % of the gap; a rod that passes by is not stopped."""
     points = np.array([[-1.0, 0.1, 1.0], [1.0, 0.1, 1.0], [1.2, 0.0, 0.0], [2.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     shapes = Shapes(points)
     shapes.rod([0, 1], 0.1)
@@ -71,18 +71,18 @@ def test_obstacles_are_no_pairs_of_their_own(device):
     shapes.obstacle.update({0, 3, 4, 13, 14, 16})
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
     still = np.array(sorted(shapes.obstacle))
-    for found, every, (first, second) in zip(listed(search), everything, SIDES, strict=True):
+    for candidates, every, (first, second) in zip(listed(search), everything, SIDES, strict=True):
         owners = shapes.things(first)[2][every[:, 0]], shapes.things(second)[2][every[:, 1]]
         both = np.isin(owners[0], still) & np.isin(owners[1], still)
-        assert found.tolist() == every[~both].tolist()
+        assert candidates.tolist() == every[~both].tolist()
         assert both.sum() > 3
         i, j = allowed(shapes, first, second)
         d, thickness = distances(shapes, points, first, second, i, j)
-        assert (d - thickness <= REACH + MARGIN).sum() <= len(found)
+        assert (d - thickness <= REACH + MARGIN).sum() <= len(candidates)
 
 
 def rods_on_balls() -> tuple[Shapes, np.ndarray]:
-    """Ten rods, each with two balls that it all but touches: inside of an edge, and beside one of its ends."""
+    """Return ten rods almost in contact with two balls each: one inside an edge, one next to an end."""
     rng = np.random.default_rng(1)
     _, points = scene(2, 5.0, rods=10, triangles=1)
     lines = points[:210].reshape(10, 21, 3)
@@ -102,8 +102,8 @@ def test_energies_forces_and_products(device):
     shapes, x = rods_on_balls()
     rng = np.random.default_rng(3)
     density, parameters = LAWS["penalty"]
-    at = upload(x, device)
-    search = BroadPhase(shapes, at, reach=REACH, margin=MARGIN)
+    positions = upload(x, device)
+    search = BroadPhase(shapes, positions, reach=REACH, margin=MARGIN)
     terms = PairTerms(search, density, **parameters)
 
     def energy(y: np.ndarray) -> float:
@@ -112,13 +112,13 @@ def test_energies_forces_and_products(device):
         return parameters["stiffness"] * psi("penalty", d - thickness).sum()
 
     def forces(y: np.ndarray) -> np.ndarray:
-        at.assign(y)
-        terms.evaluate(at)
+        positions.assign(y)
+        terms.evaluate(positions)
         return terms.forces.numpy().copy()
 
     v = rng.normal(size=x.shape)
     force = forces(x)
-    terms.search.update(at)
+    terms.search.update(positions)
     assert terms.energy.numpy()[0] == pytest.approx(energy(x), rel=1e-11)
     assert int(terms.lists[-1].count.numpy()[0]) >= 20
     along = central(lambda s: energy(x + s * v), 1e-7)
@@ -126,7 +126,7 @@ def test_energies_forces_and_products(device):
     assert np.abs(force.sum(0)).max() < 1e-12 * np.abs(force).max()
     exact = central(lambda s: -forces(x + s * v), 1e-7)
     forces(x)
-    given = upload(v, device)
-    out = wp.zeros_like(given)
-    terms.product(given, out, at)
+    direction = upload(v, device)
+    out = wp.zeros_like(direction)
+    terms.product(direction, out, positions)
     assert out.numpy() == pytest.approx(exact, rel=1e-6, abs=1e-6 * np.abs(exact).max())

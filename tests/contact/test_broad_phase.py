@@ -1,4 +1,4 @@
-"""Candidates of contact: all that are near, by comparison with all pairs, none twice, and as long as they hold."""
+"""Candidates of contact against all pairs: complete, without duplicates, and valid within the margin."""
 
 import numpy as np
 import pytest
@@ -16,9 +16,9 @@ REACH, MARGIN = 0.004, 0.01
 
 
 def agree(search: BroadPhase, x: np.ndarray, sides=SIDES) -> None:
-    """All that is near is listed once, and nothing that is farther than was searched for."""
-    for found, side in zip(listed(search), sides, strict=True):
-        pairs = [tuple(pair) for pair in found.tolist()]
+    """Assert that lists have every near pair once, and no pair beyond the search distance."""
+    for candidates, side in zip(listed(search), sides, strict=True):
+        pairs = [tuple(pair) for pair in candidates.tolist()]
         assert pairs == sorted(set(pairs))
         assert near(search.shapes, x, *side, REACH + MARGIN) <= set(pairs)
         assert set(pairs) <= near(search.shapes, x, *side, REACH + 1.002 * MARGIN)
@@ -30,7 +30,7 @@ def test_candidates_are_those_of_all_pairs(device, spread, dtype):
     shapes, points = scene(1, spread)
     search = BroadPhase(shapes, upload(points, device, dtype), reach=REACH, margin=MARGIN)
     agree(search, points.astype(np.float32) if dtype is wp.vec3f else points)
-    assert all(len(found) > 10 for found in listed(search)) or spread > 1.0
+    assert all(len(candidates) > 10 for candidates in listed(search)) or spread > 1.0
 
 
 def test_objects_that_ignore_each_other_are_no_pairs(device):
@@ -45,38 +45,38 @@ def test_objects_that_ignore_each_other_are_no_pairs(device):
 
 
 @pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("apart", [0.0, 0.35, 1.75, 3.45])
-def test_edges_within_an_arc_length_are_no_pairs(device, closed, apart):
-    """Of a circle of 40 edges, circumference 4: edges k apart have (k - 1) / 10 of arc between them."""
+@pytest.mark.parametrize("exclusion", [0.0, 0.35, 1.75, 3.45])
+def test_edges_within_an_arc_length_are_no_pairs(device, closed, exclusion):
+    """A circle has 40 edges and circumference 4: edges k apart have (k - 1) / 10 of arc between them."""
     n = 40
     angle = 2.0 * np.pi * np.arange(n) / n
     radius = 0.05 / np.sin(np.pi / n)
     points = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     shapes = Shapes(points)
-    shapes.rod(np.arange(n), 0.01, closed=closed, apart=apart)
-    (found,) = listed(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
+    shapes.rod(np.arange(n), 0.01, closed=closed, apart=exclusion)
+    (candidates,) = listed(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
     i, j = np.triu_indices(n if closed else n - 1, 1)
     steps = np.minimum(j - i, n - (j - i)) if closed else j - i
-    wanted = (steps > 1) & (0.1 * (steps - 1) >= apart)
-    assert found.tolist() == np.column_stack([i, j])[wanted].tolist()
+    wanted = (steps > 1) & (0.1 * (steps - 1) >= exclusion)
+    assert candidates.tolist() == np.column_stack([i, j])[wanted].tolist()
 
 
-@pytest.mark.parametrize("most", [1, 2, 3, 5])
-def test_bundles_change_nothing(device, monkeypatch, most):
-    """However many edges share a leaf: the same pairs, in two worlds, and the same that cross."""
+@pytest.mark.parametrize("leaf_size", [1, 2, 3, 5])
+def test_bundles_change_nothing(device, monkeypatch, leaf_size):
+    """Any number of edges a leaf gives the same pairs and the same crossings, in two worlds."""
     shapes, points = scene(17, 0.3, rods=10, triangles=40)
     move = 0.05 * np.random.default_rng(18).normal(size=(2 * len(points), 3))
-    found = []
-    for bundle in (tree.BUNDLE, (most, most)):
+    results = []
+    for bundle in (tree.BUNDLE, (leaf_size, leaf_size)):
         monkeypatch.setattr(tree, "BUNDLE", bundle)
         search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
         x = upload(np.tile(points, (2, 1)), device)
         lists = [pairs.tolist() for pairs in listed(search)]
         search.crossings(x, upload(move, device))
         assert not search.fit(x)
-        found.append((lists, search.crossed.numpy().tolist(), search.first_crossing()))
-    assert found[0] == found[1]
-    assert min(found[0][1]) > 10
+        results.append((lists, search.crossed.numpy().tolist(), search.first_crossing()))
+    assert results[0] == results[1]
+    assert min(results[0][1]) > 10
 
 
 def test_worlds_do_not_meet(device):
@@ -84,22 +84,22 @@ def test_worlds_do_not_meet(device):
     rng = np.random.default_rng(4)
     worlds = [points + 0.01 * rng.normal(size=points.shape) for _ in range(3)]
     together = BroadPhase(shapes, upload(np.concatenate(worlds), device), 3, reach=REACH, margin=MARGIN)
-    for k, found in enumerate(listed(together)):
-        pairs, parts = together.lists[k], []
+    for k, candidates in enumerate(listed(together)):
+        pairs, expected = together.lists[k], []
         for w, x in enumerate(worlds):
             alone = listed(BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN))[k]
-            parts.append(alone + w * np.array([pairs.first.count, pairs.second.count]))
-        assert found.tolist() == np.concatenate(parts).tolist()
-        assert min(map(len, parts)) > 5
+            expected.append(alone + w * np.array([pairs.first.count, pairs.second.count]))
+        assert candidates.tolist() == np.concatenate(expected).tolist()
+        assert min(map(len, expected)) > 5
 
 
 def test_edges_that_coincide_or_are_parallel_are_found(device):
-    """Sixty edges at one place, which no tree can tell apart, and twenty that lie side by side."""
+    """Sixty edges coincide, which no tree can separate, and twenty lie side by side."""
     stacked = np.tile([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], (60, 1))
-    beside = np.repeat(np.arange(20) * 0.01, 2)[:, None] * [0.0, 1.0, 0.0] + np.tile(
+    parallel = np.repeat(np.arange(20) * 0.01, 2)[:, None] * [0.0, 1.0, 0.0] + np.tile(
         [[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]], (20, 1)
     )
-    points = np.concatenate([stacked, beside])
+    points = np.concatenate([stacked, parallel])
     shapes = Shapes(points)
     for k in range(80):
         shapes.rod([2 * k, 2 * k + 1], 0.003)
@@ -110,7 +110,7 @@ def test_edges_that_coincide_or_are_parallel_are_found(device):
 
 @pytest.mark.parametrize("room", [(10,), (10_000, 10), (10, 10)])
 def test_lists_that_are_too_short_are_empty_until_they_have_grown(device, room):
-    """Too short for pairs, for those whose boxes meet, or for both."""
+    """The capacity is too small for pairs, for overlapping boxes, or for both."""
     shapes, points = scene(5, 0.3)
     x = upload(points, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
@@ -119,19 +119,19 @@ def test_lists_that_are_too_short_are_empty_until_they_have_grown(device, room):
         pairs.reserve(*room)
     search.search(x)
     assert search.overflow.numpy()[0] == 1
-    assert not any(len(found) for found in listed(search))
+    assert not any(len(candidates) for candidates in listed(search))
     searches = search.searches.numpy()[0]
     search.update(x)
-    assert search.searches.numpy()[0] == searches + 1  # it is out of date until there is room
+    assert search.searches.numpy()[0] == searches + 1  # candidates stay invalid until lists have room
     version = search.version
     assert search.fit(x)
     assert search.version > version
-    assert [found.tolist() for found in listed(search)] == [found.tolist() for found in whole]
+    assert [candidates.tolist() for candidates in listed(search)] == [candidates.tolist() for candidates in whole]
     assert not search.fit(x)
 
 
 def test_where_one_list_is_too_short_others_that_are_all_but_full_grow_with_it(device):
-    """So that graphs are captured anew once, not list by list: there is room for twice as many pairs as were found in each."""
+    """Graphs are then captured again once, not per list. Each list gets room for twice the pairs found."""
     shapes, points = scene(5, 0.3)
     x = upload(points, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
@@ -147,7 +147,7 @@ def test_where_one_list_is_too_short_others_that_are_all_but_full_grow_with_it(d
 
 @pytest.mark.parametrize("excess", [-1e-6, 1e-6])
 def test_candidates_hold_until_half_of_the_margin_is_used_up(device, excess):
-    """Two edges that approach each other from just beyond what is searched for: found as soon as they could be nearer than `reach`."""
+    """Two edges approach from just beyond the search distance; the pair is found before the gap can fall below `reach`."""
     gap = REACH + 1.002 * MARGIN
     distance = 0.02 + gap
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, -0.5, distance], [0.5, 0.5, distance]])
@@ -163,12 +163,12 @@ def test_candidates_hold_until_half_of_the_margin_is_used_up(device, excess):
     search.update(upload(moved, device))
     assert search.searches.numpy()[0] == searches + (excess > 0)
     assert len(listed(search)[0]) == (excess > 0)
-    # where no new search was needed, what is not listed is farther apart than the reach
+    # without a new search, pairs that are not listed are beyond the reach
     assert near(shapes, moved, 2, 2, REACH) <= {tuple(pair) for pair in listed(search)[0].tolist()}
 
 
 def test_what_no_thing_has_may_be_anywhere(device):
-    """Blocks that are no places, as twists of edges: they never ask for a search, whatever they are."""
+    """Dof blocks without a position, such as twist angles of edges, may have any value."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     shapes = Shapes(points)
     shapes.rod([0, 1], 0.01)
@@ -198,8 +198,8 @@ def test_a_captured_update_follows_motion_and_searches_only_where_it_must(device
         wp.capture_launch(capture.graph)
         assert not search.fit(x)
         assert search.searches.numpy()[0] == before + step // 2
-        for found, side in zip(listed(search), SIDES, strict=True):
-            assert near(shapes, position, *side, REACH) <= {tuple(pair) for pair in found.tolist()}
+        for candidates, side in zip(listed(search), SIDES, strict=True):
+            assert near(shapes, position, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
     search.search(x)
     agree(search, position)
     search.rebuild(x)
@@ -246,7 +246,7 @@ def test_running_sums(device, count):
 
 @pytest.mark.parametrize("offset", [0.0, 1e5])
 def test_boxes_hold_what_they_are_around(device, offset):
-    """In exact numbers: a float64 that float32 can not have lies inside, and no farther than rounding."""
+    """Boxes contain float64 positions that float32 cannot represent, and are larger by no more than rounding."""
     shapes, points = scene(16, 1.0, rods=20, triangles=60)
     points = points + offset
     x = upload(points, device)
@@ -254,11 +254,11 @@ def test_boxes_hold_what_they_are_around(device, offset):
     for size in shapes.sizes:
         nodes, radius, *_ = shapes.things(size)
         radii = wp.array([shapes.radii], dtype=wp.float64, device=device)
-        part = tree.Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
-        part.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
+        primitives = tree.Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
+        primitives.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
         reach = (radius + 0.002)[:, None]
-        below = points[nodes].min(1) - reach - part.lower.numpy().astype(float)
-        above = part.upper.numpy().astype(float) - points[nodes].max(1) - reach
+        below = points[nodes].min(1) - reach - primitives.lower.numpy().astype(float)
+        above = primitives.upper.numpy().astype(float) - points[nodes].max(1) - reach
         assert min(below.min(), above.min()) > 0.0
         assert max(below.max(), above.max()) <= 5e-7 * (2.0 + offset)
 
@@ -285,7 +285,7 @@ def test_order_of_objects_is_irrelevant(device):
     rods = [range(21 * r, 21 * r + 21) for r in range(12)]
     triangles = 252 + np.arange(90).reshape(-1, 3)
 
-    def found(order) -> set:
+    def pairs_of(order) -> set:
         shapes = Shapes(points)
         for k in order:
             if k == 12:
@@ -294,14 +294,16 @@ def test_order_of_objects_is_irrelevant(device):
                 shapes.rod(np.array(rods[k]), 0.004)
         search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
         result = set()
-        for pairs, part in zip(search.lists, listed(search), strict=True):
+        for pairs, candidates in zip(search.lists, listed(search), strict=True):
             nodes = [shapes.things(side.size)[0] for side in (pairs.first, pairs.second)]
-            result |= {frozenset((tuple(sorted(nodes[0][i])), tuple(sorted(nodes[1][j])))) for i, j in part.tolist()}
+            result |= {
+                frozenset((tuple(sorted(nodes[0][i])), tuple(sorted(nodes[1][j])))) for i, j in candidates.tolist()
+            }
         return result
 
-    first = found(range(13))
+    first = pairs_of(range(13))
     assert len(first) > 50
-    assert found(rng.permutation(13)) == first
+    assert pairs_of(rng.permutation(13)) == first
 
 
 def test_positions_that_are_not_finite_are_refused_by_name(device):
@@ -317,8 +319,8 @@ def test_positions_that_are_not_finite_are_refused_by_name(device):
     x.assign(np.concatenate([points, points]))
     search.update(x)
     search.check()
-    after = [found.tolist() for found in listed(search)]
-    assert after == [found.tolist() for found in listed(BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN))]
+    after = [candidates.tolist() for candidates in listed(search)]
+    assert after == [candidates.tolist() for candidates in listed(BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN))]
 
 
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

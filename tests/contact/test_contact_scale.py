@@ -1,6 +1,6 @@
-"""Contact at lengths from 1e-9 to 1e5 m: by nondimensional numbers that are the same, all of it is, in float64 and mixed.
+"""Contact at lengths from 1e-9 to 1e5 m: scenes of equal nondimensional numbers behave alike, in float64 and mixed.
 
-Lengths that are powers of two apart have the same bits, as nothing is added to anything of another dimension.
+Scaling lengths by a power of two keeps all bits, as no sum mixes dimensions.
 """
 
 import numpy as np
@@ -10,9 +10,7 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 
 YOUNG, DENSITY = 1e6, 1000.0
-SPEED = np.sqrt(
-    YOUNG / DENSITY
-)  # of waves [m/s]: speeds over it, and lengths and times over L and L / SPEED, are numbers
+SPEED = np.sqrt(YOUNG / DENSITY)  # wave speed [m/s]; speeds scale with SPEED, times with L / SPEED
 RUBBER = ddg.Material(young=YOUNG, poisson=0.3, density=DENSITY)
 GRAVITY = 1e-3 * YOUNG / DENSITY  # times 1 / L
 STEPS, DT = 12, 2.0
@@ -70,19 +68,19 @@ def rod_on_mesh(length: float) -> ddg.Scene:
 
 
 def moved(build, length: float, device, precision: str):
-    """Positions over L, forces of contact over E L^2 and gaps over L after some steps."""
+    """Return positions over L, contact force over E L^2 and smallest gap over L after some steps."""
     model = build(length).build(device, precision=precision)
     integrator, state = ddg.Integrator(model, rtol=1e-8), model.state()
     for _ in range(STEPS):
         state = integrator.step(state, DT * length / SPEED)
-    found = model.contacts(state)
-    assert len(found.gap)
-    assert (found.gap > 0.0).all()
+    contacts = model.contacts(state)
+    assert len(contacts.gap)
+    assert (contacts.gap > 0.0).all()
     assert np.linalg.norm(state.points() - model.state().points(), axis=1).max() > 1e-3 * length
-    return state.points() / length, found.force.sum(0) / (YOUNG * length**2), found.gap.min() / length
+    return state.points() / length, contacts.force.sum(0) / (YOUNG * length**2), contacts.gap.min() / length
 
 
-# float32 loses squares of forces in conjugate gradients below 1e-6 m, and shells take long there without contact, too
+# Below 1e-6 m squared forces underflow in float32 conjugate gradients, and shells are slow even without contact.
 CASES = [(build, "float64", 1e-9) for build in (rod_on_floor, rod_on_rod, rod_on_capsule, rod_on_mesh)]
 CASES += [(build, "mixed", 1e-6) for build in (rod_on_floor, rod_on_rod, shell_on_ball, rod_on_capsule, rod_on_mesh)]
 CASES += [(shell_on_ball, "float64", 1e-6)]
@@ -92,10 +90,10 @@ CASES += [(shell_on_ball, "float64", 1e-6)]
 def test_contact_is_the_same_at_every_scale(device, build, precision, small):
     points, force, gap = moved(build, 1.0, device, precision)
     for length in (small, 1e5):
-        found = moved(build, length, device, precision)
-        np.testing.assert_allclose(found[0], points, atol=1e-6)
-        np.testing.assert_allclose(found[1], force, atol=1e-4 * np.abs(force).max())
-        assert found[2] == pytest.approx(gap, rel=1e-4)
+        scaled = moved(build, length, device, precision)
+        np.testing.assert_allclose(scaled[0], points, atol=1e-6)
+        np.testing.assert_allclose(scaled[1], force, atol=1e-4 * np.abs(force).max())
+        assert scaled[2] == pytest.approx(gap, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -103,22 +101,22 @@ def test_contact_is_the_same_at_every_scale(device, build, precision, small):
 )
 def test_powers_of_two_have_the_same_bits(device, build, precision):
     points, _, gap = moved(build, 1.0, device, precision)
-    found = moved(build, 2.0**-18, device, precision)
-    np.testing.assert_array_equal(found[0], points)
-    assert found[2] == gap
+    scaled = moved(build, 2.0**-18, device, precision)
+    np.testing.assert_array_equal(scaled[0], points)
+    assert scaled[2] == gap
 
 
 @pytest.mark.parametrize("build", [rod_on_floor, shell_on_ball])
 def test_cold_starts_that_overlap_are_told_at_every_scale(device, build):
-    """And are pushed apart by the same part of the length."""
-    found = []
+    """Overlaps are resolved by the same fraction of the length."""
+    displacements = []
     for length in (1e-9, 1.0, 1e5):
         model = build(length).build(device)
         low = model.state().points() - [0.0, 0.0, 0.045 * length]
         state = model.state(points=low)
         with pytest.raises(ddg.SceneError, match="overlap"):
             ddg.Integrator(model).step(state, DT * length / SPEED)
-        apart, _ = model.pushed_apart(state)
-        found.append((apart.points() - low) / length)
-    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
-    np.testing.assert_allclose(found[2], found[1], atol=1e-6)
+        separated, _ = model.pushed_apart(state)
+        displacements.append((separated.points() - low) / length)
+    np.testing.assert_allclose(displacements[0], displacements[1], atol=1e-6)
+    np.testing.assert_allclose(displacements[2], displacements[1], atol=1e-6)

@@ -1,4 +1,4 @@
-"""The stiffness of contact where none is given: by weight, bending and membrane, alike at every scale, and by inertia if need be."""
+"""Default contact stiffness: from weight, bending, membrane and, where needed, inertia, at every scale."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ THICKNESS, SIZE = 4e-4, 0.2  # of the cloth [m]
 
 
 def thrown_cloth(radius: float, speed: float, device, young: float = 1e6, **contact):
-    """A square of cloth 5 mm above a ball, and its state as it falls with a speed [m/s]."""
+    """Return a model of a square cloth 5 mm above a ball, and a state with a falling speed [m/s]."""
     points, triangles = meshes.rectangle(10, 10)[:2]
     points = (np.array(points, float) - np.mean(points, 0)) * SIZE / np.ptp(np.array(points, float)[:, 0])
     points[:, 2] += radius + 5e-3
@@ -28,20 +28,20 @@ def thrown_cloth(radius: float, speed: float, device, young: float = 1e6, **cont
     "radius, speed, young, dt", [(5e-3, 5.0, 1e6, 1e-3), (0.05, 5.0, 1e4, 1e-3), (0.05, 20.0, 1e2, 1e-4)]
 )
 def test_cloth_thrown_at_a_ball_is_stopped(device, radius, speed, young, dt):
-    """Shorter steps resolve a larger deceleration; all end with no vertex inside of the ball."""
+    """Shorter steps resolve a larger deceleration. Every run ends with all vertices outside the ball."""
     model, state = thrown_cloth(radius, speed, device, young)
     integrator, center = ddg.Integrator(model), np.array([0.03, -0.03, 0.0])
     for _ in range(int(1.5e-2 / speed / dt) + 1):
         state = integrator.step(state, dt)
     assert np.linalg.norm(state.points() - center, axis=1).min() > radius + 0.5 * THICKNESS
-    found = integrator.statistics()["contact"]
-    assert 0.0 < found["smallest_gap"] < 0.25 * THICKNESS
-    assert found["refused_crossings"] == 0
-    assert state.velocities()[:, 2].max() > -0.9 * speed  # something was stopped
+    statistics = integrator.statistics()["contact"]
+    assert 0.0 < statistics["smallest_gap"] < 0.25 * THICKNESS
+    assert statistics["refused_crossings"] == 0
+    assert state.velocities()[:, 2].max() > -0.9 * speed  # some vertex was stopped
 
 
 def test_forces_of_a_state_are_those_of_its_step(device):
-    """Of implicit Euler h sum F = P1 - P0 - h W, also where the step had inertia in the stiffness, which `State` keeps."""
+    """Implicit Euler has h sum F = P1 - P0 - h W, also with inertia in the stiffness, which `State` keeps."""
     dt, model, state, braced = 1e-3, *thrown_cloth(0.05, 5.0, device, 1e4), 0
     integrator, mass = ddg.Integrator(model, rtol=1e-8), model.net.host.mass[:, :1]
     count = model.points_count
@@ -52,27 +52,27 @@ def test_forces_of_a_state_are_those_of_its_step(device):
             change = (mass[:count] * (state.velocities() - before)).sum(0) + dt * 9.81 * np.array(
                 [0.0, 0.0, mass[:count].sum()]
             )
-            found = model.contacts(state)
-            force = np.where(found.objects[:, :1] == 0, found.force, -found.force).sum(0)
+            contacts = model.contacts(state)
+            force = np.where(contacts.objects[:, :1] == 0, contacts.force, -contacts.force).sum(0)
             np.testing.assert_allclose(dt * force, change, atol=1e-6 * np.abs(mass[:count].sum() * 5.0))
         braced += rate > 0.0
     assert braced
 
 
 def test_a_restart_is_the_same(device):
-    """Bit by bit, from the snapshot of a state whose step had inertia in the stiffness."""
+    """The snapshot is of a step with inertia in the stiffness."""
     model, state = thrown_cloth(0.05, 5.0, device, 1e4, friction=0.3)
     integrator = ddg.Integrator(model)
     for _ in range(3):
         state = integrator.step(state, 1e-3)
     again = model.restore(state.snapshot())
     np.testing.assert_array_equal(again.net.rate.numpy(), state.net.rate.numpy())
-    on, other = integrator.step(state, 1e-3), ddg.Integrator(model).step(again, 1e-3)
-    np.testing.assert_array_equal(on.points(), other.points())
+    continued, restarted = integrator.step(state, 1e-3), ddg.Integrator(model).step(again, 1e-3)
+    np.testing.assert_array_equal(continued.points(), restarted.points())
 
 
 def test_a_given_stiffness_stays_as_it_is(device):
-    """It is refused where it has no room, and the remedy that is named first helps."""
+    """Too small a stiffness is refused, and the first remedy named works."""
     model, state = thrown_cloth(0.05, 2.0, device, stiffness=20.0)
     assert not model.net.host.touching.inertia.any()
     assert "net/rate" not in state.arrays()
@@ -93,8 +93,8 @@ def test_a_given_stiffness_stays_as_it_is(device):
 @pytest.mark.parametrize("gravity", [0.0, 1.0])
 @pytest.mark.parametrize("kind", ["rod", "shell"])
 def test_it_is_the_same_at_every_scale(kind, gravity):
-    """Stiffness over E L, range over L and mass over density and L^3 are numbers; so is g density L / E."""
-    found = []
+    """Stiffness over E L, range over L, mass over density L^3 and g density L / E are constant."""
+    scaled = []
     for length in (1e-9, 1.0, 1e5):
         young, density = 1e6, 1000.0
         scene = ddg.Scene(gravity=(0.0, 0.0, -gravity * 1e-3 * young / density / length))
@@ -108,9 +108,9 @@ def test_it_is_the_same_at_every_scale(kind, gravity):
             scene.add_shell(points, triangles, thickness=0.01 * length, material=material)
         scene.add_obstacle(ddg.Plane())
         scene.contact()
-        given = scene.build("cpu").net.host.touching
+        contact = scene.build("cpu").net.host.touching
         sizes = young * length, length, density * length**3
-        numbers = (own[given.meeting] for own in (given.stiffness, given.range, given.inertia))
-        found.append([own / size for own, size in zip(numbers, sizes, strict=True)])
-    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-9)
-    assert np.min(found) > 0.0
+        numbers = (values[contact.meeting] for values in (contact.stiffness, contact.range, contact.inertia))
+        scaled.append([values / size for values, size in zip(numbers, sizes, strict=True)])
+    np.testing.assert_allclose(scaled[1:], [scaled[0]] * 2, rtol=1e-9)
+    assert np.min(scaled) > 0.0

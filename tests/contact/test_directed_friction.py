@@ -1,4 +1,4 @@
-"""Friction of rods by direction, forwards, backwards and across: derivatives, closed forms, energy, and rods that slide and stick."""
+"""Anisotropic friction of rods, forwards, backwards and across: derivatives, closed forms, energy, sliding and sticking."""
 
 import numpy as np
 import pytest
@@ -15,22 +15,25 @@ RADIUS, RANGE = 5e-3, 1e-4
 
 
 def directed(case: str) -> dict:
-    """Rods in one group, shells in another, and friction by direction along the rods, which are the first of every pair with them."""
+    """Return groups and anisotropic factors: rods in one group, shells in the other.
+
+    Rods are the first of every pair with a shell; the factors are along the rods.
+    """
     shapes, _ = CASES[case]()
-    ways = np.ones((2, 2, 3))
-    ways[0] = ways[:, 0] = WAYS
-    return {"groups": np.array([int(name.startswith("shell")) for name in shapes.names]), "ways": ways}
+    factors = np.ones((2, 2, 3))
+    factors[0] = factors[:, 0] = WAYS
+    return {"groups": np.array([int(name.startswith("shell")) for name in shapes.names]), "ways": factors}
 
 
 @each_case
 @each_form
 def test_forces_and_products_are_differences(device, case, form):
-    """At slips of which none turns from forwards to backwards within the differences: there second derivatives jump."""
-    result, at, _, after = rubbed(case, device, form, seed=5, **directed(case))
+    """No slip changes between forwards and backwards within the differences, where second derivatives jump."""
+    result, positions, _, after = rubbed(case, device, form, seed=5, **directed(case))
     plain, *_ = rubbed(case, device, form, seed=5, groups=directed(case)["groups"])
     forces = result.forces.numpy()
     assert np.abs(forces - plain.forces.numpy()).max() > 0.1 * np.abs(forces).max()
-    hold_to_differences(result, at, after)
+    hold_to_differences(result, positions, after)
 
 
 @each_case
@@ -75,7 +78,7 @@ def test_factors_in_single_precision(device, case):
 
 
 def lying(tilt: float) -> tuple[Shapes, np.ndarray]:
-    """A rod that touches a triangle with its first edge, along x but for the `tilt` [rad]."""
+    """Return a rod in contact with a triangle at one edge, along x but for the `tilt` [rad]."""
     s = np.array([0.0, 0.05, 0.1])
     rod = np.stack([0.05 + s * np.cos(tilt), 0.05 + 0.0 * s, 0.0065 + s * np.sin(tilt)], 1)
     x = np.concatenate([[[-1.0, -1.0, 0.0], [2.0, -1.0, 0.0], [-1.0, 2.0, 0.0]], rod])
@@ -88,13 +91,13 @@ def lying(tilt: float) -> tuple[Shapes, np.ndarray]:
 @each_form
 @pytest.mark.parametrize("tilt", [0.0, 0.4, 0.5 * np.pi])
 def test_coulomb_law_by_direction(device, form, tilt):
-    """What slides is braked by N D^2 u / |D u|, D of the components along the rod and across it; what stands rubs across."""
+    """Sliding friction is -N D^2 u / |D u|, D of the components along and across the rod; a standing rod has the coefficient across."""
     shapes, x = lying(tilt)
-    ways = np.ones((2, 2, 3))
-    ways[0, 1] = ways[1, 0] = WAYS
-    given = {"groups": np.array([1, 0]), "friction": MU, "ways": ways, "velocity": VELOCITY, "friction_law": form}
-    result, at = terms(shapes, x, device, **given)
-    result.lag(at)
+    factors = np.ones((2, 2, 3))
+    factors[0, 1] = factors[1, 0] = WAYS
+    options = {"groups": np.array([1, 0]), "friction": MU, "ways": factors, "velocity": VELOCITY, "friction_law": form}
+    result, positions = terms(shapes, x, device, **options)
+    result.lag(positions)
     normal = result.forces.numpy()[3:].sum(0)[2]
     result.law.stiffness.zero_()
     assert normal > 0.0
@@ -104,8 +107,8 @@ def test_coulomb_law_by_direction(device, form, tilt):
         D2 = MU**2 * np.array([np.cos(tilt) ** 2 * along**2 + np.sin(tilt) ** 2 * WAYS[2] ** 2, WAYS[2] ** 2])
         after = x.copy()
         after[3:, :2] += 1e3 * SLIP * u
-        at.assign(after)
-        result.evaluate(at, rates(result))
+        positions.assign(after)
+        result.evaluate(positions, rates(result))
         force = result.forces.numpy()[3:].sum(0)
         size = np.sqrt(D2 @ u**2)
         assert force == pytest.approx([*(-normal * D2 * u / size), 0.0], rel=1e-9, abs=1e-12 * normal)
@@ -115,18 +118,18 @@ def test_coulomb_law_by_direction(device, form, tilt):
 @each_form
 def test_forces_are_continuous_where_the_slip_turns_back(device, form):
     shapes, x = lying(0.0)
-    ways = np.ones((2, 2, 3))
-    ways[0, 1] = ways[1, 0] = [1.0, 3.0, 2.0]
-    given = {"groups": np.array([1, 0]), "friction": MU, "ways": ways, "velocity": VELOCITY, "friction_law": form}
-    result, at = terms(shapes, x, device, **given)
-    result.lag(at)
+    factors = np.ones((2, 2, 3))
+    factors[0, 1] = factors[1, 0] = [1.0, 3.0, 2.0]
+    options = {"groups": np.array([1, 0]), "friction": MU, "ways": factors, "velocity": VELOCITY, "friction_law": form}
+    result, positions = terms(shapes, x, device, **options)
+    result.lag(positions)
 
     def force(along):
         after = x.copy()
         after[3:, 0] += along
         after[3:, 1] += 0.1 * SLIP
-        at.assign(after)
-        result.evaluate(at, rates(result))
+        positions.assign(after)
+        result.evaluate(positions, rates(result))
         return result.forces.numpy()[3:].sum(0)
 
     before, after = (force(s * 1e-9 * SLIP) for s in (-1.0, 1.0))
@@ -137,20 +140,20 @@ def test_forces_are_continuous_where_the_slip_turns_back(device, form):
 FORWARDS, BACKWARDS, ACROSS = 0.2, 0.45, 0.6
 
 
-def rod_on(obstacle, given=(FORWARDS, BACKWARDS, ACROSS), along=(1.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> ddg.Scene:
-    """A stiff rod about the origin, just above an obstacle below it."""
+def rod_on(obstacle, friction=(FORWARDS, BACKWARDS, ACROSS), along=(1.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> ddg.Scene:
+    """Return a stiff rod about the origin, just above an obstacle."""
     along, up = np.array(along), np.array(up)
     scene = ddg.Scene()
     points = np.linspace(-0.05, 0.05, 11)[:, None] * along + up * (RADIUS + 1.01 * RANGE)
     scene.add_rod(points, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e9, density=1000.0), name="rod")
     scene.add_obstacle(obstacle, name="ground")
     scene.contact(range=RANGE, velocity=1e-4)
-    scene.contact_between("rod", "ground", friction=given)
+    scene.contact_between("rod", "ground", friction=friction)
     return scene
 
 
 def thrown(scene, direction, device, count: int, dt: float = 1e-3, **options):
-    """Mean velocities at `count` steps of a rod that lies down and is then thrown at 1 m/s; model, integrator and last state."""
+    """Return mean velocities over `count` steps of a settled rod thrown at 1 m/s; model, integrator and last state."""
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model, **options), model.state()
     for _ in range(30):
@@ -175,8 +178,8 @@ def thrown(scene, direction, device, count: int, dt: float = 1e-3, **options):
 def test_a_rod_slows_by_the_coefficient_of_its_way_and_stops(device, direction, mu):
     count = round(1.3 / (mu * 9.81) / 5e-3)
     speeds, _, integrator, _ = thrown(rod_on(ddg.Plane()), direction, device, count, 5e-3)
-    early, late = 2, count // 2
-    braked = (speeds[early] - speeds[late]) / ((late - early) * 5e-3)
+    start, end = 2, count // 2
+    braked = (speeds[start] - speeds[end]) / ((end - start) * 5e-3)
     assert braked @ direction == pytest.approx(mu * 9.81, rel=1e-3)
     assert np.abs(np.cross(braked, direction)[[0, 2]]).max() < 1e-3
     assert np.linalg.norm(speeds[-1]) < 1e-4
@@ -185,7 +188,10 @@ def test_a_rod_slows_by_the_coefficient_of_its_way_and_stops(device, direction, 
 
 
 def test_work_of_friction_is_what_a_rod_loses(device):
-    """Thrown aslant, where friction turns its way: the sum of -m v1 . (v1 - v0) of steps of implicit Euler; and it turns lengthways."""
+    """Friction work is the sum of -m v1 . (v1 - v0) of implicit Euler steps.
+
+    The rod is thrown obliquely; anisotropic friction rotates the velocity towards the rod.
+    """
     speeds, model, integrator, _ = thrown(rod_on(ddg.Plane()), (0.6, 0.8, 0.0), device, 40, rtol=1e-10)
     mass = model.net.host.mass[:11, 0].sum()
     taken = -mass * ((speeds[1:] - speeds[:-1]) * speeds[1:])[:, :2].sum()
@@ -195,13 +201,13 @@ def test_work_of_friction_is_what_a_rod_loses(device):
     assert (np.diff(angles) < 0.0).all()
 
 
-@pytest.mark.parametrize(("turn", "holds"), [(0.0, False), (np.pi, True), (0.5 * np.pi, True)])
-def test_a_slope_between_coefficients_holds_backwards_and_across(device, turn, holds):
-    """tan(slope) = 0.35: forwards a rod slides down by g (sin - mu cos), else it sticks and creeps by less than the velocity."""
+@pytest.mark.parametrize(("heading", "holds"), [(0.0, False), (np.pi, True), (0.5 * np.pi, True)])
+def test_a_slope_between_coefficients_holds_backwards_and_across(device, heading, holds):
+    """The slope has tan = 0.35: forwards a rod slides by g (sin - mu cos), else it sticks, creeping below the threshold."""
     slope = np.arctan(0.35)
     normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
     down = np.array([np.cos(slope), 0.0, -np.sin(slope)])
-    along = np.cos(turn) * down + np.sin(turn) * np.cross(normal, down)
+    along = np.cos(heading) * down + np.sin(heading) * np.cross(normal, down)
     model = rod_on(ddg.Plane(normal=tuple(normal)), along=along, up=normal).build(device=device)
     integrator, state, speeds = ddg.Integrator(model), model.state(), []
     for _ in range(60):
@@ -224,7 +230,7 @@ OBSTACLES = {
 @pytest.mark.parametrize("shape", OBSTACLES)
 @pytest.mark.parametrize(("sign", "mu"), [(1.0, FORWARDS), (-1.0, BACKWARDS)])
 def test_every_kind_of_obstacle_knows_the_way(device, shape, sign, mu):
-    """Balls and capsules are round, so that the rod is held to one plane; on a large ball it touches at one point."""
+    """A constraint keeps the rod in one plane, as balls and capsules are round. A large ball has one contact point."""
     scene = rod_on(OBSTACLES[shape])
     scene.fix(0, range(11), "y")
     speeds, *_ = thrown(scene, (sign, 0.0, 0.0), device, 20)
@@ -232,16 +238,17 @@ def test_every_kind_of_obstacle_knows_the_way(device, shape, sign, mu):
 
 
 def test_a_coefficient_may_be_zero(device):
-    """On skates: free along itself, held across."""
+    """A rod moves like a skate, free along the axis and braked across."""
     for direction, mu in (((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, 0.0), ACROSS)):
         speeds, *_ = thrown(rod_on(ddg.Plane(), (0.0, 0.0, ACROSS)), direction, device, 20)
         assert (speeds[4] - speeds[-1]) @ direction / 16e-3 == pytest.approx(mu * 9.81, rel=1e-3, abs=1e-4)
 
 
 def test_three_equal_coefficients_are_one(device):
-    """To the bit."""
-    found = [thrown(rod_on(ddg.Plane(), given), (0.6, 0.8, 0.0), device, 20)[3].points() for given in (0.3, (0.3,) * 3)]
-    assert (found[0] == found[1]).all()
+    ends = [
+        thrown(rod_on(ddg.Plane(), friction), (0.6, 0.8, 0.0), device, 20)[3].points() for friction in (0.3, (0.3,) * 3)
+    ]
+    assert (ends[0] == ends[1]).all()
 
 
 def test_ways_that_are_not_symmetric_are_named(device):

@@ -1,4 +1,4 @@
-"""Distances with closest points against all cases one by one, at random places and where cases meet."""
+"""Distances with closest points against all cases one by one, at random and at boundaries of cases."""
 
 import brute_force
 import numpy as np
@@ -18,7 +18,7 @@ REGIONS = {"edges": 9, "point and triangle": 7, "edge and point": 3}
 
 
 def measured(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (n, 3) and weights (n, 4) of corners (n, 4, 3)."""
+    """Return offsets (n, 3) and weights (n, 4) of corners (n, 4, 3)."""
     X, W = wp.types.vector(3, real), wp.types.vector(4, real)
     *_, closest = pair_functions(kind, real)
     corners_of = corners_function(real)
@@ -37,7 +37,7 @@ def measured(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[n
 
 
 def true(reference, corners: np.ndarray) -> np.ndarray:
-    """Distances in extended precision, where cases that meet are told apart by less."""
+    """Return distances in extended precision, to resolve the boundaries of cases."""
     return reference(*np.moveaxis(corners.astype(np.longdouble), 1, 0)).astype(float)
 
 
@@ -69,7 +69,7 @@ def test_distances_are_those_of_all_cases(device, name, case):
     corners = configurations()[case]
     r, w = measured(kind, corners, device)
     assert np.linalg.norm(r, axis=1) == pytest.approx(true(reference, corners), abs=2e-14, rel=1e-13)
-    # the offset is that of the closest points, which lie on their sides
+    # the offset joins the closest points, which lie on both primitives
     assert np.einsum("nk,nkd->nd", w, corners) == pytest.approx(r, abs=2e-14)
     side = kind.first
     assert w[:, :side].min() >= 0.0 and w[:, side:].max() <= 0.0

@@ -1,4 +1,4 @@
-"""Equilibria in contact: beams by closed forms, what rests on obstacles, the end of damped motion, stability, and what is refused."""
+"""Equilibria in contact: beams by closed forms, bodies on obstacles, limits of damped motion, stability, and refusals."""
 
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ def line(start, end, n: int) -> np.ndarray:
 
 
 def stiffness(scene) -> float:
-    """EI of the first rod [N m^2]."""
+    """Return EI of the first rod [N m^2]."""
     return float(np.max(scene.batches[0].section.EI1))
 
 
@@ -43,13 +43,13 @@ def weight(model) -> float:
     return -float(tangent.loads(1.0, tangent.dofs(model.state())).sum())
 
 
-def pressed(n: int, law: str, at: float, both: bool):
-    """A beam of 1 m along x, clamped at one end or both, on which a ball comes down."""
+def pressed(n: int, law: str, position: float, both: bool):
+    """Return a beam of 1 m along x, clamped at one end or both, on which a ball moves down."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n), section=ddg.Circle(0.01), material=RUBBER)
     for end in ("first", "last")[: 1 + both]:
         scene.clamp_end(rod, end)
-    ball = ddg.Sphere((at, 0.0, 0.1101), 0.1)
+    ball = ddg.Sphere((position, 0.0, 0.1101), 0.1)
     scene.add_obstacle(ball, motion=ddg.Motion(lambda t: (0.0, 0.0, -3e-4 * t)), name="ball")
     scene.contact(law=law, range=2e-5, stiffness=1e4 * stiffness(scene))
     return scene
@@ -58,31 +58,31 @@ def pressed(n: int, law: str, at: float, both: bool):
 @each_law
 @pytest.mark.parametrize("load_steps", [1, 3])
 def test_crossed_beams_are_springs(device, law, load_steps):
-    """Two of 192 EI / L^3 in series: each takes half of the overlap, and they push each other with 96 EI of it over L^3."""
+    """Two springs of 192 EI / L^3 act in series: each takes half of the overlap, and the force is 96 EI / L^3 times the overlap."""
     scene = crossed_beams.build(law=law, dt=1.0 / crossed_beams.SPEED_UP)  # clamps are down at load parameter 1
     model = scene.build(device, precision="float64")
     state = statics.solve(model, load_steps=load_steps)
-    points, found, force = state.points(), model.contacts(state), forces(model, state)[:, 2]
+    points, contacts, force = state.points(), model.contacts(state), forces(model, state)[:, 2]
     assert state.stable
     middle = len(points) // 4
-    overlap = 2.0 * crossed_beams.RADIUS + found.gap.min() - points[len(points) // 2, 2]
+    overlap = 2.0 * crossed_beams.RADIUS + contacts.gap.min() - points[len(points) // 2, 2]
     np.testing.assert_allclose(force[:2].sum(), 96.0 * stiffness(scene) * overlap, rtol=6e-3)
     np.testing.assert_allclose(-points[middle, 2], 0.5 * overlap, rtol=1e-5)
     np.testing.assert_allclose(force[2:].sum(), -force[:2].sum(), rtol=1e-9)
     if law == "barrier":
-        assert (found.gap > 0.0).all()
+        assert (contacts.gap > 0.0).all()
 
 
 @each_law
-@pytest.mark.parametrize(("at", "both", "spring"), [(0.5, True, 192.0), (1.0, False, 3.0)])
-def test_a_ball_pressed_on_a_beam(device, law, at, both, spring):
+@pytest.mark.parametrize(("position", "both", "spring"), [(0.5, True, 192.0), (1.0, False, 3.0)])
+def test_a_ball_pressed_on_a_beam(device, law, position, both, spring):
     """F = 192 EI w / L^3 in the middle of a clamped beam, 3 EI w / L^3 at the tip of a cantilever (Euler and Bernoulli)."""
     errors = []
     for n in (16, 32, 64):
-        scene = pressed(n, law, at, both)
+        scene = pressed(n, law, position, both)
         model = scene.build(device, precision="float64")
         state = statics.solve(model)
-        deflection = state.points()[round(at * n), 2]
+        deflection = state.points()[round(position * n), 2]
         assert deflection < -1.5e-4
         errors.append(forces(model, state)[-1, 2] / (spring * stiffness(scene) * deflection) - 1.0)
     assert np.abs(errors[-1]) < 2e-3, errors
@@ -93,8 +93,8 @@ def test_a_ball_pressed_on_a_beam(device, law, at, both, spring):
 def test_a_heavy_rod_is_lifted_off_the_floor(device, law):
     """An end is raised by h and kept level; the rod leaves the floor over l = (72 EI h / w)^(1/4).
 
-    From where it leaves, y = F s^3 / 6 EI - w s^4 / 24 EI: height, slope and curvature are zero there, and the floor has a force F.
-    With y' = 0 at l, F = w l / 3, so that y(l) = w l^4 / 72 EI, and what holds the end carries 2 w l / 3.
+    From the lift-off point y = F s^3 / 6 EI - w s^4 / 24 EI: height, slope and curvature vanish there, and the floor exerts F. With
+    y' = 0 at l, F = w l / 3 and y(l) = w l^4 / 72 EI. The raised end carries 2 w l / 3.
     """
     lift, errors = 2e-3, []
     for n in (50, 100, 200):
@@ -107,16 +107,16 @@ def test_a_heavy_rod_is_lifted_off_the_floor(device, law):
         scene.contact(law=law, range=2e-5)
         model = scene.build(device, precision="float64")
         state = statics.solve(model)
-        points, found, force = state.points(), model.contacts(state), forces(model, state)[:, 2]
+        points, contacts, force = state.points(), model.contacts(state), forces(model, state)[:, 2]
         assert state.stable
         np.testing.assert_allclose(force.sum(), weight(model), rtol=1e-8)
-        np.testing.assert_allclose(found.force[:, 2].sum(), force[-1], rtol=1e-9)
-        w = weight(model)  # of a metre
+        np.testing.assert_allclose(contacts.force[:, 2].sum(), force[-1], rtol=1e-9)
+        w = weight(model)  # per metre
         h = points[0, 2] - np.median(points[n // 2 :, 2])
         length = (72.0 * stiffness(scene) * h / w) ** 0.25
         errors.append(force[0] / (2.0 * w * length / 3.0) - 1.0)
-        pushed = found.force[:, 2] > 0.1 * w / n
-        assert abs(found.point[pushed, 0].min() - length) < 2.5 / n
+        loaded = contacts.force[:, 2] > 0.1 * w / n
+        assert abs(contacts.point[loaded, 0].min() - length) < 2.5 / n
     assert np.abs(errors[-1]) < 1.5e-3, errors
     assert abs(errors[0]) > 2.5 * abs(errors[1]) > 5.0 * abs(errors[2]), errors
 
@@ -138,7 +138,7 @@ def sheet_on_a_ball():
     points = points - [0.5, 0.5, 0.0]
     scene.add_shell(points, triangles, thickness=4e-3, material=ddg.Material(young=1e6, density=500.0, poisson=0.3))
     scene.hold(0, [int(np.argmin(np.linalg.norm(points, axis=1)))], "xy")
-    scene.add_obstacle(ddg.Sphere((0.0, 0.0, -0.305), 0.3), name="ball")  # beyond the range of contact: it falls there
+    scene.add_obstacle(ddg.Sphere((0.0, 0.0, -0.305), 0.3), name="ball")  # beyond the contact range: the sheet falls
     scene.contact(range=1e-3)
     return scene
 
@@ -147,18 +147,18 @@ def sheet_on_a_ball():
 def test_reactions_carry_the_weight(device, scene):
     model = scene().build(device, precision="float64")
     state = statics.solve(model)
-    force, found = forces(model, state), model.contacts(state)
+    force, contacts = forces(model, state), model.contacts(state)
     np.testing.assert_allclose(force.sum(0), [0.0, 0.0, weight(model)], atol=1e-8 * weight(model))
     assert force[-1, 2] > 0.2 * weight(model)
     assert state.stable
-    assert (found.gap > 0.0).all()
+    assert (contacts.gap > 0.0).all()
     assert model.energies(state)["contact"] > 0.0
     again = statics.solve(model)
     np.testing.assert_array_equal(again.points(), state.points())
 
 
 def test_a_rod_rests_in_a_groove(device):
-    """Nothing holds it but two planes, which carry its weight, each across itself."""
+    """Two planes are the only supports, and each carries by a normal force."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     scene.add_rod(line((0.01, -0.1, 0.05), (0.01, 0.1, 0.05), 8), section=ddg.Circle(0.005), material=RUBBER)
     for side in (1.0, -1.0):
@@ -171,7 +171,7 @@ def test_a_rod_rests_in_a_groove(device):
 
 
 def test_an_equilibrium_is_where_damped_motion_ends(device):
-    """A rod that two supports hold lies across another one and a ball."""
+    """A rod with two clamped ends lies across another rod and a ball."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G), mass_damping=20.0)
     soft = ddg.Material(young=3e8, density=1000.0)
     scene.clamp(
@@ -189,13 +189,13 @@ def test_an_equilibrium_is_where_damped_motion_ends(device):
     assert np.abs(moved.velocities()).max() < 1e-10
     rest = statics.solve(model)
     np.testing.assert_allclose(rest.points(), moved.points(), atol=1e-8)
-    found, ended = model.contacts(rest), model.contacts(moved)
-    assert {tuple(pair) for pair in found.objects} == {(0, 1), (1, 2)}
-    np.testing.assert_allclose(found.force, ended.force, atol=1e-6 * weight(model))
+    contacts, ended = model.contacts(rest), model.contacts(moved)
+    assert {tuple(pair) for pair in contacts.objects} == {(0, 1), (1, 2)}
+    np.testing.assert_allclose(contacts.force, ended.force, atol=1e-6 * weight(model))
 
 
 def over(lower: np.ndarray, upper: np.ndarray) -> float:
-    """How high above one row of edges another one is where they cross as seen from above [m], the least."""
+    """Return the least height of one polyline over another at crossings in plan view [m]."""
     heights = []
     for a, b in pairwise(lower):
         for c, d in pairwise(upper):
@@ -208,7 +208,7 @@ def over(lower: np.ndarray, upper: np.ndarray) -> float:
 @each_law
 @pytest.mark.parametrize("both", [True, False])
 def test_nothing_is_pushed_through_anything(device, law, both):
-    """Clamps go 0.25 m beyond a beam in one load step, and in ten: the rods never cross, and end alike."""
+    """Clamps move 0.25 m beyond a beam in one load step and in ten: the rods never cross, and both end alike."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     s = np.linspace(-0.5, 0.5, 17)
     for name, points in (("lower", [s, 0.0 * s, 0.0 * s]), ("upper", [0.0 * s + 0.02, s, 0.0 * s + 0.05])):
@@ -224,14 +224,14 @@ def test_nothing_is_pushed_through_anything(device, law, both):
         state = statics.solve(model, state, start=0.1 * k, end=0.1 * (k + 1))
         lower, upper = state.points()[:17], state.points()[17:]
         a, b = np.repeat(np.arange(16), 16), np.tile(np.arange(16), 16)
-        apart = edge_edge(lower[a], lower[a + 1], upper[b], upper[b + 1]).min()
-        assert apart > (0.02 if law == "barrier" else 1e-3)
+        distance = edge_edge(lower[a], lower[a + 1], upper[b], upper[b + 1]).min()
+        assert distance > (0.02 if law == "barrier" else 1e-3)
         assert over(lower, upper) > 0.0
     np.testing.assert_allclose(state.points(), once.points(), atol=1e-8)
 
 
 def test_worlds_are_as_alone(device):
-    """Each under its own gravity, which presses a cantilever on a floor."""
+    """Every world presses a cantilever on a floor by another gravity."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(line((0.0, 0.0, 0.03), (0.5, 0.0, 0.03), 16), section=ddg.Circle(0.004), material=RUBBER)
     scene.clamp(rod)
@@ -244,36 +244,36 @@ def test_worlds_are_as_alone(device):
     assert set(model.contacts(state).world) == {0, 1, 2}
     alone = scene.build(device, precision="float64")
     for world, gravity in enumerate(down):
-        found = statics.solve(alone, controls=ddg.Controls(gravity=gravity))
-        np.testing.assert_allclose(state.points()[world], found.points(), atol=1e-9)
+        expected = statics.solve(alone, controls=ddg.Controls(gravity=gravity))
+        np.testing.assert_allclose(state.points()[world], expected.points(), atol=1e-9)
 
 
 @each_law
 @pytest.mark.parametrize("name", SCENES)
 def test_the_tangent_of_what_touches(name, law):
-    """Against central differences of forces, along a direction in which all free dofs move."""
+    """Products equal central differences of forces along a direction that moves all free dofs."""
     model = built(scene_of(name, law))
     state, tangent = touching(model), Tangent(model)
     assert len(model.contacts(state))
     q = tangent.dofs(state)
     direction = np.where(tangent.free, np.random.default_rng(1).normal(size=tangent.size), 0.0)
     direction *= np.where(tangent.angle, 1e-2, 1e-5)
-    found = tangent.stiffness(state) @ direction
+    product = tangent.stiffness(state) @ direction
 
     def forces_at(x):
-        there = state.copy()
-        there.net.q.assign((q + x * direction).reshape(-1, 3))  # in the frames of the state
-        return tangent.gradient(there)
+        displaced = state.copy()
+        displaced.net.q.assign((q + x * direction).reshape(-1, 3))  # in the frames of the state
+        return tangent.gradient(displaced)
 
     step = 1e-3
     one, two = ((forces_at(s * step) - forces_at(-s * step)) / (2.0 * s * step) for s in (1.0, 2.0))
     reference = (4.0 * one - two) / 3.0
-    assert np.abs(found - reference)[tangent.free].max() < 1e-6 * np.abs(reference[tangent.free]).max()
+    assert np.abs(product - reference)[tangent.free].max() < 1e-6 * np.abs(reference[tangent.free]).max()
 
 
 @each_law
 def test_what_lies_on_a_floor_swings_upon_it(device, law):
-    """Up and down at omega^2 = (dW / dz) / m, from equilibria under a little more and less weight; it is all but rigid."""
+    """A nearly rigid rod vibrates at omega^2 = (dW / dz) / m, by equilibria under slightly more and less weight."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     rod = scene.add_rod(
         line((0.0, 0.0, 0.0052), (0.02, 0.0, 0.0052), 2),
@@ -295,10 +295,10 @@ def test_what_lies_on_a_floor_swings_upon_it(device, law):
 
 
 def ruck(load: float) -> tuple[float, float]:
-    """Shortening and height of a heavy rod's ruck on a floor, EI = 1, w = 1, by the force along it.
+    """Return shortening and height of a heavy rod's ruck on a floor, for EI = w = 1 and an axial force.
 
-    EI theta'' = -P sin(theta) - w s cos(theta), theta = 0 at its crest s = 0, and theta = theta' = 0 where it comes down, at a length
-    that is to be found (Vella, Boudaoud and Adda-Bedia, Phys. Rev. Lett. 103, 2009, 174301).
+    EI theta'' = -P sin(theta) - w s cos(theta), with theta = 0 at the crest s = 0. The rod comes down with theta = theta' = 0 at a
+    length to be found (Vella, Boudaoud and Adda-Bedia, Phys. Rev. Lett. 103, 2009, 174301).
     """
 
     def along(u, y, p):
@@ -307,7 +307,7 @@ def ruck(load: float) -> tuple[float, float]:
     u, root = np.linspace(0.0, 1.0, 201), 4.493409  # of tan(x) = x, for small slopes
     half = root / np.sqrt(load)
     guess = half / load * (np.sin(root * u) / np.sin(root) - u)
-    found = solve_bvp(
+    solution = solve_bvp(
         along,
         lambda a, b, p: np.array([a[0], b[0], b[1]]),
         u,
@@ -316,13 +316,13 @@ def ruck(load: float) -> tuple[float, float]:
         tol=1e-9,
     )
     u = np.linspace(0.0, 1.0, 4001)
-    slope, half = found.sol(u)[0], found.p[0]
+    slope, half = solution.sol(u)[0], solution.p[0]
     return 2.0 * half * trapezoid(1.0 - np.cos(slope), u), half * abs(trapezoid(np.sin(slope), u))
 
 
 @each_law
 def test_a_ruck_in_a_rug(device, law):
-    """A heavy rod that is too long for the room between its ends lies on the floor but for one wave."""
+    """A heavy rod, too long for the distance between the supports, lies on the floor but for one wave."""
     load, far, n, radius = 3.0, 4.0, 240, 0.005
     shortening, height = ruck(load)
     x = np.linspace(-far, far, 20001)
@@ -345,8 +345,8 @@ def test_a_ruck_in_a_rug(device, law):
     scene.contact(law=law, range=1e-3)
     model = scene.build(device, precision="float64")
     state = statics.solve(model, start=1.0, end=1.0, max_iterations=1000)
-    pushes = np.array([reaction.force for reaction in model.reactions(state)])[1:3, 0]
-    np.testing.assert_allclose(pushes, [load, -load], rtol=2e-3)
+    end_forces = np.array([reaction.force for reaction in model.reactions(state)])[1:3, 0]
+    np.testing.assert_allclose(end_forces, [load, -load], rtol=2e-3)
     assert np.ptp(state.points()[:, 2]) == pytest.approx(height, rel=1e-3)
 
 
@@ -366,7 +366,9 @@ def test_what_equilibria_refuse(device):
     def model_of(scene):
         return scene.build(device, precision="float64")
 
-    rough, smooth, partly = (model_of(rods_with(**given)) for given in ({"friction": 0.3}, {}, {"objects": ["one"]}))
+    rough, smooth, partly = (
+        model_of(rods_with(**options)) for options in ({"friction": 0.3}, {}, {"objects": ["one"]})
+    )
     with pytest.raises(
         ddg.SceneError,
         match=r"stability and paths .* know no friction, and it is 0.3 between 'floor' and 'one'.*set friction=0",
@@ -395,15 +397,15 @@ def test_what_nothing_holds_is_carried_away(device):
 
 @pytest.mark.parametrize("outcome", ["max_iterations", "line_search_failed"])
 def test_what_the_device_does_not_finish_the_host_does(monkeypatch, outcome):
-    """From near the end, where rounding may keep the device from one: the same equilibrium."""
+    """The device stops near the end, where rounding may keep it from converging: the host finds the same equilibrium."""
     model = pressed(16, "barrier", 0.5, True).build("cpu", precision="float64")
     finished, solve = statics.solve(model), NetEquilibrium.solve
 
-    def unfinished(self, state, at, before, increment):
-        found = solve(self, state, at, before, increment)
-        moved = self.tangent.dofs(found)
-        self.tangent.assign(found, moved - 1e-9 * self.tangent.free * np.cos(np.arange(len(moved))))
-        raise SolverError("not finished", state=found, outcome=outcome)
+    def unfinished(self, state, load_factor, before, increment):
+        solution = solve(self, state, load_factor, before, increment)
+        moved = self.tangent.dofs(solution)
+        self.tangent.assign(solution, moved - 1e-9 * self.tangent.free * np.cos(np.arange(len(moved))))
+        raise SolverError("not finished", state=solution, outcome=outcome)
 
     monkeypatch.setattr(NetEquilibrium, "solve", unfinished)
     state = statics.solve(model)
@@ -412,7 +414,10 @@ def test_what_the_device_does_not_finish_the_host_does(monkeypatch, outcome):
 
 
 def layers_apart() -> ddg.Scene:
-    """Crossed layers far above each other, that can go up and down alone; the higher, the heavier, so that all overtake all."""
+    """Return crossed layers of rods, far above each other, that only move vertically.
+
+    Higher rods are heavier, so that every rod overtakes all rods below.
+    """
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     s, off = np.linspace(-0.1, 0.1, 13), np.linspace(-0.08, 0.08, 8)
     for level in range(5):
@@ -431,7 +436,7 @@ def layers_apart() -> ddg.Scene:
 
 
 def test_long_ways_past_a_crowd_are_gone_in_parts(device, monkeypatch):
-    """By room for few pairs, or for all there are along the ways, what sags far comes to the same rest."""
+    """Room for few pairs, or for all pairs along the motion, leads rods that sag far to the same equilibrium."""
     model = layers_apart().build(device, precision="float64")
     at_once = statics.Equilibrium(model)
     rest = at_once.load(model.state(), 1)
@@ -447,16 +452,16 @@ def test_long_ways_past_a_crowd_are_gone_in_parts(device, monkeypatch):
 
 
 def test_the_part_of_a_motion_that_is_safe(device, monkeypatch):
-    """Whatever there is room for at first: up to where crossed rods 23 mm apart meet, which are 4 mm thick, or by room for few less."""
+    """The step fraction reaches up to where crossed rods, 23 mm apart and 4 mm thick, meet. Room for few pairs gives less."""
     model = layers_apart().build(device, precision="float64")
     before = Tangent(model).dofs(model.state()).reshape(-1, 3)
     z = before[: 40 * 13, 2]
-    way = np.zeros_like(before)
-    way[: len(z), 2] = -12.0 * (z - z.min())  # all come together, and pass by each other
+    motion = np.zeros_like(before)
+    motion[: len(z), 2] = -12.0 * (z - z.min())  # all rods come together and pass each other
     meet = (1.0 - 4.0 / 23.0) / 12.0
-    share = statics.Equilibrium(model).net.share(before.ravel(), (before + way).ravel())
-    assert 0.85 * meet < share < meet
+    fraction = statics.Equilibrium(model).net.share(before.ravel(), (before + motion).ravel())
+    assert 0.85 * meet < fraction < meet
     monkeypatch.setattr(pairs, "CROWD", 1)
     monkeypatch.setattr(pairs, "CROWD_LEAST", 1)
-    part = statics.Equilibrium(model).net.share(before.ravel(), (before + way).ravel())
-    assert 0.2 * meet < part < meet
+    limited = statics.Equilibrium(model).net.share(before.ravel(), (before + motion).ravel())
+    assert 0.2 * meet < limited < meet

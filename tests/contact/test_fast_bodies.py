@@ -1,4 +1,4 @@
-"""Thick bodies that pass each other within a step, and are clear of each other at both of its ends."""
+"""Thick bodies that pass each other within a step, apart at the start and at the end."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,15 @@ RADIUS, THICK, DT = 2e-3, 0.02, 0.01
 SOFT = ddg.Material(young=1e6, density=1000.0)
 
 
-def passing(shape: str, off: float) -> ddg.Scene:
-    """A rod along z, and a body of a shape that goes along x by five times its width in a step, its middle beside the rod's."""
+def passing(shape: str, offset: float) -> ddg.Scene:
+    """Return a rod along z and a body that passes along x by five widths in a step.
+
+    `offset` is the distance of the centrelines along y [m].
+    """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     line = np.linspace((0.0, 0.0, -0.05), (0.0, 0.0, 0.05), 11)
     scene.add_rod(line, section=ddg.Circle(RADIUS), material=SOFT)
-    motion, start = ddg.Motion(translation=lambda t: (0.1 * t / DT, 0.0, 0.0)), np.array([-0.05, off, 0.0])
+    motion, start = ddg.Motion(translation=lambda t: (0.1 * t / DT, 0.0, 0.0)), np.array([-0.05, offset, 0.0])
     end = start + [0.0, 0.1, 0.0]
     if shape == "ball":
         scene.add_obstacle(ddg.Sphere(tuple(start), THICK), motion=motion)
@@ -29,14 +32,14 @@ def passing(shape: str, off: float) -> ddg.Scene:
 
 @pytest.mark.parametrize("shape", ["ball", "capsule", "rod"])
 def test_what_passes_beside_the_middle_is_met_by_its_surface(device, shape):
-    """Surfaces meet where middles pass at less than the thickness, also where rods are stepped on their own while nothing is near."""
+    """Surfaces collide where centrelines pass at less than the thickness, in decoupled steps, too."""
     for off in (0.98 * THICK, 1.2 * THICK + RADIUS):
-        model, found = passing(shape, off).build(device=device), []
+        model, ends = passing(shape, off).build(device=device), []
         for whole in (False, True):
             integrator = ddg.Integrator(model)
             if whole:
                 integrator.step_whole()
-            found.append(integrator.step(model.state(), DT).points()[:11])
-            moved = np.abs(found[-1] - model.state().points()[:11]).max()
+            ends.append(integrator.step(model.state(), DT).points()[:11])
+            moved = np.abs(ends[-1] - model.state().points()[:11]).max()
             assert (moved > 1e-3) == (off < THICK + RADIUS)
-        np.testing.assert_array_equal(*found)
+        np.testing.assert_array_equal(*ends)

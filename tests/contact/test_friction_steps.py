@@ -1,4 +1,4 @@
-"""Friction on pairs over steps: what is lagged, what searches and captures leave of it, precision, and what is refused."""
+"""Pair friction over steps: lagging, effects of searches and captures, precision, and refusals."""
 
 import numpy as np
 import pytest
@@ -23,75 +23,75 @@ def test_two_runs_agree_to_the_bit(device, case):
 
 
 def test_worlds_are_alone(device):
-    """Each with its own rate."""
+    """Each world has another rate."""
     shapes, x = CASES["crossing"]()
     random = np.random.default_rng(4)
     starts = [x + 1e-3 * random.normal(size=x.shape) for _ in range(3)]
     slips = [SLIP * random.normal(size=x.shape) for _ in range(3)]
 
     def run(x, slip, *rate):
-        result, at = terms(shapes, x, device, worlds=len(rate), friction=MU, velocity=VELOCITY)
-        result.lag(at)
-        at.assign(x + slip)
-        result.evaluate(at, rates(result, *rate))
+        result, positions = terms(shapes, x, device, worlds=len(rate), friction=MU, velocity=VELOCITY)
+        result.lag(positions)
+        positions.assign(x + slip)
+        result.evaluate(positions, rates(result, *rate))
         return [*state(result), result.dissipated.numpy()]
 
-    given = (RATE, 0.0, 3.0 * RATE)
-    together = run(np.concatenate(starts), np.concatenate(slips), *given)
-    alone = [run(*each) for each in zip(starts, slips, given, strict=True)]
-    for whole, parts in zip(together, zip(*alone, strict=True), strict=True):
-        assert (whole == np.concatenate(parts)).all()
+    world_rates = (RATE, 0.0, 3.0 * RATE)
+    together = run(np.concatenate(starts), np.concatenate(slips), *world_rates)
+    alone = [run(*each) for each in zip(starts, slips, world_rates, strict=True)]
+    for whole, separate in zip(together, zip(*alone, strict=True), strict=True):
+        assert (whole == np.concatenate(separate)).all()
     assert (together[-1] > 0.0).tolist() == [True, False, True]
 
 
 def test_searches_within_a_step_leave_friction_alone(device):
-    """Lists of contact change, then change back; and slip may count from elsewhere."""
-    result, at, x, _ = rubbed("crossing", device)
+    """Contact lists change and change back; slip may count from other positions."""
+    result, positions, x, _ = rubbed("crossing", device)
     before = state(result)
     number = [pairs.count.numpy()[0] for pairs in result.search.lists]
     away = upload(x + 2.0 * MARGIN * np.random.default_rng(2).normal(size=x.shape), device)
     result.search.search(away)
     result.evaluate(away)
     assert [pairs.count.numpy()[0] for pairs in result.search.lists] != number
-    result.evaluate(at, rates(result))
+    result.evaluate(positions, rates(result))
     assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
-    result.evaluate(at, rates(result), upload(x, device))
+    result.evaluate(positions, rates(result), upload(x, device))
     assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
-    result.evaluate(at, rates(result), at)
+    result.evaluate(positions, rates(result), positions)
     assert not result.forces.numpy().any()
 
 
 def test_lists_grow_and_friction_has_to_be_lagged_anew(device):
     shapes, x = CASES["crossing"]()
-    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
-    there = upload(x + SLIP, device)
+    result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    shifted = upload(x + SLIP, device)
 
     def step():
-        result.lag(at)
-        result.evaluate(there, rates(result))
+        result.lag(positions)
+        result.evaluate(shifted, rates(result))
         return state(result)
 
     with pytest.raises(SolverError, match=r"no pairs of the step's start; call lag\(\) there"):
-        result.evaluate(at, rates(result))
+        result.evaluate(positions, rates(result))
     before = step()
     for pairs in result.search.lists:
         pairs.reserve(10)
-    result.search.search(at)
+    result.search.search(positions)
     assert np.isinf(step()[0]).all()
-    assert result.search.fit(at) and result.fit()
+    assert result.search.fit(positions) and result.fit()
     with pytest.raises(SolverError, match=r"call lag\(\) there, anew after fit\(\)"):
-        result.evaluate(there, rates(result))
+        result.evaluate(shifted, rates(result))
     assert all((a == b).all() for a, b in zip(step(), before, strict=True))
 
 
 @pytest.mark.parametrize("conditional", [False, True])
 def test_captured_steps(device, conditional):
-    """Lagged where the last step ended, also in a conditional part."""
+    """Friction is lagged at the end of the last step, also in a conditional node."""
     shapes, x = CASES["crossing"]()
-    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
     plain, _ = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
     start, rate = upload(x, device), rates(result)
-    given, out = upload(x, device), upload(0.0 * x, device)
+    direction, out = upload(x, device), upload(0.0 * x, device)
     wanted = wp.ones(1, dtype=int, device=device)
 
     def lag():
@@ -104,20 +104,20 @@ def test_captured_steps(device, conditional):
             wp.capture_if(wanted, lag)
         else:
             lag()
-        result.search.update(at)
-        result.evaluate(at, rate)
+        result.search.update(positions)
+        result.evaluate(positions, rate)
         out.zero_()
-        result.product(given, out)
+        result.product(direction, out)
         result.join()
     speed = 0.3 * MARGIN * np.random.default_rng(5).normal(size=x.shape)
     for step in range(4):
         move(plain, start, x + step * speed)
         plain.lag(start)
-        move(plain, at, x + (step + 1) * speed)
-        plain.evaluate(at, rate)
+        move(plain, positions, x + (step + 1) * speed)
+        plain.evaluate(positions, rate)
         wp.capture_launch(capture.graph)
-        for one, other in zip(state(plain), state(result), strict=True):
-            assert np.abs(one - other).max() <= 1e-13 * np.abs(one).max()
+        for expected, actual in zip(state(plain), state(result), strict=True):
+            assert np.abs(expected - actual).max() <= 1e-13 * np.abs(expected).max()
         assert np.abs(out.numpy() - times(plain, x)).max() < 1e-12 * np.abs(out.numpy()).max()
         assert result.dissipated.numpy()[0] == pytest.approx(plain.dissipated.numpy()[0], rel=1e-12)
         assert result.dissipated.numpy()[0] > 0.0
@@ -136,15 +136,15 @@ def test_factors_in_single_precision(device, case, form):
 
 @each_case
 def test_all_in_single_precision(device, case):
-    """A slip of 1 mm is known to 1e-4 of it."""
+    """Float32 positions resolve a slip of 1 mm to 1e-4."""
     whole, _, x, after = rubbed(case, device, slip=1e-3, velocity=1.0)
-    at = upload(x, device, wp.vec3f)
-    search = BroadPhase(CASES[case]()[0], at, reach=REACH, margin=MARGIN)
+    positions = upload(x, device, wp.vec3f)
+    search = BroadPhase(CASES[case]()[0], positions, reach=REACH, margin=MARGIN)
     single = PairTerms(search, smooth_penalty, **LAWS["penalty"][1], friction=MU, velocity=1.0)
-    single.lag(at)
+    single.lag(positions)
     single.law.stiffness.zero_()
-    at.assign(after)
-    single.evaluate(at, rates(single))
+    positions.assign(after)
+    single.evaluate(positions, rates(single))
     v = np.random.default_rng(7).normal(size=x.shape)
     for value, exact in (
         (single.forces.numpy(), whole.forces.numpy()),
@@ -172,8 +172,8 @@ def test_wrong_parameters_are_named(device, options, message):
 
 
 def test_rates_that_do_not_fit_are_refused(device):
-    result, at = terms(*bundle(), device, friction=MU)
-    result.lag(at)
+    result, positions = terms(*bundle(), device, friction=MU)
+    result.lag(positions)
     for wrong in (rates(result, 1.0, 2.0), wp.ones(1, dtype=wp.float32, device=device)):
         with pytest.raises(SolverError, match=r"rates of contact are 1 of float64, one a world, not \(. ?.?,?\)"):
-            result.evaluate(at, wrong)
+            result.evaluate(positions, wrong)

@@ -1,4 +1,4 @@
-"""What contact with friction keeps over whole runs: momentum, energy, rest, sheets from crossing, whatever the order of objects."""
+"""Invariants of whole runs with friction: momentum, energy, rest, no self-crossing, and the order of objects."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ LAWS = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
 def collision(friction: float, law: str) -> tuple[ddg.Scene, np.ndarray]:
-    """Two rods without twist and a sheet that fly at each other, and their velocities."""
+    """Return two rods without twist and a sheet that collide, and velocities."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod(scene, line(0.1, 10, middle=(0.0, 0.01, 0.03)), "first", twist=False)
     rod(scene, line(0.1, 10, (0.0, 1.0, 0.0), (0.0, 0.0, 0.04)), "second", twist=False)
@@ -40,17 +40,17 @@ def collision(friction: float, law: str) -> tuple[ddg.Scene, np.ndarray]:
 @LAWS
 @pytest.mark.parametrize("friction", [0.0, MU])
 def test_internal_contact_keeps_momentum(device, friction, law):
-    """Forces of contact and friction sum to zero to rounding, and so do moments of contact; momentum is kept to the solver's tolerance.
+    """Contact and friction forces sum to zero to rounding, as do moments of contact; momentum is conserved to the solver's tolerance.
 
-    Steps of implicit Euler give sum x1 x m (v1 - v0) = 0 where moments of all forces are zero. Friction acts between middles, whose
-    distance is the arm of a couple, so that with it this holds of contact alone.
+    Implicit Euler has sum x1 x m (v1 - v0) = 0 where the moments of all forces vanish. Friction acts between centrelines, whose
+    distance is the arm of a couple, so that this holds without friction only.
     """
     scene, speed = collision(friction, law)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model, rtol=1e-11), model.state(velocities=speed)
     contact, mass = integrator._net.newton.contact, model.net.host.mass[: len(speed), :1]
     start, size, total = (mass * speed).sum(0), (mass * np.abs(speed)).sum(), [sum(model.energies(state).values())]
-    pushed = 0.0
+    largest = 0.0
     for _ in range(40):
         before, state = state.velocities(), integrator.step(state, 2e-3)
         after, points = state.velocities(), state.points()
@@ -58,7 +58,7 @@ def test_internal_contact_keeps_momentum(device, friction, law):
         assert np.abs(forces.sum(0)).max() <= 1e-13 * max(np.abs(forces).sum(), 1e-300)
         model.touch.at(state.net.q)
         forces = model.touch.terms.forces.numpy()[: len(speed)]  # without
-        pushed = max(pushed, np.abs(forces).sum())
+        largest = max(largest, np.abs(forces).sum())
         moments = np.cross(points, forces)
         assert np.abs(moments.sum(0)).max() <= 1e-13 * max(np.abs(forces).sum() * np.abs(points).max(), 1e-300)
         assert np.abs((mass * after).sum(0) - start).max() < 1e-10 * size
@@ -66,14 +66,14 @@ def test_internal_contact_keeps_momentum(device, friction, law):
             change = (mass * np.cross(points, after - before)).sum(0)
             assert np.abs(change).max() < 1e-10 * size * np.abs(points).max()
         total.append(sum(model.energies(state).values()))
-    assert pushed > 1.0
+    assert largest > 1.0
     assert_no_energy_is_made(np.array(total))
     assert integrator.statistics()["contact"]["refused_crossings"] == 0
 
 
 @LAWS
 def test_friction_never_adds_energy(device, law):
-    """27 rods that fly into each other: energy falls in every step, with friction by more; its work is positive in every step."""
+    """The energy of 27 colliding rods falls in every step, more so with friction. Friction work never decreases."""
     total, works = {}, []
     for friction in (0.0, 0.5):
         scene, speed = heap(law, **({"friction": friction, "velocity": 1e-2} if friction else {}))
@@ -91,7 +91,7 @@ def test_friction_never_adds_energy(device, law):
 
 
 def test_a_rod_rests_for_a_minute_on_a_slope(device):
-    """It creeps at nu atanh(tan(slope) / mu) / 7.5, as the logistic law says, less than its velocity nu, and does not sink."""
+    """The rod creeps at nu atanh(tan(slope) / mu) / 7.5, by the logistic law below nu, and does not sink."""
     slope, friction, velocity = 0.3, 0.5, 1e-4
     normal, down = np.array([np.sin(slope), 0.0, np.cos(slope)]), np.array([np.cos(slope), 0.0, -np.sin(slope)])
     scene = ddg.Scene()
@@ -107,19 +107,19 @@ def test_a_rod_rests_for_a_minute_on_a_slope(device):
 
 
 def test_a_heap_rests_for_a_minute(device):
-    """Bent rods push each other aside, which friction holds but for a creep: a hundredth of its velocity of 1e-5 m/s."""
+    """Friction stops bent rods but for a creep of a hundredth of the threshold, 1e-5 m/s."""
     model, integrator, states = run(heap_at_rest(None, 0.05), device, 1200, 0.05)
     moved = np.abs(states[-1].points() - states[200].points()).max()
     assert moved < 0.01 * 1e-5 * 50.0
     assert np.abs(states[-1].velocities()).max() < 1e-7
-    found = model.contacts(states[-1])
-    assert -forces_on(found, 4).sum(0)[2] == pytest.approx(4 * 0.1 * WEIGHT, rel=1e-4)
+    contacts = model.contacts(states[-1])
+    assert -forces_on(contacts, 4).sum(0)[2] == pytest.approx(4 * 0.1 * WEIGHT, rel=1e-4)
     assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
 
 
 @pytest.mark.parametrize("cells", [8, pytest.param(16, marks=pytest.mark.slow)])
 def test_a_sheet_is_crumpled_in_a_shrinking_box(device, cells):
-    """Six planes close in on it to a fifth of its side; it touches itself all over and crosses itself nowhere."""
+    """Six planes close in to a fifth of the side; the sheet has self-contact all over and crosses itself nowhere."""
     side, thickness, dt, steps, least = 0.1, 1e-3, 0.02, 60, 0.2
     points, triangles = meshes.rectangle(cells, cells, (side, side), "alternating")
     points = points - [0.5 * side, 0.5 * side, 0.0]
@@ -128,10 +128,10 @@ def test_a_sheet_is_crumpled_in_a_shrinking_box(device, cells):
     scene.add_shell(points, triangles, thickness=thickness, material=material, bending="hinge", name="sheet")
     half = 0.55 * side
     for axis in np.eye(3):
-        for way in (axis, -axis):
-            inwards = -(1.0 - least) * half * way
+        for direction in (axis, -axis):
+            inwards = -(1.0 - least) * half * direction
             motion = ddg.Motion(translation=lambda t, inwards=inwards: inwards * min(1.0, t / (0.8 * dt * steps)))
-            scene.add_obstacle(ddg.Plane(half * way, -way), motion=motion, name="wall")
+            scene.add_obstacle(ddg.Plane(half * direction, -direction), motion=motion, name="wall")
     scene.contact(range=0.5 * thickness, friction=MU)
     start = points + np.random.default_rng(1).normal(size=points.shape) * [0.0, 0.0, 0.5 * thickness]
 
@@ -141,11 +141,11 @@ def test_a_sheet_is_crumpled_in_a_shrinking_box(device, cells):
     model, integrator, states = crumple()
     last = states[-1]
     assert np.abs(last.points()).max() < least * half - 0.5 * thickness
-    found = model.contacts(last)
-    itself = (found.objects == 0).all(1)
+    contacts = model.contacts(last)
+    itself = (contacts.objects == 0).all(1)
     assert itself.sum() > 10 * cells
     assert min(least_gap(model, state) for state in states[1::10]) > 0.0
-    assert least_gap(model, last) == pytest.approx(found.gap[itself].min(), rel=1e-9)
+    assert least_gap(model, last) == pytest.approx(contacts.gap[itself].min(), rel=1e-9)
     assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
     if cells == 8:
         np.testing.assert_array_equal(crumple()[2][-1].points(), last.points())
@@ -164,7 +164,7 @@ ON_THE_CPU = [
 
 
 def falls(device, order) -> dict[str, np.ndarray]:
-    """Where a sheet that falls on a ball and a floor, and rods on it, are after 0.3 s, added in some order."""
+    """Return positions after 0.3 s by object, added in some order: a sheet falls on a ball and a floor, and rods on the sheet."""
     points, triangles = meshes.rectangle(4, 4, (0.1, 0.1), "alternating")
     scene = ddg.Scene(mass_damping=1.0)
     for name in order:
@@ -190,12 +190,12 @@ def falls(device, order) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("order", [NAMES[::-1], ["rod1", "floor", "sheet", "rod2", "rod0", "ball"]])
 def test_the_order_of_objects_does_not_matter(device, order):
     first = falls(device, NAMES)
-    for name, found in falls(device, order).items():
-        np.testing.assert_allclose(found, first[name], atol=1e-6 * RADIUS)
+    for name, points in falls(device, order).items():
+        np.testing.assert_allclose(points, first[name], atol=1e-6 * RADIUS)
 
 
 def test_devices_agree(device):
-    """Corners of the sheet and middles of the rods, to a millionth of a radius of what one core finds in float64 [m]."""
-    found = falls(device, NAMES)
-    points = np.concatenate([found["sheet"][[0, 4, 20, 24]], [found[f"rod{k}"][5] for k in range(3)]])
+    """Corners of the sheet and middles of the rods equal a float64 run on one core to a millionth of a radius [m]."""
+    positions = falls(device, NAMES)
+    points = np.concatenate([positions["sheet"][[0, 4, 20, 24]], [positions[f"rod{k}"][5] for k in range(3)]])
     np.testing.assert_allclose(points, ON_THE_CPU, atol=1e-6 * RADIUS)

@@ -1,4 +1,4 @@
-"""Steps that contact holds up: what is cut short is not taken for rounding, and a knot that locks says so."""
+"""Steps limited by contact: CCD cuts are not mistaken for rounding, and a knot that locks is reported."""
 
 import numpy as np
 import pytest
@@ -13,28 +13,28 @@ from ddg_warp.solve.tangent import Tangent
 
 
 def test_steps_that_are_cut_end_in_balance(device):
-    """A rod that is drawn by its clamp onto a floor that it almost touches: motion is cut to nothing, forces are not small."""
-    radius, apart, edges = 2e-3, 2e-5, 40
+    """A clamp draws a rod onto a floor almost in contact: CCD cuts the motion to nothing while residuals are large."""
+    radius, gap, edges = 2e-3, 2e-5, 40
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     points = np.zeros((edges + 1, 3))
-    points[:, 2] = np.linspace(1.0, 0.0, edges + 1) + radius + apart
+    points[:, 2] = np.linspace(1.0, 0.0, edges + 1) + radius + gap
     section = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=1.0, mass_per_length=1e-3, rotary_inertia=1e-9, radius=radius)
     rod = scene.add_rod(points, section=section)
     scene.clamp_end(rod, "first", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -1e-3 * t)))
     scene.add_force(rod, edges // 2, (0.1, 0.0, 0.0))
     scene.add_obstacle(ddg.Plane())
-    scene.contact(range=apart, stiffness=1e6)
+    scene.contact(range=gap, stiffness=1e6)
     model = scene.build(device=device)
     integrator = ddg.Integrator(model)
     state = integrator.step(model.state(), 1.0)
     tangent = Tangent(model)
-    left = np.where(tangent.free, tangent.gradient(state) - tangent.loads(1.0, tangent.dofs(state)), 0.0)
-    assert np.abs(left).max() < 1e-5  # inertia is some 1e-6 N
+    residual = np.where(tangent.free, tangent.gradient(state) - tangent.loads(1.0, tangent.dofs(state)), 0.0)
+    assert np.abs(residual).max() < 1e-5  # inertia is some 1e-6 N
     assert list(integrator.statistics()["outcomes"]) == ["converged"]
 
 
 def test_what_a_whole_step_brings_there_is_there(device, monkeypatch):
-    """A rod is drawn by its end onto another, which cuts the predictor: a whole step ends its way, though directions are float32."""
+    """A clamp draws a rod onto another, and CCD cuts the predictor: one whole step completes the prescribed motion, despite float32."""
     s = np.linspace(-0.05, 0.05, 13)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     about = {"section": ddg.Circle(2e-3), "material": ddg.Material(young=1e5, density=1000.0, poisson=0.5)}
@@ -43,28 +43,28 @@ def test_what_a_whole_step_brings_there_is_there(device, monkeypatch):
     scene.clamp(drawn, edges=[0], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -0.1 * np.pi * t)))
     scene.contact(range=1e-3, friction=0.0)
     model = scene.build(device=device, precision="mixed")
-    seen, hold, place = [], NetContact.hold, NetContact.place
+    records, hold, place = [], NetContact.hold, NetContact.place
 
-    def look(contact):
+    def record(contact):
         islands = contact.newton.islands
-        found = (contact.search.time, islands.step_length, islands.driven)
-        seen.append([float(values.numpy()[0]) for values in found])
+        arrays = (contact.search.time, islands.step_length, islands.driven)
+        records.append([float(values.numpy()[0]) for values in arrays])
 
     def watched(method):
-        return lambda contact: (method(contact), look(contact))
+        return lambda contact: (method(contact), record(contact))
 
     monkeypatch.setattr(NetContact, "place", watched(place))
     monkeypatch.setattr(NetContact, "hold", watched(hold))
     eagerly(ddg.Integrator(model, rtol=1e-3), model.state(), 1 / 240)
-    predictor, *steps = seen
+    predictor, *steps = records
     assert predictor[0] < 1.0 and predictor[2] == ON_THE_WAY
-    whole = [driven for share, length, driven in steps if share == 1.0 and length == 1.0]
+    whole = [driven for fraction, length, driven in steps if fraction == 1.0 and length == 1.0]
     assert whole and ON_THE_WAY not in whole
 
 
 @pytest.mark.slow
 def test_a_knot_is_drawn_until_it_locks(device):
-    """Far beyond the loose knot every step converges, until no room is left, which names the edges; nothing passes through."""
+    """Every step far beyond the loose knot converges, until no room is left. The error names the edges; no rod crosses."""
     scene = overhand_knot.build(tighter=100.0, steps=200)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), scene.initial(model)
@@ -75,8 +75,8 @@ def test_a_knot_is_drawn_until_it_locks(device):
         except SolverError as error:
             locked = str(error)
             break
-    found = overhand_knot.observe(model, state)
-    assert found["radius"] < 20.0 * overhand_knot.RADIUS
+    observed = overhand_knot.observe(model, state)
+    assert observed["radius"] < 20.0 * overhand_knot.RADIUS
     assert locked is None or ("no_room" in locked and "is between edge" in locked)
     contact = integrator.statistics()["contact"]
     assert contact["refused_crossings"] == 0

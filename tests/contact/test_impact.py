@@ -14,7 +14,10 @@ SIDES = {"edges": (2, 2), "point and triangle": (1, 3)}
 
 
 def pairs_apart(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, np.ndarray]:
-    """A pair in each of `count` worlds, random in place and motion; a point is the end of an edge that meets nothing itself."""
+    """Return one pair in each of `count` worlds, random in position and motion.
+
+    A point is the end of an edge that is itself in no pair.
+    """
     rng = np.random.default_rng(seed)
     nodes = 4 if name == "edges" else 5
     x, move = rng.normal(size=(2, count, nodes, 3))
@@ -30,16 +33,16 @@ def pairs_apart(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, n
 
 
 def gaps(shapes: Shapes, name: str, x: np.ndarray) -> np.ndarray:
-    """Gaps (pairs, worlds) of all pairs that there are at x (worlds, nodes, 3)."""
-    found = []
+    """Return the gaps (pairs, worlds) of all pairs at x (worlds, nodes, 3)."""
+    result = []
     for side in [SIDES["edges"]] + [SIDES["point and triangle"]] * (name != "edges"):
         for i, j in zip(*brute_force.allowed(shapes, *side), strict=True):
             nodes_a, radius_a, *_ = shapes.things(side[0])
             nodes_b, radius_b, *_ = shapes.things(side[1])
             corners = [*np.moveaxis(x[:, nodes_a[i]], 1, 0), *np.moveaxis(x[:, nodes_b[j]], 1, 0)]
             d = (brute_force.edge_edge if side[0] == 2 else brute_force.point_triangle)(*corners)
-            found.append(d - radius_a[i] - radius_b[j])
-    return np.array(found)
+            result.append(d - radius_a[i] - radius_b[j])
+    return np.array(result)
 
 
 @pytest.mark.parametrize("name", SIDES)
@@ -57,7 +60,7 @@ def test_time_of_impact_is_never_late_and_not_much_too_early(device, name):
     assert hit.sum() > 50 and (time[hit] <= first[hit]).all()
     assert np.median((first - time)[hit] / first[hit]) < 0.25
     assert (gaps(shapes, name, x + time[:, None, None] * move)[:, ~overlap] > 0.0).all()
-    # a motion is not stopped unless a pair is to come as near as a tenth of its gap, and is wherever a pair would pass
+    # a motion is stopped wherever a pair would cross, and only where a pair would close a gap to a tenth
     stopped = np.flatnonzero((time < 1.0) & ~overlap)
     left = [(gap[int(time[k] * (FRAMES - 1)) :, :, k].min(0) / gap[0, :, k]).min() for k in stopped]
     assert max(left) <= 0.101
@@ -65,7 +68,7 @@ def test_time_of_impact_is_never_late_and_not_much_too_early(device, name):
 
 
 def test_head_on_impact_by_its_closed_form(device):
-    """Crossed edges at distance 1 with radii 0.1 that approach by 2: they touch at 0.4; a tenth of the gap of 0.8 is left at 0.36."""
+    """Crossed edges at distance 1 with radii 0.1 approach by 2: contact is at 0.4, and a tenth of the gap of 0.8 is left at 0.36."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 1.0, 1.0]])
     move = np.array([[0.0, 0.0, 1.0]] * 2 + [[0.0, 0.0, -1.0]] * 2)
     shapes = Shapes(points)
@@ -79,7 +82,7 @@ def test_head_on_impact_by_its_closed_form(device):
     assert search.time.numpy()[0] == pytest.approx(0.45, rel=1e-12)
     search.impact(x, upload(0.35 * move, device))
     assert search.time.numpy()[0] == 1.0
-    # a motion that all share is none
+    # a common translation is no relative motion
     search.impact(x, upload(np.broadcast_to([300.0, 5.0, -7.0], (4, 3)), device))
     assert search.time.numpy()[0] == 1.0
     # a gap of 0.003 within the reach may go down to a fifth, one little wider to a fifth of the reach
@@ -91,11 +94,11 @@ def test_head_on_impact_by_its_closed_form(device):
 
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 def test_crossings_are_counted_exactly(device, offset):
-    """A grid of 8 x 8 rods that fall through 8 x 8 others across them: all 64 pairs cross as soon as they have met, none before."""
-    ends, at = np.array([-1.0, 1.0]), np.linspace(-0.8, 0.8, 8)
-    one = np.stack(np.broadcast_arrays(ends, at[:, None], 0.0), axis=-1).reshape(-1, 3)
-    other = np.stack(np.broadcast_arrays(at[:, None], ends, 0.3), axis=-1).reshape(-1, 3)
-    points = np.concatenate([one, other]) + offset
+    """Eight rods fall through eight others across: all 64 pairs cross once the layers have met, none before."""
+    ends, offsets = np.array([-1.0, 1.0]), np.linspace(-0.8, 0.8, 8)
+    lower = np.stack(np.broadcast_arrays(ends, offsets[:, None], 0.0), axis=-1).reshape(-1, 3)
+    upper = np.stack(np.broadcast_arrays(offsets[:, None], ends, 0.3), axis=-1).reshape(-1, 3)
+    points = np.concatenate([lower, upper]) + offset
     shapes = Shapes(points)
     for k in range(16):
         shapes.rod([2 * k, 2 * k + 1], 0.01)
@@ -119,7 +122,7 @@ def test_crossings_are_counted_exactly(device, offset):
 
 @pytest.mark.parametrize("distance", [1e-4, 0.0])
 def test_what_slides_past_close_by_has_not_crossed(device, distance):
-    """A rod that slides by ten thousand times its distance from another, across or along it; without any, they meet."""
+    """A rod slides by ten thousand times the distance from another, across or along. Rods at no distance meet."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.5, -1.0, distance], [-0.5, 1.0, distance]])
     shapes = Shapes(points)
     shapes.rod([0, 1], 1e-5)
@@ -132,7 +135,7 @@ def test_what_slides_past_close_by_has_not_crossed(device, distance):
 
 
 def test_crossings_are_found_whether_candidates_hold_or_not(device):
-    """A rod that falls past another, within half of the margin and farther; nothing is searched for anew."""
+    """A rod falls past another, within half of the margin and farther, without a new search."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 3e-3], [0.0, 1.0, 3e-3]])
     shapes = Shapes(points)
     shapes.rod([0, 1], 1e-4)
@@ -148,7 +151,7 @@ def test_crossings_are_found_whether_candidates_hold_or_not(device):
 
 
 def test_crossings_of_random_motion_are_those_of_signed_volumes(device):
-    """Pairs pass where the volume of their nodes changes its sign while the closest points lie inside: roots of a cubic."""
+    """A pair crosses at a root of the volume of four nodes, a cubic in time, if the closest points are interior."""
     rng = np.random.default_rng(3)
     n = 2000
     x, move = rng.normal(size=(2, n, 4, 3))

@@ -1,4 +1,4 @@
-"""What a thread each finds, as on a GPU, is what one thread finds that walks along everything."""
+"""Thread mappings: one thread per item, as on a GPU, and one thread over all items agree."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ REACH, MARGIN = 0.004, 0.01
 
 @pytest.fixture
 def many(monkeypatch):
-    """Makes what follows take a thread each, and what meets lie in several parts."""
+    """Return a switch to one thread per item, with several blocks of overlapping boxes."""
 
     def switch():
         monkeypatch.setattr(arrays, "serial", lambda device: False)
@@ -33,17 +33,17 @@ def test_candidates_are_the_same(device, many, worlds):
     many()
     search = BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN)
     assert max(len(side._found) for side in search.lists) > 4
-    for found, other in zip(one, listed(search), strict=True):
-        np.testing.assert_array_equal(found, other)
+    for expected, actual in zip(one, listed(search), strict=True):
+        np.testing.assert_array_equal(expected, actual)
 
 
 def test_walks_go_along_a_morton_curve(device):
-    """World by world; in each, keys of three times ten bits grow, and boxes outside of the room are at its sides."""
+    """Keys of three times ten bits increase, world by world; boxes outside the bounds are clamped to the sides."""
     rng, count = np.random.default_rng(2), 200
     for worlds in (1, 3):
         boxes = tree.Boxes(count, worlds, wp.get_device(device))
         order = tree.WalkOrder(boxes)
-        for away in (0.0, 5.0):  # the second time some have left the room, which stays
+        for away in (0.0, 5.0):  # the second time some boxes have left the bounds, which stay
             lower = rng.uniform(size=(worlds * count, 3))
             lower[::7] += away
             boxes.lower.assign(lower.astype(np.float32))
@@ -62,7 +62,7 @@ def test_walks_go_along_a_morton_curve(device):
 
 
 def crossed_layers() -> ddg.Scene:
-    """Two layers of rods that fall onto each other and a plane, with friction."""
+    """Return two layers of rods that fall onto each other and a plane, with friction."""
     model = ddg.Scene(mass_damping=0.5)
     s = np.linspace(-0.1, 0.1, 13)
     for layer in range(2):
@@ -77,18 +77,18 @@ def crossed_layers() -> ddg.Scene:
 
 
 def test_steps_are_the_same(device, many):
-    """Sums are taken in other orders, so but for rounding, which 40 steps with impacts make grow."""
-    found = []
+    """The order of summation differs, and 40 steps with impacts amplify rounding."""
+    results = []
     for _ in range(2):
         model = crossed_layers().build(device)
         integrator, state = ddg.Integrator(model, rtol=1e-9), model.state()
         for _ in range(40):
             state = integrator.step(state, 1 / 480)
         statistics = integrator.statistics()
-        found.append((state.points(), state.velocities(), statistics["contact"]["contacts"]["mean"]))
+        results.append((state.points(), state.velocities(), statistics["contact"]["contacts"]["mean"]))
         assert statistics["pcg_iterations"] > 100
         many()
-    assert found[0][2] > 5
-    assert found[0][2] == found[1][2]
-    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found[1][1], found[0][1], rtol=0, atol=1e-6)
+    assert results[0][2] > 5
+    assert results[0][2] == results[1][2]
+    np.testing.assert_allclose(results[1][0], results[0][0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(results[1][1], results[0][1], rtol=0, atol=1e-6)

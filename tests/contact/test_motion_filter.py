@@ -1,4 +1,4 @@
-"""Shares of a motion: nothing passes, nothing is held back that need not be, and searches along the motion find all pairs."""
+"""CCD step fractions: no pair crosses, no motion is limited needlessly, and searches along motions find all pairs."""
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ from ddg_warp.solve.contact.shapes import Shapes
 
 
 def gone(gap: float) -> float:
-    """How far a gap may close at once [m]: to a part of it, or a larger part of it and of the reach where that is more."""
+    """Return how far a gap may close at once [m]: to `REST` of the gap, or to `NEAR` of gap or reach where that is more."""
     return gap - max(REST * gap, NEAR * min(gap, REACH))
 
 
 def wish(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
-    """Random displacements, of nodes or, with a tenth of that beside, of objects."""
+    """Return random displacements of nodes, or of objects with a tenth of node motion added."""
     move = rng.normal(size=shapes.points.shape)
     if kind != "node":
         unit, units = units_of(shapes, "object")
@@ -33,37 +33,42 @@ def wish(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
 @pytest.mark.parametrize("size", [0.01, 0.5])
 @pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
 def test_no_gap_closes_and_nothing_passes(device, kind, size, dtype):
-    """Motions from once to fifty times the margin, three in a row."""
+    """Three motions follow each other, each once to fifty times the margin."""
     shapes, points = tangle(5)
     motion, rng = Motion(shapes, points, device, kind, dtype=dtype), np.random.default_rng(6)
     rounding = 1e-12 if dtype is wp.vec3d else 1e-6
     for _ in range(3):
         base, move = motion.base.numpy().astype(float), wish(shapes, rng, size, kind)
         landing = motion(move).astype(float)
-        search, shares = motion.search, motion.search.shares.numpy()
-        assert shares.shape == (motion.units,) and 0.0 < shares.min() == search.time.numpy()[0] <= shares.max() <= 1.0
-        assert search.limited.numpy()[0] == (shares < 1.0).sum()
-        assert landing == pytest.approx(base + shares[motion.unit.numpy()][:, None] * move, rel=rounding, abs=rounding)
+        search, fractions = motion.search, motion.search.shares.numpy()
+        assert (
+            fractions.shape == (motion.units,)
+            and 0.0 < fractions.min() == search.time.numpy()[0] <= fractions.max() <= 1.0
+        )
+        assert search.limited.numpy()[0] == (fractions < 1.0).sum()
+        assert landing == pytest.approx(
+            base + fractions[motion.unit.numpy()][:, None] * move, rel=rounding, abs=rounding
+        )
         for t in np.linspace(0.0, 1.0, 5):
             for side in SIDES:
                 assert not near(shapes, base + t * (landing - base), *side, 0.0)
         search.crossings(motion.base, upload(landing - base, device, dtype))
         assert search.crossed.numpy()[0] == 0
-        # candidates hold where the motion has led to
-        for side, found in zip(SIDES, listed(search), strict=True):
-            assert near(shapes, landing, *side, REACH) <= {tuple(pair) for pair in found.tolist()}
+        # candidates are valid at the end of the motion
+        for side, candidates in zip(SIDES, listed(search), strict=True):
+            assert near(shapes, landing, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
         searches = search.searches.numpy()[0]
         search.update(upload(landing + 0.49 * MARGIN / np.sqrt(3.0), device, dtype))
         assert search.searches.numpy()[0] == searches
         motion.base.assign(landing)
     if size == 0.5:
-        assert shares.min() < 0.1
+        assert fractions.min() < 0.1
 
 
 @pytest.mark.parametrize("name", ["edges", "point and triangle"])
 @pytest.mark.parametrize("kind", ["node", "object", "world"])
 def test_pairs_stop_in_time_and_not_much_too_early(device, name, kind):
-    """Pairs at random, one in each of 300 worlds, against dense sampling in time: all that do not overlap at first stay apart."""
+    """Random pairs, one in each of 300 worlds, are sampled densely in time: pairs without initial overlap stay separate."""
     shapes, x, move = pairs_apart(name, 2, 300)
     motion = Motion(shapes, x.reshape(-1, 3), device, kind, worlds=len(x))
     landing = motion(move.reshape(-1, 3)).reshape(x.shape)
@@ -80,7 +85,7 @@ def test_pairs_stop_in_time_and_not_much_too_early(device, name, kind):
 
 @pytest.mark.parametrize("kind", ["node", "object", "world"])
 def test_a_motion_that_all_share_is_not_shortened(device, kind):
-    """A translation by a thousand times what things are apart, with a little of each node's own."""
+    """The translation is a thousand times the distance of objects, with small random node motion added."""
     shapes, points = tangle(7)
     rng = np.random.default_rng(8)
     motion = Motion(shapes, points, device, kind, together=(0,) if kind != "world" else ())
@@ -91,14 +96,14 @@ def test_a_motion_that_all_share_is_not_shortened(device, kind):
 
 
 def test_what_goes_together_needs_few_candidates(device):
-    """Of a common motion of fifty margins, as many as at rest; where shares may differ, a hundred times as many."""
+    """Separate step fractions need more than 30 times as many candidates for a motion of fifty margins."""
     shapes, points = tangle(9)
     move = np.tile([0.3, 0.4, 0.0], (len(points), 1))
     x, step = upload(points, device), upload(move, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    rest = [found.tolist() for found in listed(search)]
+    rest = [candidates.tolist() for candidates in listed(search)]
     search.search(x, step, wp.ones(1, dtype=int, device=device))
-    assert [found.tolist() for found in listed(search)] == rest
+    assert [candidates.tolist() for candidates in listed(search)] == rest
     search.search(x, step)
     while search.fit(x):
         search.search(x, step)
@@ -106,33 +111,33 @@ def test_what_goes_together_needs_few_candidates(device):
 
 
 def test_one_tight_pair_holds_nobody_else(device):
-    """A thousand rods side by side sink by three times their distance; the first two, crossed by a still one, stop alone."""
-    n, apart = 1000, 0.05
-    y = apart * np.arange(n)
-    points = np.array([[[-0.01, at, 0.0], [0.01, at, 0.0]] for at in y]).reshape(-1, 3)
-    points = np.concatenate([points, [[0.0, -0.5 * apart, -0.03], [0.0, 1.5 * apart, -0.03]]])
+    """A thousand rods side by side sink by three spacings; the first two, crossed by a fixed rod, stop alone."""
+    n, spacing = 1000, 0.05
+    y = spacing * np.arange(n)
+    points = np.array([[[-0.01, offset, 0.0], [0.01, offset, 0.0]] for offset in y]).reshape(-1, 3)
+    points = np.concatenate([points, [[0.0, -0.5 * spacing, -0.03], [0.0, 1.5 * spacing, -0.03]]])
     shapes = Shapes(points)
     for k in range(n + 1):
         shapes.rod([2 * k, 2 * k + 1], 0.005, still=k == n)
     motion = Motion(shapes, points, device)
     move = np.zeros_like(points)
-    move[:-2, 2] = -3.0 * apart
+    move[:-2, 2] = -3.0 * spacing
     landing = motion(move)
-    shares = motion.search.shares.numpy()
-    # of the gap of 0.02 nine tenths may be used up, and nine tenths of what is left
-    assert shares[:2] == pytest.approx(gone(0.02) / (3.0 * apart), rel=1e-9)
-    assert (shares[2:n] == 1.0).all()
+    fractions = motion.search.shares.numpy()
+    # the gap of 0.02 may close by nine tenths
+    assert fractions[:2] == pytest.approx(gone(0.02) / (3.0 * spacing), rel=1e-9)
+    assert (fractions[2:n] == 1.0).all()
     assert motion.search.limited.numpy()[0] == 3
     assert (landing[4:] == (points + move)[4:]).all()
 
 
 @pytest.mark.parametrize("layers", [40, ROUNDS + 10])
 def test_what_falls_on_what_has_stopped_stops_layer_by_layer(device, layers):
-    """Crossed layers fall on the floor by five times their distance: those above go farther than the first, up to so many."""
-    apart = 0.02
+    """Crossed layers fall on the floor by five spacings: up to `ROUNDS` layers, upper layers go farther than the first."""
+    spacing = 0.02
     ends = np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]])
     points = np.concatenate(
-        [(ends[:, [1, 0, 2]] if k % 2 else ends) + [0.0, 0.0, apart * (k + 1)] for k in range(layers)]
+        [(ends[:, [1, 0, 2]] if k % 2 else ends) + [0.0, 0.0, spacing * (k + 1)] for k in range(layers)]
     )
     points = np.concatenate([points, [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
     shapes = Shapes(points)
@@ -141,21 +146,21 @@ def test_what_falls_on_what_has_stopped_stops_layer_by_layer(device, layers):
     shapes.shell([[2 * layers, 2 * layers + 1, 2 * layers + 2]], 1e-3, still=True)
     motion = Motion(shapes, points, device)
     move = np.zeros_like(points)
-    move[: 2 * layers, 2] = -5.0 * apart
+    move[: 2 * layers, 2] = -5.0 * spacing
     landing = motion(move)
-    shares = motion.search.shares.numpy()[:layers]
+    fractions = motion.search.shares.numpy()[:layers]
     height = landing[: 2 * layers : 2, 2]
     assert (np.diff(height) > 0.008).all() and height[0] > 0.0045
-    first = gone(apart - 0.0045) / (5.0 * apart)
-    assert shares[0] == motion.search.time.numpy()[0] == pytest.approx(first, rel=1e-9)
+    first = gone(spacing - 0.0045) / (5.0 * spacing)
+    assert fractions[0] == motion.search.time.numpy()[0] == pytest.approx(first, rel=1e-9)
     if layers > ROUNDS:
-        assert (shares == shares[0]).all()
+        assert (fractions == fractions[0]).all()
     else:
-        assert (shares[1:] > 1.1 * shares[0]).all() and shares[-1] > 2.0 * shares[0]
+        assert (fractions[1:] > 1.1 * fractions[0]).all() and fractions[-1] > 2.0 * fractions[0]
 
 
 def test_worlds_have_shares_of_their_own(device):
-    """In one that goes together all have the smallest; one in which nothing moves has none below 1."""
+    """A world with a common motion has the smallest fraction throughout; a world at rest has fraction 1."""
     shapes, points = tangle(10)
     move = wish(shapes, np.random.default_rng(11), 0.05, "object")
     alone = Motion(shapes, points, device)
@@ -164,14 +169,14 @@ def test_worlds_have_shares_of_their_own(device):
     motion = Motion(shapes, np.tile(points, (3, 1)), device, worlds=3, together=(1,))
     base = motion.base.numpy()
     result = motion(everywhere).reshape(3, -1, 3)
-    shares = motion.search.shares.numpy().reshape(3, -1)
+    fractions = motion.search.shares.numpy().reshape(3, -1)
     assert result[0].tobytes() == landing.tobytes()
     motion.search.impact(motion.base, upload(base + everywhere - base, device))
     first = motion.search.time.numpy()
-    np.testing.assert_allclose(shares[1], first[1], rtol=1e-14)
-    assert (shares[1] == shares[1, 0]).all() and 0.0 < first[1] < 1.0
-    assert first[1] <= (1.0 + 1e-14) * shares[0].min() and shares[0].max() == 1.0
-    assert (shares[2] == 1.0).all() and (result[2] == points).all()
+    np.testing.assert_allclose(fractions[1], first[1], rtol=1e-14)
+    assert (fractions[1] == fractions[1, 0]).all() and 0.0 < first[1] < 1.0
+    assert first[1] <= (1.0 + 1e-14) * fractions[0].min() and fractions[0].max() == 1.0
+    assert (fractions[2] == 1.0).all() and (result[2] == points).all()
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -185,13 +190,13 @@ def test_a_search_along_a_motion_finds_all_pairs_of_any_shares(device, together)
     search.search(x, step, flags)
     if search.fit(x):
         search.search(x, step, flags)
-    found = [{tuple(pair) for pair in pairs.tolist()} for pairs in listed(search)]
+    candidates = [{tuple(pair) for pair in pairs.tolist()} for pairs in listed(search)]
     for k in range(20):
-        shares = (
+        fractions = (
             np.full((1, 1), k / 19.0) if together else rng.uniform(size=(len(points), 1)) ** rng.choice([0.2, 1.0, 5.0])
         )
-        for side, pairs in zip(SIDES, found, strict=True):
-            assert near(shapes, points + shares * move, *side, REACH + MARGIN) <= pairs
+        for side, pairs in zip(SIDES, candidates, strict=True):
+            assert near(shapes, points + fractions * move, *side, REACH + MARGIN) <= pairs
 
 
 def test_a_captured_filter_is_that_without_a_graph(device):
@@ -200,7 +205,7 @@ def test_a_captured_filter_is_that_without_a_graph(device):
 
     def run(captured: bool) -> list:
         motion = Motion(shapes, points, device)
-        motion(large)  # lists have grown to what the motion needs
+        motion(large)  # let lists grow for the large motion
         motion.search.rebuild(motion.base)
         motion.search.search(motion.base)
         step = motion.launch
@@ -261,8 +266,8 @@ def test_smallest_gaps(device):
 def test_what_can_not_be_filtered_is_refused_by_name(device, change, message):
     shapes, points = scene(12, 1.0, rods=3, nodes=20, triangles=4)
     motion = Motion(shapes, points, device)
-    given = {"unit": motion.unit, "together": motion.together, "units": motion.units, "keep": 1.0}
+    arguments = {"unit": motion.unit, "together": motion.together, "units": motion.units, "keep": 1.0}
     for name, value in change.items():
-        given[name] = wp.zeros(value, dtype=int, device=device) if name in ("unit", "together") else value
+        arguments[name] = wp.zeros(value, dtype=int, device=device) if name in ("unit", "together") else value
     with pytest.raises(SceneError, match=message):
-        motion.search.filter(motion.base, motion.q, **given)
+        motion.search.filter(motion.base, motion.q, **arguments)

@@ -1,4 +1,4 @@
-"""Obstacles at rest and moved: what they carry, what they push, and what holds within a step."""
+"""Obstacles at rest and in motion: weight carried, rods moved, and friction lags within a step."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
 
 
 def bar(z: float, motion=None, **contact) -> ddg.Scene:
-    """A straight rod along x at a height, over the origin."""
+    """Return a straight rod along x at a height over the origin."""
     scene = ddg.Scene(mass_damping=5.0)
     s = np.linspace(-0.05, 0.05, 11)
     scene.add_rod(np.stack([s, 0 * s, 0 * s + z], 1), section=ddg.Circle(RADIUS), material=SOFT)
@@ -38,21 +38,21 @@ SHAPES = {
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_obstacles_carry_what_lies_on_them(device, shape):
-    """At rest the reaction of the obstacle is the weight, rho A L g."""
+    """The reaction of an obstacle at rest is the weight, rho A L g."""
     scene = bar(1.3 * RADIUS, friction=0.5)
     scene.add_obstacle(SHAPES[shape])
     model, integrator, state = run(scene, device, 120)
     section = model.scene.batches[0].section
     weight = section.mass_per_length * 0.1 * 9.81
-    found = model.contacts(state)
-    np.testing.assert_allclose(np.abs(found.force.sum(0)), [0.0, 0.0, weight], atol=2e-3 * weight)
+    contacts = model.contacts(state)
+    np.testing.assert_allclose(np.abs(contacts.force.sum(0)), [0.0, 0.0, weight], atol=2e-3 * weight)
     np.testing.assert_allclose(model.reactions(state)[0].force, [0.0, 0.0, weight], atol=2e-3 * weight)
-    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] <= found.gap.min() + 1e-12
+    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] <= contacts.gap.min() + 1e-12
 
 
 @pytest.mark.parametrize("shape", ["plane", "sphere", "capsule", "box"])
 def test_moved_obstacles_take_along_what_is_in_their_way(device, shape):
-    """An obstacle that goes up by many gaps in a step lifts the rod, and nothing passes."""
+    """An obstacle that rises by many gaps in a step lifts the rod without a crossing."""
     height = 0.05
     motion = ddg.Motion(translation=lambda t: (0.0, 0.0, height * min(1.0, t / 0.2)))
     scene = bar(1.3 * RADIUS, friction=0.5)
@@ -72,19 +72,19 @@ def test_moved_obstacles_take_along_what_is_in_their_way(device, shape):
 ROUND = {
     "sphere": SHAPES["sphere"],
     "capsule": SHAPES["capsule"],
-    # its first point is of no triangle
+    # the first point belongs to no triangle
     "mesh": ddg.Mesh(
         [[1.0, 0, 0], [-1e-4, -0.1, -0.05], [1e-4, -0.1, -0.05], [0, 0.1, -0.05]], [[1, 2, 3]], radius=0.05
     ),
 }
 
 
-@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("shape", ROUND)
-def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, held):
-    """A rod across the top of what turns about the line in its middle slides with mu N / m until it is as fast as the surface, omega R.
+def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, drive):
+    """A rod across the top of a rotating body slides by mu N / m up to the surface speed omega R.
 
-    What turns it brings up the couple mu N R while it slides, and none once nothing does.
+    The drive exerts the couple mu N R while the rod slides, and none afterwards.
     """
     mu, dt, settled, radius = 0.3, 2e-3, 60, ROUND[shape].radius
     pivot, speed = (0.0, 0.0, -radius), 0.08
@@ -97,27 +97,28 @@ def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, held):
         return speed / radius * max(0.0, t - settled * dt)
 
     motions = {"motion": ddg.Motion(angle=angle, axis=(0.0, 1.0, 0.0), pivot=pivot), "grip": ddg.Grip(pivot=pivot)}
-    scene.add_obstacle(ROUND[shape], motion=motions[held])
+    scene.add_obstacle(ROUND[shape], motion=motions[drive])
     model = scene.build(device=device)
-    integrator, state, speeds, pushes, couples = ddg.Integrator(model), model.state(), [], [], []
+    integrator, state, speeds, normal_forces, couples = ddg.Integrator(model), model.state(), [], [], []
     for _ in range(settled + 18):
-        told = {}
-        if held == "grip":
-            told["controls"] = ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, 0.0, angle(state.time + dt), 0.0]]))
-        state = integrator.step(state, dt, **told)
+        inputs = {}
+        if drive == "grip":
+            inputs["controls"] = ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, 0.0, angle(state.time + dt), 0.0]]))
+        state = integrator.step(state, dt, **inputs)
         speeds.append(state.velocities()[:, 0].mean())
-        pushes.append(np.linalg.norm(model.contacts(state).force.sum(0)))
+        normal_forces.append(np.linalg.norm(model.contacts(state).force.sum(0)))
         couples.append(model.reactions(state, point=pivot)[0].moment[1])
     mass = model.scene.batches[0].section.mass_per_length * 0.1
     sliding = slice(settled, settled + 8)
-    np.testing.assert_allclose(np.diff(speeds)[sliding].sum() / dt, mu * np.sum(pushes[sliding]) / mass, rtol=0.03)
-    np.testing.assert_allclose(np.sum(couples[sliding]), mu * radius * np.sum(pushes[sliding]), rtol=0.03)
+    np.testing.assert_allclose(
+        np.diff(speeds)[sliding].sum() / dt, mu * np.sum(normal_forces[sliding]) / mass, rtol=0.03
+    )
+    np.testing.assert_allclose(np.sum(couples[sliding]), mu * radius * np.sum(normal_forces[sliding]), rtol=0.03)
     assert abs(speeds[-1] - speed) < model.scene.touching.velocity
-    assert abs(couples[-1]) < 0.05 * mu * radius * pushes[-1]
+    assert abs(couples[-1]) < 0.05 * mu * radius * normal_forces[-1]
 
 
 def test_a_turned_mesh_sweeps_a_rod_aside(device):
-    """A wall that turns about z pushes the rod ahead of it."""
     wall = ddg.Mesh([[-0.001, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1], [-0.001, 0, 0.1]], [[0, 1, 2], [0, 2, 3]])
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=20.0)
     s = np.linspace(-0.05, 0.05, 11)
@@ -131,7 +132,7 @@ def test_a_turned_mesh_sweeps_a_rod_aside(device):
 
 
 def test_a_slope_holds_by_friction_up_to_its_coefficient(device):
-    """tan(slope) < mu sticks, creeping by less than the velocity; tan(slope) > mu slides with g (sin - mu cos)."""
+    """The rod sticks for tan(slope) < mu, creeping below the threshold, and else slides by g (sin - mu cos)."""
     slope, velocity = 0.3, 1e-4
     normal = (np.sin(slope), 0.0, np.cos(slope))
     down = np.array([np.cos(slope), 0.0, -np.sin(slope)])
@@ -161,5 +162,5 @@ def test_friction_is_lagged_as_often_as_stated(device, lags):
     scene = bar(1.3 * RADIUS, friction=0.5, lags=lags)
     scene.add_obstacle(ddg.Plane(), motion=ddg.Motion(translation=lambda t: (0.1 * t, 0.0, 0.0)))
     _, integrator, state = run(scene, device, 60)
-    assert state.net.v.numpy()[:11, 0].mean() == pytest.approx(0.1, rel=0.05)  # taken along
+    assert state.net.v.numpy()[:11, 0].mean() == pytest.approx(0.1, rel=0.05)  # moves with the plane
     assert len(integrator._net.newton.contact.solutions) == lags - 1

@@ -1,4 +1,4 @@
-"""Lists of the pairs of nodes where one is in thousands: their order, and what one thread and many make of them."""
+"""Incidence lists of nodes in thousands of pairs: order, and agreement of thread mappings."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ MU, RATE, SIDE = 0.4, 100.0, 50
 
 
 def star() -> tuple[Shapes, np.ndarray]:
-    """2,500 short rods that lie on one triangle, each with two points on it, some along its side."""
+    """Return 2,500 short rods that lie on one triangle with both points, some along a side."""
     x, y = np.meshgrid(0.02 + 0.03 * np.arange(SIDE), 0.02 + 0.03 * np.arange(SIDE))
     first = np.stack([x, y, np.full_like(x, 0.0058)], -1).reshape(-1, 3)
     corners = [[-1.0, 0.018, 0.0], [5.0, 0.018, 0.0], [-1.0, 5.0, 0.0]]
@@ -28,25 +28,25 @@ def star() -> tuple[Shapes, np.ndarray]:
 
 
 def test_a_node_in_thousands_of_pairs(device, monkeypatch):
-    """A thread a pair, and one for all: energies, forces, products and blocks, of contact and friction."""
+    """One thread per pair and one for all agree on energies, forces, products and blocks of contact and friction."""
     shapes, x = star()
     v = np.random.default_rng(1).normal(size=x.shape)
     slip = 3e-6 * np.random.default_rng(2).normal(size=x.shape)
 
     def run():
-        result, at = terms(shapes, x, device, friction=MU)
-        result.lag(at)
-        move(result, at, x + slip)
-        result.evaluate(at, wp.full(1, RATE, dtype=wp.float64, device=device))
+        result, positions = terms(shapes, x, device, friction=MU)
+        result.lag(positions)
+        move(result, positions, x + slip)
+        result.evaluate(positions, wp.full(1, RATE, dtype=wp.float64, device=device))
         _, points = result.lists
         assert points.numbers.numpy()[:3].tolist() == [2 * SIDE**2] * 3
-        for part in (points, result.frictions[1]):
+        for pair_list in (points, result.frictions[1]):
             for node in (0, 1, 2, 3):
-                start, number = (of.numpy()[node] for of in (part.places, part.numbers))
-                items = part.items.numpy()[start : start + number]
-                of = part.factor.nodes.numpy()[items // gather.ITEMS, items % gather.ITEMS]
-                assert (np.diff(items) > 0).all() and (of == node).all()
-        return [*state(result), times(result, v), times(result, v, at), result.dissipated.numpy()]
+                start, number = (array.numpy()[node] for array in (pair_list.places, pair_list.numbers))
+                items = pair_list.items.numpy()[start : start + number]
+                targets = pair_list.factor.nodes.numpy()[items // gather.ITEMS, items % gather.ITEMS]
+                assert (np.diff(items) > 0).all() and (targets == node).all()
+        return [*state(result), times(result, v), times(result, v, positions), result.dissipated.numpy()]
 
     one = run()
     monkeypatch.setattr(arrays, "serial", lambda device: False)
@@ -58,18 +58,18 @@ def test_a_node_in_thousands_of_pairs(device, monkeypatch):
 
 @pytest.mark.parametrize("kind", [EDGES, POINT_TRIANGLE, Kind(2, 1)])
 def test_items_in_any_order_are_sorted(device, kind):
-    """5,000 pairs that all have one node in common, in any slot."""
+    """5,000 pairs have one node in common, at any local index."""
     count, size, rng = 5000, kind.first + kind.second, np.random.default_rng(3)
     nodes = np.column_stack([np.zeros(count, int), rng.integers(1, 4000, (count, size - 1))])
-    nodes = rng.permuted(nodes, axis=1)  # some have one twice, which does not matter here
+    nodes = rng.permuted(nodes, axis=1)  # some pairs have a node twice, which does not matter here
     nodes = np.column_stack([nodes, np.repeat(nodes[:, :1], 4 - size, 1)])
     items = (gather.ITEMS * np.arange(count)[:, None] + np.arange(size)).ravel()
-    of = nodes[:, :size].ravel()
-    numbers = np.bincount(of, minlength=4000)
+    targets = nodes[:, :size].ravel()
+    numbers = np.bincount(targets, minlength=4000)
     starts = np.cumsum(numbers) - numbers
-    wanted = items[np.argsort(of, kind="stable")]
+    wanted = items[np.argsort(targets, kind="stable")]
     mixed = rng.permutation(len(items))
-    mixed = items[mixed][np.argsort(of[mixed], kind="stable")]
+    mixed = items[mixed][np.argsort(targets[mixed], kind="stable")]
     assert (mixed[:count] != wanted[:count]).any()
     inputs = [wp.array(values, dtype=int, device=device) for values in ([count], starts, numbers, mixed)]
     inputs.insert(1, wp.array(nodes, dtype=wp.vec4i, device=device))

@@ -1,4 +1,4 @@
-"""Contact of two rods along paths through parallel positions and past their ends: nothing jumps, and nothing is counted twice."""
+"""Contact of two rods through parallel positions and past rod ends: continuous, with no point counted twice."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def straight(edges: int, length: float, height: float = 0.0) -> np.ndarray:
 
 
 def turned(points: np.ndarray, angle: float) -> np.ndarray:
-    """About z."""
+    """Return points rotated about z."""
     c, s = np.cos(angle), np.sin(angle)
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -50,14 +50,14 @@ PATHS = {
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("edges", [(1, 1), (3, 4)])
 def test_energy_and_forces_are_continuous(device, law, path, edges):
-    """Steps an eighth as long have an eighth of the largest change of forces; energies change by the work of the forces."""
+    """An eighth of the step length has an eighth of the largest force change; energies change by the work of the forces."""
     lower, upper = straight(edges[0], 0.1), straight(edges[1], 0.08, height(law))
     shapes, _ = two_rods(lower, upper)
 
     def along(count: int):
-        """Each position is a world."""
-        ways = (PATHS[path](s) for s in np.linspace(-1.0, 1.0, count))
-        positions = np.array([np.concatenate([lower, motion(upper, a)]) for motion, a in ways])
+        """Return energies, forces and positions along the path, one world per position."""
+        motions = (PATHS[path](s) for s in np.linspace(-1.0, 1.0, count))
+        positions = np.array([np.concatenate([lower, motion(upper, a)]) for motion, a in motions])
         result, _ = terms(shapes, positions.reshape(-1, 3), device, law, count)
         return result.energy.numpy(), result.forces.numpy().reshape(positions.shape), positions
 
@@ -73,7 +73,7 @@ def test_energy_and_forces_are_continuous(device, law, path, edges):
 @each_law
 @pytest.mark.parametrize("edges", [1, 2, 5])
 def test_along_an_edge_each_point_counts_once(device, law, edges):
-    """n edges along the middle of one that is longer: n - 1 nodes inside, whole, and two ends, half."""
+    """n edges lie along the middle of a longer edge: n - 1 interior nodes count whole, two ends half."""
     shapes, points = two_rods(straight(1, 0.5), straight(edges, 0.1, height(law)))
     result, _ = terms(shapes, points, device, law)
     one = LAWS[law][1]["stiffness"] * float(psi(law, np.array(GAP)))
@@ -84,13 +84,13 @@ def test_along_an_edge_each_point_counts_once(device, law, edges):
 
 @each_law
 def test_rods_along_each_other_count_each_node_once(device, law):
-    """Wherever their nodes are: n - 1 of the upper inside, its ends half, and of the lower those that face it and reach to its ends."""
+    """n - 1 nodes of the upper rod count whole and the ends half, at any shift; nodes of the lower rod count within reach."""
     lower, upper = straight(20, 0.4), straight(5, 0.1, height(law))
     shapes, points = two_rods(lower, upper)
-    result, at = terms(shapes, points, device, law)
+    result, positions = terms(shapes, points, device, law)
     one = LAWS[law][1]["stiffness"] * float(psi(law, np.array(GAP)))
     for shift in np.linspace(0.0, 0.02, 21):
-        move(result, at, np.concatenate([lower, upper + [shift, 0.0, 0.0]]))
+        move(result, positions, np.concatenate([lower, upper + [shift, 0.0, 0.0]]))
         x = lower[:, 0] - shift
         beyond = np.maximum(np.abs(x) - 0.05, 0.0)
         gaps = np.hypot(beyond, height(law)) - (height(law) - GAP)
@@ -108,7 +108,7 @@ def test_edges_that_cross_count_once(device, law):
 
 @each_law
 def test_rods_end_to_end_push_each_other(device, law):
-    """In one line, where the mollifier is zero: two ends, half each."""
+    """The mollifier of collinear rods is zero: two ends count half each."""
     first = straight(1, 0.1)
     shapes, points = two_rods(first, first + [0.1 + height(law), 0.0, 0.0])
     result, _ = terms(shapes, points, device, law)

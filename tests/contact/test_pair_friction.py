@@ -1,4 +1,4 @@
-"""Friction on pairs: its forces as derivatives and in closed form, its energy and momentum, and what has none."""
+"""Pair friction: forces as derivatives and in closed form, energy, momentum, and cases without friction."""
 
 import numpy as np
 import pytest
@@ -8,26 +8,26 @@ from pair_cases import LAWS, assembled, bundle, central, psi, state, terms, time
 from ddg_warp.solve.contact.shapes import Shapes
 
 
-def shares_of(part) -> np.ndarray:
-    """Friction of pairs over mu N, where there is any."""
-    used = used_of(part)
-    force = part.gradient.numpy()[: part.found.kind.first, used].sum(0)
-    return np.linalg.norm(force, axis=1) / part.lagged.bound.numpy()[used]
+def shares_of(pair_list) -> np.ndarray:
+    """Return friction over mu N of the used pairs."""
+    used = used_of(pair_list)
+    force = pair_list.gradient.numpy()[: pair_list.found.kind.first, used].sum(0)
+    return np.linalg.norm(force, axis=1) / pair_list.lagged.bound.numpy()[used]
 
 
-def share(form: str, y):
-    """Of mu N, by the slip over nu h."""
-    return np.tanh(7.5 * y) if form == "logistic" else np.where(y < 1.0, y * (2.0 - y), 1.0)
+def share(form: str, slip):
+    """Return friction over mu N at a slip over nu h."""
+    return np.tanh(7.5 * slip) if form == "logistic" else np.where(slip < 1.0, slip * (2.0 - slip), 1.0)
 
 
 @each_case
 @each_form
 def test_forces_and_products_are_differences(device, case, form):
-    result, at, _, after = rubbed(case, device, form)
+    result, positions, _, after = rubbed(case, device, form)
     assert all(len(used_of(part)) > 5 for part in result.frictions)
-    shares = np.concatenate([shares_of(part) for part in result.frictions])
-    assert (shares < 0.8).sum() > 5 and (shares > 0.95).sum() > 5
-    hold_to_differences(result, at, after)
+    ratios = np.concatenate([shares_of(part) for part in result.frictions])
+    assert (ratios < 0.8).sum() > 5 and (ratios > 0.95).sum() > 5
+    hold_to_differences(result, positions, after)
 
 
 @each_case
@@ -43,29 +43,29 @@ def test_matrix_is_symmetric_and_positive(device, case, form):
 
 @each_form
 def test_blocks_and_stiffness_are_those_of_the_matrix(device, form):
-    """Contact and friction together, without triangles: between nodes of an edge there is what the pairs of the edge add."""
+    """Contact and friction act together, without triangles: blocks between nodes of an edge only have pairs of that edge."""
     shapes, x = bundle()
-    for other in range(4):
-        shapes.ignore(3, other)
-    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY, friction_law=form)
-    result.lag(at)
-    at.assign(x + SLIPS[form] * np.random.default_rng(1).normal(size=x.shape))
+    for number in range(4):
+        shapes.ignore(3, number)
+    result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY, friction_law=form)
+    result.lag(positions)
+    positions.assign(x + SLIPS[form] * np.random.default_rng(1).normal(size=x.shape))
     n, nodes = len(x), shapes.things(2)[0]
     for rate in (None, rates(result)):
-        result.evaluate(at, rate)
+        result.evaluate(positions, rate)
         matrix = assembled(result, n).transpose(0, 2, 1, 3)
         _, _, diagonal, between = state(result)
         largest = np.abs(matrix).max()
-        own = matrix[np.arange(n), np.arange(n)]
-        assert np.abs(diagonal - own).max() < 1e-13 * largest
+        blocks = matrix[np.arange(n), np.arange(n)]
+        assert np.abs(diagonal - blocks).max() < 1e-13 * largest
         assert np.abs(between - matrix[nodes[:, 0], nodes[:, 1]]).max() < 1e-13 * largest
-        assert np.abs(result.stiffness.numpy() - np.trace(own, axis1=1, axis2=2)).max() < 1e-13 * largest
+        assert np.abs(result.stiffness.numpy() - np.trace(blocks, axis1=1, axis2=2)).max() < 1e-13 * largest
         along = np.abs(between[:, 0, 0]).max()  # rods lie along x
         assert along < 1e-3 * largest if rate is None else along > 1e-2 * largest
 
 
 def crossing() -> tuple[Shapes, np.ndarray]:
-    """Two rods that cross."""
+    """Return two rods that cross."""
     x = np.array([[-0.03, 0.0, 0.0], [0.07, 0.0, 0.0], [0.01, -0.05, 0.0068], [0.01, 0.05, 0.0068]])
     shapes = Shapes(x)
     shapes.rod([0, 1], 0.003)
@@ -74,7 +74,7 @@ def crossing() -> tuple[Shapes, np.ndarray]:
 
 
 def landing() -> tuple[Shapes, np.ndarray]:
-    """A rod that stands on a triangle, and rubs with its end."""
+    """Return a rod that stands on a triangle with one end."""
     x = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.1, 0.08, 0.0058], [0.1, 0.08, 0.1]])
     shapes = Shapes(x)
     shapes.shell(np.array([[0, 1, 2]]), 0.004)
@@ -86,34 +86,36 @@ def landing() -> tuple[Shapes, np.ndarray]:
 @pytest.mark.parametrize("scene", [crossing, landing])
 @pytest.mark.parametrize("law", LAWS)
 def test_coulomb_law(device, scene, form, law):
-    """Against the slip, mu N times the law's share: N by the law of contact, for slips that stick and slide."""
+    """Friction against the slip is mu N times the ratio of the law, N by the contact law, for slips that stick and slide."""
     shapes, x = scene()
-    result, at = terms(shapes, x, device, law, friction=MU, velocity=VELOCITY, friction_law=form)
-    result.lag(at)
+    result, positions = terms(shapes, x, device, law, friction=MU, velocity=VELOCITY, friction_law=form)
+    result.lag(positions)
     upper = slice(2, 4) if scene is crossing else slice(3, 5)
-    push = result.forces.numpy()[upper].sum(0)
+    contact_force = result.forces.numpy()[upper].sum(0)
     thickness = 0.0 if law == "barrier" else 0.006 if scene is crossing else 0.005
     normal = -LAWS[law][1]["stiffness"] * central(lambda s: psi(law, np.array(x[upper.start, 2] - thickness + s)), 1e-7)
-    assert push == pytest.approx([0.0, 0.0, normal], rel=1e-6, abs=1e-12 * normal)
+    assert contact_force == pytest.approx([0.0, 0.0, normal], rel=1e-6, abs=1e-12 * normal)
     result.law.stiffness.zero_()
     direction = np.array([0.6, -0.8, 0.0])
     for y in (0.001, 0.1, 0.5, 0.99, 3.0, 50.0):
         after = x.copy()
-        after[upper] += y * SLIP * direction + [0.0, 0.0, 3.0 * SLIP]  # along the normal there is none
-        at.assign(after)
-        result.evaluate(at, rates(result))
+        after[upper] += y * SLIP * direction + [0.0, 0.0, 3.0 * SLIP]  # motion along the normal causes no friction
+        positions.assign(after)
+        result.evaluate(positions, rates(result))
         force = result.forces.numpy()[upper].sum(0)
-        assert force == pytest.approx(-MU * push[2] * share(form, y) * direction, rel=1e-10, abs=1e-12 * normal)
-        assert np.linalg.norm(force) <= MU * push[2] * (1.0 + 1e-14)
+        assert force == pytest.approx(
+            -MU * contact_force[2] * share(form, y) * direction, rel=1e-10, abs=1e-12 * normal
+        )
+        assert np.linalg.norm(force) <= MU * contact_force[2] * (1.0 + 1e-14)
         assert result.dissipated.numpy()[0] == pytest.approx(-force @ direction * y * SLIP, rel=1e-9)
         assert 0.0 < result.energy.numpy()[0] < result.dissipated.numpy()[0]
     creep = np.arctanh(0.9) / 7.5 if form == "logistic" else 1.0 - np.sqrt(0.1)
-    assert share(form, creep) == pytest.approx(0.9)  # sticks at nine tenths of the most with so little slip
+    assert share(form, creep) == pytest.approx(0.9)  # slip at nine tenths of mu N
 
 
 @each_case
 def test_no_resultant_and_the_moment_of_the_offsets(device, case):
-    """Forces of a pair act at both centres of pressure, r apart: their moment is that of the force at r, at most |r| mu N."""
+    """Forces of a pair act at both centres of pressure, r apart: the moment is r x f, at most |r| mu N."""
     result, _, _, after = rubbed(case, device)
     forces = result.forces.numpy()
     largest = np.abs(forces).sum()
@@ -136,14 +138,14 @@ def test_no_resultant_and_the_moment_of_the_offsets(device, case):
 
 
 def test_nodes_of_edges_in_line_are_held_by_no_more_than_what_pushes_them(device):
-    """Where forces of ends all but cancel the centre of pressure is far away, and force and stiffness yet bounded."""
+    """End forces that nearly cancel move the centre of pressure far away; force and stiffness stay bounded."""
     shapes, x = bundle(6, 10, 1e-6)
-    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
-    result.lag(at)
+    result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    result.lag(positions)
     most = [MU * np.linalg.norm(part.gradient.numpy(), axis=-1) for part in result.lists]
     assert max(np.abs(part.lagged.weight.numpy()).max() for part in result.frictions) > 100.0
-    at.assign(x + SLIP * np.random.default_rng(1).normal(size=x.shape))
-    result.evaluate(at, rates(result))
+    positions.assign(x + SLIP * np.random.default_rng(1).normal(size=x.shape))
+    result.evaluate(positions, rates(result))
     for part, bound in zip(result.frictions, most, strict=True):
         used = used_of(part)
         force = np.linalg.norm(part.gradient.numpy(), axis=-1)
@@ -153,7 +155,7 @@ def test_nodes_of_edges_in_line_are_held_by_no_more_than_what_pushes_them(device
 @each_case
 @each_form
 def test_friction_takes_energy(device, case, form):
-    """The work of the forces since the start of the step, no less than the potential and no more than that of Coulomb's law."""
+    """The work since the start of the step is at least the potential and at most that of Coulomb's law."""
     for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
         result, _, x, after = rubbed(case, device, form, slip, seed)
         taken, energy = result.dissipated.numpy()[0], result.energy.numpy()[0]
@@ -169,11 +171,11 @@ def test_friction_takes_energy(device, case, form):
 
 
 def test_rods_along_each_other_rub_with_all_of_their_normal_force(device):
-    """Near-parallel edges, where the energy is of many distances: a rod that is drawn off its neighbours is held by mu N of each."""
+    """Near-parallel edges have the energy of many distances: a rod drawn off two neighbours is braked by mu N of each."""
     shapes, x = bundle(jitter=0.0)
     x = x * [1.0, 1.0, 0.0] + [0.0, 0.0, -1.0] * (np.arange(len(x)) >= 15)[:, None]  # rods alone, in one plane
-    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
-    result.lag(at)
+    result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    result.lag(positions)
     middle = slice(5, 10)
     contact = result.forces.numpy().copy()
     outer = contact[:5].sum(0), contact[10:15].sum(0)
@@ -182,8 +184,8 @@ def test_rods_along_each_other_rub_with_all_of_their_normal_force(device):
     for direction in ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]):
         after = x.copy()
         after[middle] += 50.0 * SLIP * np.array(direction)
-        at.assign(after)
-        result.evaluate(at, rates(result))
+        positions.assign(after)
+        result.evaluate(positions, rates(result))
         force = result.forces.numpy()[middle].sum(0)
         normal = np.abs(contact[:5, 1]).sum() + np.abs(contact[10:15, 1]).sum()
         assert force == pytest.approx(-MU * normal * np.array(direction), rel=1e-9, abs=1e-12 * normal)
@@ -196,21 +198,21 @@ def test_no_friction_without_rate_or_coefficient(device):
     none, _ = terms(shapes, x, device)
     assert not none.frictions
     assert not terms(shapes, x, device, friction=0.0)[0].frictions
-    some, at = terms(shapes, x, device, groups=groups, friction=table, velocity=VELOCITY)
+    some, positions = terms(shapes, x, device, groups=groups, friction=table, velocity=VELOCITY)
     after = x + SLIP * np.random.default_rng(1).normal(size=x.shape)
     for result in (none, some):
-        result.lag(at)
-    at.assign(after)
-    none.evaluate(at, rates(none))
+        result.lag(positions)
+    positions.assign(after)
+    none.evaluate(positions, rates(none))
     assert none.energy.numpy()[0] > 0.0
     wanted = [*state(none), times(none, x)]
     for rate in (None, rates(some, 0.0)):
-        some.evaluate(at, rates(some))
-        some.evaluate(at, rate)
+        some.evaluate(positions, rates(some))
+        some.evaluate(positions, rate)
         assert all((a == b).all() for a, b in zip([*state(some), times(some, x)], wanted, strict=True))
         assert not some.dissipated.numpy().any()
-    some.evaluate(at, rates(some))
+    some.evaluate(positions, rates(some))
     for part, sizes in zip(some.frictions, ((2, 2), (1, 3)), strict=True):
         pairs = part.pairs.numpy()[used_of(part)]
-        one, other = (groups[shapes.things(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
-        assert len(pairs) > 5 and (one != other).all()
+        first, second = (groups[shapes.things(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
+        assert len(pairs) > 5 and (first != second).all()

@@ -26,7 +26,7 @@ STENCILS = {"edge_edge": edge_edge, "point_triangle": point_triangle}
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("case", ["random", "parallel", "near parallel", "flat"])
 def test_distances_of_the_search(device, name, case):
-    """Squared, of lengths about one; in the plane edges cross. The toolkit loses digits below 1e-7 of an angle."""
+    """Squared distances of lengths about one agree; flat cases have crossing edges. The toolkit loses digits at angles below 1e-7."""
     corners = configurations()[case]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 2]
     sine = np.linalg.norm(np.cross(a, b), axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
@@ -39,7 +39,7 @@ def test_distances_of_the_search(device, name, case):
 
 
 def scene(stencil: str) -> Shapes:
-    """Two rods of an edge, or a triangle and a rod that has a point near it, at rest."""
+    """Return two rods of an edge, or a triangle and a rod with a point near the triangle, at rest."""
     if stencil == "edge_edge":
         shapes = Shapes(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 1.0]]))
         shapes.rod([0, 1], 0.1)
@@ -52,7 +52,10 @@ def scene(stencil: str) -> Shapes:
 
 
 def positions(stencil: str, inside: bool) -> np.ndarray:
-    """Nodes (COUNT, 4 or 5, 3) within the range, edges more than two degrees from parallel; closest inside of both, if asked for."""
+    """Return nodes (COUNT, 4 or 5, 3) within the range, with interior closest points if `inside`.
+
+    Edges are more than two degrees from parallel.
+    """
     random = np.random.default_rng(7)
     x = scene(stencil).points + 0.3 * random.normal(size=(200 * COUNT, len(scene(stencil).points), 3))
     if stencil == "edge_edge":
@@ -72,17 +75,19 @@ def positions(stencil: str, inside: bool) -> np.ndarray:
 
 
 def terms(stencil: str, x: np.ndarray, device, **options) -> tuple[PairTerms, wp.array]:
-    """Of the pairs of this kind alone."""
-    at = upload(x.reshape(-1, 3), device)
-    search = BroadPhase(scene(stencil), at, len(x), reach=RANGE, margin=0.1)
+    """Return the terms of this kind of pair alone, and positions on the device."""
+    points = upload(x.reshape(-1, 3), device)
+    search = BroadPhase(scene(stencil), points, len(x), reach=RANGE, margin=0.1)
     result = PairTerms(search, log_barrier, stiffness=STIFFNESS, range=RANGE, thickness=0.0, **options)
     result.lists, result.frictions = result.lists[-1:], result.frictions[-1:]
-    return result, at
+    return result, points
 
 
 def pushed(stencil: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Energy, gradient and Hessian of a pair by the toolkit's barrier of the distance."""
-    D, dD, ddD = (np.array(getattr(ipctk, f"{stencil}_distance{of}")(*corners)) for of in ("", "_gradient", "_hessian"))
+    """Return energy, gradient and Hessian of a pair by the toolkit's barrier of the distance."""
+    D, dD, ddD = (
+        np.array(getattr(ipctk, f"{stencil}_distance{suffix}")(*corners)) for suffix in ("", "_gradient", "_hessian")
+    )
     d = np.sqrt(D)
     row = dD / (2.0 * d)
     bend = ddD / (2.0 * d) - np.outer(row, row) / d
@@ -92,24 +97,27 @@ def pushed(stencil: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def rubbed(stencil: str, corners, move, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Energy, gradient and Hessian of the toolkit's friction, with the normal force of its barrier."""
+    """Return energy, gradient and Hessian of the toolkit's friction, with the normal force of the barrier."""
     d = np.sqrt(getattr(ipctk, f"{stencil}_distance")(*corners))
     bound = -MU * STIFFNESS * ipctk.barrier_first_derivative(d, RANGE)
     point = getattr(ipctk, f"{stencil}_closest_point")(*corners)
     basis = np.array(getattr(ipctk, f"{stencil}_tangent_basis")(*corners))
-    of = getattr(ipctk, f"{stencil}_relative_velocity")
+    relative_velocity = getattr(ipctk, f"{stencil}_relative_velocity")
     unit = np.eye(12).reshape(12, 4, 3)
-    J = basis.T @ np.array([of(*each, point) for each in unit]).T
+    J = basis.T @ np.array([relative_velocity(*each, point) for each in unit]).T
     u = J @ move.ravel() * rate
     y = np.linalg.norm(u)
     f0 = ipctk.smooth_friction_f0(y, VELOCITY) - ipctk.smooth_friction_f0(0.0, VELOCITY)
-    over = ipctk.smooth_friction_f1_over_x(y, VELOCITY)
-    bend = over * np.eye(2) + ipctk.smooth_friction_f2_x_minus_f1_over_x3(y, VELOCITY) * np.outer(u, u)
-    return bound * f0 / rate, bound * over * J.T @ u, bound * rate * J.T @ bend @ J
+    force_over_speed = ipctk.smooth_friction_f1_over_x(y, VELOCITY)
+    bend = force_over_speed * np.eye(2) + ipctk.smooth_friction_f2_x_minus_f1_over_x3(y, VELOCITY) * np.outer(u, u)
+    return bound * f0 / rate, bound * force_over_speed * J.T @ u, bound * rate * J.T @ bend @ J
 
 
-def agree(result: PairTerms, at, wanted: list, products: tuple) -> None:
-    """Energies, forces and products with the matrix (or, where `products` has positions, the exact Hessian) of each world."""
+def agree(result: PairTerms, points, wanted: list, products: tuple) -> None:
+    """Assert that energies, forces and products of each world agree.
+
+    For None in `products` the product is of the matrix, for positions of the exact Hessian.
+    """
     energy, gradient, hessian = (np.array(values) for values in zip(*wanted, strict=True))
     np.testing.assert_allclose(result.energy.numpy(), energy, rtol=1e-8)
 
@@ -120,32 +128,32 @@ def agree(result: PairTerms, at, wanted: list, products: tuple) -> None:
         return (np.abs(value[:, :4] - reference).max((1, 2)) / np.abs(reference).max((1, 2))).max()
 
     assert worst(-result.forces.numpy(), gradient) < 1e-8
-    v = np.random.default_rng(8).normal(size=(COUNT, len(at) // COUNT, 3))
+    v = np.random.default_rng(8).normal(size=(COUNT, len(points) // COUNT, 3))
     bent = np.einsum("eij,ej->ei", hessian, v[:, :4].reshape(COUNT, 12))
-    for given in products:
-        assert worst(times(result, v.reshape(-1, 3), given), bent) < 1e-7
+    for product_points in products:
+        assert worst(times(result, v.reshape(-1, 3), product_points), bent) < 1e-7
 
 
 @pytest.mark.parametrize("stencil", STENCILS)
 def test_barrier(device, stencil):
     x = positions(stencil, False)
-    result, at = terms(stencil, x, device)
-    result.evaluate(at)
-    agree(result, at, [pushed(stencil, corners) for corners in x[:, :4]], (at,))
+    result, points = terms(stencil, x, device)
+    result.evaluate(points)
+    agree(result, points, [pushed(stencil, corners) for corners in x[:, :4]], (points,))
 
 
 @pytest.mark.parametrize("stencil", STENCILS)
 def test_friction(device, stencil):
-    """Each world with its own rate, sticking or sliding."""
-    x, random = positions(stencil, True), np.random.default_rng(9)
-    rate = random.uniform(10.0, 100.0, COUNT)
-    move = 10.0 ** random.uniform(-4.0, -2.0, (COUNT, 1, 1)) * random.normal(size=x.shape)
-    result, at = terms(stencil, x, device, friction=MU, friction_law="polynomial", velocity=VELOCITY)
-    result.lag(at)
+    """Each world has another rate and sticks or slides."""
+    x, rng = positions(stencil, True), np.random.default_rng(9)
+    rate = rng.uniform(10.0, 100.0, COUNT)
+    move = 10.0 ** rng.uniform(-4.0, -2.0, (COUNT, 1, 1)) * rng.normal(size=x.shape)
+    result, points = terms(stencil, x, device, friction=MU, friction_law="polynomial", velocity=VELOCITY)
+    result.lag(points)
     result.law.stiffness.zero_()
-    at.assign((x + move).reshape(-1, 3))
-    result.evaluate(at, wp.array(rate, dtype=wp.float64, device=device))
+    points.assign((x + move).reshape(-1, 3))
+    result.evaluate(points, wp.array(rate, dtype=wp.float64, device=device))
     wanted = [rubbed(stencil, *each) for each in zip(x[:, :4], move[:, :4], rate, strict=True)]
-    agree(result, at, wanted, (None, at))
+    agree(result, points, wanted, (None, points))
     ratio = result.dissipated.numpy() / result.energy.numpy()
-    assert 0.2 < (ratio > 1.5).mean() < 0.8  # f1 x / f0 is between 3/2 and 2 of what sticks, less of what slides
+    assert 0.2 < (ratio > 1.5).mean() < 0.8  # f1 x / f0 is between 3/2 and 2 for sticking pairs, less for sliding ones

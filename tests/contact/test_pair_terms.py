@@ -1,4 +1,4 @@
-"""Contact on pairs: energies and forces of all pairs, products with the Hessian, momentum, and what may not change them."""
+"""Contact on pairs: energies and forces of all pairs, products with the Hessian, momentum, and invariances."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_energy_is_that_of_all_pairs(device, case, law):
     result, _ = terms(shapes, x, device, law)
     assert result.energy.numpy()[0] == pytest.approx(brute(shapes, x, law), rel=1e-11)
     assert all(int(part.count.numpy()[0]) > 5 for part in result.lists)
-    if case == "parallel":  # both parts of the energy of edges are there
+    if case == "parallel":  # both kinds of edge energies occur
         edges = result.lists[0]
         used = edges.factor.used.numpy()[: int(edges.count.numpy()[0])]
         assert ((used & 0b10) != 0).sum() > 5 and ((used & 0b111100) != 0).sum() > 5
@@ -48,20 +48,20 @@ def test_energy_is_that_of_all_pairs(device, case, law):
 @each_law
 def test_forces_and_exact_products_are_differences(device, case, law):
     shapes, x = CASES[case]()
-    result, at = terms(shapes, x, device, law)
+    result, positions = terms(shapes, x, device, law)
     forces = result.forces.numpy().copy()
-    step = 2e-8  # regions of closest points, where second derivatives jump, are as near as 1e-7
-    random = np.random.default_rng(1)
+    step = 2e-8  # second derivatives jump between regions of closest points, which are as near as 1e-7
+    rng = np.random.default_rng(1)
     for _ in range(5):
-        v = random.normal(size=x.shape)
-        product = times(result, v, at)
+        v = rng.normal(size=x.shape)
+        product = times(result, v, positions)
 
         def quantities(s, v=v):
-            move(result, at, x + s * v)
+            move(result, positions, x + s * v)
             return np.append(result.energy.numpy()[0], result.forces.numpy().ravel())
 
         slopes = central(quantities, step)
-        move(result, at, x)
+        move(result, positions, x)
         assert slopes[0] == pytest.approx(-(forces * v).sum(), rel=1e-6)
         assert np.abs(product.ravel() + slopes[1:]).max() < 1e-6 * np.abs(product).max()
 
@@ -69,24 +69,24 @@ def test_forces_and_exact_products_are_differences(device, case, law):
 @each_case
 @each_law
 def test_pairs_that_turn(device, case, law):
-    """The Gauss-Newton matrix with `pair_bend`, and what is kept of edges all but parallel, is the exact Hessian."""
+    """The Gauss-Newton matrix with `pair_bend`, and the stored term of near-parallel edges, is the exact Hessian."""
     shapes, x = CASES[case]()
-    result, at = terms(shapes, x, device, law)
+    result, positions = terms(shapes, x, device, law)
     v = np.random.default_rng(4).normal(size=x.shape)
-    exact, plain = times(result, v, at), times(result, v)
+    exact, plain = times(result, v, positions), times(result, v)
     wanted = wp.ones(1, dtype=int, device=device)
     mollified = (result.lists[0].factor.used.numpy() != 0) & (result.lists[0].factor.bend.numpy() == 0.0)
     assert mollified.any() == (case == "parallel")
     assert np.abs(exact - plain).max() > 0.01 * np.abs(exact).max()
-    assert np.abs(times(result, v, at, wanted) - exact).max() < 1e-10 * np.abs(exact).max()
+    assert np.abs(times(result, v, positions, wanted) - exact).max() < 1e-10 * np.abs(exact).max()
     wanted.zero_()
-    np.testing.assert_array_equal(times(result, v, at, wanted), plain)
+    np.testing.assert_array_equal(times(result, v, positions, wanted), plain)
 
 
 @each_case
 @each_law
 def test_gauss_newton_matrix(device, case, law):
-    """Symmetric, positive semi-definite, and what psi'' makes of the derivatives of distances."""
+    """v . H v is psi'' times the squared derivative of distances along v."""
     shapes, x = CASES[case]()
     result, _ = terms(shapes, x, device, law)
     v = np.random.default_rng(2).normal(size=x.shape)
@@ -103,17 +103,17 @@ def test_gauss_newton_matrix(device, case, law):
 @each_law
 def test_blocks_are_those_of_the_matrix(device, law):
     shapes, x = bundle()
-    for other in range(4):
-        shapes.ignore(3, other)  # no triangles: between nodes of an edge there is what the pairs of the edge add
+    for number in range(4):
+        shapes.ignore(3, number)  # no triangles: blocks between nodes of an edge only have pairs of that edge
     result, _ = terms(shapes, x, device, law)
     n = len(x)
     matrix = assembled(result, n).transpose(0, 2, 1, 3)
     _, _, diagonal, between = state(result)
     nodes = shapes.things(2)[0]
     largest = np.abs(matrix).max()
-    own = matrix[np.arange(n), np.arange(n)]
-    assert np.abs(diagonal - own).max() < 1e-13 * largest
-    assert np.abs(result.stiffness.numpy() - np.trace(own, axis1=1, axis2=2)).max() < 1e-13 * largest
+    blocks = matrix[np.arange(n), np.arange(n)]
+    assert np.abs(diagonal - blocks).max() < 1e-13 * largest
+    assert np.abs(result.stiffness.numpy() - np.trace(blocks, axis1=1, axis2=2)).max() < 1e-13 * largest
     assert np.abs(between - matrix[nodes[:, 0], nodes[:, 1]]).max() < 1e-13 * largest
     assert np.abs(between).max() > 1e-3 * largest
 
@@ -143,46 +143,46 @@ def test_two_runs_agree_to_the_bit(device, case):
 
 def test_worlds_are_alone(device):
     shapes, x = CASES["crossing"]()
-    random = np.random.default_rng(4)
-    worlds = [x + 1e-3 * random.normal(size=x.shape) for _ in range(3)]
+    rng = np.random.default_rng(4)
+    worlds = [x + 1e-3 * rng.normal(size=x.shape) for _ in range(3)]
     together = state(terms(shapes, np.concatenate(worlds), device, worlds=3)[0])
     alone = [state(terms(shapes, each, device)[0]) for each in worlds]
-    for whole, parts in zip(together, zip(*alone, strict=True), strict=True):
-        assert (whole == np.concatenate(parts)).all()
+    for whole, separate in zip(together, zip(*alone, strict=True), strict=True):
+        assert (whole == np.concatenate(separate)).all()
     assert len(set(together[0])) == 3
 
 
 def test_lists_grow_and_nothing_is_dropped(device):
     shapes, x = CASES["crossing"]()
-    result, at = terms(shapes, x, device)
+    result, positions = terms(shapes, x, device)
     before = state(result)
     for pairs in result.search.lists:
         pairs.reserve(10)
-    result.search.search(at)
-    result.evaluate(at)
+    result.search.search(positions)
+    result.evaluate(positions)
     assert np.isinf(result.energy.numpy()).all()
     assert not result.forces.numpy().any()
-    assert result.search.fit(at)
+    assert result.search.fit(positions)
     with pytest.raises(SolverError, match=r"have grown; call fit\(\)"):
-        result.evaluate(at)
+        result.evaluate(positions)
     assert result.fit()
     assert not result.fit()
-    result.evaluate(at)
+    result.evaluate(positions)
     assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
 
 
 def test_the_order_of_objects_does_not_matter(device):
-    """Objects and their nodes the other way round, and rods from their other end."""
+    """Objects and nodes are in reverse order, and rods run from the other end."""
     shapes, x = bundle()
     rods, edges = 3, 4
     n = len(x)
-    turned = Shapes(shapes.points[::-1])
+    backwards = Shapes(shapes.points[::-1])
     triangles = n - 1 - shapes.things(3)[0]
-    turned.shell(triangles[::-1, [1, 2, 0]], 0.004)
+    backwards.shell(triangles[::-1, [1, 2, 0]], 0.004)
     for r in reversed(range(rods)):
-        turned.rod(n - 1 - (r * (edges + 1) + np.arange(edges + 1)), 0.003)
+        backwards.rod(n - 1 - (r * (edges + 1) + np.arange(edges + 1)), 0.003)
     first, _ = terms(shapes, x, device)
-    second, _ = terms(turned, x[::-1], device)
+    second, _ = terms(backwards, x[::-1], device)
     assert second.energy.numpy()[0] == pytest.approx(first.energy.numpy()[0], rel=1e-12)
     forces = first.forces.numpy()
     assert np.abs(second.forces.numpy()[::-1] - forces).max() < 1e-11 * np.abs(forces).max()
@@ -190,20 +190,20 @@ def test_the_order_of_objects_does_not_matter(device):
 
 def test_a_captured_evaluation_follows_motion(device):
     shapes, x = CASES["crossing"]()
-    result, at = terms(shapes, x, device)
+    result, positions = terms(shapes, x, device)
     v = np.random.default_rng(5).normal(size=x.shape)
-    given, out = upload(v, device), upload(0.0 * v, device)
+    direction, out = upload(v, device), upload(0.0 * v, device)
     arrays.load_kernels([*result.search.kernels, *result.kernels], device)
     with wp.ScopedCapture(device=device) as capture:
-        result.search.update(at)
-        result.evaluate(at)
+        result.search.update(positions)
+        result.evaluate(positions)
         out.zero_()
-        result.product(given, out)
+        result.product(direction, out)
         result.join()
     velocity = 0.3 * MARGIN * v / np.linalg.norm(v, axis=1, keepdims=True)
     searches = result.search.searches.numpy()[0]
     for step in range(1, 5):
-        at.assign(x + step * velocity)
+        positions.assign(x + step * velocity)
         wp.capture_launch(capture.graph)
         assert result.energy.numpy()[0] == pytest.approx(brute(shapes, x + step * velocity, "penalty"), rel=1e-11)
         assert (out.numpy() * v).sum() == pytest.approx(brute(shapes, x + step * velocity, "penalty", v), rel=1e-6)
@@ -211,7 +211,7 @@ def test_a_captured_evaluation_follows_motion(device):
 
 
 def test_parameters_are_those_of_groups(device):
-    """What each pair of groups has with its parameters for all, where other pairs ignore each other; together the whole."""
+    """The energies of each pair of groups, with all others ignored, add up to the energy of the whole."""
     groups = np.array([0, 0, 1, 1])
     parameters = {
         "stiffness": np.array([[1.0, 2.0], [2.0, 5.0]]),
@@ -235,41 +235,41 @@ def test_parameters_are_those_of_groups(device):
 def test_factors_in_single_precision(device):
     shapes, x = CASES["parallel"]()
     whole, _ = terms(shapes, x, device)
-    single, at = terms(shapes, x, device, linear=wp.float32)
+    single, points = terms(shapes, x, device, linear=wp.float32)
     v = np.random.default_rng(6).normal(size=x.shape)
     assert (single.forces.numpy() == whole.forces.numpy()).all()
-    for positions in (None, at):
+    for positions in (None, points):
         exact = times(whole, v, positions)
         assert np.abs(times(single, v, positions) - exact).max() < 1e-5 * np.abs(exact).max()
 
 
 def test_overlaps_and_what_is_not_finite_show_in_the_energy(device):
     shapes, x = bundle()
-    result, at = terms(shapes, x, device, "barrier", thickness=0.006, range=0.002)
+    result, positions = terms(shapes, x, device, "barrier", thickness=0.006, range=0.002)
     assert np.isinf(result.energy.numpy()).all()
     without, _ = terms(shapes, x, device, "barrier", thickness=0.006, range=0.002, stiffness=0.0)
     assert not without.energy.numpy().any()
-    result, at = terms(shapes, x, device)
+    result, positions = terms(shapes, x, device)
     x[7] = np.nan
-    at.assign(x)
-    result.evaluate(at)
+    positions.assign(x)
+    result.evaluate(positions)
     assert np.isnan(result.energy.numpy()).all()
 
 
 @each_case
 def test_all_in_single_precision(device, case):
-    """Positions err by 1e-8 of 0.3 m, a gap of 1e-3 m by 1e-5 of it."""
+    """Positions of 0.3 m err by 1e-8 m, gaps of 1e-3 m by 1e-5 of the gap."""
     shapes, x = CASES[case]()
-    at = upload(x, device, wp.vec3f)
-    search = BroadPhase(shapes, at, reach=REACH, margin=MARGIN)
+    points = upload(x, device, wp.vec3f)
+    search = BroadPhase(shapes, points, reach=REACH, margin=MARGIN)
     result = PairTerms(search, smooth_penalty, **LAWS["penalty"][1])
-    result.evaluate(at)
+    result.evaluate(points)
     assert result.energy.numpy()[0] == pytest.approx(
         brute(shapes, x.astype(np.float32).astype(float), "penalty"), rel=1e-4
     )
     v = np.random.default_rng(7).normal(size=x.shape)
-    whole, there = terms(shapes, x, device)
-    for positions, exact in ((None, times(whole, v)), (at, times(whole, v, there))):
+    whole, whole_points = terms(shapes, x, device)
+    for positions, exact in ((None, times(whole, v)), (points, times(whole, v, whole_points))):
         assert np.abs(times(result, v, positions) - exact).max() < 1e-3 * np.abs(exact).max()
 
 

@@ -1,5 +1,6 @@
-"""Paths of equilibria in contact: closed forms of a truss that snaps onto a stop, of balance on a ball, and of a column between walls;
-all kinds of objects against load steps, and what is refused.
+"""Paths of equilibria in contact: closed forms, every kind of object against load steps, and refusals.
+
+Closed forms are of a truss that snaps onto a stop, of balance on a ball, and of a column between walls.
 """
 
 from functools import cache
@@ -21,7 +22,10 @@ each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
 def truss(device, law: str, stop: float, reach: float, stiffness: float):
-    """Two bars from (-1, 0, 0) and (1, 0, 0) to an apex, EA = 1, pressed down by the load parameter onto a ball at height `stop`."""
+    """Return the continuation of a truss, pressed down by the load parameter onto a ball at height `stop`.
+
+    Two bars with EA = 1 run from (-1, 0, 0) and (1, 0, 0) to an apex.
+    """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     section = ddg.Stiffness(EA=1.0, radius=THICK, mass_per_length=1.0)
     points = [[-1.0, 0.0, 0.0], [0.0, 0.0, HEIGHT], [1.0, 0.0, 0.0]]
@@ -36,12 +40,15 @@ def truss(device, law: str, stop: float, reach: float, stiffness: float):
 
 
 def carried(z):
-    """Load that the bars carry with their apex at z: 2 EA z (1 / l - 1 / l0), l^2 = 1 + z^2."""
+    """Return the load of the bars with the apex at z.
+
+    The load is 2 EA z (1 / l - 1 / l0), l^2 = 1 + z^2.
+    """
     return 2.0 * z * (1.0 / np.sqrt(1.0 + z**2) - 1.0 / LENGTH)
 
 
 def pushes(model, state) -> float:
-    """What obstacles push upwards [N]; a reaction is what the support exerts."""
+    """Return the upward force of obstacles [N]; a reaction is the force that a support exerts."""
     obstacles = len(model.scene.obstacles)
     return float(sum(reaction.force[2] for reaction in model.reactions(state)[-obstacles:]))
 
@@ -51,14 +58,14 @@ def pushes(model, state) -> float:
     ("reach", "stiffness"), [(1e-2, 10.0), pytest.param(1e-4, 1e3, marks=pytest.mark.slow), (1e-6, 1e5)]
 )
 def test_a_truss_snaps_onto_a_stop(device, law, reach, stiffness):
-    """The load falls until bars and ball touch, and grows with what the ball takes; the way back is the same."""
+    """The load falls until bars and ball are in contact, then grows with the force of the ball. The way back is the same."""
     stop = -0.1
     follower = truss(device, law, stop, reach, stiffness)
     path = follower.trace(stop=Stop(load=(-1.0, 0.3)))
     assert path.outcome == "load"
     for point in path.points:
-        pushed = pushes(follower.model, point.state)
-        assert point.load == pytest.approx(carried(HEIGHT - point.values["drop"]) + pushed, abs=1e-9)
+        ball_force = pushes(follower.model, point.state)
+        assert point.load == pytest.approx(carried(HEIGHT - point.values["drop"]) + ball_force, abs=1e-9)
     highest = carried(np.sqrt(LENGTH ** (2.0 / 3.0) - 1.0))
     first, corner = path.limit_points
     assert first.load == pytest.approx(highest, rel=1e-9)
@@ -73,22 +80,22 @@ def test_a_truss_snaps_onto_a_stop(device, law, reach, stiffness):
 
 @each_law
 def test_what_balances_on_a_ball_falls_off(device, law):
-    """The apex slides off where the push F is its stiffness sideways times the distance of the middles.
+    """The apex slides off where the contact force is the lateral stiffness times the distance of the centres.
 
-    That of the bars is 2 (EA / l0 cos^2 + N / l sin^2), with their force N = EA (l / l0 - 1) and slope z over 1.
+    The bars have the lateral stiffness 2 (EA / l0 cos^2 + N / l sin^2), with axial force N = EA (l / l0 - 1) and slope z over 1.
     """
     follower = truss(device, law, -0.5, 1e-3, 1e2)
     (event,) = follower.trace(stop=Stop(load=(-1.0, 0.6))).bifurcations
     z = HEIGHT - event.values["drop"]
     length = np.hypot(1.0, z)
     sideways = 2.0 * (1.0 / LENGTH + (length / LENGTH - 1.0) / length * z**2) / length**2
-    apart = z - (-0.5 - THICK - BALL)
-    assert pushes(follower.model, event.state) == pytest.approx(sideways * apart, rel=1e-6)
+    distance = z - (-0.5 - THICK - BALL)
+    assert pushes(follower.model, event.state) == pytest.approx(sideways * distance, rel=1e-6)
     assert np.abs(event.mode_displacements[1]).argmax() == 0
 
 
 def column(device, law: str, n: int):
-    """A hinged column along x, EI = 1, L = 1, compressed by the load parameter between two walls."""
+    """Return the continuation of a hinged column along x, EI = 1, L = 1, compressed between two walls."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     section = ddg.Stiffness(EA=1e6, EI1=1.0, radius=COLUMN, mass_per_length=1.0)
     points = np.zeros((n + 1, 3))
@@ -106,15 +113,15 @@ def column(device, law: str, n: int):
 
 @each_law
 def test_a_column_between_walls(device, law):
-    """It buckles at pi^2 EI / L^2 until its middle touches a wall, which pushes it by R.
+    """The column buckles at pi^2 EI / L^2 until the middle meets a wall, which exerts a force R.
 
-    Each half is w = A sin k x + B x of P = EI k^2, with w'' = 0 at the hinge, and w = h, w' = 0 in the middle; the force across is
-    P B there (Feodosiev, Selected Problems and Questions in Strength of Materials, 1973; Domokos, Holmes and Royce,
-    J. Nonlinear Sci. 7, 1997, 281). So with t = k L / 2
+    Each half is w = A sin k x + B x of P = EI k^2, with w'' = 0 at the hinge. In the middle w = h and w' = 0. The lateral force is P
+    B there (Feodosiev, Selected Problems and Questions in Strength of Materials, 1973; Domokos, Holmes and Royce, J. Nonlinear Sci.
+    7, 1997, 281). With t = k L / 2,
 
         R = -2 P k h cos t / (sin t - t cos t) ,
 
-    until w'' vanishes in the middle, too, at t = pi. Of finite slopes it is off by (h / L)^2 and of n edges by 1 / n^2.
+    until w'' vanishes in the middle, too, at t = pi. Finite slopes cause an error of (h / L)^2, n edges one of 1 / n^2.
     """
     follower = column(device, law, 40)
     (buckles,) = follower.trace(stop=Stop(load=(-1.0, 12.0))).bifurcations
@@ -133,7 +140,7 @@ def test_a_column_between_walls(device, law):
 
 
 def test_mode_follow_keeps_what_is_unstable(device):
-    """Beyond Euler's load a column stays straight by mode "follow", and goes to a wall by mode "minimise"; walls hold it there."""
+    """A column above Euler's load stays straight by mode "follow" and goes to a wall by mode "minimise", where it stays."""
     model = column(device, "barrier", 20).model
     straight = statics.solve(model, mode="follow", start=0.0, end=15.0)
     bent = statics.solve(model, straight, start=15.0, end=15.0)
@@ -150,7 +157,10 @@ RADIUS = 4e-3
 
 
 def cantilever(scene) -> int:
-    """A rod of 0.2 m from the origin along x; its end sinks by 0.05 m if nothing is below."""
+    """Add a rod of 0.2 m from the origin along x and return the number.
+
+    The tip sinks by 0.05 m without obstacles.
+    """
     points = np.linspace((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 13)
     rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=RUBBER, name="rod")
     scene.clamp(rod, edges=[0])
@@ -158,7 +168,7 @@ def cantilever(scene) -> int:
 
 
 def sheet(scene) -> None:
-    """One of 0.2 by 0.05 m, clamped along one side."""
+    """Add a sheet of 0.2 by 0.05 m, clamped along one side."""
     points, triangles = meshes.rectangle(8, 2, (0.2, 0.05))
     points = np.array(points, float) - [0.0, 0.021, 0.0]
     shell = scene.add_shell(points, triangles, thickness=2.0 * RADIUS, material=RUBBER, name="sheet")
@@ -191,11 +201,11 @@ def rods_across(scene) -> None:
 
 
 def joined(scene) -> None:
-    """A frame of two rods, whose far corner comes down on a plane."""
+    """Add a frame of two rods; the far corner comes down on a plane."""
     rod = cantilever(scene)
     points = np.stack([np.full(7, 0.2), np.linspace(0.0, 0.08, 7), np.zeros(7)], axis=1)
-    other = scene.add_rod(points, section=ddg.Circle(RADIUS), material=RUBBER, name="arm")
-    scene.join([(rod, 12), (other, 0)])
+    arm = scene.add_rod(points, section=ddg.Circle(RADIUS), material=RUBBER, name="arm")
+    scene.join([(rod, 12), (arm, 0)])
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -0.014)), name="obstacle")
 
 
@@ -225,25 +235,25 @@ def kind_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
 @each_law
 @pytest.mark.parametrize("name", KINDS)
 def test_paths_lead_where_load_steps_do(device, name, law):
-    """Weight grows with the load parameter, and obstacles move by it: the same state at its end, and the same pushes."""
+    """Weight and obstacle motions follow the load parameter: end states and reactions are the same."""
     model = kind_of(name, law).build(device, "float64")
     path = Continuation(model).trace(stop=Stop(load=(-1.0, 1.0)))
-    found, stepped = path.points[-1].state, statics.solve(model, load_steps=4)
+    end, stepped = path.points[-1].state, statics.solve(model, load_steps=4)
     assert path.points[-1].load == 1.0
     assert path.stable.all()
-    assert len(model.contacts(path.points[0].state)) == 0 < len(model.contacts(found))
-    np.testing.assert_allclose(found.points(), stepped.points(), atol=1e-8)
-    for one, other in zip(model.reactions(found), model.reactions(stepped), strict=True):
-        np.testing.assert_allclose(one.force, other.force, atol=1e-6)
+    assert len(model.contacts(path.points[0].state)) == 0 < len(model.contacts(end))
+    np.testing.assert_allclose(end.points(), stepped.points(), atol=1e-8)
+    for traced, expected in zip(model.reactions(end), model.reactions(stepped), strict=True):
+        np.testing.assert_allclose(traced.force, expected.force, atol=1e-6)
 
 
 def test_what_paths_refuse(device):
     rough = kind_of("ball", "barrier", 0.3).build(device, "float64")
-    for ask in (lambda: Continuation(rough), lambda: statics.solve(rough, mode="follow")):
+    for call in (lambda: Continuation(rough), lambda: statics.solve(rough, mode="follow")):
         with pytest.raises(
             ddg.SceneError, match=r"paths .* know no friction, and it is 0.3 between .*; set friction=0"
         ):
-            ask()
+            call()
     smooth = kind_of("ball", "barrier").build(device, "float64")
     sunk = smooth.state(points=smooth.state().points() - [0.0, 0.0, 0.02])
     with pytest.raises(ddg.SceneError, match=r"overlap by .* at the start"):

@@ -1,4 +1,4 @@
-"""States in which things overlap, and those made of them in which nothing does."""
+"""Overlap resolution: states with overlaps, and the separated states."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ MATERIAL = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
 
 
 def scene_of(*directions, lift: float = 0.0, nodes: int = 4) -> ddg.Scene:
-    """Rods through the origin, each higher than the one before by `lift`."""
+    """Return rods through the origin, each higher than the last by `lift`."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     along = np.linspace(-0.1, 0.1, nodes)[:, None]
     for k, direction in enumerate(directions):
@@ -23,7 +23,7 @@ def scene_of(*directions, lift: float = 0.0, nodes: int = 4) -> ddg.Scene:
 
 
 def test_rods_that_meet_in_a_point_pass_by_each_other(device):
-    """Both give way by halves, across both: all four nodes have half of the closest point and move by half of what is missing."""
+    """Rods move by half of the missing distance each, across both. The nodes of the middle edges move as far."""
     model = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)).build(device=device, precision="float64")
     state = model.state()
     before = state.points().copy()
@@ -41,7 +41,7 @@ def test_rods_that_meet_in_a_point_pass_by_each_other(device):
 
 
 def test_what_is_held_stays(device):
-    """A rod too deep in the floor is lifted by what is missing; one that is clamped is passed by the other alone."""
+    """A rod too deep in the floor is lifted by the missing distance; a fixed rod stays, and the other one moves."""
     scene = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), lift=0.5 * RADIUS)
     scene.fix(0, [0, 1, 2, 3])
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -RADIUS - 0.5 * RANGE)))
@@ -61,7 +61,7 @@ def test_what_is_held_stays(device):
 
 @pytest.mark.parametrize("precision", ["float64", "mixed"])
 def test_a_heap_comes_apart(device, precision):
-    """Twelve rods through one point above a sheet, in two worlds: nothing is too close then, and steps go on from there."""
+    """Twelve rods through one point above a sheet, in two worlds, separate to the required gap; steps continue from there."""
     rng = np.random.default_rng(3)
     scene = scene_of(*rng.normal(size=(12, 3)), lift=1e-4, nodes=16)
     sheet = np.array([[-0.2, -0.2, -0.11], [0.2, -0.2, -0.11], [0.0, 0.2, -0.11]])

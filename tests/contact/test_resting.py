@@ -1,4 +1,4 @@
-"""Islands of what touches: found anew for each direction; those in balance rest while others go on."""
+"""Sleeping islands: recomputed for each direction; converged islands sleep while others iterate."""
 
 import numpy as np
 import pytest
@@ -16,78 +16,82 @@ APART = 0.2  # m, between pairs of rods
 
 
 def pairs(speeds) -> tuple[ddg.Scene, np.ndarray]:
-    """Pairs of crossed rods, each of which meets at a speed of its own, and velocities."""
+    """Return pairs of crossed rods, each meeting at another speed, and velocities."""
     scene, velocities = ddg.Scene(gravity=(0.0, 0.0, 0.0)), []
     for i, speed in enumerate(speeds):
-        at = np.array([APART * i, 0.0, 0.0])
-        one = np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + at
-        other = np.stack([0 * STRAIGHT, STRAIGHT, 0 * STRAIGHT + 4e-3 + 0.5e-3], 1) + at
-        scene.add_rods(np.stack([one, other]), section=ddg.Circle(RADIUS), material=SOFT, name=f"pair {i}")
+        offset = np.array([APART * i, 0.0, 0.0])
+        lower = np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + offset
+        upper = np.stack([0 * STRAIGHT, STRAIGHT, 0 * STRAIGHT + 4e-3 + 0.5e-3], 1) + offset
+        scene.add_rods(np.stack([lower, upper]), section=ddg.Circle(RADIUS), material=SOFT, name=f"pair {i}")
         velocities += [np.zeros((9, 3)), np.tile([0.0, 0.0, -speed], (9, 1))]
     scene.contact(range=1e-3, friction=0.3)
     return scene, np.concatenate(velocities)
 
 
-def joined_over_beam(scene, at, lift: float) -> float:
-    """Two rods, joined rigidly, over a third, and lifted [m]; above what height nodes move at first [m]."""
-    half = np.stack([0 * STRAIGHT[:5], STRAIGHT[:5], 0 * STRAIGHT[:5] + 4.5e-3 + lift], 1) + at
-    scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + at, section=ddg.Circle(RADIUS), material=SOFT)
-    rods = [scene.add_rod(own, section=ddg.Circle(RADIUS), material=SOFT) for own in (half, half * [1, -1, 1])]
+def joined_over_beam(scene, offset, lift: float) -> float:
+    """Add two rigidly joined rods, `lift` above a third; return the height above which nodes move at first [m]."""
+    half = np.stack([0 * STRAIGHT[:5], STRAIGHT[:5], 0 * STRAIGHT[:5] + 4.5e-3 + lift], 1) + offset
+    scene.add_rod(
+        np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + offset, section=ddg.Circle(RADIUS), material=SOFT
+    )
+    rods = [scene.add_rod(points, section=ddg.Circle(RADIUS), material=SOFT) for points in (half, half * [1, -1, 1])]
     scene.join([(rods[0], -1), (rods[1], -1)])
     return RADIUS
 
 
-def sheet_over_beam(scene, at, lift: float) -> float:
-    """A sheet over a rod."""
-    scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + at, section=ddg.Circle(RADIUS), material=SOFT)
+def sheet_over_beam(scene, offset, lift: float) -> float:
+    """Add a sheet over a rod."""
+    scene.add_rod(
+        np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + offset, section=ddg.Circle(RADIUS), material=SOFT
+    )
     points, triangles = meshes.rectangle(3, 3, (0.05, 0.05), "alternating")
-    scene.add_shell(points - [0.025, 0.025, -3.0e-3 - lift] + at, triangles, thickness=1e-3, material=SOFT)
+    scene.add_shell(points - [0.025, 0.025, -3.0e-3 - lift] + offset, triangles, thickness=1e-3, material=SOFT)
     return RADIUS
 
 
-def rod_on_ball(scene, at, lift: float) -> float:
-    """A rod over a ball that is held, which joins nothing."""
-    points = np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT + lift], 1) + at
+def rod_on_ball(scene, offset, lift: float) -> float:
+    """Add a rod over a fixed ball, which joins no islands."""
+    points = np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT + lift], 1) + offset
     scene.add_rod(points, section=ddg.Circle(RADIUS), material=SOFT)
-    scene.add_obstacle(ddg.Sphere(tuple(at - [0.0, 0.0, 0.0125]), 0.01))
+    scene.add_obstacle(ddg.Sphere(tuple(offset - [0.0, 0.0, 0.0125]), 0.01))
     return -RADIUS
 
 
 def watched(device, scene, velocities, worlds: int = 1, linear="chain", **options):
-    """A step launched piece by piece: the state at its end, nodes there, and of each direction, which it is, and nodes before it."""
+    """Launch a step without capture; return the end state, nodes there, and every direction with the nodes before."""
     model = scene.build(device=device, worlds=worlds)
     integrator = ddg.Integrator(model, linear=linear, **options)
     state = model.state(velocities=velocities)
     integrator.step(state, 1e-9)  # loads kernels and makes room
-    newton, seen = integrator._net.newton, []
+    newton, records = integrator._net.newton, []
     nodes = model.net.host.nodes
     direct = newton.direct
 
-    def directed():
+    def record():
         before = newton.q.numpy().reshape(worlds, -1, 3)[:, :nodes]
         direct()
-        seen.append((newton.direction.numpy().reshape(worlds, -1, 3)[:, :nodes].astype(float), before))
+        records.append((newton.direction.numpy().reshape(worlds, -1, 3)[:, :nodes].astype(float), before))
 
-    newton.direct = directed
+    newton.direct = record
     end = eagerly(integrator, state, DT)
-    return end.state, end.own.net.q.numpy().reshape(worlds, -1, 3)[:, :nodes], seen
+    return end.state, end.own.net.q.numpy().reshape(worlds, -1, 3)[:, :nodes], records
 
 
 def test_an_island_in_balance_rests(device):
-    """Of two pairs one balances first: it is left where it is, to the bit, while the other goes on."""
+    """The first of two pairs to converge sleeps: nodes stay equal bitwise while the other pair iterates."""
     scene, velocities = pairs([0.05, 3.0])
-    _, end, seen = watched(device, scene, velocities, rtol=1e-6)
-    moved = np.array([[np.abs(d[0, own : own + 18]).max() for own in (0, 18)] for d, _ in seen])
+    _, end, records = watched(device, scene, velocities, rtol=1e-6)
+    moved = np.array([[np.abs(d[0, start : start + 18]).max() for start in (0, 18)] for d, _ in records])
     assert moved[0].all()  # both set out
     (first,) = np.flatnonzero(moved[-1] == 0.0)
-    rests = np.flatnonzero(moved[:, first] == 0.0)
-    assert (rests == np.arange(rests[0], len(seen))).all() and moved[rests, 1 - first].all()
-    own = slice(18 * first, 18 * first + 18)
-    assert (end[0, own] == seen[rests[0]][1][0, own]).all()
+    asleep = np.flatnonzero(moved[:, first] == 0.0)
+    assert (asleep == np.arange(asleep[0], len(records))).all() and moved[asleep, 1 - first].all()
+    island = slice(18 * first, 18 * first + 18)
+    assert (end[0, island] == records[asleep[0]][1][0, island]).all()
 
 
 def test_islands_do_not_change_what_others_find(device):
-    """Three pairs in one world, and each on its own."""
+    """Three pairs in one world converge as in separate scenes."""
     speeds = [0.1, 3.0, 1.0]
     scene, velocities = pairs(speeds)
     _, together, _ = watched(device, scene, velocities, rtol=1e-10)
@@ -99,44 +103,44 @@ def test_islands_do_not_change_what_others_find(device):
 @pytest.mark.parametrize("linear", ["block_jacobi", "chain", "multilevel", "chain_multilevel"])
 @pytest.mark.parametrize("made", [joined_over_beam, sheet_over_beam, rod_on_ball])
 def test_islands_of_all_objects(device, made, linear):
-    """Of two of a kind one flies by itself, which its predictor has right: it rests while the other meets what is under it.
+    """One of two objects flies as predicted and sleeps while the other meets an object below.
 
-    Each ends as on its own.
+    Each ends as in a separate scene.
     """
     lifts, ends = [0.01, 0.0], []
-    for which in ([0, 1], [0], [1]):
+    for chosen in ([0, 1], [0], [1]):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
-        still = [made(scene, np.array([APART * i, 0.0, 0.0]), lifts[i]) for i in which]
+        still = [made(scene, np.array([APART * i, 0.0, 0.0]), lifts[i]) for i in chosen]
         scene.contact(range=1e-3, friction=0.3)
         points = scene.build(device=device).state().points()
         velocities = np.zeros_like(points)
-        for i in which:
+        for i in chosen:
             moves = (np.abs(points[:, 0] - APART * i) < 0.5 * APART) & (points[:, 2] > still[0])
-            velocities[moves, 2] = -0.04  # no predictor is cut: none would rest then
+            velocities[moves, 2] = -0.04  # no predictor is cut, as no island would sleep then
         ends.append(watched(device, scene, velocities, linear=linear, rtol=1e-9)[0].points())
-        if len(which) == 2:
-            _, _, seen = watched(device, scene, velocities, linear=linear, rtol=1e-5)
-            assert len(seen) > 2
-            near = [np.abs(seen[0][1][0, :, 0] - APART * i) < 0.5 * APART for i in which]
-            moved = np.array([[np.abs(d[0, own]).max() for own in near] for d, _ in seen])
+        if len(chosen) == 2:
+            _, _, records = watched(device, scene, velocities, linear=linear, rtol=1e-5)
+            assert len(records) > 2
+            near = [np.abs(records[0][1][0, :, 0] - APART * i) < 0.5 * APART for i in chosen]
+            moved = np.array([[np.abs(d[0, nodes]).max() for nodes in near] for d, _ in records])
             assert (moved[:, 0] == 0.0).all() and moved[:, 1].all()
     for i, alone in enumerate(ends[1:]):
-        own = np.abs(ends[0][:, 0] - APART * i) < 0.5 * APART
-        np.testing.assert_allclose(ends[0][own], alone, rtol=0, atol=1e-8 * APART)
+        nodes = np.abs(ends[0][:, 0] - APART * i) < 0.5 * APART
+        np.testing.assert_allclose(ends[0][nodes], alone, rtol=0, atol=1e-8 * APART)
 
 
 def test_worlds_have_islands_of_their_own(device):
-    """The same in two worlds."""
+    """Two equal worlds repeat the iterations of one."""
     scene, velocities = pairs([0.1, 3.0])
-    _, one, seen = watched(device, scene, velocities, rtol=1e-6)
+    _, one, records = watched(device, scene, velocities, rtol=1e-6)
     _, both, more = watched(device, scene, velocities, worlds=2, rtol=1e-6)
-    assert len(more) == len(seen)
+    assert len(more) == len(records)
     for end in both:
         np.testing.assert_allclose(end, one[0], rtol=0, atol=1e-12)
 
 
 def test_islands_are_those_of_the_pairs(device):
-    """Rods are joined by what pushes, links by links; of all islands the first body is known."""
+    """Contact pairs join rods, link by link; every island is named by the first body."""
     rng = np.random.default_rng(3)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     direction = rng.normal(size=(60, 1, 3))
@@ -154,11 +158,14 @@ def test_islands_are_those_of_the_pairs(device):
     newton.resting(newton.contact.terms.products)
     link = newton.resting._link.numpy()
     nodes = np.concatenate(
-        [part.factor.nodes.numpy()[: int(part.count.numpy()[0])].reshape(-1, 4) for part in newton.contact.terms.lists]
+        [
+            pair_list.factor.nodes.numpy()[: int(pair_list.count.numpy()[0])].reshape(-1, 4)
+            for pair_list in newton.contact.terms.lists
+        ]
     )
     body, _ = newton.contact.bodies
-    one, other = body[nodes[:, 0]], body[nodes[:, 2]]
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(60, 60))
+    body_a, body_b = body[nodes[:, 0]], body[nodes[:, 2]]
+    graph = coo_array((np.ones(len(body_a)), (body_a, body_b)), shape=(60, 60))
     count, expected = connected_components(graph, directed=False)
     assert 2 < count < 50
     first = np.array([np.flatnonzero(expected == label)[0] for label in expected])

@@ -1,4 +1,4 @@
-"""Friction that turns rods about their axes: closed forms of rolling, and the derivatives and blocks of its energy."""
+"""Rolling contact: closed forms, and derivatives and blocks of the friction potential."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def rod(scene, points, **options) -> int:
 
 
 def spin(model, state, rod: int = 0) -> np.ndarray:
-    """Rates of the angles of a rod [rad/s]."""
+    """Return the rates of the twist angles of a rod [rad/s]."""
     return state.net.v.numpy()[model.net.host.rods[rod].edges, 0]
 
 
@@ -34,8 +34,10 @@ def run(model, steps: int, dt: float = 1e-3, state=None, **options):
 @pytest.mark.parametrize(("slope", "mu"), [(0.3, 0.5), (0.3, 0.2), (0.5, 0.1), (0.5, 0.15)])
 @pytest.mark.parametrize("mesh", [False, True])
 def test_down_a_slope(device, slope, mu, mesh):
-    """A cylinder, I = m r^2 / 2, rolls with 2/3 g sin while tan(slope) <= 3 mu; else it slides with g (sin - mu cos), and friction
-    turns it up by 2 mu g cos / r."""
+    """A cylinder, I = m r^2 / 2, rolls with 2/3 g sin while tan(slope) <= 3 mu.
+
+    Else it slides with g (sin - mu cos), and friction spins it up by 2 mu g cos / r.
+    """
     normal, down = np.array([np.sin(slope), 0.0, np.cos(slope)]), np.array([np.cos(slope), 0.0, -np.sin(slope)])
     scene = ddg.Scene()
     rod(scene, ALONG_Y + 1.48 * RADIUS * normal)
@@ -44,17 +46,17 @@ def test_down_a_slope(device, slope, mu, mesh):
     scene.contact(friction=mu, rolling=True)
     model = scene.build(device)
     state = run(model, 150)
-    speed, turning = (state.velocities() @ down).mean(), spin(model, state).mean()
+    speed, spin_rate = (state.velocities() @ down).mean(), spin(model, state).mean()
     rolls = np.tan(slope) <= 3.0 * mu
     expected = 2.0 / 3.0 * G * np.sin(slope) if rolls else G * (np.sin(slope) - mu * np.cos(slope))
     np.testing.assert_allclose(speed / state.time, expected, rtol=2e-3)
-    turned = speed / RADIUS if rolls else 2.0 * mu * G * np.cos(slope) / RADIUS * state.time
-    np.testing.assert_allclose(turning, turned, rtol=5e-3)
+    expected_spin = speed / RADIUS if rolls else 2.0 * mu * G * np.cos(slope) / RADIUS * state.time
+    np.testing.assert_allclose(spin_rate, expected_spin, rtol=5e-3)
 
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
 def test_what_slides_comes_to_roll(device, law):
-    """From v0 without spin, after v0 / (3 mu g), it rolls with 2/3 v0, whatever mu; friction has taken a third of its energy."""
+    """A rod of speed v0 without spin rolls after v0 / (3 mu g) with 2/3 v0, whatever mu; friction has taken a third of the energy."""
     mu, v0 = 0.2, 0.4
     scene = ddg.Scene()
     rod(scene, ALONG_Y + [0.0, 0.0, 1.48 * RADIUS])
@@ -65,7 +67,7 @@ def test_what_slides_comes_to_roll(device, law):
     dt, needed = 2.5e-4, v0 / (3.0 * mu * G)
     middle = run(model, round(0.5 * needed / dt), dt, start)
     state = run(model, round(needed / dt), dt, middle)
-    for each in (middle, state):  # what friction does to both keeps m v r + I omega
+    for each in (middle, state):  # friction conserves m v r + I omega
         speed = np.average(each.velocities()[:, 0], weights=[0.5, *[1.0] * 9, 0.5])
         np.testing.assert_allclose(speed + 0.5 * RADIUS * spin(model, each).mean(), v0, rtol=1e-4)
     assert 0.7 * v0 < middle.velocities()[:, 0].mean() < 0.9 * v0
@@ -76,7 +78,7 @@ def test_what_slides_comes_to_roll(device, law):
 
 @pytest.mark.parametrize("quasistatic", [True, False])
 def test_a_roller_between_plates(device, quasistatic):
-    """It goes half as far as the upper plate, whose pull is none: rolling resists nothing."""
+    """Rolling has no resistance, so that nothing pulls the upper plate back."""
     scene, far = ddg.Scene(gravity=(0.0, 0.0, 0.0)), 0.02
     rod(scene, ALONG_Y)
     motion = ddg.Motion(lambda t: (far * t, 0.0, 0.0))
@@ -86,21 +88,23 @@ def test_a_roller_between_plates(device, quasistatic):
     model = scene.build(device, precision="float64")
     state = statics.solve(model, load_steps=2) if quasistatic else run(model, 100, 1e-2)
     np.testing.assert_allclose(state.points()[:, 0], 0.5 * far, rtol=1e-3)
-    turned = state.angles()[:10] - model.state().angles()[:10]
-    np.testing.assert_allclose(turned, 0.5 * far / RADIUS, rtol=1e-3)
-    pushed = model.contacts(state)
-    assert np.linalg.norm(pushed.friction, axis=1).max() < 0.02 * np.linalg.norm(pushed.force, axis=1).max()
+    rotation = state.angles()[:10] - model.state().angles()[:10]
+    np.testing.assert_allclose(rotation, 0.5 * far / RADIUS, rtol=1e-3)
+    contacts = model.contacts(state)
+    assert np.linalg.norm(contacts.friction, axis=1).max() < 0.02 * np.linalg.norm(contacts.force, axis=1).max()
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_shaft_drives_what_lies_on_it(device, parallel):
-    """A rod that is turned, by mu N r while it slips, takes another one across it along with omega r; one along it, which can not get
-    away, turns as fast, the other way round."""
+    """A slipping shaft needs the moment mu N r and moves a rod across at omega r.
+
+    A parallel rod that cannot move away counter-rotates as fast.
+    """
     omega, mu = 30.0, 0.3
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     shaft = rod(scene, ALONG_Y, name="shaft")
-    turn = ddg.Motion(angle=lambda t: omega * t, axis=(0.0, 1.0, 0.0))
-    scene.clamp(shaft, edges=list(range(10)), motion=turn)
+    motion = ddg.Motion(angle=lambda t: omega * t, axis=(0.0, 1.0, 0.0))
+    scene.clamp(shaft, edges=list(range(10)), motion=motion)
     lying = ALONG_Y if parallel else ALONG_Y[:, [1, 0, 2]]
     upper = rod(scene, lying + [0.0, 0.0, 2.48 * RADIUS], name="upper")
     if parallel:
@@ -108,9 +112,9 @@ def test_a_shaft_drives_what_lies_on_it(device, parallel):
     scene.contact(friction=mu, rolling=True)
     model = scene.build(device)
     state = run(model, 5)
-    pushed = np.linalg.norm(model.contacts(state).force.sum(0))
+    normal_force = np.linalg.norm(model.contacts(state).force.sum(0))
     moment = model.reactions(state, point=(0.0, 0.0, 0.0))[0].moment
-    np.testing.assert_allclose(moment[1], mu * pushed * RADIUS, rtol=1e-2)
+    np.testing.assert_allclose(moment[1], mu * normal_force * RADIUS, rtol=1e-2)
     state = run(model, 55, state=state)
     if parallel:
         np.testing.assert_allclose(spin(model, state, upper), -omega, rtol=0.05)
@@ -120,29 +124,29 @@ def test_a_shaft_drives_what_lies_on_it(device, parallel):
 
 @pytest.mark.parametrize(("angle", "load_steps"), [(-0.5, 1), (7.0, 1), (7.0, 5)])
 def test_a_shaft_draws_what_is_held(device, angle, load_steps):
-    """In equilibria as in steps: with mu N at the end that holds the rod which lies across it, and mu N r to turn the shaft."""
+    """The fixed end of the rod across carries mu N, and the shaft needs mu N r, in equilibria as in steps."""
     mu, scene = 0.3, ddg.Scene(gravity=(0.0, 0.0, -G))
-    turn = ddg.Motion(angle=lambda t: angle * t, axis=(0.0, 1.0, 0.0))
-    scene.clamp(rod(scene, ALONG_Y, name="shaft"), edges=list(range(10)), motion=turn)
-    held = rod(scene, ALONG_Y[:, [1, 0, 2]] + [0.0, 0.0, 2.48 * RADIUS], name="held")
-    scene.fix(held, [0])
-    scene.fix(held, [-1], "y")
+    motion = ddg.Motion(angle=lambda t: angle * t, axis=(0.0, 1.0, 0.0))
+    scene.clamp(rod(scene, ALONG_Y, name="shaft"), edges=list(range(10)), motion=motion)
+    fixed_rod = rod(scene, ALONG_Y[:, [1, 0, 2]] + [0.0, 0.0, 2.48 * RADIUS], name="held")
+    scene.fix(fixed_rod, [0])
+    scene.fix(fixed_rod, [-1], "y")
     scene.contact(friction=mu, rolling=True, velocity=1e-4)
     model = scene.build(device, precision="float64")
     state = statics.solve(model, load_steps=load_steps)
-    touching = model.contacts(state)  # forces on the shaft
-    rubbed, pushed = (of.sum(0) for of in (touching.friction, touching.force))
+    contacts = model.contacts(state)  # forces on the shaft
+    friction, normal_force = (array.sum(0) for array in (contacts.friction, contacts.force))
     shaft, end, _ = model.reactions(state, point=(0.0, 0.0, 0.0))
-    np.testing.assert_allclose(rubbed[0], -np.sign(angle) * mu * np.linalg.norm(pushed), rtol=1e-3)
-    np.testing.assert_allclose(end.force[0], (rubbed + pushed)[0], rtol=1e-6)
-    np.testing.assert_allclose(shaft.moment[1], np.sign(angle) * mu * np.linalg.norm(pushed) * RADIUS, rtol=1e-3)
+    np.testing.assert_allclose(friction[0], -np.sign(angle) * mu * np.linalg.norm(normal_force), rtol=1e-3)
+    np.testing.assert_allclose(end.force[0], (friction + normal_force)[0], rtol=1e-6)
+    np.testing.assert_allclose(shaft.moment[1], np.sign(angle) * mu * np.linalg.norm(normal_force) * RADIUS, rtol=1e-3)
 
 
 def logs(between: float, floor: float) -> ddg.Scene:
-    """Two logs side by side on a floor, which do not touch, and one on top of both."""
+    """Return two logs side by side on a floor, without contact between both, and one on top."""
     scene, radius, gap = ddg.Scene(gravity=(0.0, 0.0, -G)), 0.01, 1e-4
-    y, apart = np.linspace(-0.02, 0.02, 3), 1.0005 * (radius + 0.5 * gap)
-    for x, z in ((-apart, 0.0), (apart, 0.0), (0.0, np.sqrt(3.0) * (radius + 0.5 * gap))):
+    y, offset = np.linspace(-0.02, 0.02, 3), 1.0005 * (radius + 0.5 * gap)
+    for x, z in ((-offset, 0.0), (offset, 0.0), (0.0, np.sqrt(3.0) * (radius + 0.5 * gap))):
         points = np.stack([0.0 * y + x, y, 0.0 * y + radius + gap + z], 1)
         name = "top" if z else "left" if x < 0.0 else "right"
         scene.add_rod(points, section=ddg.Circle(radius), material=STIFF, name=name)
@@ -157,10 +161,11 @@ def logs(between: float, floor: float) -> ddg.Scene:
 @pytest.mark.parametrize(("statically", "near"), [(True, 0.01), (False, 0.02)])
 @pytest.mark.parametrize("floor", [False, True])
 def test_a_pile_of_logs(device, statically, near, floor):
-    """It stands where friction between logs is 2 - sqrt(3) at least, and a third of that on the floor; else the upper one parts them.
+    """The pile stands for friction of at least 2 - sqrt(3) between logs, and a third of that on the floor; else the upper log
+    separates the others.
 
-    The lower log's moment about its axis, and about where it touches the floor, ask for the same friction at both places; normal
-    forces on it are W / 2 / (cos 30 + sin 30 tan 15) from above and 3 W / 2 from below.
+    A lower log's moments about the axis and about the floor contact need the same friction at both contacts. The normal forces are W
+    / 2 / (cos 30 + sin 30 tan 15) from above and 3 W / 2 from below.
     """
     least = (2.0 - np.sqrt(3.0)) / (3.0 if floor else 1.0)
     for mu in (least * (1.0 - near), least * (1.0 + near)):
@@ -171,13 +176,13 @@ def test_a_pile_of_logs(device, statically, near, floor):
 
 @pytest.mark.parametrize("turns_freely", [True, False])
 def test_a_rope_over_a_pulley(device, turns_freely):
-    """A drum that is held but free to turn passes tension on as it is; one that is clamped by Euler's and Eytelwein's law."""
+    """A drum free to rotate passes tension on unchanged; a clamped drum follows Euler's and Eytelwein's law."""
     slack, mu = 1000.0 * capstan.B / capstan.AROUND**2, 0.3
     points, ends = capstan.wound(np.pi, np.pi * capstan.AROUND / 30, capstan.AROUND)
     EA = capstan.STIFF * slack * np.exp(np.pi * mu)
-    own = {"mass_per_length": capstan.MASS_PER_LENGTH, "rotary_inertia": 1e-10, "radius": capstan.RADIUS}
+    inertia = {"mass_per_length": capstan.MASS_PER_LENGTH, "rotary_inertia": 1e-10, "radius": capstan.RADIUS}
     scene, drum = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.outer(np.linspace(-1.0, 1.0, 4), [0.0, capstan.DRUM, 0.0])
-    section = ddg.Stiffness(EA=EA, EI1=capstan.B, GJ=capstan.B, **own)
+    section = ddg.Stiffness(EA=EA, EI1=capstan.B, GJ=capstan.B, **inertia)
     rope = scene.add_rod(points, section=section, natural="straight")
     scene.add_force(rope, 0, slack * ends[0])
     scene.fix(rope, [-1], motion=ddg.Motion(translation=lambda t: tuple(capstan.SPEED * t * ends[1])))
@@ -201,7 +206,7 @@ def test_a_rope_over_a_pulley(device, turns_freely):
 
 
 def test_angles_beside_held_nodes(device):
-    """Clamped edges of a sagging rod touch the floor where free edges begin: these roll, and the matrix knows that they do."""
+    """Clamped edges of a sagging rod meet the floor where free edges begin, which roll: the tangent includes the rolling."""
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     x = np.linspace(-0.05, 0.05, 7)
     height = 1.4 * RADIUS + 0.003 * x + 3e-4 * np.cos(55.0 * x)
@@ -219,14 +224,14 @@ def test_angles_beside_held_nodes(device):
 
 @each_form
 def test_forces_and_products_are_differences(device, form):
-    result, at, _, after = rubbed(ROLLING, device, form)
+    result, positions, _, after = rubbed(ROLLING, device, form)
     assert sum((part.factor.angles.numpy()[: int(part.count.numpy()[0])] >= 0).sum() for part in result.frictions) > 20
-    hold_to_differences(result, at, after)
+    hold_to_differences(result, positions, after)
 
 
 @each_form
 def test_blocks_are_those_of_the_matrix(device, form):
-    """Of what each rod has for itself: its nodes and angles with themselves, of neighbours, and of edges with their nodes."""
+    """Blocks are of nodes and angles with themselves, of neighbouring angles, and of edges with both nodes."""
     result, *_ = rubbed(ROLLING, device, form)
     n, shapes = len(result.forces), result.search.shapes
     matrix, diagonal = assembled(result, n).transpose(0, 2, 1, 3), result.diagonal.numpy()
@@ -235,18 +240,18 @@ def test_blocks_are_those_of_the_matrix(device, form):
     assert np.abs(flat - flat.T).max() < 1e-14 * largest
     assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
     result.join()
-    first, second, ahead = (array.numpy() for array in result.turned)
+    first, second, neighbour = (array.numpy() for array in result.turned)
     (nodes, *_), angles = shapes.things(2), shapes.angles(2)[:, 0]
     rolling = np.flatnonzero(angles >= 0)
-    assert np.abs(first).max() > 1e-3 * largest and np.abs(ahead).max() > 1e-7 * largest
-    own = np.arange(n)
-    assert np.abs(diagonal[angles[rolling]] - matrix[own, own][angles[rolling]]).max() < 1e-13 * largest
+    assert np.abs(first).max() > 1e-3 * largest and np.abs(neighbour).max() > 1e-7 * largest
+    index = np.arange(n)
+    assert np.abs(diagonal[angles[rolling]] - matrix[index, index][angles[rolling]]).max() < 1e-13 * largest
     for e in rolling:
         # neighbouring edges of a rod are no pair of one edge: rows of two rods alone have both
         assert np.abs(first[e] - matrix[angles[e], nodes[e, 0], 0]).max() < 1e-13 * largest
         assert np.abs(second[e] - matrix[angles[e], nodes[e, 1], 0]).max() < 1e-13 * largest
         if e + 1 in rolling and nodes[e + 1, 0] == nodes[e, 1]:
-            assert abs(ahead[e] - matrix[angles[e], angles[e + 1], 0, 0]) < 1e-13 * largest
+            assert abs(neighbour[e] - matrix[angles[e], angles[e + 1], 0, 0]) < 1e-13 * largest
 
 
 def test_two_runs_and_worlds_agree_to_the_bit(device):
@@ -257,10 +262,10 @@ def test_two_runs_and_worlds_agree_to_the_bit(device):
     scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (0.2, 0.1, 1.0)))
     scene.contact(friction=0.3, rolling=True)
     model = scene.build(device, worlds=2)
-    one, other = (run(model, 80) for _ in range(2))
-    assert np.abs(spin(model, one)).max() > 1.0
-    np.testing.assert_array_equal(one.points(), other.points())
-    np.testing.assert_array_equal(one.points()[0], one.points()[1])
+    first, second = (run(model, 80) for _ in range(2))
+    assert np.abs(spin(model, first)).max() > 1.0
+    np.testing.assert_array_equal(first.points(), second.points())
+    np.testing.assert_array_equal(first.points()[0], first.points()[1])
 
 
 def test_where_nothing_can_roll_it_is_refused(device):
@@ -284,9 +289,10 @@ def test_where_nothing_can_roll_it_is_refused(device):
 
 @pytest.mark.parametrize("rolling, kept, off", [(False, 0.0, 0.01), (True, 4.0e-3 / 4.35e-3, 0.05)])
 def test_angular_momentum_of_a_pair_that_rubs(device, rolling, kept, off):
-    """Two free parallel rods meet and slide across each other. Their momentum m v d of sliding, d the distance of their middles, goes.
+    """Two free parallel rods meet and slide across each other, which ends the angular momentum m v d of sliding.
 
-    On surfaces friction makes up for it by spins, but for the share of the gap in d; between middles nothing does.
+    d is the distance of the centrelines. Surface friction replaces the loss by spins, but for the fraction of the gap in d; friction
+    between centrelines does not.
     """
     radius, line = 2e-3, np.linspace(-0.03, 0.03, 7)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -301,7 +307,7 @@ def test_angular_momentum_of_a_pair_that_rubs(device, rolling, kept, off):
     host, integrator = model.net.host, ddg.Integrator(model, rtol=1e-8)
 
     def momentum(state) -> float:
-        """About x, the common direction: of positions, and of spins."""
+        """Return the angular momentum of positions and spins about x, the common direction."""
         points, moves = state.points(), host.mass[:14, :1] * state.velocities()
         spins = [host.mass[rod.edges, 0] @ state.net.v.numpy()[rod.edges, 0] for rod in host.rods]
         return float(np.cross(points - points.mean(0), moves).sum(0)[0] + sum(spins))

@@ -1,4 +1,4 @@
-"""Equilibria with friction: what rests on a slope, what is drawn and let go, a rope about a drum, and what is refused."""
+"""Equilibria with friction: rest on slopes, drawn rods, a rope about a drum, and refusals."""
 
 from dataclasses import replace
 
@@ -28,9 +28,9 @@ def rod_on_floor(scene):
 
 
 def cross_on_floor(scene):
-    one = rod_on_floor(scene)
-    other = scene.add_rod(line((0.1, 0.015, 0.006), (0.09, 0.1, 0.006), 4), section=ddg.Circle(0.005), material=RUBBER)
-    scene.join([(one, 3), (other, 0)])
+    along = rod_on_floor(scene)
+    across = scene.add_rod(line((0.1, 0.015, 0.006), (0.09, 0.1, 0.006), 4), section=ddg.Circle(0.005), material=RUBBER)
+    scene.join([(along, 3), (across, 0)])
 
 
 def sheet_on_floor(scene):
@@ -43,7 +43,7 @@ def rod_on_rods(scene):
     for x in (0.03, 0.17):
         rod = scene.add_rod(line((x, -0.1, 0.0), (x, 0.1, 0.0), 5), section=ddg.Circle(0.005), material=RUBBER)
         scene.fix(rod, range(6))
-    stiff = ddg.Material(young=1e11, density=1000.0, poisson=0.5)  # which does not sag in between
+    stiff = ddg.Material(young=1e11, density=1000.0, poisson=0.5)  # stiff enough not to sag in between
     scene.add_rod(line((0.0, 0.0, 0.011), (0.2, 0.0, 0.011), 7), section=ddg.Circle(0.005), material=stiff)
 
 
@@ -57,7 +57,7 @@ def on_slope(add, angle: float, **contact) -> ddg.Scene:
     return scene
 
 
-CREEP = {  # speed over nu at which the law has a share s of the friction
+CREEP = {  # speed over nu at which the law has a fraction s of the friction
     "logistic": lambda s: -np.log(2.0 / (1.0 + s) - 1.0) / 15.0,
     "polynomial": lambda s: 1.0 - np.sqrt(1.0 - s),
 }
@@ -66,34 +66,36 @@ CREEP = {  # speed over nu at which the law has a share s of the friction
 @pytest.mark.parametrize("law", CREEP)
 @pytest.mark.parametrize("name", RESTING)
 def test_what_rests_on_a_slope_creeps(device, name, law):
-    """Friction is tan(angle) / mu of all there is at every point: all creep at the same speed, for the time of the increments."""
+    """Friction is tan(angle) / mu of the limit everywhere: all nodes creep at one speed, with the load increments as time."""
     mu, angle = 0.5, 0.3
     model = on_slope(RESTING[name], angle, friction=mu, friction_law=law).build(device, precision="float64")
-    found = [statics.solve(model, load_steps=steps) for steps in (1, 4)]
-    for state in found:
-        moved = (state.points() - model.state().points())[-7:, 0]  # of what is free
+    states = [statics.solve(model, load_steps=steps) for steps in (1, 4)]
+    for state in states:
+        moved = (state.points() - model.state().points())[-7:, 0]  # of free nodes
         np.testing.assert_allclose(moved.mean(), NU * CREEP[law](np.tan(angle) / mu), rtol=1e-3)
         assert not state.velocities().any()
         assert state.stable is None
 
 
-@pytest.mark.parametrize("way, mu", [(1.0, 0.3), (-1.0, 0.6)])
-def test_friction_by_direction(device, way, mu):
-    """A rod creeps down the slope by the friction of its way, whose speed nu is as much smaller as that is more than the least."""
+@pytest.mark.parametrize("sign, mu", [(1.0, 0.3), (-1.0, 0.6)])
+def test_friction_by_direction(device, sign, mu):
+    """A rod creeps by the coefficient of the direction; nu is smaller by the least coefficient over this one."""
     angle = 0.2
     for law in ("barrier", "penalty"):
-        scene = ddg.Scene(gravity=(way * G * np.sin(angle), 0.0, -G * np.cos(angle)))
+        scene = ddg.Scene(gravity=(sign * G * np.sin(angle), 0.0, -G * np.cos(angle)))
         scene.add_rod(line((0.0, 0.0, 0.0055), (0.2, 0.0, 0.0055), 6), section=ddg.Circle(0.005), material=RUBBER)
         scene.add_obstacle(ddg.Plane(), name="floor")
         scene.contact(law=law)
         scene.contact_between("rod", "floor", friction=(0.3, 0.6, 0.5))
         model = scene.build(device, precision="float64")
         moved = (statics.solve(model).points() - model.state().points())[:, 0]
-        np.testing.assert_allclose(moved.mean(), way * NU * 0.3 / mu * CREEP["logistic"](np.tan(angle) / mu), rtol=1e-3)
+        np.testing.assert_allclose(
+            moved.mean(), sign * NU * 0.3 / mu * CREEP["logistic"](np.tan(angle) / mu), rtol=1e-3
+        )
 
 
 def test_reactions_and_contacts_have_friction(device):
-    """What rests is held by the floor against its weight, along the slope by friction, pair by pair."""
+    """The floor carries the weight, along the slope by friction, with tan(angle) of the force in every pair."""
     angle = 0.3
     model = on_slope(rod_on_floor, angle, friction=0.5).build(device, precision="float64")
     state = statics.solve(model)
@@ -102,11 +104,11 @@ def test_reactions_and_contacts_have_friction(device):
     np.testing.assert_allclose(
         floor, weight * np.array([-np.sin(angle), 0.0, np.cos(angle)]), rtol=1e-6, atol=1e-9 * weight
     )
-    touching = model.contacts(state)
-    shares = np.linalg.norm(touching.friction, axis=1) / np.linalg.norm(touching.force, axis=1)
-    np.testing.assert_allclose(shares, np.tan(angle), rtol=1e-3)
+    contacts = model.contacts(state)
+    ratios = np.linalg.norm(contacts.friction, axis=1) / np.linalg.norm(contacts.force, axis=1)
+    np.testing.assert_allclose(ratios, np.tan(angle), rtol=1e-3)
     again = state.copy()
-    np.testing.assert_array_equal(model.contacts(again).friction, touching.friction)
+    np.testing.assert_array_equal(model.contacts(again).friction, contacts.friction)
 
 
 def test_what_slides_off_has_no_equilibrium(device):
@@ -119,14 +121,14 @@ def test_what_slides_off_has_no_equilibrium(device):
 
 
 def test_friction_that_has_not_settled_is_no_equilibrium(device):
-    """After two rounds what is found is in equilibrium with the friction of other normal forces, a sixth off."""
+    """Two rounds leave an equilibrium with the friction of other normal forces, a sixth off."""
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
     with pytest.raises(SolverError, match="max_iterations"):
         statics.solve(model, max_cuts=1, max_iterations=2)
 
 
 def test_rests_on_in_time(device):
-    """Steps from an equilibrium begin at rest, and it goes on creeping as slowly."""
+    """The first time step from an equilibrium begins at rest, and the creep goes on as slowly."""
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
     state = first = statics.solve(model, load_steps=2)
     integrator = ddg.Integrator(model)
@@ -137,10 +139,10 @@ def test_rests_on_in_time(device):
 
 
 def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
-    """A stiff rod of 1 m from the floor to a wall, at an angle to the floor."""
-    radius, apart = 0.005, 0.0054
+    """Return a stiff rod of 1 m from the floor to a wall, at an angle to the floor."""
+    radius, offset = 0.005, 0.0054
     scene, s = ddg.Scene(gravity=(0.0, 0.0, -G)), np.linspace(0.0, 1.0, 9)
-    points = np.stack([(s - 1.0) * np.cos(angle) - apart, 0.0 * s, s * np.sin(angle) + apart], axis=1)
+    points = np.stack([(s - 1.0) * np.cos(angle) - offset, 0.0 * s, s * np.sin(angle) + offset], axis=1)
     rod = scene.add_rod(points, section=ddg.Circle(radius), material=ddg.Material(young=1e11, density=1000.0))
     scene.fix(rod, range(9), "y")
     scene.add_obstacle(ddg.Plane(), name="floor")
@@ -155,8 +157,10 @@ def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
     "load_steps", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(8, marks=pytest.mark.slow)]
 )
 def test_a_ladder_stands_from_its_critical_angle_on(device, law, mu, load_steps):
-    """Where both ends slide, N (1 + mu^2) = w of the floor, and the moment about the foot is w cos / 2 = mu N (sin + mu cos): so at
-    tan(angle) = (1 - mu^2) / (2 mu). By normal forces that are those of a smaller load it would fall.
+    """The ends slide at tan(angle) = (1 - mu^2) / (2 mu).
+
+    There N (1 + mu^2) = w of the floor, and the moment about the foot is w cos / 2 = mu N (sin + mu cos). With the normal forces of a
+    smaller load the ladder would fall.
     """
     critical = np.arctan((1.0 - mu**2) / (2.0 * mu))
     for beyond in (0.02, 0.1, 0.3):
@@ -173,7 +177,7 @@ def test_a_ladder_stands_from_its_critical_angle_on(device, law, mu, load_steps)
         state = statics.solve(model, load_steps=load_steps)
     except SolverError:
         return
-    assert np.abs(state.points() - model.state().points()).max() > 0.1  # it lies
+    assert np.abs(state.points() - model.state().points()).max() > 0.1  # the ladder lies on the floor
 
 
 LENGTH, RADIUS, SOFT = 1.0, 0.005, 1e5  # m, m, N/m^2
@@ -181,7 +185,7 @@ WEIGHT = 1000.0 * G * np.pi * RADIUS**2  # N/m
 
 
 def drawn(mu: float, far: float) -> ddg.Scene:
-    """A rod that lies on a floor; its last end is drawn by `far` after t = 1000, and back by a part of it after 1001."""
+    """Return a rod on a floor; the last end is drawn by `far` after t = 1000, and partly back after 1001."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G / 1000.0))  # of load parameters about 1000
     material = ddg.Material(young=SOFT, density=1000.0, poisson=0.5)
     points = line((0.0, 0.0, RADIUS), (LENGTH, 0.0, RADIUS), 100)
@@ -194,16 +198,17 @@ def drawn(mu: float, far: float) -> ddg.Scene:
 
 
 def test_a_rod_that_is_drawn_slides_from_its_end(device):
-    """Tension falls by mu w where it slides: F^2 / (2 EA mu w) at the end. Drawn back, friction turns round from the end on: the force
-    falls by 2 sqrt(EA mu w du), so that it depends on the way. Friction takes the integral of mu w u, F^3 / (6 EA mu w).
-    The weight is a thousandth or two more.
+    """Tension falls by mu w along the sliding length, so that an end force F moves the end by F^2 / (2 EA mu w).
+
+    Drawn back, friction reverses from the end on: the force falls by 2 sqrt(EA mu w du) and depends on the path. Friction dissipates
+    the integral of mu w u, F^3 / (6 EA mu w). The weight is a thousandth or two more.
     """
     mu, EA = 0.4, SOFT * np.pi * RADIUS**2
     friction = mu * WEIGHT
     far = (0.5 * friction * LENGTH) ** 2 / (2.0 * EA * friction)  # half of it slides
     full = np.sqrt(2.0 * EA * friction * far)
     back = full - 2.0 * np.sqrt(EA * friction * 0.8 * far)
-    assert back < 0.0 < np.sqrt(2.0 * EA * friction * 0.2 * far)  # the force of one that was never drawn farther
+    assert back < 0.0 < np.sqrt(2.0 * EA * friction * 0.2 * far)  # force of a rod that was never drawn farther
     model = drawn(mu, far).build(device, precision="float64")
     search = Equilibrium(model)
     state = search.load(model.state(), 1, 999.0, 1000.0)
@@ -217,7 +222,7 @@ def test_a_rod_that_is_drawn_slides_from_its_end(device):
 
 
 def test_a_rope_about_a_drum(device):
-    """Euler and Eytelwein, with the bending stiffness of the rod; see the scene."""
+    """Euler's and Eytelwein's law, with the bending stiffness of the rod; see the scene."""
     scene = capstan.build(n=30, friction=0.3)
     model = scene.build(device, precision="float64")
     slack = np.linalg.norm(scene.loads[0].force)
@@ -228,29 +233,29 @@ def test_a_rope_about_a_drum(device):
 
 @pytest.mark.parametrize("sense", [-1.0, 1.0])
 def test_a_band_brake(device, sense):
-    """The drum turns in a rope whose end is held: away from that this pulls as one that is drawn does, towards it the slack one does.
+    """The drum rotates in a rope with one fixed end: by the sense of rotation the fixed end is the tight or the slack side.
 
-    What turns the drum brings up the difference of both tensions times its radius.
+    The moment on the drum is the difference of both tensions times the radius.
     """
     scene, slip = capstan.build(n=30, friction=0.3), 1.5 * capstan.SPEED
     scene.supports[0] = replace(scene.supports[0], motion=None)
-    turn = ddg.Motion(angle=lambda t: sense * slip * t / capstan.DRUM, axis=(0.0, 1.0, 0.0))
-    scene.obstacles[0] = replace(scene.obstacles[0], motion=turn)
+    motion = ddg.Motion(angle=lambda t: sense * slip * t / capstan.DRUM, axis=(0.0, 1.0, 0.0))
+    scene.obstacles[0] = replace(scene.obstacles[0], motion=motion)
     model = scene.build(device, precision="float64")
     slack = np.linalg.norm(scene.loads[0].force)
     state = statics.solve(model, scene.initial(model), start=1.0, end=5.0)
     end, drum = model.reactions(state, point=(0.0, 0.0, 0.0), factor=5.0)
-    found, low = np.linalg.norm(end.force), 5.0 * slack
-    ratio = found / low
+    tension, low = np.linalg.norm(end.force), 5.0 * slack
+    ratio = tension / low
     if sense > 0.0:
-        ratio, low = 1.0 / ratio, found
+        ratio, low = 1.0 / ratio, tension
     assert abs(ratio / capstan.expected(0.3, np.pi, low) - 1.0) < 5e-3
-    np.testing.assert_allclose(drum.moment[1], sense * abs(found - 5.0 * slack) * capstan.DRUM, rtol=5e-3)
+    np.testing.assert_allclose(drum.moment[1], sense * abs(tension - 5.0 * slack) * capstan.DRUM, rtol=5e-3)
 
 
 @pytest.mark.parametrize("load_steps", [1, 3])
 def test_pushed_by_an_obstacle(device, load_steps):
-    """A wall pushes a rod along the floor over many ranges of contact: by mu of its weight."""
+    """A wall moves a rod along the floor over many ranges of contact, by mu of the weight."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     scene.add_rod(line((0.0, -0.1, 0.006), (0.0, 0.1, 0.006), 6), section=ddg.Circle(0.005), material=RUBBER)
     scene.add_obstacle(ddg.Plane(), name="floor")
@@ -269,10 +274,10 @@ def test_pushed_by_an_obstacle(device, load_steps):
 
 def test_runs_are_bitwise_equal_and_worlds_to_rounding(device):
     model = on_slope(cross_on_floor, 0.3, friction=0.5).build(device, precision="float64", worlds=2)
-    one, other = (statics.solve(model, load_steps=2).points() for _ in range(2))
-    np.testing.assert_array_equal(one, other)
-    # worlds share one factorisation, which rounds by where in it they are
-    np.testing.assert_allclose(one[0], one[1], rtol=0.0, atol=1e-15)
+    first, second = (statics.solve(model, load_steps=2).points() for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    # worlds have one factorisation, whose rounding depends on the position in it
+    np.testing.assert_allclose(first[0], first[1], rtol=0.0, atol=1e-15)
 
 
 def test_friction_needs_an_increment(device):
@@ -282,7 +287,10 @@ def test_friction_needs_an_increment(device):
 
 
 def bracket(beyond: float) -> ddg.Scene:
-    """A bracket about a pole, with a bar behind it above and one before it below, under a force at `beyond` the critical distance."""
+    """Return a bracket about a pole, under a force at `beyond` the critical distance.
+
+    One bar is behind the pole above, one before the pole below.
+    """
     mu, height, pole, radius, steel = 0.3, 0.1, 0.01, 0.003, ddg.Material(young=2e11, density=7800.0)
     scene, section, away = ddg.Scene(gravity=(0.0, 0.0, 0.0)), ddg.Circle(radius), pole + radius + 1.5e-5
     post = scene.add_rod(line((0, 0, -0.15), (0, 0, 0.15), 6), section=ddg.Circle(pole), material=steel, name="pole")
@@ -291,31 +299,32 @@ def bracket(beyond: float) -> ddg.Scene:
     bars = [((x, -0.03, z), (x, 0.03, z), 6) for x, z in (above, below)]
     sides = [((above[0], y, above[1]), (below[0], y, below[1]), 4) for y in (-0.03, 0.03)]
     arms = [((below[0], y, below[1]), end, 4) for y in (-0.03, 0.03)]
-    upper, lower, left, right, one, other = (
-        scene.add_rod(line(*of), section=section, material=steel, name="bracket") for of in (*bars, *sides, *arms)
+    upper, lower, left, right, left_arm, right_arm = (
+        scene.add_rod(line(*segment), section=section, material=steel, name="bracket")
+        for segment in (*bars, *sides, *arms)
     )
-    for k, side, arm in ((0, left, one), (-1, right, other)):
+    for k, side, arm in ((0, left, left_arm), (-1, right, right_arm)):
         scene.join([(upper, k), (side, 0)], rigid=True)
         scene.join([(lower, k), (side, -1), (arm, 0)], rigid=True)
-    scene.join([(one, -1), (other, -1)], rigid=True)
-    scene.add_force(one, -1, (0.0, 0.0, -1.0))
+    scene.join([(left_arm, -1), (right_arm, -1)], rigid=True)
+    scene.add_force(left_arm, -1, (0.0, 0.0, -1.0))
     scene.contact(friction=mu, velocity=1e-6, range=1e-5)
     scene.contact_between("bracket", "bracket", ignore=True)
     return scene
 
 
 def test_a_bracket_locks_itself(device):
-    """A force W at a distance e from a pole is held where e > h / 2 mu: N = W e / h pushes it at both heights, 2 mu N holds it."""
+    """A force W at a distance e from a pole is carried where e > h / 2 mu: N = W e / h acts at both heights, with friction 2 mu N."""
     model = bracket(1.03).build(device, precision="float64")
     state = statics.solve(model)
-    found = model.contacts(state)
-    np.testing.assert_allclose((found.force + found.friction)[:, 2].sum(), -1.0, rtol=1e-6)
+    contacts = model.contacts(state)
+    np.testing.assert_allclose((contacts.force + contacts.friction)[:, 2].sum(), -1.0, rtol=1e-6)
     with pytest.raises(SolverError, match="what slides may come to no rest"):
         statics.solve(bracket(0.97).build(device, precision="float64"), max_cuts=1)
 
 
 def test_less_of_a_way_leads_into_nothing(device):
-    """Half of the way that iterates have gone around a rod would be in it: then all of it is gone."""
+    """Half of a motion around a rod would end in the rod: then the whole motion is taken."""
     scene = ddg.Scene()
     scene.fix(
         scene.add_rod(line((0.0, -0.1, 0.0), (0.0, 0.1, 0.0), 4), section=ddg.Circle(0.005), material=RUBBER), range(5)
@@ -325,24 +334,24 @@ def test_less_of_a_way_leads_into_nothing(device):
     model = scene.build(device, precision="float64")
     search, state = Equilibrium(model).net, model.state()
     begun = state.net.q.numpy().copy()
-    for way, gone in ((-0.04, -0.04), (0.04, 0.02)):
+    for displacement, expected in ((-0.04, -0.04), (0.04, 0.02)):
         moved = begun.copy()
-        moved[5:10, 2] += way
+        moved[5:10, 2] += displacement
         state.net.q.assign(moved)
-        search._relax(lambda way, whole: np.array([0.5]), state, begun)
-        np.testing.assert_allclose(state.net.q.numpy()[5:10, 2] - begun[5:10, 2], gone, rtol=1e-12)
+        search._relax(lambda displacement, whole: np.array([0.5]), state, begun)
+        np.testing.assert_allclose(state.net.q.numpy()[5:10, 2] - begun[5:10, 2], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_pile_at_rest_is_in_equilibrium(device, seed):
-    """What has come to rest in steps, all held by friction, moves on in an equilibrium as far as it creeps in that time."""
-    random, rods = np.random.default_rng(seed), 12
+    """A pile at rest in steps, by friction alone, moves in an equilibrium as far as the creep of that time."""
+    rng, rods = np.random.default_rng(seed), 12
     scene = ddg.Scene(gravity=(0.0, 0.0, -G), mass_damping=5.0)
     soft = ddg.Material(young=1e6, density=1000.0, viscosity=3e-3)
     for k in range(rods):
-        angle = random.uniform(0.0, np.pi)
-        middle = np.array([*random.uniform(-0.02, 0.02, 2), 0.012 + 0.011 * k])
-        along = 0.05 * np.array([np.cos(angle), np.sin(angle), 0.05 * random.normal()])
+        angle = rng.uniform(0.0, np.pi)
+        middle = np.array([*rng.uniform(-0.02, 0.02, 2), 0.012 + 0.011 * k])
+        along = 0.05 * np.array([np.cos(angle), np.sin(angle), 0.05 * rng.normal()])
         scene.add_rod(line(middle - along, middle + along, 6), section=ddg.Circle(0.004), material=soft)
     scene.add_obstacle(ddg.Plane())
     scene.contact(friction=0.5, velocity=1e-4)
@@ -351,8 +360,8 @@ def test_a_pile_at_rest_is_in_equilibrium(device, seed):
     for _ in range(2500):
         state = integrator.step(state, 1e-3)
     search = Equilibrium(model)
-    found = search.load(state, 1, 0.99, 1.0)
+    equilibrium = search.load(state, 1, 0.99, 1.0)
     creep = np.abs(state.velocities()).max()
     assert creep < 1e-4
-    assert 0.3 * 0.01 * creep < np.abs(found.points() - state.points()).max() < 3.0 * 0.01 * creep
+    assert 0.3 * 0.01 * creep < np.abs(equilibrium.points() - state.points()).max() < 3.0 * 0.01 * creep
     assert search.iterations < 30

@@ -1,4 +1,4 @@
-"""Whether anything is near at all: never told wrongly, and told at once where rods are apart and do not curl up."""
+"""Rod culling: never wrong, and immediate for rods that are apart and do not curl up."""
 
 from itertools import pairwise
 
@@ -23,7 +23,7 @@ def rods(points: np.ndarray, nodes: int) -> Shapes:
 
 
 class Asked:
-    """Runs of some worlds at points; called with the ends of a motion, whether they leave it in doubt, world by world."""
+    """Rod culling of some worlds: a call with the ends of a motion returns the doubt of each world."""
 
     def __init__(self, shapes: Shapes, points: np.ndarray, device, worlds: int = 1, dtype=wp.vec3d):
         self.device, self.worlds, self.dtype = device, worlds, dtype
@@ -31,7 +31,7 @@ class Asked:
         self.runs = Runs(self.search)
 
     def __call__(self, x: np.ndarray, y: np.ndarray | None = None, tried=1) -> np.ndarray:
-        """In steps one after the other, as `Alone` takes them: by the boxes that there are, and where they do not do by new ones."""
+        """Advance by a step as `Alone` does: test by the existing bounds, and by new ones where these leave doubt."""
         self.looked = 0
         x, y = self._upload(x), self._upload(x if y is None else y)
         tried = wp.array(np.resize(tried, self.worlds).astype(np.int32), device=self.device)
@@ -50,135 +50,135 @@ class Asked:
 
 
 def close(shapes: Shapes, x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether any pair is, by all pairs at places along the way."""
-    return any(near(shapes, x + share * (y - x), 2, 2, REACH) for share in np.linspace(0.0, 1.0, 5))
+    """Return True if any pair is within reach at one of five positions along the motion."""
+    return any(near(shapes, x + fraction * (y - x), 2, 2, REACH) for fraction in np.linspace(0.0, 1.0, 5))
 
 
 @pytest.mark.parametrize(("nodes", "spread"), [(5, 2.0), (12, 4.0), (30, 8.0), (90, 30.0)])
 def test_what_is_told_to_be_apart_is_apart_on_the_way(device, spread, nodes):
-    found = []
+    doubts = []
     for seed in range(16):
         rng = np.random.default_rng(seed)
         points = curves(rng, 6, nodes, spread, 0.03)
         move = rng.normal(size=3) * 0.1 + 0.002 * rng.normal(size=points.shape)
         shapes = rods(points, nodes)
-        found.append(bool(Asked(shapes, points, device)(points, points + move)[0]))
-        assert found[-1] or not close(shapes, points, points + move)
-    assert any(found) and not all(found)
+        doubts.append(bool(Asked(shapes, points, device)(points, points + move)[0]))
+        assert doubts[-1] or not close(shapes, points, points + move)
+    assert any(doubts) and not all(doubts)
 
 
 @pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
 def test_straight_and_gently_bent_rods_are_told_apart(device, dtype):
-    """A circle of circumference 1.2 opens by 0.2; a step of translation, far beyond the margin, changes nothing."""
-    turn = np.linspace(0.0, 2.0 * np.pi / 1.2, 81)
-    arc = 1.2 / (2.0 * np.pi) * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], 1)
+    """A circle of circumference 1.2 opens by 0.2. A translation far beyond the margin changes nothing."""
+    angle = np.linspace(0.0, 2.0 * np.pi / 1.2, 81)
+    arc = 1.2 / (2.0 * np.pi) * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
     line = np.stack([np.linspace(0.0, 1.0, 81), np.full(81, 1.0), np.zeros(81)], 1)
     points = np.concatenate([arc, line])
-    asked = Asked(rods(points, 81), points, device, dtype=dtype)
-    assert asked(points)[0] == 0 and asked(points, points + 0.7)[0] == 0
+    culling = Asked(rods(points, 81), points, device, dtype=dtype)
+    assert culling(points)[0] == 0 and culling(points, points + 0.7)[0] == 0
 
 
 def swarm(rng, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places and velocities of six arcs that fly past a middle, which moves, each turning, bending and stretching, in 20 steps."""
+    """Return positions and velocities of six arcs that fly past a moving centre, rotating, bending and stretching, in 20 steps."""
     length, (along, bend) = 0.03 * (nodes - 1), rng.normal(size=(2, 6, 1, 3))
     middle = length * rng.uniform(-2.0, 2.0, (6, 1, 3)).repeat(nodes, axis=1).reshape(-1, 3)
     edges = along + bend * np.linspace(-0.5, 0.5, nodes)[:, None]
     steps = 0.03 * edges / np.linalg.norm(edges, axis=2, keepdims=True)
     points = middle + (steps.cumsum(axis=1) - 0.5 * steps.sum(axis=1, keepdims=True)).reshape(-1, 3)
-    turn, aside = (rng.normal(size=(6, 3)).repeat(nodes, axis=0) for _ in range(2))
-    way = -0.05 * middle + 0.01 * length * aside + length * rng.normal(size=3)
-    return points, way + 0.02 * np.cross(turn, points - middle) + 1e-4 * rng.normal(size=points.shape)
+    spin, aside = (rng.normal(size=(6, 3)).repeat(nodes, axis=0) for _ in range(2))
+    drift = -0.05 * middle + 0.01 * length * aside + length * rng.normal(size=3)
+    return points, drift + 0.02 * np.cross(spin, points - middle) + 1e-4 * rng.normal(size=points.shape)
 
 
 @pytest.mark.parametrize(
     ("nodes", "dtype"), [(6, wp.vec3d), (6, wp.vec3f), (20, wp.vec3d), (20, wp.vec3f), (70, wp.vec3d)]
 )
 def test_boxes_serve_step_after_step_and_tell_nothing_wrongly(device, nodes, dtype):
-    """Nothing that is near is told to be apart, and many of the steps in which nothing is need no new boxes."""
-    looked, doubts, nears = [], [], []
+    """Near pairs always leave doubt, and many steps without near pairs need no new bounds."""
+    updates, doubts, nears = [], [], []
     for seed in range(3):
         rng = np.random.default_rng(seed)
         points, velocity = swarm(rng, nodes)
         shapes = rods(points, nodes)
-        asked = Asked(shapes, points, device, dtype=dtype)
+        culling = Asked(shapes, points, device, dtype=dtype)
         for _ in range(40):
             velocity = velocity + 1e-5 * rng.normal(size=velocity.shape)
             after = points + velocity
-            doubts.append(bool(asked(points, after)[0]))
+            doubts.append(bool(culling(points, after)[0]))
             nears.append(close(shapes, points, after))
-            looked.append(asked.looked)
+            updates.append(culling.looked)
             assert doubts[-1] or not nears[-1]
             points = after
     quiet = ~np.array(doubts)
     assert any(nears) and np.mean(doubts) < 0.8
-    assert np.mean(np.array(looked)[quiet] > 0) < 0.7
+    assert np.mean(np.array(updates)[quiet] > 0) < 0.7
 
 
 def test_boxes_serve_wherever_a_state_comes_from(device):
-    """What counts is where things are: not when boxes were made, nor what was done since."""
+    """The age of bounds and earlier motions do not matter."""
     line = np.stack([np.linspace(0.0, 1.0, 81), np.zeros(81), np.zeros(81)], 1)
     points = np.concatenate([line, line + [0.0, 0.2, 0.0]])
-    asked = Asked(rods(points, 81), points, device)
-    assert asked(points)[0] == 0 and asked.looked
-    assert asked(points)[0] == 0 and not asked.looked
+    culling = Asked(rods(points, 81), points, device)
+    assert culling(points)[0] == 0 and culling.looked
+    assert culling(points)[0] == 0 and not culling.looked
     together = points * [1.0, 0.03, 1.0]
     for _ in range(3):
-        assert asked(together)[0] == 1
-        assert asked(points)[0] == 0
+        assert culling(together)[0] == 1
+        assert culling(points)[0] == 0
     # the second passes through the first and is as far beyond
-    assert asked(points, points * [1.0, -1.0, 1.0])[0] == 1
-    assert asked(np.full_like(points, np.nan))[0] == 1
-    assert asked(points)[0] == 0
+    assert culling(points, points * [1.0, -1.0, 1.0])[0] == 1
+    assert culling(np.full_like(points, np.nan))[0] == 1
+    assert culling(points)[0] == 0
 
 
 def test_rods_too_near_for_the_widest_boxes_have_smaller_ones(device):
     line = np.stack([np.linspace(0.0, 1.0, 81), np.zeros(81), np.zeros(81)], 1)
     points = np.concatenate([line, line + [0.0, 2.0 * RADIUS + 1.1 * REACH, 0.0]])
-    asked, still = Asked(rods(points, 81), points, device), []
+    culling, still = Asked(rods(points, 81), points, device), []
     for _ in range(12):
-        assert asked(points)[0] == 0
-        still.append(asked.runs.known.numpy()[AHEAD, 0])
+        assert culling(points)[0] == 0
+        still.append(culling.runs.known.numpy()[AHEAD, 0])
     assert max(still) <= 1
 
 
 def test_a_rod_that_winds_up_is_followed(device):
-    """From a line into a ring and on, until its ends meet: in doubt before they are near, but not long before."""
+    """A line winds into a ring until the ends meet: doubt begins before the ends are near, but not long before."""
     s = np.linspace(0.0, 1.0, 81)
 
     def wound(turns: float) -> np.ndarray:
         radius = 1.0 / (2.0 * np.pi * turns)
         return np.stack([radius * np.sin(s / radius), radius * (1.0 - np.cos(s / radius)), 0.0 * s], 1)
 
-    shapes, told = rods(wound(0.2), 81), []
-    asked = Asked(shapes, wound(0.2), device)
+    shapes, doubts = rods(wound(0.2), 81), []
+    culling = Asked(shapes, wound(0.2), device)
     turns = np.linspace(0.2, 1.1, 181)
-    for one, other in pairwise(turns):
-        told.append(bool(asked(wound(one), wound(other))[0]))
-        assert told[-1] or not close(shapes, wound(one), wound(other))
-    first = turns[told.index(True)]
+    for start, end in pairwise(turns):
+        doubts.append(bool(culling(wound(start), wound(end))[0]))
+        assert doubts[-1] or not close(shapes, wound(start), wound(end))
+    first = turns[doubts.index(True)]
     assert 0.9 < first < 1.0
 
 
 def test_rods_that_come_round_to_themselves_or_to_others_are_seen(device):
-    turn = np.linspace(0.0, 1.99 * np.pi, 81)
-    ring = 0.2 * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], 1)
+    angle = np.linspace(0.0, 1.99 * np.pi, 81)
+    ring = 0.2 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
     assert Asked(rods(ring, 81), ring, device)(ring)[0] == 1
     two = np.concatenate([ring[:60], ring[:60] + [0.0, 0.5, 0.0]])
-    asked, x = Asked(rods(two, 60), np.tile(two, (2, 1)), device, 2), np.tile(two, (2, 1))
-    assert asked(x).tolist() == [0, 0]
+    culling, x = Asked(rods(two, 60), np.tile(two, (2, 1)), device, 2), np.tile(two, (2, 1))
+    assert culling(x).tolist() == [0, 0]
     x[-60:, 1] -= 0.495
-    assert asked(x).tolist() == [0, 1]
-    assert asked(np.tile(two, (2, 1)), tried=[1, 0]).tolist() == [0, 1]
-    assert asked(np.tile(two, (2, 1))).tolist() == [0, 0]
+    assert culling(x).tolist() == [0, 1]
+    assert culling(np.tile(two, (2, 1)), tried=[1, 0]).tolist() == [0, 1]
+    assert culling(np.tile(two, (2, 1))).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("nodes", [5, 81, 140])
 @pytest.mark.parametrize("rod", [1, 2])
 def test_rods_beside_each_other_are_seen(device, nodes, rod):
-    """The first, and one of two others, by its ends."""
+    """The first rod and one of two others are end to end, at 0.9 and 1.1 of the reach."""
     line = np.stack([np.linspace(0.0, 1.0, nodes), np.zeros(nodes), np.zeros(nodes)], 1)
     for gap, expected in ((0.9, 1), (1.1, 0)):
-        places = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 1.0, 0.0]]
-        places[rod] = [1.0, 2.0 * RADIUS + gap * REACH, 0.0]
-        points = np.concatenate([line + place for place in places])
+        offsets = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 1.0, 0.0]]
+        offsets[rod] = [1.0, 2.0 * RADIUS + gap * REACH, 0.0]
+        points = np.concatenate([line + offset for offset in offsets])
         assert Asked(rods(points, nodes), points, device)(points)[0] == expected

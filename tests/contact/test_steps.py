@@ -1,4 +1,4 @@
-"""Steps in which rods touch: nothing passes, momentum, balance, repeatability, and what refuses."""
+"""Steps of rods in contact: non-penetration, momentum, balance, repeatability, and refusals."""
 
 from importlib import import_module
 
@@ -13,15 +13,15 @@ SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
 
 
 def heap(law: str = "barrier", rods: int = 27, order=None, **contact) -> tuple[ddg.Scene, np.ndarray]:
-    """Rods in all directions that fly at each other, and their velocities."""
+    """Return rods in all directions that fly at each other, and velocities."""
     rng = np.random.default_rng(1)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     side = round(rods ** (1 / 3))
-    places = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3) - 0.5 * (side - 1)
-    direction = rng.normal(size=(len(places), 1, 3))
+    centres = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3) - 0.5 * (side - 1)
+    direction = rng.normal(size=(len(centres), 1, 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    points = 0.08 * places[:, None] + np.linspace(-0.03, 0.03, 9)[:, None] * direction
-    velocities = np.broadcast_to(-2.0 * 0.08 * places[:, None], points.shape)
+    points = 0.08 * centres[:, None] + np.linspace(-0.03, 0.03, 9)[:, None] * direction
+    velocities = np.broadcast_to(-2.0 * 0.08 * centres[:, None], points.shape)
     order = np.arange(len(points)) if order is None else order
     scene.add_rods(points[order], section=ddg.Circle(RADIUS), material=SOFT)
     scene.contact(law=law, **contact)
@@ -40,7 +40,7 @@ def run(device, scene, velocities=None, steps: int = 25, dt: float = 0.01, **opt
 
 
 def momentum(model, state) -> tuple[np.ndarray, np.ndarray]:
-    """Linear and angular momentum of nodes, without that of spins."""
+    """Return linear and angular momentum of nodes, without that of spins."""
     mass = model.net.host.mass[: model.net.host.nodes, :1]
     x, v = (array.numpy()[: len(mass)] for array in (state.net.q, state.net.v))
     return (mass * v).sum(0), (mass * np.cross(x, v)).sum(0)
@@ -48,24 +48,24 @@ def momentum(model, state) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
 def test_rods_that_fly_at_each_other_bounce(device, law):
-    """Sum of impulses is zero (Newton's third law); speeds along the line of the centres fall to a fraction."""
+    """Impulses sum to zero (Newton's third law), and contact dissipates kinetic energy."""
     scene, velocities = heap(law)
     model, integrator, states = run(device, scene, velocities, 30, rtol=1e-11)
     size = model.net.host.mass[: model.net.host.nodes, 0].sum() * np.abs(velocities).max()
     for state in states:
         linear, _ = momentum(model, state)
         assert np.abs(linear).max() < 1e-9 * size
-    touched = [model.contacts(state) for state in states]
-    assert max(map(len, touched)) > 4
+    lists = [model.contacts(state) for state in states]
+    assert max(map(len, lists)) > 4
     least = 0.0 if law == "barrier" else -0.5 * RADIUS
-    assert min(found.gap.min() for found in touched if len(found)) > least
+    assert min(contacts.gap.min() for contacts in lists if len(contacts)) > least
     kinetic = [model.energies(state)["kinetic"] for state in states]
     assert kinetic[-1] < 0.995 * kinetic[0]
     assert integrator.statistics()["contact"]["refused_crossings"] == 0
 
 
 def test_what_lies_on_a_beam_weighs_on_it(device):
-    """Forces of contact carry the weight of what is on top: sum of forces = m g at rest."""
+    """The contact forces on a beam at rest are the weight of the rods on top, m g."""
     scene = ddg.Scene(mass_damping=20.0)
     s = np.linspace(-0.05, 0.05, 11)
     for name, points in (
@@ -77,9 +77,9 @@ def test_what_lies_on_a_beam_weighs_on_it(device):
     scene.clamp(0, edges=[0, -1])
     scene.contact()
     model, _, states = run(device, scene, steps=150)
-    found = model.contacts(states[-1])
+    contacts = model.contacts(states[-1])
     weight = 2 * model.scene.batches[1].section.mass_per_length * 0.1 * 9.81
-    on_lower = np.where(found.objects[:, :1] == 0, found.force, -found.force)[(found.objects == 0).any(1)]
+    on_lower = np.where(contacts.objects[:, :1] == 0, contacts.force, -contacts.force)[(contacts.objects == 0).any(1)]
     np.testing.assert_allclose(-on_lower.sum(0)[2], weight, rtol=1e-3)
 
 
@@ -109,7 +109,7 @@ def test_worlds_do_not_touch_each_other(device):
 
 
 def test_more_pairs_than_there_is_room_for(device):
-    """The step is done again with more room, and is the same; it was not tried in shorter ones before."""
+    """An overflowing step is repeated with more room and is the same, without shorter attempts."""
     scene, velocities = heap()
     _, usual, states = run(device, scene, velocities)
     expected = states[-1].points()
@@ -124,14 +124,17 @@ def test_more_pairs_than_there_is_room_for(device):
         state = integrator.step(state, 0.01)
     np.testing.assert_allclose(state.points(), expected, atol=1e-9)
     assert integrator.statistics()["retries"] == 0
-    searches = [own.statistics()["contact"]["searches"] for own in (usual, integrator)]
+    searches = [each.statistics()["contact"]["searches"] for each in (usual, integrator)]
     assert searches[1] <= searches[0] + 8
 
 
-def crossing(apart: float, law: str = "barrier") -> ddg.Scene:
+def crossing(distance: float, law: str = "barrier") -> ddg.Scene:
     scene = ddg.Scene()
     s = np.linspace(-0.05, 0.05, 11)
-    for name, points in (("lower", np.stack([s, 0 * s, 0 * s], 1)), ("upper", np.stack([0 * s, s, 0 * s + apart], 1))):
+    for name, points in (
+        ("lower", np.stack([s, 0 * s, 0 * s], 1)),
+        ("upper", np.stack([0 * s, s, 0 * s + distance], 1)),
+    ):
         scene.add_rod(points, section=ddg.Circle(RADIUS), material=SOFT, name=name)
     scene.contact(law=law)
     return scene
@@ -145,20 +148,20 @@ def test_overlaps_at_the_start_are_refused(device):
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
 def test_derivatives_of_the_energy(device, law):
-    """Forces of contact as the host's tangent has them are those of its energy, by central differences."""
+    """Contact forces of the host's tangent are central differences of the contact energy."""
     model = crossing((2.0 if law == "barrier" else 1.9) * RADIUS + 2e-4, law).build(device=device)
     state = model.state()
     q = state.net.q.numpy().copy()
     rng = np.random.default_rng(0)
-    way = rng.normal(size=q.shape) * (np.arange(len(q)) < model.net.host.nodes)[:, None]
+    direction = rng.normal(size=q.shape) * (np.arange(len(q)) < model.net.host.nodes)[:, None]
 
     def energy(h):
-        other = state.copy()
-        other.net.q.assign(q + h * way)
-        return model.energies(other)["contact"]
+        displaced = state.copy()
+        displaced.net.q.assign(q + h * direction)
+        return model.energies(displaced)["contact"]
 
     model.touch.at(state.net.q)
-    slope = -(model.touch.terms.forces.numpy() * way).sum()
+    slope = -(model.touch.terms.forces.numpy() * direction).sum()
     h = 1e-8
     assert slope != 0.0
     np.testing.assert_allclose((energy(h) - energy(-h)) / (2 * h), slope, rtol=1e-5)
@@ -177,21 +180,23 @@ def test_refusals(device):
 
 @pytest.mark.parametrize("name", ["noodles", "crossed_beams"])
 def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, name):
-    """Contact's part of the bands is in both: the same iterations and the same motion but for rounding, by which one of hundreds of
-    iterations may be more or less."""
-    found = []
+    """Two eliminations include the contact terms of the bands: motions agree to rounding, iterations to one of hundreds."""
+    results = []
     for reduces in (False, True):
         monkeypatch.setattr(net_chains, "long_and_few", lambda *_, reduces=reduces: reduces)
         scene = import_module(f"ddg_warp.scenes.{name}").build()
         model = scene.build(device, precision="float64")
-        integrator = ddg.Integrator(model, rtol=1e-5)  # above rounding, of which iterations are another number
+        integrator = ddg.Integrator(model, rtol=1e-5)  # above the rounding floor, where iterations are another number
         state = model.state()
         for _ in range(40):
             state = integrator.step(state, scene.analysis.dt)
-        found.append((state.points(), integrator.statistics()))
-    (one, by_one), (many, by_many) = found
+        results.append((state.points(), integrator.statistics()))
+    (one, by_one), (many, by_many) = results
     assert by_one["contact"]["contacts"]["mean"] > 0.0
-    newton = [by["newton_iterations"]["mean"] * sum(by["outcomes"].values()) for by in (by_one, by_many)]
+    newton = [
+        statistics["newton_iterations"]["mean"] * sum(statistics["outcomes"].values())
+        for statistics in (by_one, by_many)
+    ]
     assert abs(newton[1] - newton[0]) <= 1.0 + 1e-9
     assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.1 * by_one["pcg_iterations"]
     np.testing.assert_allclose(many, one, rtol=0.0, atol=1e-7)

@@ -1,4 +1,4 @@
-"""What a run says of its contact: counts and the work of friction, against those of its states."""
+"""Contact statistics of a run: counts and friction work, against values from the states."""
 
 import json
 import math
@@ -12,7 +12,7 @@ RADIUS, MU = 2e-3, 0.3
 
 
 def lying(height: float = 5e-4, friction: float = MU) -> ddg.Scene:
-    """A rod on a floor, or some way above it."""
+    """Return a rod at a height above a floor [m]."""
     scene = ddg.Scene()
     y = np.linspace(-0.05, 0.05, 11)
     material = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -23,7 +23,7 @@ def lying(height: float = 5e-4, friction: float = MU) -> ddg.Scene:
 
 
 def test_friction_takes_what_the_rod_loses(device):
-    """Of implicit Euler F = m (v1 - v0) / h acts along h v1: the work of friction is the sum of -m v1 . (v1 - v0)."""
+    """Implicit Euler friction F = m (v1 - v0) / h acts along h v1, so that the work is the sum of -m v1 . (v1 - v0)."""
     model = lying().build(device=device, worlds=2)
     integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
     for _ in range(40):
@@ -38,28 +38,28 @@ def test_friction_takes_what_the_rod_loses(device):
         after = state.velocities()
         taken -= (mass * after * (after - before))[..., :2].sum()
         counts.append(len(model.contacts(state)))
-    found = integrator.statistics()["contact"]
-    np.testing.assert_allclose(found["friction_work"], taken, rtol=1e-4)
+    statistics = integrator.statistics()["contact"]
+    np.testing.assert_allclose(statistics["friction_work"], taken, rtol=1e-4)
     np.testing.assert_allclose(
         taken, MU * mass.sum() * 9.81 * np.ptp(state.points()[..., 0].mean(1)), rtol=1e-3
-    )  # mu m g times the way
-    assert found["contacts"] == {"mean": np.mean(counts), "last": counts[-1]}
-    assert found["contacts"]["last"] > 0
+    )  # mu m g times the path length
+    assert statistics["contacts"] == {"mean": np.mean(counts), "last": counts[-1]}
+    assert statistics["contacts"]["last"] > 0
 
 
 def test_what_nothing_touches_has_no_gap(device):
     model = lying(height=1.0, friction=0.0).build(device=device)
     integrator = ddg.Integrator(model)
     integrator.step(model.state(), 1e-3)
-    found = integrator.statistics()["contact"]
-    assert found["contacts"] == {"mean": 0.0, "last": 0}
-    assert found["smallest_gap"] == math.inf
-    assert "friction_work" not in found
+    statistics = integrator.statistics()["contact"]
+    assert statistics["contacts"] == {"mean": 0.0, "last": 0}
+    assert statistics["smallest_gap"] == math.inf
+    assert "friction_work" not in statistics
 
 
 def test_steps_done_again_count_once(device):
-    """What overflows is taken back and counted once."""
-    scene, found = lying(), []
+    """An overflowing step is undone and counted once."""
+    scene, counts = lying(), []
     for room in (None, 1):
         model = scene.build(device=device)
         integrator, state = ddg.Integrator(model), model.state()
@@ -71,9 +71,9 @@ def test_steps_done_again_count_once(device):
             contact.terms.fit()
         for _ in range(20):
             state = integrator.step(state, 0.01)
-        found.append(integrator.statistics()["contact"]["contacts"])
-    assert found[0] == found[1]
-    assert found[0]["last"] > 0
+        counts.append(integrator.statistics()["contact"]["contacts"])
+    assert counts[0] == counts[1]
+    assert counts[0]["last"] > 0
 
 
 def test_the_summary_has_it(device, tmp_path, capsys):

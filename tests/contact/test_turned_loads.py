@@ -1,4 +1,4 @@
-"""Increments of static loads are cut where supports or obstacles turn far in contact, as steps are (`test_turns`)."""
+"""Load increments with large rotations of supports or obstacles are split, as time steps are (`test_turns`)."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,10 @@ from turn_cases import LAST, OBSTACLES, RADIUS, ahead, needed, place, posed
 import ddg_warp as ddg
 
 
-def bent(motion, at, reach=None) -> ddg.Scene:
-    """A soft rod held at both ends, in the way of a capsule that turns."""
+def bent(motion, centre, reach=None) -> ddg.Scene:
+    """Return a soft rod fixed at both ends, in the path of a rotating capsule."""
     made = ddg.Scene(gravity=(0.0, 0.0, 0.0))
-    line = np.linspace((*at, -0.1), (*at, 0.1), 11)
+    line = np.linspace((*centre, -0.1), (*centre, 0.1), 11)
     rod = made.add_rod(line, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e5, density=1000.0), twist=False)
     made.fix(rod, [0, -1])
     made.add_obstacle(OBSTACLES["capsule"], motion=motion, name="blade")
@@ -18,17 +18,17 @@ def bent(motion, at, reach=None) -> ddg.Scene:
     return made
 
 
-@pytest.mark.parametrize("held", ["motion", "grip"])
-def test_increments_of_static_loads_are_cut_likewise(device, held):
-    """A rod that the blade ends behind is bent ahead of it, in one load step or more of a third of a turn; a chord would pass it."""
+@pytest.mark.parametrize("drive", ["motion", "grip"])
+def test_increments_of_static_loads_are_cut_likewise(device, drive):
+    """The blade ends beyond the undeformed rod, which is bent ahead, in one load step or three. A chord would pass."""
     turns = 1 / 3
-    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t) if held == "motion" else ddg.Grip()
-    controls = {"controls": posed(turns)} if held == "grip" else {}
+    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t) if drive == "motion" else ddg.Grip()
+    controls = {"controls": posed(turns)} if drive == "grip" else {}
     model = bent(motion, place(0.19, 1.9 * np.pi * turns)).build(device=device)
-    for load_steps in (1, 3) if held == "motion" else (1,):
-        way = []
-        state = ddg.statics.solve(model, load_steps=load_steps, way=way, **controls)
-        assert len(way) >= load_steps * needed(2.0 * np.pi * turns / load_steps, LAST)
+    for load_steps in (1, 3) if drive == "motion" else (1,):
+        path = []
+        state = ddg.statics.solve(model, load_steps=load_steps, way=path, **controls)
+        assert len(path) >= load_steps * needed(2.0 * np.pi * turns / load_steps, LAST)
         lead = ahead(state.points()[5:6], 2.0 * np.pi * turns)
         assert 0.0 < lead[0] < 0.02
 

@@ -1,4 +1,4 @@
-"""What turns far in a step pushes what its arcs meet; chords would pass it."""
+"""Large rotations in a step: contact follows arcs, where chords would pass bodies."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ import ddg_warp as ddg
 from ddg_warp.kernels.motion import MOST_PARTS
 from ddg_warp.solve.net.arcs import PART
 
-WIDE = "mesh", "box", "hold", "half-space"  # push a whole rod, which does not turn out of their way
+WIDE = "mesh", "box", "hold", "half-space"  # these move a whole rod, which cannot rotate aside
 TURNS = 0.02, 0.05, 1 / 6, 0.3, 0.5, 0.75, 0.95, 1.0, 1.3, 2.5
 RADII = 0.07, 0.1, 0.15, 0.19, 0.198, 0.1995
 QUICK = [(1 / 6, 0.198), (0.75, 0.19), (2.5, 0.1)]
@@ -48,36 +48,39 @@ def substeps(integrator) -> list[int]:
 
 
 def radii(kind: str) -> list[float]:
-    """Where rods are met: by a ball in the middle of its way, and on either side."""
+    """Return the radii of rods in the path of a blade: the middle of a ball, and either side."""
     if kind == "ball":
-        return [LAST - BALL + part * BALL for part in (-0.9, 0.0, 0.9)]
+        return [LAST - BALL + fraction * BALL for fraction in (-0.9, 0.0, 0.9)]
     return [*RADII, LAST + 0.7 * (RADIUS if kind == "box" else THICKNESS)]
 
 
 def swept(kind: str, turns: float, radius: float) -> bool:
-    """Whether rods are met at half of the way that are not so before."""
+    """Return True if a rod halfway along the rotation is in the path, but not at the start."""
     start = np.arcsin(min(1.0, (BALL + THICKNESS) / radius)) if kind == "ball" else 2.0 * THICKNESS / radius
     return 2.0 * start < np.pi * turns and (kind != "half-space" or turns < 1.0)
 
 
 def outward(turns: float, radius: float) -> float:
-    """How far a rod goes out along a blade at most, by d + r omega / alpha for each radian, d ahead of it and dragged by alpha m v."""
-    turn = 2.0 * np.pi * turns
-    return (turn - 0.5 * turn % (2.0 * np.pi)) * (THICKNESS + RANGE + radius * turn / DT / DAMPING)
+    """Return a bound of the outward motion of a rod along a blade.
 
-
-def check_pushed(kind: str, turns: float, radius: float, held: str, device) -> None:
-    """A rod half-way along the turn is pushed, and a rod at an angle that nothing sweeps stays where it is, to the bit.
-
-    Wide blades have it ahead of them at the end: dragged by what surrounds it, it goes no farther than it is pushed.
+    The bound is d + r omega / alpha per radian, with d the distance ahead of the blade and drag alpha m v.
     """
-    motion = turning(turns) if held == "motion" else ddg.Grip()
+    angle = 2.0 * np.pi * turns
+    return (angle - 0.5 * angle % (2.0 * np.pi)) * (THICKNESS + RANGE + radius * angle / DT / DAMPING)
+
+
+def check_pushed(kind: str, turns: float, radius: float, drive: str, device) -> None:
+    """Assert that a rod halfway along the rotation moves, and that a rod outside the swept angle stays, bitwise.
+
+    Wide blades end behind the rod, which drag stops wherever contact ends.
+    """
+    motion = turning(turns) if drive == "motion" else ddg.Grip()
     beyond = place(LAST + BALL + 0.05, -0.5)
     away = place(radius, 1.5 * np.pi) if turns < 0.7 and kind != "half-space" else beyond
     made = scene(
         kind, motion, [place(radius, np.pi * turns), away] if kind != "half-space" else [place(radius, np.pi * turns)]
     )
-    integrator, state = step(made, device, posed(turns) if held == "grip" else None)
+    integrator, state = step(made, device, posed(turns) if drive == "grip" else None)
     points = (
         state.points()[:, :2].reshape(-1, 11, 2) if kind in OBSTACLES else state.points()[:22, :2].reshape(-1, 11, 2)
     )
@@ -94,20 +97,20 @@ def check_pushed(kind: str, turns: float, radius: float, held: str, device) -> N
         assert (points[1] == away).all()
 
 
-@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_arcs_push_what_chords_would_pass(device, kind, held):
+def test_arcs_push_what_chords_would_pass(device, kind, drive):
     for turns, radius in QUICK:
         radius = radius if kind != "ball" else LAST - BALL
-        if swept(kind, turns, radius) and (held == "motion" or turns <= 0.5):
-            check_pushed(kind, turns, radius, held, device)
+        if swept(kind, turns, radius) and (drive == "motion" or turns <= 0.5):
+            check_pushed(kind, turns, radius, drive, device)
 
 
 @pytest.mark.parametrize("kind", ["mesh", "capsule", "fix"])
 def test_a_rod_is_pushed_along_the_arc_at_and_near_the_axis(device, kind):
-    """A blade through the axis pushes a rod that is dragged, so that it goes along the normal of the blade, and out along it.
+    """A blade through the axis moves a dragged rod along the blade's normal, and outwards.
 
-    At a distance d ahead of the blade and r along it a substep that turns by a has r cos(a) + d sin(a).
+    A substep that rotates by a takes a distance d ahead of the blade and r along to r cos(a) + d sin(a).
     """
     turns = 1.0
     for radius in (0.0035, 0.01, 0.05):
@@ -122,22 +125,22 @@ def test_a_rod_is_pushed_along_the_arc_at_and_near_the_axis(device, kind):
         for k in range(1, count + 1):
             normal = place(1.0, angle * k / count + 0.5 * np.pi)
             wanted = wanted + max(0.0, off - wanted @ normal) * normal
-        # what is dragged by alpha m v keeps a part of 1 / (1 + alpha s) of its velocity in a substep s
+        # drag alpha m v leaves 1 / (1 + alpha s) of the velocity in a substep s
         assert along == pytest.approx(wanted @ place(1.0, angle), rel=0.05)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_arcs_push_what_chords_would_pass_at_any_radius(device, kind, held):
+def test_arcs_push_what_chords_would_pass_at_any_radius(device, kind, drive):
     for turns in TURNS:
         for radius in radii(kind):
-            if swept(kind, turns, radius) and (held == "motion" or turns <= 0.5):
-                check_pushed(kind, turns, radius, held, device)
+            if swept(kind, turns, radius) and (drive == "motion" or turns <= 0.5):
+                check_pushed(kind, turns, radius, drive, device)
 
 
 def test_substeps_are_as_many_as_the_sagitta_asks_for(device):
-    """Just below the turn whose sagitta is allowed none are cut, and motions and grips are cut alike, about any axis."""
+    """Rotations just below the allowed sagitta are not split. Motions and grips are split alike."""
     limit = 2.0 * np.arccos(1.0 - PART * min(RANGE, THICKNESS) / LAST) / (2.0 * np.pi)
     for turns in (0.99 * limit, 1.01 * limit, 3.9 * limit, 0.4):
         wanted = needed(2.0 * np.pi * turns, LAST)
@@ -156,45 +159,45 @@ SYMMETRIC = {
 }
 
 
-@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("shape", SYMMETRIC)
-def test_what_turns_about_its_axis_of_symmetry_needs_no_substeps(device, shape, held):
-    """However far it turns; a half-space as few as its tilts would."""
-    turn, pivot = 0.49 * 2.0 * np.pi, (0.1, 0.0, 0.0)
+def test_what_turns_about_its_axis_of_symmetry_needs_no_substeps(device, shape, drive):
+    """The angle does not matter. A half-space needs as few substeps as a tilt would."""
+    angle, pivot = 0.49 * 2.0 * np.pi, (0.1, 0.0, 0.0)
     made = ddg.Scene(gravity=(0, 0, 0))
     made.add_rod(
         np.linspace((-0.3, -0.3, -0.3), (-0.3, -0.3, -0.2), 5) + 2.0 * AXIS, section=ddg.Circle(RADIUS), material=STIFF
     )
-    motion = ddg.Motion(angle=lambda t: turn * t / DT, axis=tuple(AXIS), pivot=pivot)
-    made.add_obstacle(SYMMETRIC[shape], motion=motion if held == "motion" else ddg.Grip(pivot=pivot))
+    motion = ddg.Motion(angle=lambda t: angle * t / DT, axis=tuple(AXIS), pivot=pivot)
+    made.add_obstacle(SYMMETRIC[shape], motion=motion if drive == "motion" else ddg.Grip(pivot=pivot))
     made.contact()
-    controls = ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, *(turn * AXIS)]])) if held == "grip" else None
+    controls = ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, *(angle * AXIS)]])) if drive == "grip" else None
     integrator, _ = step(made, device, controls)
     assert substeps(integrator) == [16 if shape == "half-space" else 1]
 
 
 def test_a_drum_that_spins_by_half_a_turn_a_step_rubs_as_one_that_spins_slowly(device):
-    """A rod that lies on top slides: m dv / dt = mu N, by whatever angle the drum turns in a step."""
+    """A rod on top slides by m dv / dt = mu N, whatever the drum's angle per step."""
     mu, dt, settled, steps, radius = 0.3, 2e-3, 40, 6, 0.05
-    for turn in (0.2, np.pi):
+    for increment in (0.2, np.pi):
         made = ddg.Scene(mass_damping=5.0)
         line = np.linspace((-0.05, 0.0, 1.3 * RADIUS), (0.05, 0.0, 1.3 * RADIUS), 11)
         made.add_rod(line, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e8, density=1000.0, viscosity=1e-3))
         made.contact(friction=mu)
 
-        def angle(t, turn=turn):
-            return turn * max(0.0, t / dt - settled)
+        def angle(t, increment=increment):
+            return increment * max(0.0, t / dt - settled)
 
         motion = ddg.Motion(angle=angle, axis=(0.0, 1.0, 0.0), pivot=(0.0, 0.0, -radius))
         made.add_obstacle(ddg.Capsule((0.0, -0.1, -radius), (0.0, 0.1, -radius), radius), motion=motion)
         model = made.build(device=device)
-        integrator, state, pushes = ddg.Integrator(model), model.state(), 0.0
+        integrator, state, normal_forces = ddg.Integrator(model), model.state(), 0.0
         for k in range(settled + steps):
             state = integrator.step(state, dt)
-            pushes += np.linalg.norm(model.contacts(state).force.sum(0)) if k >= settled else 0.0
+            normal_forces += np.linalg.norm(model.contacts(state).force.sum(0)) if k >= settled else 0.0
         mass = model.scene.batches[0].section.mass_per_length * 0.1
         speed = state.velocities()[:, 0].mean()
-        np.testing.assert_allclose(speed, mu * pushes * dt / mass, rtol=0.1)
+        np.testing.assert_allclose(speed, mu * normal_forces * dt / mass, rtol=0.1)
         assert speed > 0.5 * mu * 9.81 * steps * dt
 
 
@@ -202,16 +205,16 @@ ORBIT = LAST - BALL
 
 
 @pytest.mark.parametrize("turns", [1.0, 2.0, 7.0])
-@pytest.mark.parametrize("way", ["orbit", "swing", "vertices"])
-def test_functions_of_time_are_sampled_until_their_arcs_are_resolved(device, way, turns):
-    """A ball that goes round by its translation, a blade that swings to and fro, vertices that go round: all are back at the end."""
-    if way == "orbit":
+@pytest.mark.parametrize("path", ["orbit", "swing", "vertices"])
+def test_functions_of_time_are_sampled_until_their_arcs_are_resolved(device, path, turns):
+    """A ball orbits by translation, a blade swings to and fro, and vertices orbit: all are back at the end."""
+    if path == "orbit":
 
         def shift(t):
             return (*(place(ORBIT, 2.0 * np.pi * turns * t / DT) - [ORBIT, 0.0]), 0.0)
 
         made = scene("ball", ddg.Motion(translation=shift), place(ORBIT, 2.1))
-    elif way == "swing":
+    elif path == "swing":
         motion = ddg.Motion(angle=lambda t: 1.5 * np.sin(np.pi * turns * t / DT) ** 2)
         made = scene("capsule", motion, place(0.19, 0.7))
     else:
@@ -254,7 +257,7 @@ def test_a_grip_goes_the_shorter_way_and_no_farther_than_half_a_turn(device):
     with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.6 turns") as error:
         ddg.Integrator(model).step(model.state(), DT, posed(0.6))
     assert error.value.outcome == "turned_too_far"
-    # counted turns go on, and orientations may begin again
+    # poses may count revolutions, and may restart
     integrator, state = ddg.Integrator(model), model.state()
     for turns in (0.45, 0.9, 0.2):
         state = integrator.step(state, DT, posed(turns))
@@ -282,8 +285,8 @@ def test_a_grip_that_substeps_do_not_resolve_gives_up_its_world_alone(device):
 
 
 def test_every_world_is_cut_for_itself(device):
-    """To the bit as it is alone."""
-    turns, found = (1 / 6, 0.0, 0.4), {}
+    """Each world equals a single world, bitwise."""
+    turns, points = (1 / 6, 0.0, 0.4), {}
     for some in (turns, *((each,) for each in turns)):
         model = scene("capsule", ddg.Grip(), place(0.19, np.pi / 6)).build(device=device, worlds=len(some))
         integrator, state = ddg.Integrator(model), model.state()
@@ -291,14 +294,14 @@ def test_every_world_is_cut_for_itself(device):
             poses = np.zeros((len(some), 1, 6))
             poses[:, 0, 5] = 2.0 * np.pi * (k + 1) * np.array(some)
             state = integrator.step(state, DT, ddg.Controls(poses=poses))
-        found[some] = state.points().reshape(len(some), -1, 3)
+        points[some] = state.points().reshape(len(some), -1, 3)
         assert substeps(integrator) == [needed(2.0 * np.pi * t, LAST) if t else 1 for t in some]
     for w, each in enumerate(turns):
-        np.testing.assert_array_equal(found[turns][w], found[(each,)][0])
+        np.testing.assert_array_equal(points[turns][w], points[(each,)][0])
 
 
 def test_grips_and_functions_of_time_are_cut_together(device):
-    """A ball that orbits and an arm that a grip turns, each with a rod in its way; worlds where the arm rests go by the ball."""
+    """A ball orbits and a grip rotates an arm, each with a rod in the path. Where the arm is at rest the ball decides."""
 
     def shift(t):
         return (*(place(ORBIT, 0.3 * np.pi * t / DT) - [ORBIT, 0.0]), 0.0)
@@ -314,8 +317,8 @@ def test_grips_and_functions_of_time_are_cut_together(device):
     assert moved[0, 1] == 0.0 and moved[1, 1] > THICKNESS
     ends = state.net.q.numpy().reshape(2, -1, 3)[:, model.net.host.obstacles[0]]
     np.testing.assert_allclose(ends[:, 0, :2], [place(ORBIT, 0.3 * np.pi)] * 2, atol=1e-12)
-    one, other = substeps(integrator)
-    assert one < other == needed(0.9 * np.pi, 0.12)
+    first, second = substeps(integrator)
+    assert first < second == needed(0.9 * np.pi, 0.12)
 
 
 @pytest.mark.parametrize(("law", "precision"), [("penalty", "float64"), ("barrier", "mixed")])

@@ -1,4 +1,4 @@
-"""Blades that turn about z, by every kind of support and obstacle, and a rod across the plane of their turn."""
+"""Blades that rotate about z, as every kind of support and obstacle, and rods across the plane of rotation."""
 
 import numpy as np
 
@@ -37,14 +37,14 @@ SUPPORTS = ("clamp", "fix", "hold")
 KINDS = (*OBSTACLES, *SUPPORTS)
 
 
-def scene(kind: str, motion, places, reach: float | None = None, first: float = FIRST, **contact) -> ddg.Scene:
-    """A blade of a kind from `first` on, with its motion, and short rods along z through places (n, 2) of the plane.
+def scene(kind: str, motion, centres, reach: float | None = None, first: float = FIRST, **contact) -> ddg.Scene:
+    """Return a scene of a moving blade from radius `first` on and short rods along z, through `centres` (n, 2).
 
-    The rods are dragged by all that surrounds them, and so go no farther than they are pushed.
+    Strong damping stops the rods wherever contact ends.
     """
     made = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=DAMPING)
     across = np.linspace((0.0, 0.0, -0.05), (0.0, 0.0, 0.05), 11)
-    for x, y in np.atleast_2d(places):
+    for x, y in np.atleast_2d(centres):
         made.add_rod(across + [x, y, 0.0], section=ddg.Circle(RADIUS), material=STIFF, name="rod")
     section = {"section": ddg.Circle(HALF), "material": RIGID}
     if kind in OBSTACLES:
@@ -67,7 +67,7 @@ def place(radius: float, angle: float) -> np.ndarray:
 
 
 def ahead(points: np.ndarray, angle: float) -> np.ndarray:
-    """Angles by which points are ahead of a blade, between -pi and pi."""
+    """Return the angles of points ahead of a blade, between -pi and pi."""
     return (np.arctan2(points[:, 1], points[:, 0]) - angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
@@ -75,7 +75,7 @@ def posed(turns: float) -> ddg.Controls:
     return ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2.0 * np.pi * turns]]))
 
 
-def needed(turn: float, radius: float, thickness: float = THICKNESS) -> int:
-    """2^k >= turn / a, where the sagitta R (1 - cos(a / 2)) is `PART` of the range and the thickness."""
+def needed(angle: float, radius: float, thickness: float = THICKNESS) -> int:
+    """Return 2^k >= angle / a, where the sagitta R (1 - cos(a / 2)) is `PART` of range and thickness."""
     a = 2.0 * np.arccos(1.0 - PART * min(RANGE, thickness) / radius)
-    return 2 ** int(np.ceil(np.log2(turn / a)))
+    return 2 ** int(np.ceil(np.log2(angle / a)))
