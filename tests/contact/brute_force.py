@@ -12,7 +12,7 @@ def upload(x: np.ndarray, device: str, dtype=wp.vec3d) -> wp.array:
     return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
 
 
-def listed(search) -> list[np.ndarray]:
+def candidate_pairs(search) -> list[np.ndarray]:
     """Return the pairs (n, 2) of each candidate list, in order."""
     return [pairs.pairs.numpy()[: pairs.count.numpy()[0]] for pairs in search.lists]
 
@@ -81,7 +81,7 @@ def point_triangle(p, a, b, c) -> np.ndarray:
     return np.where(inside, np.abs(height), best)
 
 
-def allowed(shapes: Shapes, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+def admissible_pairs(shapes: Shapes, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (n,), (n,) of pairs of primitives that are not excluded, by numbers of nodes."""
     nodes_a, _, owner_a, span_a = shapes.things(first)
     nodes_b, _, owner_b, _ = shapes.things(second)
@@ -112,9 +112,9 @@ def distances(shapes: Shapes, x: np.ndarray, first: int, second: int, i, j) -> t
     return (edge_edge if first == 2 else point_triangle)(*corners), radius_a[i] + radius_b[j]
 
 
-def near(shapes: Shapes, x: np.ndarray, first: int, second: int, reach: float) -> set[tuple[int, int]]:
+def near_pairs(shapes: Shapes, x: np.ndarray, first: int, second: int, reach: float) -> set[tuple[int, int]]:
     """Return the pairs with a gap of at most `reach`."""
-    i, j = allowed(shapes, first, second)
+    i, j = admissible_pairs(shapes, first, second)
     balls = []
     for size in (first, second):
         nodes, radius, *_ = shapes.things(size)

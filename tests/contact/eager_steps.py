@@ -1,7 +1,7 @@
 """Steps without graph capture, so that tests can observe the stages."""
 
 
-def eagerly(integrator, state, dt):
+def step_without_capture(integrator, state, dt):
     """Launch a step without capture and return the buffers of the end; candidate lists must have room."""
     source = integrator._own(state)
     integrator._vacate(1 - source)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from pair_cases import CASES, bundle, central, terms, times
+from pair_cases import CASES, bundle, central, hessian_product, terms
 
 MU, RATE, VELOCITY = 0.4, 100.0, 0.01
 SLIP = VELOCITY / RATE  # slip at which the polynomial law slides [m]
@@ -17,7 +17,7 @@ def rates(result, *values) -> wp.array:
     return wp.array(values or [RATE], dtype=result.real, device=result.device)
 
 
-def rubbed(case: str, device, form: str = "logistic", slip: float | None = None, seed: int = 1, **options):
+def friction_terms(case: str, device, form: str = "logistic", slip: float | None = None, seed: int = 1, **options):
     """Return terms of friction alone, lagged and moved by about `slip`: terms, device positions, positions before and after."""
     shapes, x = bundle(rolls=True) if case == ROLLING else CASES[case]()
     result, positions = terms(
@@ -31,7 +31,7 @@ def rubbed(case: str, device, form: str = "logistic", slip: float | None = None,
     return result, positions, x, after
 
 
-def hold_to_differences(result, positions: wp.array, after: np.ndarray) -> None:
+def assert_central_differences(result, positions: wp.array, after: np.ndarray) -> None:
     """Assert that forces and products with random vectors equal central differences.
 
     The positions are `after`, on the host, and `positions` on the device.
@@ -39,7 +39,7 @@ def hold_to_differences(result, positions: wp.array, after: np.ndarray) -> None:
     forces = result.forces.numpy().copy()
     for seed in range(5):
         v = np.random.default_rng(seed).normal(size=after.shape)
-        product, exact = times(result, v), times(result, v, positions)
+        product, exact = hessian_product(result, v), hessian_product(result, v, positions)
         assert (product == exact).all()
 
         def quantities(s, v=v):

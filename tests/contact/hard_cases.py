@@ -1,7 +1,7 @@
 """Materials, rods, runs and brute-force gaps for hard cases of contact."""
 
 import numpy as np
-from brute_force import SIDES, allowed, distances
+from brute_force import SIDES, admissible_pairs, distances
 
 import ddg_warp as ddg
 
@@ -23,7 +23,7 @@ def rod(scene: ddg.Scene, points: np.ndarray, name: str = "rod", material=SOFT, 
     return scene.add_rod(points, section=ddg.Circle(RADIUS), material=material, name=name, **options)
 
 
-def hold(scene: ddg.Scene, number: int, nodes: int) -> None:
+def fix_nodes(scene: ddg.Scene, number: int, nodes: int) -> None:
     """Fix all nodes of a rod."""
     scene.fix(number, list(range(nodes)))
 
@@ -63,7 +63,7 @@ def least_gap(model, state) -> float:
     shapes, x, gaps = model.touch.shapes, state.net.q.numpy(), []
     for sides in SIDES:
         if set(sides) <= set(shapes.sizes):
-            distance, thickness = distances(shapes, x, *sides, *allowed(shapes, *sides))
+            distance, thickness = distances(shapes, x, *sides, *admissible_pairs(shapes, *sides))
             gaps.append(float((distance - thickness).min(initial=np.inf)))
     return min(gaps)
 

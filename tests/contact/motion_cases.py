@@ -2,7 +2,7 @@
 
 import numpy as np
 import warp as wp
-from brute_force import SIDES, near, scene, upload
+from brute_force import SIDES, near_pairs, scene, upload
 
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
@@ -14,14 +14,14 @@ def tangle(seed: int, spread: float = 0.6) -> tuple[Shapes, np.ndarray]:
     """Return a scene without overlaps: overlapping objects ignore each other."""
     shapes, points = scene(seed, spread, rods=30, triangles=60)
     for first, second in SIDES:
-        i, j = np.array(sorted(near(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
+        i, j = np.array(sorted(near_pairs(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
         owners = shapes.things(first)[2][i], shapes.things(second)[2][j]
         for a, b in set(zip(*map(np.ndarray.tolist, owners), strict=True)):
             shapes.ignore(a, b)
     return shapes, points
 
 
-def units_of(shapes: Shapes, kind: str) -> tuple[np.ndarray, int]:
+def ccd_bodies(shapes: Shapes, kind: str) -> tuple[np.ndarray, int]:
     """Return the CCD body of each node (nodes,), and the number of bodies."""
     n = len(shapes.points)
     if kind == "node":
@@ -48,7 +48,7 @@ class Motion:
         together=(),
         dtype=wp.vec3d,
     ):
-        unit, self.units = units_of(shapes, kind)
+        unit, self.units = ccd_bodies(shapes, kind)
         self.base, self.q = (upload(points, device, dtype) for _ in range(2))
         self.search = BroadPhase(shapes, self.base, worlds, reach=REACH, margin=MARGIN)
         self.unit = wp.array(unit, dtype=int, device=device)

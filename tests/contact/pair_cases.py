@@ -2,7 +2,7 @@
 
 import numpy as np
 import warp as wp
-from brute_force import allowed, edge_edge, point_edge, point_triangle, scene
+from brute_force import admissible_pairs, edge_edge, point_edge, point_triangle, scene
 
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.solve.contact.broad_phase import BroadPhase
@@ -78,7 +78,7 @@ def state(result: PairTerms) -> list[np.ndarray]:
     return [array.numpy().copy() for array in (result.energy, result.forces, result.diagonal, result.between)]
 
 
-def times(result: PairTerms, v: np.ndarray, positions=None, wanted=None) -> np.ndarray:
+def hessian_product(result: PairTerms, v: np.ndarray, positions=None, wanted=None) -> np.ndarray:
     """Return H v, of the exact Hessian where `positions` are given.
 
     Worlds flagged in `wanted` add the geometric stiffness to the Gauss-Newton matrix instead.
@@ -91,18 +91,18 @@ def times(result: PairTerms, v: np.ndarray, positions=None, wanted=None) -> np.n
     return out.numpy().copy()
 
 
-def assembled(result: PairTerms, n: int, positions=None) -> np.ndarray:
+def assembled_hessian(result: PairTerms, n: int, positions=None) -> np.ndarray:
     """Return H (n, 3, n, 3), one column per product."""
     unit = np.eye(3 * n).reshape(3 * n, n, 3)
-    return np.stack([times(result, v, positions) for v in unit], -1).reshape(n, 3, n, 3)
+    return np.stack([hessian_product(result, v, positions) for v in unit], -1).reshape(n, 3, n, 3)
 
 
-def used_of(pair_list) -> np.ndarray:
+def used_pairs(pair_list) -> np.ndarray:
     """Return the indices of the used pairs of an element list."""
     return np.flatnonzero(pair_list.factor.used.numpy()[: int(pair_list.count.numpy()[0])])
 
 
-def repeats(run) -> None:
+def assert_repeatable(run) -> None:
     """Assert that two runs agree bitwise and that no result is all zero."""
     for first, again in zip(run(), run(), strict=True):
         assert np.abs(first).max() > 0.0
@@ -123,7 +123,7 @@ def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
     return np.where(gap < within, value, 0.0)
 
 
-def ends(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
+def end_distances(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
     """Return distances and weights (2, 3, n) of the ends of edges i from edges j and both nodes of these."""
     nodes, _, owner, span = shapes.things(2)
     key = owner[:, None] * len(rest) + nodes
@@ -134,13 +134,13 @@ def ends(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
     return d, np.stack([0.5 * weights * (span[j, 3] >= 0.0)] * 2)
 
 
-def brute(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) -> float:
+def brute_force_energy(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) -> float:
     """Return the contact energy of all pairs [J]; with v, v . H v of the Gauss-Newton matrix.
 
     The latter is psi'' times the squared change of distances along v.
     """
     rest, k = shapes.points, LAWS[law][1]["stiffness"]
-    i, j = allowed(shapes, 2, 2)
+    i, j = admissible_pairs(shapes, 2, 2)
     nodes, radius, *_ = shapes.things(2)
     order = 0 if v is None else 2
 
@@ -160,13 +160,15 @@ def brute(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) 
     m, both = y * (2.0 - y), radius[i] + radius[j]
     total = (m * value(edge_edge(a, b, c, e), both) * change(lambda x: edge_edge(*corners(x)))).sum()
     for first, second in ((i, j), (j, i)):
-        d, weights = ends(shapes, rest, x, first, second)
+        d, weights = end_distances(shapes, rest, x, first, second)
         counted = (weights * value(d, both)).sum(1)
         if v is not None:
             counted = np.maximum(counted, 0.0)
-        total += ((1.0 - m) * counted * change(lambda x, o=first, p=second: ends(shapes, rest, x, o, p)[0][:, 0])).sum()
+        total += (
+            (1.0 - m) * counted * change(lambda x, o=first, p=second: end_distances(shapes, rest, x, o, p)[0][:, 0])
+        ).sum()
     if 3 in shapes.sizes:
-        i, j = allowed(shapes, 1, 3)
+        i, j = admissible_pairs(shapes, 1, 3)
         (point, thin, *_), (sides, thick, *_) = shapes.things(1), shapes.things(3)
 
         def separation(x):

@@ -24,7 +24,7 @@ def rods(count: int = 4, contact: bool = True, material=SOFT, spacing: float = 0
     return result
 
 
-def falling(height: float = 0.02, speed: float = 0.0, **contact) -> tuple[ddg.Scene, np.ndarray]:
+def falling_rod(height: float = 0.02, speed: float = 0.0, **contact) -> tuple[ddg.Scene, np.ndarray]:
     """Return a rod that falls across a beam, and velocities."""
     scene = ddg.Scene()
     scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT)
@@ -55,7 +55,7 @@ def run(device, scene, steps: int, dt: float = DT, velocities=None, worlds: int 
         (ddg.Material(young=1e6, density=1000.0, poisson=0.5), {"mass_damping": 2.0}),
     ],
 )
-def test_what_never_touches_moves_as_without_contact(device, material, scene):
+def test_rods_without_candidates_move_as_without_contact(device, material, scene):
     """Decoupled steps use the solver of uncoupled rods: only strains of the last step and frames round differently."""
     states = [run(device, rods(contact=contact, material=material, **scene), 30)[0] for contact in (False, True)]
     for values in (ddg.State.points, ddg.State.velocities, ddg.State.angles, ddg.State.directors):
@@ -64,9 +64,9 @@ def test_what_never_touches_moves_as_without_contact(device, material, scene):
         np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_a_rod_that_falls_on_another(device):
+def test_falling_rod_is_coupled_only_near_contact(device):
     """The motion equals that of coupled steps: decoupled while apart, coupled while near, decoupled again after."""
-    scene, velocities = falling(speed=0.5)
+    scene, velocities = falling_rod(speed=0.5)
     options = {"rtol": 1e-10, "dt": 1 / 480, "velocities": velocities}
     actual, integrator, decoupled = run(device, scene, 90, **options)
     expected, _, _ = run(device, scene, 90, linear="chain", **options)
@@ -76,9 +76,9 @@ def test_a_rod_that_falls_on_another(device):
     np.testing.assert_allclose(actual.velocities(), expected.velocities(), rtol=0.0, atol=1e-5)
 
 
-def test_what_would_pass_through_within_a_step_is_caught(device):
+def test_crossing_within_a_step_is_prevented(device):
     """A fast rod is far from the other rod at both ends of the step."""
-    scene, velocities = falling(height=0.02, speed=20.0)
+    scene, velocities = falling_rod(height=0.02, speed=20.0)
     options = {"dt": 2e-3, "velocities": velocities, "rtol": 1e-10}
     actual, _, decoupled = run(device, scene, 1, **options)
     expected, _, _ = run(device, scene, 1, linear="chain", **options)
@@ -88,9 +88,9 @@ def test_what_would_pass_through_within_a_step_is_caught(device):
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
 
 
-def test_worlds_are_judged_one_by_one(device):
+def test_worlds_decouple_independently(device):
     """One world has contact, the other has none: each moves as a single world."""
-    scene, velocities = falling(height=0.012)
+    scene, velocities = falling_rod(height=0.012)
     world_velocities = np.stack([velocities, velocities])
     world_velocities[0, 11:, 2] = -0.5
     actual, _, decoupled = run(device, scene, 24, velocities=world_velocities, worlds=2, rtol=1e-10)
@@ -100,7 +100,7 @@ def test_worlds_are_judged_one_by_one(device):
         np.testing.assert_allclose(actual.points()[world], expected.points(), rtol=0.0, atol=1e-8 * 0.1)
 
 
-def test_obstacles_that_move_push_rods_and_are_where_they_have_to_be(device):
+def test_moving_obstacles_couple_rods_and_follow_their_motion(device):
     scene = rods(2)
     lift = ddg.Motion(translation=lambda t: (0.0, 0.0, 0.5 * t))
     scene.add_obstacle(ddg.Sphere((0.0, 0.0, -0.04), 0.01), motion=lift, name="ball")
@@ -116,7 +116,7 @@ def test_obstacles_that_move_push_rods_and_are_where_they_have_to_be(device):
     assert decoupled.all()
 
 
-def test_drag_supports_that_move_and_loads(device):
+def test_drag_moving_supports_and_loads_act_in_decoupled_steps(device):
     """Drag, loads, couples and moving supports act in decoupled steps as without contact."""
 
     def scene(contact: bool) -> ddg.Scene:
@@ -135,7 +135,7 @@ def test_drag_supports_that_move_and_loads(device):
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-12)
 
 
-def test_rods_with_damping_and_without_in_one_set(device):
+def test_damped_and_undamped_rods_in_one_element_set(device):
     def scene(contact: bool) -> ddg.Scene:
         result = rods(2, contact=contact)
         stiff = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -155,7 +155,7 @@ def test_rods_with_damping_and_without_in_one_set(device):
         np.testing.assert_allclose(kept, updated.numpy(), rtol=0.0, atol=1e-12 * np.abs(kept).max())
 
 
-def test_grips_take_rods_along(device):
+def test_grips_move_decoupled_rods(device):
     """Two worlds have different poses."""
     states = []
     for contact in (False, True):
@@ -176,9 +176,9 @@ def test_grips_take_rods_along(device):
     np.testing.assert_allclose(states[1].angles(), states[0].angles(), rtol=0.0, atol=1e-10)
 
 
-def test_a_run_that_is_resumed_takes_the_same_steps(device):
+def test_resumed_run_repeats_its_steps_bitwise(device):
     """Decoupling does not depend on earlier searches, wherever the run resumes."""
-    scene, velocities = falling(height=0.012, speed=0.5)
+    scene, velocities = falling_rod(height=0.012, speed=0.5)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state(velocities=velocities)
     snapshots, coupled = [], []
@@ -195,7 +195,7 @@ def test_a_run_that_is_resumed_takes_the_same_steps(device):
             np.testing.assert_array_equal(values, state.snapshot()[name], err_msg=name)
 
 
-def shot(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **contact) -> tuple[ddg.Scene, np.ndarray]:
+def approaching_rods(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **contact) -> tuple[ddg.Scene, np.ndarray]:
     """Return rods that slowly approach a beam without gravity, and velocities.
 
     Each rod has its own speed. With `kick`, forces drive the rods into the beam from 0.2 s on.
@@ -217,26 +217,26 @@ def shot(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **contact) -> tupl
     return scene, velocities
 
 
-def looks(integrator) -> int:
+def bound_updates(integrator) -> int:
     return int(integrator._net.alone.runs.looks.numpy()[0])
 
 
-def test_what_was_quiet_for_long_is_seen_when_it_is_driven_at_another(device):
+def test_sudden_motion_out_of_old_bounds_is_detected(device):
     """Bounds made for a slow motion serve for long. Then rods leave them by centimetres in a step, into the beam."""
-    scene, velocities = shot(kick=0.01, rods=2)
+    scene, velocities = approaching_rods(kick=0.01, rods=2)
     options = {"rtol": 1e-10, "dt": 1 / 480, "velocities": velocities}
     actual, integrator, decoupled = run(device, scene, 150, **options)
     expected, reference, _ = run(device, scene, 150, linear="chain", **options)
     first = int(np.argmin(decoupled[:, 0]))
-    assert decoupled[:first].all() and first > 96 and looks(integrator) < 40
+    assert decoupled[:first].all() and first > 96 and bound_updates(integrator) < 40
     gaps = [each.statistics()["contact"]["smallest_gap"] for each in (integrator, reference)]
     assert 0.0 < gaps[1] < np.inf and gaps[0] == pytest.approx(gaps[1], rel=1e-3)
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-6 * 0.1)
 
 
-def test_worlds_share_no_boxes(device):
+def test_worlds_have_separate_bounds(device):
     """One world has contact early, one late, one never: each moves as a single world."""
-    scene, velocities = falling(height=0.03)
+    scene, velocities = falling_rod(height=0.03)
     scene.gravity = (0.0, 0.0, 0.0)
     speeds, steps = (0.5, 0.2, 0.0), 60
     world_velocities = np.stack([velocities] * 3)
@@ -250,7 +250,7 @@ def test_worlds_share_no_boxes(device):
         np.testing.assert_allclose(actual.points()[world], expected.points(), rtol=0.0, atol=1e-8 * 0.1)
 
 
-def test_a_capsule_that_is_swung_at_rods_is_seen(device):
+def test_swung_capsule_is_detected(device):
     """The capsule stands for long, then moves by centimetres in a step; the motion equals that of coupled steps."""
     scene = rods(3, gravity=(0.0, 0.0, 0.0))
     swing = ddg.Motion(translation=lambda t: (0.0, 0.0, 3.0 * max(0.0, t - 0.1)))
@@ -259,16 +259,16 @@ def test_a_capsule_that_is_swung_at_rods_is_seen(device):
     actual, integrator, decoupled = run(device, scene, 78, **options)
     expected, _, _ = run(device, scene, 78, linear="chain", **options)
     first = int(np.argmin(decoupled[:, 0]))
-    assert 60 < first < 78 and looks(integrator) < 24
+    assert 60 < first < 78 and bound_updates(integrator) < 24
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-6 * 0.1)
     np.testing.assert_allclose(actual.obstacle_points(), expected.obstacle_points(), rtol=0.0, atol=1e-15)
 
 
-def test_worlds_that_start_anew_within_reach_are_seen(device):
+def test_reset_within_reach_is_detected(device):
     """A reset moves rods out of the bounds of that world."""
-    scene, _ = falling(height=0.05)
+    scene, _ = falling_rod(height=0.05)
     scene.gravity = (0.0, 0.0, 0.0)
-    model, near = scene.build(device=device, worlds=2), falling(height=2.2 * RADIUS, speed=0.5)
+    model, near = scene.build(device=device, worlds=2), falling_rod(height=2.2 * RADIUS, speed=0.5)
     integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
     for _ in range(5):
         state = integrator.step(state, DT)
@@ -281,9 +281,9 @@ def test_worlds_that_start_anew_within_reach_are_seen(device):
     assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] < 1e-3
 
 
-def test_a_quiet_run_that_is_resumed_takes_the_same_steps(device):
+def test_run_resumed_before_contact_repeats_its_steps_bitwise(device):
     """Resumes start within the validity of bounds, where bounds end, and around the first contact."""
-    scene, velocities = shot(kick=0.01, rods=2)
+    scene, velocities = approaching_rods(kick=0.01, rods=2)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state(velocities=velocities)
     snapshots, coupled, updates = [], [], []
@@ -291,7 +291,7 @@ def test_a_quiet_run_that_is_resumed_takes_the_same_steps(device):
         snapshots.append(state.snapshot())
         state = integrator.step(state, 1 / 480)
         coupled.append(bool(integrator._net.alone.left.numpy()[0]))
-        updates.append(looks(integrator))
+        updates.append(bound_updates(integrator))
     assert len(set(coupled)) == 2
     left = int(np.flatnonzero(np.diff(updates))[2])
     for start in (left - 1, left, left + 1, left + 2, 90, coupled.index(True) - 1, coupled.index(True) + 1):
@@ -302,7 +302,7 @@ def test_a_quiet_run_that_is_resumed_takes_the_same_steps(device):
             np.testing.assert_array_equal(values, state.snapshot()[name], err_msg=name)
 
 
-def test_a_quiet_step_launches_little_more_than_one_without_contact(device, monkeypatch):
+def test_decoupled_step_adds_at_most_five_launches(device, monkeypatch):
     """Decoupling adds five kernels, copies of rod states included, and no conditional node."""
     counts = {}
     for contact in (False, True):
@@ -325,7 +325,7 @@ def test_a_quiet_step_launches_little_more_than_one_without_contact(device, monk
     )
 
 
-def test_statistics_count_a_step_as_any_other(device):
+def test_statistics_of_decoupled_steps(device):
     state, integrator, decoupled = run(device, rods(3), 10)
     assert decoupled.all()
     statistics = integrator.statistics()
@@ -341,7 +341,7 @@ def test_statistics_count_a_step_as_any_other(device):
     assert len(model.contacts(state)) == 0 and model.energies(state)["kinetic"] > 0.0
 
 
-def closed() -> ddg.Scene:
+def closed_rod() -> ddg.Scene:
     scene = ddg.Scene()
     angle = np.linspace(0.0, 2 * np.pi, 17)[:-1]
     scene.add_rod(
@@ -356,9 +356,9 @@ def closed() -> ddg.Scene:
 
 @pytest.mark.parametrize(
     ("scene", "options"),
-    [(closed, {}), (rods, {"linear": "chain"}), (lambda: rods(contact=False), {})],
+    [(closed_rod, {}), (rods, {"linear": "chain"}), (lambda: rods(contact=False), {})],
 )
-def test_where_it_does_not_apply_nothing_of_it_is_made(device, scene, options, monkeypatch):
+def test_decoupling_is_not_built_where_it_does_not_apply(device, scene, options, monkeypatch):
     def refuse(*_):
         raise AssertionError("made")
 
@@ -366,8 +366,8 @@ def test_where_it_does_not_apply_nothing_of_it_is_made(device, scene, options, m
     run(device, scene(), 2, **options)
 
 
-def test_what_gradients_and_controls_need_is_solved_with_the_net(device):
-    scene, _ = falling()
+def test_steps_with_controls_are_coupled(device):
+    scene, _ = falling_rod()
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state()
     state = integrator.step(state, DT)
@@ -376,11 +376,11 @@ def test_what_gradients_and_controls_need_is_solved_with_the_net(device):
     assert integrator._net.alone is None
 
 
-def test_parameters_that_change_go_to_rods_on_their_own(device):
+def test_changed_parameters_reach_decoupled_rods(device):
     """Decoupled steps stay decoupled and equal coupled steps with the new parameter."""
     points = []
     for whole, stiffness in ((False, None), (False, 10.0), (True, 10.0)):
-        scene, _ = falling()
+        scene, _ = falling_rod()
         model = scene.build(device=device, precision="float64")
         integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
         if whole:

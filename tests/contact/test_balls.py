@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from brute_force import SIDES, allowed, distances, listed, near, scene, upload
+from brute_force import SIDES, admissible_pairs, candidate_pairs, distances, near_pairs, scene, upload
 from motion_cases import MARGIN, REACH, Motion
 from pair_cases import LAWS, central, psi
 
@@ -12,7 +12,7 @@ from ddg_warp.solve.contact.pair_terms import PairTerms
 from ddg_warp.solve.contact.shapes import BALLS, Shapes
 
 
-def balls(seed: int) -> tuple[Shapes, np.ndarray]:
+def rods_shell_and_balls(seed: int) -> tuple[Shapes, np.ndarray]:
     """Return rods, a shell and thirty balls, ten of which ignore a rod."""
     shapes, points = scene(seed, 0.3, rods=30, triangles=30)
     rng = np.random.default_rng(seed)
@@ -26,17 +26,19 @@ def balls(seed: int) -> tuple[Shapes, np.ndarray]:
     return shapes, points
 
 
-def test_balls_are_paired_with_edges_of_rods_and_with_triangles(device):
-    shapes, points = balls(18)
+def test_balls_pair_with_edges_of_rods(device):
+    shapes, points = rods_shell_and_balls(18)
     search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
     assert [pairs.second.size for pairs in search.lists] == [2, 3, BALLS]
-    for candidates, side in zip(listed(search), (*SIDES, (2, BALLS)), strict=True):
+    for candidates, side in zip(candidate_pairs(search), (*SIDES, (2, BALLS)), strict=True):
         pairs = {tuple(pair) for pair in candidates.tolist()}
         assert (
-            near(shapes, points, *side, REACH + MARGIN) <= pairs <= near(shapes, points, *side, REACH + 1.002 * MARGIN)
+            near_pairs(shapes, points, *side, REACH + MARGIN)
+            <= pairs
+            <= near_pairs(shapes, points, *side, REACH + 1.002 * MARGIN)
         )
         assert len(pairs) > 20
-    one = listed(search)[2][0]
+    one = candidate_pairs(search)[2][0]
     owner = shapes.names[shapes.things(2)[2][one[0]]]
     assert search.describe(search.lists[2], *one.tolist()) == (
         f"edge {one[0] % 20} of {owner} (nodes {', '.join(map(str, shapes.things(2)[0][one[0]]))}) and ball {35 + one[1]} "
@@ -44,7 +46,7 @@ def test_balls_are_paired_with_edges_of_rods_and_with_triangles(device):
     )
 
 
-def test_a_rod_stops_at_a_ball(device):
+def test_rod_stops_at_a_ball(device):
     """The rod keeps between 1 % and 15 % of the gap; a rod that passes by is not stopped."""
     points = np.array([[-1.0, 0.1, 1.0], [1.0, 0.1, 1.0], [1.2, 0.0, 0.0], [2.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     shapes = Shapes(points)
@@ -64,19 +66,19 @@ def test_a_rod_stops_at_a_ball(device):
     assert landing[4].tolist() == [0.0, 0.0, 0.0]
 
 
-def test_obstacles_are_no_pairs_of_their_own(device):
+def test_obstacles_form_no_pairs_with_each_other(device):
     shapes, points = scene(19, 0.3, rods=12, triangles=40)
     x = upload(points, device)
-    everything = listed(BroadPhase(shapes, x, reach=REACH, margin=MARGIN))
+    everything = candidate_pairs(BroadPhase(shapes, x, reach=REACH, margin=MARGIN))
     shapes.obstacle.update({0, 3, 4, 13, 14, 16})
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
     still = np.array(sorted(shapes.obstacle))
-    for candidates, every, (first, second) in zip(listed(search), everything, SIDES, strict=True):
+    for candidates, every, (first, second) in zip(candidate_pairs(search), everything, SIDES, strict=True):
         owners = shapes.things(first)[2][every[:, 0]], shapes.things(second)[2][every[:, 1]]
         both = np.isin(owners[0], still) & np.isin(owners[1], still)
         assert candidates.tolist() == every[~both].tolist()
         assert both.sum() > 3
-        i, j = allowed(shapes, first, second)
+        i, j = admissible_pairs(shapes, first, second)
         d, thickness = distances(shapes, points, first, second, i, j)
         assert (d - thickness <= REACH + MARGIN).sum() <= len(candidates)
 
@@ -98,7 +100,7 @@ def rods_on_balls() -> tuple[Shapes, np.ndarray]:
     return shapes, shapes.points
 
 
-def test_energies_forces_and_products(device):
+def test_energies_forces_and_products_of_ball_pairs(device):
     shapes, x = rods_on_balls()
     rng = np.random.default_rng(3)
     density, parameters = LAWS["penalty"]
@@ -107,7 +109,7 @@ def test_energies_forces_and_products(device):
     terms = PairTerms(search, density, **parameters)
 
     def energy(y: np.ndarray) -> float:
-        i, j = allowed(shapes, 2, BALLS)
+        i, j = admissible_pairs(shapes, 2, BALLS)
         d, thickness = distances(shapes, y, 2, BALLS, i, j)
         return parameters["stiffness"] * psi("penalty", d - thickness).sum()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from brute_force import SIDES, listed, near, scene, upload
+from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
@@ -15,38 +15,38 @@ from ddg_warp.solve.contact.shapes import Shapes
 REACH, MARGIN = 0.004, 0.01
 
 
-def agree(search: BroadPhase, x: np.ndarray, sides=SIDES) -> None:
+def assert_complete(search: BroadPhase, x: np.ndarray, sides=SIDES) -> None:
     """Assert that lists have every near pair once, and no pair beyond the search distance."""
-    for candidates, side in zip(listed(search), sides, strict=True):
+    for candidates, side in zip(candidate_pairs(search), sides, strict=True):
         pairs = [tuple(pair) for pair in candidates.tolist()]
         assert pairs == sorted(set(pairs))
-        assert near(search.shapes, x, *side, REACH + MARGIN) <= set(pairs)
-        assert set(pairs) <= near(search.shapes, x, *side, REACH + 1.002 * MARGIN)
+        assert near_pairs(search.shapes, x, *side, REACH + MARGIN) <= set(pairs)
+        assert set(pairs) <= near_pairs(search.shapes, x, *side, REACH + 1.002 * MARGIN)
 
 
 @pytest.mark.parametrize("spread", [0.3, 1.0, 3.0])
 @pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
-def test_candidates_are_those_of_all_pairs(device, spread, dtype):
+def test_candidates_equal_those_of_all_pairs(device, spread, dtype):
     shapes, points = scene(1, spread)
     search = BroadPhase(shapes, upload(points, device, dtype), reach=REACH, margin=MARGIN)
-    agree(search, points.astype(np.float32) if dtype is wp.vec3f else points)
-    assert all(len(candidates) > 10 for candidates in listed(search)) or spread > 1.0
+    assert_complete(search, points.astype(np.float32) if dtype is wp.vec3f else points)
+    assert all(len(candidates) > 10 for candidates in candidate_pairs(search)) or spread > 1.0
 
 
-def test_objects_that_ignore_each_other_are_no_pairs(device):
+def test_ignored_objects_form_no_pairs(device):
     shapes, points = scene(2, 0.3)
     x = upload(points, device)
-    before = listed(BroadPhase(shapes, x, reach=REACH, margin=MARGIN))
+    before = candidate_pairs(BroadPhase(shapes, x, reach=REACH, margin=MARGIN))
     for pair in ((0, 1), (7, 3), (5, 5), (50, 51), (2, 52), (54, 54)):
         shapes.ignore(*pair)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    agree(search, points)
-    assert all(len(after) < len(all_of) for after, all_of in zip(listed(search), before, strict=True))
+    assert_complete(search, points)
+    assert all(len(after) < len(all_of) for after, all_of in zip(candidate_pairs(search), before, strict=True))
 
 
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("exclusion", [0.0, 0.35, 1.75, 3.45])
-def test_edges_within_an_arc_length_are_no_pairs(device, closed, exclusion):
+def test_edges_within_the_exclusion_distance_form_no_pairs(device, closed, exclusion):
     """A circle has 40 edges and circumference 4: edges k apart have (k - 1) / 10 of arc between them."""
     n = 40
     angle = 2.0 * np.pi * np.arange(n) / n
@@ -54,7 +54,7 @@ def test_edges_within_an_arc_length_are_no_pairs(device, closed, exclusion):
     points = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     shapes = Shapes(points)
     shapes.rod(np.arange(n), 0.01, closed=closed, apart=exclusion)
-    (candidates,) = listed(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
+    (candidates,) = candidate_pairs(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
     i, j = np.triu_indices(n if closed else n - 1, 1)
     steps = np.minimum(j - i, n - (j - i)) if closed else j - i
     wanted = (steps > 1) & (0.1 * (steps - 1) >= exclusion)
@@ -62,7 +62,7 @@ def test_edges_within_an_arc_length_are_no_pairs(device, closed, exclusion):
 
 
 @pytest.mark.parametrize("leaf_size", [1, 2, 3, 5])
-def test_bundles_change_nothing(device, monkeypatch, leaf_size):
+def test_leaf_size_changes_no_pair_and_no_crossing(device, monkeypatch, leaf_size):
     """Any number of edges a leaf gives the same pairs and the same crossings, in two worlds."""
     shapes, points = scene(17, 0.3, rods=10, triangles=40)
     move = 0.05 * np.random.default_rng(18).normal(size=(2 * len(points), 3))
@@ -71,7 +71,7 @@ def test_bundles_change_nothing(device, monkeypatch, leaf_size):
         monkeypatch.setattr(tree, "BUNDLE", bundle)
         search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
         x = upload(np.tile(points, (2, 1)), device)
-        lists = [pairs.tolist() for pairs in listed(search)]
+        lists = [pairs.tolist() for pairs in candidate_pairs(search)]
         search.crossings(x, upload(move, device))
         assert not search.fit(x)
         results.append((lists, search.crossed.numpy().tolist(), search.first_crossing()))
@@ -79,21 +79,21 @@ def test_bundles_change_nothing(device, monkeypatch, leaf_size):
     assert min(results[0][1]) > 10
 
 
-def test_worlds_do_not_meet(device):
+def test_worlds_form_no_pairs_with_each_other(device):
     shapes, points = scene(3, 0.3, rods=10, triangles=40)
     rng = np.random.default_rng(4)
     worlds = [points + 0.01 * rng.normal(size=points.shape) for _ in range(3)]
     together = BroadPhase(shapes, upload(np.concatenate(worlds), device), 3, reach=REACH, margin=MARGIN)
-    for k, candidates in enumerate(listed(together)):
+    for k, candidates in enumerate(candidate_pairs(together)):
         pairs, expected = together.lists[k], []
         for w, x in enumerate(worlds):
-            alone = listed(BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN))[k]
+            alone = candidate_pairs(BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN))[k]
             expected.append(alone + w * np.array([pairs.first.count, pairs.second.count]))
         assert candidates.tolist() == np.concatenate(expected).tolist()
         assert min(map(len, expected)) > 5
 
 
-def test_edges_that_coincide_or_are_parallel_are_found(device):
+def test_coincident_and_parallel_edges_are_found(device):
     """Sixty edges coincide, which no tree can separate, and twenty lie side by side."""
     stacked = np.tile([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], (60, 1))
     parallel = np.repeat(np.arange(20) * 0.01, 2)[:, None] * [0.0, 1.0, 0.0] + np.tile(
@@ -104,33 +104,35 @@ def test_edges_that_coincide_or_are_parallel_are_found(device):
     for k in range(80):
         shapes.rod([2 * k, 2 * k + 1], 0.003)
     search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
-    agree(search, points, SIDES[:1])
+    assert_complete(search, points, SIDES[:1])
     assert search.lists[0].count.numpy()[0] == 60 * 59 // 2 + 19 + 18
 
 
 @pytest.mark.parametrize("room", [(10,), (10_000, 10), (10, 10)])
-def test_lists_that_are_too_short_are_empty_until_they_have_grown(device, room):
+def test_overflowing_lists_are_empty_until_they_grow(device, room):
     """The capacity is too small for pairs, for overlapping boxes, or for both."""
     shapes, points = scene(5, 0.3)
     x = upload(points, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    whole = listed(search)
+    whole = candidate_pairs(search)
     for pairs in search.lists:
         pairs.reserve(*room)
     search.search(x)
     assert search.overflow.numpy()[0] == 1
-    assert not any(len(candidates) for candidates in listed(search))
+    assert not any(len(candidates) for candidates in candidate_pairs(search))
     searches = search.searches.numpy()[0]
     search.update(x)
     assert search.searches.numpy()[0] == searches + 1  # candidates stay invalid until lists have room
     version = search.version
     assert search.fit(x)
     assert search.version > version
-    assert [candidates.tolist() for candidates in listed(search)] == [candidates.tolist() for candidates in whole]
+    assert [candidates.tolist() for candidates in candidate_pairs(search)] == [
+        candidates.tolist() for candidates in whole
+    ]
     assert not search.fit(x)
 
 
-def test_where_one_list_is_too_short_others_that_are_all_but_full_grow_with_it(device):
+def test_nearly_full_lists_grow_with_overflowing_ones(device):
     """Graphs are then captured again once, not per list. Each list gets room for twice the pairs found."""
     shapes, points = scene(5, 0.3)
     x = upload(points, device)
@@ -146,7 +148,7 @@ def test_where_one_list_is_too_short_others_that_are_all_but_full_grow_with_it(d
 
 
 @pytest.mark.parametrize("excess", [-1e-6, 1e-6])
-def test_candidates_hold_until_half_of_the_margin_is_used_up(device, excess):
+def test_candidates_are_valid_for_half_the_margin(device, excess):
     """Two edges approach from just beyond the search distance; the pair is found before the gap can fall below `reach`."""
     gap = REACH + 1.002 * MARGIN
     distance = 0.02 + gap
@@ -155,19 +157,19 @@ def test_candidates_hold_until_half_of_the_margin_is_used_up(device, excess):
     shapes.rod([0, 1], 0.01)
     shapes.rod([2, 3], 0.01)
     search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
-    assert not len(listed(search)[0])
+    assert not len(candidate_pairs(search)[0])
     searches = search.searches.numpy()[0]
     moved = points.copy()
     moved[:2, 2] += (0.5 + excess) * MARGIN
     moved[2:, 2] -= (0.5 + excess) * MARGIN
     search.update(upload(moved, device))
     assert search.searches.numpy()[0] == searches + (excess > 0)
-    assert len(listed(search)[0]) == (excess > 0)
+    assert len(candidate_pairs(search)[0]) == (excess > 0)
     # without a new search, pairs that are not listed are beyond the reach
-    assert near(shapes, moved, 2, 2, REACH) <= {tuple(pair) for pair in listed(search)[0].tolist()}
+    assert near_pairs(shapes, moved, 2, 2, REACH) <= {tuple(pair) for pair in candidate_pairs(search)[0].tolist()}
 
 
-def test_what_no_thing_has_may_be_anywhere(device):
+def test_dofs_of_no_primitive_trigger_no_search(device):
     """Dof blocks without a position, such as twist angles of edges, may have any value."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     shapes = Shapes(points)
@@ -181,7 +183,7 @@ def test_what_no_thing_has_may_be_anywhere(device):
         search.search(upload(np.tile(points, (2, 1)), device))
 
 
-def test_a_captured_update_follows_motion_and_searches_only_where_it_must(device):
+def test_captured_update_searches_only_where_needed(device):
     shapes, points = scene(6, 0.5, rods=20, triangles=60)
     x = upload(points, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
@@ -198,16 +200,16 @@ def test_a_captured_update_follows_motion_and_searches_only_where_it_must(device
         wp.capture_launch(capture.graph)
         assert not search.fit(x)
         assert search.searches.numpy()[0] == before + step // 2
-        for candidates, side in zip(listed(search), SIDES, strict=True):
-            assert near(shapes, position, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
+        for candidates, side in zip(candidate_pairs(search), SIDES, strict=True):
+            assert near_pairs(shapes, position, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
     search.search(x)
-    agree(search, position)
+    assert_complete(search, position)
     search.rebuild(x)
     search.search(x)
-    agree(search, position)
+    assert_complete(search, position)
 
 
-def test_a_captured_motion_is_that_without_a_graph(device):
+def test_captured_motion_equals_uncaptured(device):
     shapes, points = scene(13, 0.5, rods=20, triangles=60)
     rng = np.random.default_rng(14)
     x, move = upload(points, device), upload(0.02 * rng.normal(size=points.shape), device)
@@ -223,7 +225,7 @@ def test_a_captured_motion_is_that_without_a_graph(device):
 
     def results() -> list[bytes]:
         numbers = (search.gap, search.time, search.crossed)
-        return [part.tobytes() for part in (*listed(search), *(array.numpy() for array in numbers))]
+        return [part.tobytes() for part in (*candidate_pairs(search), *(array.numpy() for array in numbers))]
 
     step()
     plain = results()
@@ -237,7 +239,7 @@ def test_a_captured_motion_is_that_without_a_graph(device):
 
 
 @pytest.mark.parametrize("count", [1, 64, 65, 1_025, 70_000, 1_100_000])
-def test_running_sums(device, count):
+def test_prefix_sums(device, count):
     values = np.random.default_rng(15).integers(0, 9, count)
     sums = RunningSums(wp.array(values, dtype=int, device=device))
     sums()
@@ -245,7 +247,7 @@ def test_running_sums(device, count):
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e5])
-def test_boxes_hold_what_they_are_around(device, offset):
+def test_boxes_contain_their_primitives(device, offset):
     """Boxes contain float64 positions that float32 cannot represent, and are larger by no more than rounding."""
     shapes, points = scene(16, 1.0, rods=20, triangles=60)
     points = points + offset
@@ -263,7 +265,7 @@ def test_boxes_hold_what_they_are_around(device, offset):
         assert max(below.max(), above.max()) <= 5e-7 * (2.0 + offset)
 
 
-def test_two_runs_are_the_same_to_the_bit(device):
+def test_runs_agree_bitwise(device):
     shapes, points = scene(8, 0.5)
     x = upload(points, device)
     move = upload(0.01 * np.random.default_rng(9).normal(size=points.shape), device)
@@ -274,7 +276,7 @@ def test_two_runs_are_the_same_to_the_bit(device):
         search.impact(x, move, keep=0.0)
         search.crossings(x, move)
         numbers = (search.gap, search.time, search.crossed)
-        return [part.tobytes() for part in (*listed(search), *(array.numpy() for array in numbers))]
+        return [part.tobytes() for part in (*candidate_pairs(search), *(array.numpy() for array in numbers))]
 
     assert run() == run()
 
@@ -294,7 +296,7 @@ def test_order_of_objects_is_irrelevant(device):
                 shapes.rod(np.array(rods[k]), 0.004)
         search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
         result = set()
-        for pairs, candidates in zip(search.lists, listed(search), strict=True):
+        for pairs, candidates in zip(search.lists, candidate_pairs(search), strict=True):
             nodes = [shapes.things(side.size)[0] for side in (pairs.first, pairs.second)]
             result |= {
                 frozenset((tuple(sorted(nodes[0][i])), tuple(sorted(nodes[1][j])))) for i, j in candidates.tolist()
@@ -306,7 +308,7 @@ def test_order_of_objects_is_irrelevant(device):
     assert pairs_of(rng.permutation(13)) == first
 
 
-def test_positions_that_are_not_finite_are_refused_by_name(device):
+def test_non_finite_positions_are_refused_by_name(device):
     shapes, points = scene(12, 1.0, rods=4, triangles=4)
     x = upload(np.concatenate([points, points]), device)
     search = BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN)
@@ -319,8 +321,10 @@ def test_positions_that_are_not_finite_are_refused_by_name(device):
     x.assign(np.concatenate([points, points]))
     search.update(x)
     search.check()
-    after = [candidates.tolist() for candidates in listed(search)]
-    assert after == [candidates.tolist() for candidates in listed(BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN))]
+    after = [candidates.tolist() for candidates in candidate_pairs(search)]
+    assert after == [
+        candidates.tolist() for candidates in candidate_pairs(BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN))
+    ]
 
 
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -352,6 +356,6 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
         (lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), reach=0.0, margin=1.0), "reach = 0.0"),
     ],
 )
-def test_what_can_not_be_searched_is_refused_by_name(describe, message):
+def test_invalid_shapes_are_refused_by_name(describe, message):
     with pytest.raises(SceneError, match=message):
         describe(Shapes(POINTS))

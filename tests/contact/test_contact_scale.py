@@ -67,7 +67,7 @@ def rod_on_mesh(length: float) -> ddg.Scene:
     return scene
 
 
-def moved(build, length: float, device, precision: str):
+def scaled_results(build, length: float, device, precision: str):
     """Return positions over L, contact force over E L^2 and smallest gap over L after some steps."""
     model = build(length).build(device, precision=precision)
     integrator, state = ddg.Integrator(model, rtol=1e-8), model.state()
@@ -88,9 +88,9 @@ CASES += [(shell_on_ball, "float64", 1e-6)]
 
 @pytest.mark.parametrize("build, precision, small", CASES)
 def test_contact_is_the_same_at_every_scale(device, build, precision, small):
-    points, force, gap = moved(build, 1.0, device, precision)
+    points, force, gap = scaled_results(build, 1.0, device, precision)
     for length in (small, 1e5):
-        scaled = moved(build, length, device, precision)
+        scaled = scaled_results(build, length, device, precision)
         np.testing.assert_allclose(scaled[0], points, atol=1e-6)
         np.testing.assert_allclose(scaled[1], force, atol=1e-4 * np.abs(force).max())
         assert scaled[2] == pytest.approx(gap, rel=1e-4)
@@ -99,15 +99,15 @@ def test_contact_is_the_same_at_every_scale(device, build, precision, small):
 @pytest.mark.parametrize(
     "build, precision", [(rod_on_floor, "float64"), (rod_on_rod, "mixed"), (shell_on_ball, "float64")]
 )
-def test_powers_of_two_have_the_same_bits(device, build, precision):
-    points, _, gap = moved(build, 1.0, device, precision)
-    scaled = moved(build, 2.0**-18, device, precision)
+def test_scaling_by_powers_of_two_keeps_all_bits(device, build, precision):
+    points, _, gap = scaled_results(build, 1.0, device, precision)
+    scaled = scaled_results(build, 2.0**-18, device, precision)
     np.testing.assert_array_equal(scaled[0], points)
     assert scaled[2] == gap
 
 
 @pytest.mark.parametrize("build", [rod_on_floor, shell_on_ball])
-def test_cold_starts_that_overlap_are_told_at_every_scale(device, build):
+def test_overlapping_starts_are_refused_and_resolved_at_every_scale(device, build):
     """Overlaps are resolved by the same fraction of the length."""
     displacements = []
     for length in (1e-9, 1.0, 1e5):

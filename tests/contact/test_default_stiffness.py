@@ -40,7 +40,7 @@ def test_cloth_thrown_at_a_ball_is_stopped(device, radius, speed, young, dt):
     assert state.velocities()[:, 2].max() > -0.9 * speed  # some vertex was stopped
 
 
-def test_forces_of_a_state_are_those_of_its_step(device):
+def test_contact_forces_of_a_state_equal_its_momentum_change(device):
     """Implicit Euler has h sum F = P1 - P0 - h W, also with inertia in the stiffness, which `State` keeps."""
     dt, model, state, braced = 1e-3, *thrown_cloth(0.05, 5.0, device, 1e4), 0
     integrator, mass = ddg.Integrator(model, rtol=1e-8), model.net.host.mass[:, :1]
@@ -59,7 +59,7 @@ def test_forces_of_a_state_are_those_of_its_step(device):
     assert braced
 
 
-def test_a_restart_is_the_same(device):
+def test_restart_is_bitwise_equal(device):
     """The snapshot is of a step with inertia in the stiffness."""
     model, state = thrown_cloth(0.05, 5.0, device, 1e4, friction=0.3)
     integrator = ddg.Integrator(model)
@@ -71,7 +71,7 @@ def test_a_restart_is_the_same(device):
     np.testing.assert_array_equal(continued.points(), restarted.points())
 
 
-def test_a_given_stiffness_stays_as_it_is(device):
+def test_given_stiffness_is_kept(device):
     """Too small a stiffness is refused, and the first remedy named works."""
     model, state = thrown_cloth(0.05, 2.0, device, stiffness=20.0)
     assert not model.net.host.touching.inertia.any()
@@ -92,7 +92,7 @@ def test_a_given_stiffness_stays_as_it_is(device):
 
 @pytest.mark.parametrize("gravity", [0.0, 1.0])
 @pytest.mark.parametrize("kind", ["rod", "shell"])
-def test_it_is_the_same_at_every_scale(kind, gravity):
+def test_default_stiffness_is_scale_invariant(kind, gravity):
     """Stiffness over E L, range over L, mass over density L^3 and g density L / E are constant."""
     scaled = []
     for length in (1e-9, 1.0, 1e5):

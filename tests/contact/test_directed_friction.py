@@ -3,45 +3,45 @@
 import numpy as np
 import pytest
 import warp as wp
-from friction_cases import MU, SLIP, VELOCITY, each_case, each_form, hold_to_differences, rates, rubbed
-from pair_cases import CASES, assembled, repeats, state, terms, times
+from friction_cases import MU, SLIP, VELOCITY, assert_central_differences, each_case, each_form, friction_terms, rates
+from pair_cases import CASES, assembled_hessian, assert_repeatable, hessian_product, state, terms
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
 from ddg_warp.solve.contact.shapes import Shapes
 
-WAYS = np.array([1.0, 1.7, 2.5])  # forwards, backwards and across, over MU
+FACTORS = np.array([1.0, 1.7, 2.5])  # forwards, backwards and across, over MU
 RADIUS, RANGE = 5e-3, 1e-4
 
 
-def directed(case: str) -> dict:
+def anisotropic(case: str) -> dict:
     """Return groups and anisotropic factors: rods in one group, shells in the other.
 
     Rods are the first of every pair with a shell; the factors are along the rods.
     """
     shapes, _ = CASES[case]()
     factors = np.ones((2, 2, 3))
-    factors[0] = factors[:, 0] = WAYS
+    factors[0] = factors[:, 0] = FACTORS
     return {"groups": np.array([int(name.startswith("shell")) for name in shapes.names]), "ways": factors}
 
 
 @each_case
 @each_form
-def test_forces_and_products_are_differences(device, case, form):
+def test_forces_and_products_equal_central_differences(device, case, form):
     """No slip changes between forwards and backwards within the differences, where second derivatives jump."""
-    result, positions, _, after = rubbed(case, device, form, seed=5, **directed(case))
-    plain, *_ = rubbed(case, device, form, seed=5, groups=directed(case)["groups"])
+    result, positions, _, after = friction_terms(case, device, form, seed=5, **anisotropic(case))
+    plain, *_ = friction_terms(case, device, form, seed=5, groups=anisotropic(case)["groups"])
     forces = result.forces.numpy()
     assert np.abs(forces - plain.forces.numpy()).max() > 0.1 * np.abs(forces).max()
-    hold_to_differences(result, positions, after)
+    assert_central_differences(result, positions, after)
 
 
 @each_case
 @each_form
 def test_matrix_is_symmetric_and_positive(device, case, form):
-    result, *_ = rubbed(case, device, form, **directed(case))
+    result, *_ = friction_terms(case, device, form, **anisotropic(case))
     n = len(result.forces)
-    flat = assembled(result, n).reshape(3 * n, 3 * n)
+    flat = assembled_hessian(result, n).reshape(3 * n, 3 * n)
     largest = np.abs(flat).max()
     assert np.abs(flat - flat.T).max() < 1e-14 * largest
     assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
@@ -49,9 +49,9 @@ def test_matrix_is_symmetric_and_positive(device, case, form):
 
 @each_case
 @each_form
-def test_friction_takes_energy_and_makes_no_resultant(device, case, form):
+def test_friction_dissipates_energy_without_resultant(device, case, form):
     for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
-        result, _, x, after = rubbed(case, device, form, slip, seed, **directed(case))
+        result, _, x, after = friction_terms(case, device, form, slip, seed, **anisotropic(case))
         forces, taken = result.forces.numpy(), result.dissipated.numpy()[0]
         assert taken == pytest.approx(-(forces * (after - x)).sum(), rel=1e-10)
         assert 0.0 < result.energy.numpy()[0] < taken
@@ -59,25 +59,25 @@ def test_friction_takes_energy_and_makes_no_resultant(device, case, form):
 
 
 @each_case
-def test_two_runs_agree_to_the_bit(device, case):
+def test_runs_agree_bitwise(device, case):
     def run():
-        result, _, x, _ = rubbed(case, device, **directed(case))
-        return [*state(result), times(result, np.random.default_rng(3).normal(size=x.shape))]
+        result, _, x, _ = friction_terms(case, device, **anisotropic(case))
+        return [*state(result), hessian_product(result, np.random.default_rng(3).normal(size=x.shape))]
 
-    repeats(run)
+    assert_repeatable(run)
 
 
 @each_case
-def test_factors_in_single_precision(device, case):
-    whole, _, x, _ = rubbed(case, device, **directed(case))
-    single, *_ = rubbed(case, device, linear=wp.float32, **directed(case))
+def test_float32_factors_keep_forces_and_products(device, case):
+    whole, _, x, _ = friction_terms(case, device, **anisotropic(case))
+    single, *_ = friction_terms(case, device, linear=wp.float32, **anisotropic(case))
     v = np.random.default_rng(6).normal(size=x.shape)
     assert (single.forces.numpy() == whole.forces.numpy()).all()
-    exact = times(whole, v)
-    assert np.abs(times(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
+    exact = hessian_product(whole, v)
+    assert np.abs(hessian_product(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
 
 
-def lying(tilt: float) -> tuple[Shapes, np.ndarray]:
+def rod_on_triangle(tilt: float) -> tuple[Shapes, np.ndarray]:
     """Return a rod in contact with a triangle at one edge, along x but for the `tilt` [rad]."""
     s = np.array([0.0, 0.05, 0.1])
     rod = np.stack([0.05 + s * np.cos(tilt), 0.05 + 0.0 * s, 0.0065 + s * np.sin(tilt)], 1)
@@ -90,11 +90,11 @@ def lying(tilt: float) -> tuple[Shapes, np.ndarray]:
 
 @each_form
 @pytest.mark.parametrize("tilt", [0.0, 0.4, 0.5 * np.pi])
-def test_coulomb_law_by_direction(device, form, tilt):
+def test_anisotropic_coulomb_law(device, form, tilt):
     """Sliding friction is -N D^2 u / |D u|, D of the components along and across the rod; a standing rod has the coefficient across."""
-    shapes, x = lying(tilt)
+    shapes, x = rod_on_triangle(tilt)
     factors = np.ones((2, 2, 3))
-    factors[0, 1] = factors[1, 0] = WAYS
+    factors[0, 1] = factors[1, 0] = FACTORS
     options = {"groups": np.array([1, 0]), "friction": MU, "ways": factors, "velocity": VELOCITY, "friction_law": form}
     result, positions = terms(shapes, x, device, **options)
     result.lag(positions)
@@ -103,8 +103,8 @@ def test_coulomb_law_by_direction(device, form, tilt):
     assert normal > 0.0
     for angle in np.linspace(0.0, 2.0 * np.pi, 9)[:-1] + 0.1:
         u = np.array([np.cos(angle), np.sin(angle)])
-        along = WAYS[0] if u[0] > 0.0 else WAYS[1]
-        D2 = MU**2 * np.array([np.cos(tilt) ** 2 * along**2 + np.sin(tilt) ** 2 * WAYS[2] ** 2, WAYS[2] ** 2])
+        along = FACTORS[0] if u[0] > 0.0 else FACTORS[1]
+        D2 = MU**2 * np.array([np.cos(tilt) ** 2 * along**2 + np.sin(tilt) ** 2 * FACTORS[2] ** 2, FACTORS[2] ** 2])
         after = x.copy()
         after[3:, :2] += 1e3 * SLIP * u
         positions.assign(after)
@@ -116,8 +116,8 @@ def test_coulomb_law_by_direction(device, form, tilt):
 
 
 @each_form
-def test_forces_are_continuous_where_the_slip_turns_back(device, form):
-    shapes, x = lying(0.0)
+def test_friction_is_continuous_where_slip_reverses(device, form):
+    shapes, x = rod_on_triangle(0.0)
     factors = np.ones((2, 2, 3))
     factors[0, 1] = factors[1, 0] = [1.0, 3.0, 2.0]
     options = {"groups": np.array([1, 0]), "friction": MU, "ways": factors, "velocity": VELOCITY, "friction_law": form}
@@ -152,7 +152,7 @@ def rod_on(obstacle, friction=(FORWARDS, BACKWARDS, ACROSS), along=(1.0, 0.0, 0.
     return scene
 
 
-def thrown(scene, direction, device, count: int, dt: float = 1e-3, **options):
+def throw_rod(scene, direction, device, count: int, dt: float = 1e-3, **options):
     """Return mean velocities over `count` steps of a settled rod thrown at 1 m/s; model, integrator and last state."""
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model, **options), model.state()
@@ -175,9 +175,9 @@ def thrown(scene, direction, device, count: int, dt: float = 1e-3, **options):
         ((0.0, -1.0, 0.0), ACROSS),
     ],
 )
-def test_a_rod_slows_by_the_coefficient_of_its_way_and_stops(device, direction, mu):
+def test_deceleration_is_that_of_the_sliding_direction(device, direction, mu):
     count = round(1.3 / (mu * 9.81) / 5e-3)
-    speeds, _, integrator, _ = thrown(rod_on(ddg.Plane()), direction, device, count, 5e-3)
+    speeds, _, integrator, _ = throw_rod(rod_on(ddg.Plane()), direction, device, count, 5e-3)
     start, end = 2, count // 2
     braked = (speeds[start] - speeds[end]) / ((end - start) * 5e-3)
     assert braked @ direction == pytest.approx(mu * 9.81, rel=1e-3)
@@ -187,12 +187,12 @@ def test_a_rod_slows_by_the_coefficient_of_its_way_and_stops(device, direction, 
     assert set(statistics["outcomes"]) == {"converged"} and statistics["contact"]["refused_crossings"] == 0
 
 
-def test_work_of_friction_is_what_a_rod_loses(device):
+def test_friction_work_equals_lost_kinetic_energy(device):
     """Friction work is the sum of -m v1 . (v1 - v0) of implicit Euler steps.
 
     The rod is thrown obliquely; anisotropic friction rotates the velocity towards the rod.
     """
-    speeds, model, integrator, _ = thrown(rod_on(ddg.Plane()), (0.6, 0.8, 0.0), device, 40, rtol=1e-10)
+    speeds, model, integrator, _ = throw_rod(rod_on(ddg.Plane()), (0.6, 0.8, 0.0), device, 40, rtol=1e-10)
     mass = model.net.host.mass[:11, 0].sum()
     taken = -mass * ((speeds[1:] - speeds[:-1]) * speeds[1:])[:, :2].sum()
     assert integrator.statistics()["contact"]["friction_work"] == pytest.approx(taken, rel=1e-3)
@@ -202,7 +202,7 @@ def test_work_of_friction_is_what_a_rod_loses(device):
 
 
 @pytest.mark.parametrize(("heading", "holds"), [(0.0, False), (np.pi, True), (0.5 * np.pi, True)])
-def test_a_slope_between_coefficients_holds_backwards_and_across(device, heading, holds):
+def test_slope_between_coefficients_holds_backwards_and_across(device, heading, holds):
     """The slope has tan = 0.35: forwards a rod slides by g (sin - mu cos), else it sticks, creeping below the threshold."""
     slope = np.arctan(0.35)
     normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
@@ -229,30 +229,31 @@ OBSTACLES = {
 
 @pytest.mark.parametrize("shape", OBSTACLES)
 @pytest.mark.parametrize(("sign", "mu"), [(1.0, FORWARDS), (-1.0, BACKWARDS)])
-def test_every_kind_of_obstacle_knows_the_way(device, shape, sign, mu):
+def test_every_obstacle_has_anisotropic_friction(device, shape, sign, mu):
     """A constraint keeps the rod in one plane, as balls and capsules are round. A large ball has one contact point."""
     scene = rod_on(OBSTACLES[shape])
     scene.fix(0, range(11), "y")
-    speeds, *_ = thrown(scene, (sign, 0.0, 0.0), device, 20)
+    speeds, *_ = throw_rod(scene, (sign, 0.0, 0.0), device, 20)
     assert sign * (speeds[4, 0] - speeds[-1, 0]) / 16e-3 == pytest.approx(mu * 9.81, rel=1e-3)
 
 
-def test_a_coefficient_may_be_zero(device):
+def test_coefficient_may_be_zero(device):
     """A rod moves like a skate, free along the axis and braked across."""
     for direction, mu in (((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, 0.0), ACROSS)):
-        speeds, *_ = thrown(rod_on(ddg.Plane(), (0.0, 0.0, ACROSS)), direction, device, 20)
+        speeds, *_ = throw_rod(rod_on(ddg.Plane(), (0.0, 0.0, ACROSS)), direction, device, 20)
         assert (speeds[4] - speeds[-1]) @ direction / 16e-3 == pytest.approx(mu * 9.81, rel=1e-3, abs=1e-4)
 
 
-def test_three_equal_coefficients_are_one(device):
+def test_equal_coefficients_equal_isotropic_friction_bitwise(device):
     ends = [
-        thrown(rod_on(ddg.Plane(), friction), (0.6, 0.8, 0.0), device, 20)[3].points() for friction in (0.3, (0.3,) * 3)
+        throw_rod(rod_on(ddg.Plane(), friction), (0.6, 0.8, 0.0), device, 20)[3].points()
+        for friction in (0.3, (0.3,) * 3)
     ]
     assert (ends[0] == ends[1]).all()
 
 
-def test_ways_that_are_not_symmetric_are_named(device):
-    options = directed("parallel")
+def test_asymmetric_factors_are_refused_by_name(device):
+    options = anisotropic("parallel")
     options["ways"][0, 1, 2] = 3.0
     shapes, x = CASES["parallel"]()
     with pytest.raises(SceneError, match=r"ways = 3.0 of contact between groups 0 and 1 is not symmetric"):

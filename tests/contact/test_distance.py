@@ -17,7 +17,7 @@ KINDS = {
 REGIONS = {"edges": 9, "point and triangle": 7, "edge and point": 3}
 
 
-def measured(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[np.ndarray, np.ndarray]:
+def closest_points(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[np.ndarray, np.ndarray]:
     """Return offsets (n, 3) and weights (n, 4) of corners (n, 4, 3)."""
     X, W = wp.types.vector(3, real), wp.types.vector(4, real)
     *_, closest = pair_functions(kind, real)
@@ -36,7 +36,7 @@ def measured(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[n
     return r.numpy(), w.numpy()
 
 
-def true(reference, corners: np.ndarray) -> np.ndarray:
+def exact_distances(reference, corners: np.ndarray) -> np.ndarray:
     """Return distances in extended precision, to resolve the boundaries of cases."""
     return reference(*np.moveaxis(corners.astype(np.longdouble), 1, 0)).astype(float)
 
@@ -64,11 +64,11 @@ def configurations() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("case", configurations())
-def test_distances_are_those_of_all_cases(device, name, case):
+def test_distances_equal_the_least_of_all_cases(device, name, case):
     kind, reference = KINDS[name]
     corners = configurations()[case]
-    r, w = measured(kind, corners, device)
-    assert np.linalg.norm(r, axis=1) == pytest.approx(true(reference, corners), abs=2e-14, rel=1e-13)
+    r, w = closest_points(kind, corners, device)
+    assert np.linalg.norm(r, axis=1) == pytest.approx(exact_distances(reference, corners), abs=2e-14, rel=1e-13)
     # the offset joins the closest points, which lie on both primitives
     assert np.einsum("nk,nkd->nd", w, corners) == pytest.approx(r, abs=2e-14)
     side = kind.first
@@ -82,13 +82,13 @@ def test_float32_keeps_seven_digits_of_the_size(device, name):
     kind, reference = KINDS[name]
     for corners in configurations().values():
         corners = corners.astype(np.float32).astype(float)
-        r, _ = measured(kind, corners, device, wp.float32)
-        assert np.linalg.norm(r, axis=1) == pytest.approx(true(reference, corners), abs=2e-5)
+        r, _ = closest_points(kind, corners, device, wp.float32)
+        assert np.linalg.norm(r, axis=1) == pytest.approx(exact_distances(reference, corners), abs=2e-5)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_region_is_met_and_has_zero_weights_outside(device, name):
+def test_every_region_occurs_with_zero_weights_outside(device, name):
     kind, _ = KINDS[name]
-    _, w = measured(kind, configurations()["random"], device)
+    _, w = closest_points(kind, configurations()["random"], device)
     regions = {tuple(row) for row in w != 0.0}
     assert len(regions) == REGIONS[name]

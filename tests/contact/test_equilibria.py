@@ -43,7 +43,7 @@ def weight(model) -> float:
     return -float(tangent.loads(1.0, tangent.dofs(model.state())).sum())
 
 
-def pressed(n: int, law: str, position: float, both: bool):
+def beam_under_a_ball(n: int, law: str, position: float, both: bool):
     """Return a beam of 1 m along x, clamped at one end or both, on which a ball moves down."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n), section=ddg.Circle(0.01), material=RUBBER)
@@ -75,11 +75,11 @@ def test_crossed_beams_are_springs(device, law, load_steps):
 
 @each_law
 @pytest.mark.parametrize(("position", "both", "spring"), [(0.5, True, 192.0), (1.0, False, 3.0)])
-def test_a_ball_pressed_on_a_beam(device, law, position, both, spring):
+def test_ball_on_a_beam_matches_euler_bernoulli(device, law, position, both, spring):
     """F = 192 EI w / L^3 in the middle of a clamped beam, 3 EI w / L^3 at the tip of a cantilever (Euler and Bernoulli)."""
     errors = []
     for n in (16, 32, 64):
-        scene = pressed(n, law, position, both)
+        scene = beam_under_a_ball(n, law, position, both)
         model = scene.build(device, precision="float64")
         state = statics.solve(model)
         deflection = state.points()[round(position * n), 2]
@@ -90,7 +90,7 @@ def test_a_ball_pressed_on_a_beam(device, law, position, both, spring):
 
 
 @each_law
-def test_a_heavy_rod_is_lifted_off_the_floor(device, law):
+def test_lifted_rod_leaves_the_floor_at_the_closed_form_length(device, law):
     """An end is raised by h and kept level; the rod leaves the floor over l = (72 EI h / w)^(1/4).
 
     From the lift-off point y = F s^3 / 6 EI - w s^4 / 24 EI: height, slope and curvature vanish there, and the floor exerts F. With
@@ -121,7 +121,7 @@ def test_a_heavy_rod_is_lifted_off_the_floor(device, law):
     assert abs(errors[0]) > 2.5 * abs(errors[1]) > 5.0 * abs(errors[2]), errors
 
 
-def chain_over_a_bar():
+def rod_over_a_bar():
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     soft = ddg.Material(young=1e5, density=1000.0)
     rod = scene.add_rod(line((-0.4, 0.0, 0.0), (0.4, 0.0, 0.0), 40), section=ddg.Circle(0.004), material=soft)
@@ -143,7 +143,7 @@ def sheet_on_a_ball():
     return scene
 
 
-@pytest.mark.parametrize("scene", [chain_over_a_bar, sheet_on_a_ball])
+@pytest.mark.parametrize("scene", [rod_over_a_bar, sheet_on_a_ball])
 def test_reactions_carry_the_weight(device, scene):
     model = scene().build(device, precision="float64")
     state = statics.solve(model)
@@ -157,7 +157,7 @@ def test_reactions_carry_the_weight(device, scene):
     np.testing.assert_array_equal(again.points(), state.points())
 
 
-def test_a_rod_rests_in_a_groove(device):
+def test_groove_carries_a_rod_by_normal_forces(device):
     """Two planes are the only supports, and each carries by a normal force."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     scene.add_rod(line((0.01, -0.1, 0.05), (0.01, 0.1, 0.05), 8), section=ddg.Circle(0.005), material=RUBBER)
@@ -170,7 +170,7 @@ def test_a_rod_rests_in_a_groove(device):
     np.testing.assert_allclose(forces(model, state), [[half, 0.0, half], [-half, 0.0, half]], atol=1e-7 * half)
 
 
-def test_an_equilibrium_is_where_damped_motion_ends(device):
+def test_equilibrium_equals_the_limit_of_damped_motion(device):
     """A rod with two clamped ends lies across another rod and a ball."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G), mass_damping=20.0)
     soft = ddg.Material(young=3e8, density=1000.0)
@@ -194,7 +194,7 @@ def test_an_equilibrium_is_where_damped_motion_ends(device):
     np.testing.assert_allclose(contacts.force, ended.force, atol=1e-6 * weight(model))
 
 
-def over(lower: np.ndarray, upper: np.ndarray) -> float:
+def least_height(lower: np.ndarray, upper: np.ndarray) -> float:
     """Return the least height of one polyline over another at crossings in plan view [m]."""
     heights = []
     for a, b in pairwise(lower):
@@ -207,7 +207,7 @@ def over(lower: np.ndarray, upper: np.ndarray) -> float:
 
 @each_law
 @pytest.mark.parametrize("both", [True, False])
-def test_nothing_is_pushed_through_anything(device, law, both):
+def test_large_load_steps_never_cross_rods(device, law, both):
     """Clamps move 0.25 m beyond a beam in one load step and in ten: the rods never cross, and both end alike."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     s = np.linspace(-0.5, 0.5, 17)
@@ -226,11 +226,11 @@ def test_nothing_is_pushed_through_anything(device, law, both):
         a, b = np.repeat(np.arange(16), 16), np.tile(np.arange(16), 16)
         distance = edge_edge(lower[a], lower[a + 1], upper[b], upper[b + 1]).min()
         assert distance > (0.02 if law == "barrier" else 1e-3)
-        assert over(lower, upper) > 0.0
+        assert least_height(lower, upper) > 0.0
     np.testing.assert_allclose(state.points(), once.points(), atol=1e-8)
 
 
-def test_worlds_are_as_alone(device):
+def test_worlds_equal_single_world_equilibria(device):
     """Every world presses a cantilever on a floor by another gravity."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(line((0.0, 0.0, 0.03), (0.5, 0.0, 0.03), 16), section=ddg.Circle(0.004), material=RUBBER)
@@ -250,7 +250,7 @@ def test_worlds_are_as_alone(device):
 
 @each_law
 @pytest.mark.parametrize("name", SCENES)
-def test_the_tangent_of_what_touches(name, law):
+def test_contact_tangent_equals_differences(name, law):
     """Products equal central differences of forces along a direction that moves all free dofs."""
     model = built(scene_of(name, law))
     state, tangent = touching(model), Tangent(model)
@@ -272,7 +272,7 @@ def test_the_tangent_of_what_touches(name, law):
 
 
 @each_law
-def test_what_lies_on_a_floor_swings_upon_it(device, law):
+def test_vertical_vibration_on_a_floor(device, law):
     """A nearly rigid rod vibrates at omega^2 = (dW / dz) / m, by equilibria under slightly more and less weight."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     rod = scene.add_rod(
@@ -321,7 +321,7 @@ def ruck(load: float) -> tuple[float, float]:
 
 
 @each_law
-def test_a_ruck_in_a_rug(device, law):
+def test_ruck_matches_the_elastica(device, law):
     """A heavy rod, too long for the distance between the supports, lies on the floor but for one wave."""
     load, far, n, radius = 3.0, 4.0, 240, 0.005
     shortening, height = ruck(load)
@@ -362,7 +362,7 @@ def rods_with(friction: float = 0.0, objects=None):
     return scene
 
 
-def test_what_equilibria_refuse(device):
+def test_refusals(device):
     def model_of(scene):
         return scene.build(device, precision="float64")
 
@@ -386,7 +386,7 @@ def test_what_equilibria_refuse(device):
         statics.solve(smooth, state)
 
 
-def test_what_nothing_holds_is_carried_away(device):
+def test_unsupported_rod_is_reported_adrift(device):
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     scene.add_rod(line((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 6), section=ddg.Circle(0.005), material=RUBBER)
     scene.add_obstacle(ddg.Sphere((1.0, 0.0, 0.0), 0.1), name="ball")
@@ -396,9 +396,9 @@ def test_what_nothing_holds_is_carried_away(device):
 
 
 @pytest.mark.parametrize("outcome", ["max_iterations", "line_search_failed"])
-def test_what_the_device_does_not_finish_the_host_does(monkeypatch, outcome):
+def test_host_finishes_unconverged_device_solves(monkeypatch, outcome):
     """The device stops near the end, where rounding may keep it from converging: the host finds the same equilibrium."""
-    model = pressed(16, "barrier", 0.5, True).build("cpu", precision="float64")
+    model = beam_under_a_ball(16, "barrier", 0.5, True).build("cpu", precision="float64")
     finished, solve = statics.solve(model), NetEquilibrium.solve
 
     def unfinished(self, state, load_factor, before, increment):
@@ -413,7 +413,7 @@ def test_what_the_device_does_not_finish_the_host_does(monkeypatch, outcome):
     np.testing.assert_allclose(state.points(), finished.points(), rtol=0.0, atol=1e-13)
 
 
-def layers_apart() -> ddg.Scene:
+def separate_layers() -> ddg.Scene:
     """Return crossed layers of rods, far above each other, that only move vertically.
 
     Higher rods are heavier, so that every rod overtakes all rods below.
@@ -435,9 +435,9 @@ def layers_apart() -> ddg.Scene:
     return scene
 
 
-def test_long_ways_past_a_crowd_are_gone_in_parts(device, monkeypatch):
+def test_long_motions_past_many_bodies_are_split(device, monkeypatch):
     """Room for few pairs, or for all pairs along the motion, leads rods that sag far to the same equilibrium."""
-    model = layers_apart().build(device, precision="float64")
+    model = separate_layers().build(device, precision="float64")
     at_once = statics.Equilibrium(model)
     rest = at_once.load(model.state(), 1)
     monkeypatch.setattr(pairs, "CROWD", 1)
@@ -451,9 +451,9 @@ def test_long_ways_past_a_crowd_are_gone_in_parts(device, monkeypatch):
     np.testing.assert_allclose(state.points(), rest.points(), rtol=0.0, atol=1e-8)
 
 
-def test_the_part_of_a_motion_that_is_safe(device, monkeypatch):
+def test_step_fraction_of_a_long_motion(device, monkeypatch):
     """The step fraction reaches up to where crossed rods, 23 mm apart and 4 mm thick, meet. Room for few pairs gives less."""
-    model = layers_apart().build(device, precision="float64")
+    model = separate_layers().build(device, precision="float64")
     before = Tangent(model).dofs(model.state()).reshape(-1, 3)
     z = before[: 40 * 13, 2]
     motion = np.zeros_like(before)

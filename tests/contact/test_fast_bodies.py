@@ -9,7 +9,7 @@ RADIUS, THICK, DT = 2e-3, 0.02, 0.01
 SOFT = ddg.Material(young=1e6, density=1000.0)
 
 
-def passing(shape: str, offset: float) -> ddg.Scene:
+def passing_body(shape: str, offset: float) -> ddg.Scene:
     """Return a rod along z and a body that passes along x by five widths in a step.
 
     `offset` is the distance of the centrelines along y [m].
@@ -31,10 +31,10 @@ def passing(shape: str, offset: float) -> ddg.Scene:
 
 
 @pytest.mark.parametrize("shape", ["ball", "capsule", "rod"])
-def test_what_passes_beside_the_middle_is_met_by_its_surface(device, shape):
+def test_surfaces_collide_where_centrelines_pass(device, shape):
     """Surfaces collide where centrelines pass at less than the thickness, in decoupled steps, too."""
     for off in (0.98 * THICK, 1.2 * THICK + RADIUS):
-        model, ends = passing(shape, off).build(device=device), []
+        model, ends = passing_body(shape, off).build(device=device), []
         for whole in (False, True):
             integrator = ddg.Integrator(model)
             if whole:

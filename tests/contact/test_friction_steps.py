@@ -3,8 +3,20 @@
 import numpy as np
 import pytest
 import warp as wp
-from friction_cases import MU, RATE, SLIP, VELOCITY, each_case, each_form, rates, rubbed
-from pair_cases import CASES, LAWS, MARGIN, REACH, bundle, move, repeats, state, terms, times, upload
+from friction_cases import MU, RATE, SLIP, VELOCITY, each_case, each_form, friction_terms, rates
+from pair_cases import (
+    CASES,
+    LAWS,
+    MARGIN,
+    REACH,
+    assert_repeatable,
+    bundle,
+    hessian_product,
+    move,
+    state,
+    terms,
+    upload,
+)
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
@@ -14,15 +26,19 @@ from ddg_warp.solve.contact.pair_terms import PairTerms
 
 
 @each_case
-def test_two_runs_agree_to_the_bit(device, case):
+def test_runs_agree_bitwise(device, case):
     def run():
-        result, _, x, _ = rubbed(case, device)
-        return [*state(result), times(result, np.random.default_rng(3).normal(size=x.shape)), result.dissipated.numpy()]
+        result, _, x, _ = friction_terms(case, device)
+        return [
+            *state(result),
+            hessian_product(result, np.random.default_rng(3).normal(size=x.shape)),
+            result.dissipated.numpy(),
+        ]
 
-    repeats(run)
+    assert_repeatable(run)
 
 
-def test_worlds_are_alone(device):
+def test_worlds_are_independent(device):
     """Each world has another rate."""
     shapes, x = CASES["crossing"]()
     random = np.random.default_rng(4)
@@ -44,9 +60,9 @@ def test_worlds_are_alone(device):
     assert (together[-1] > 0.0).tolist() == [True, False, True]
 
 
-def test_searches_within_a_step_leave_friction_alone(device):
+def test_searches_within_a_step_do_not_change_friction(device):
     """Contact lists change and change back; slip may count from other positions."""
-    result, positions, x, _ = rubbed("crossing", device)
+    result, positions, x, _ = friction_terms("crossing", device)
     before = state(result)
     number = [pairs.count.numpy()[0] for pairs in result.search.lists]
     away = upload(x + 2.0 * MARGIN * np.random.default_rng(2).normal(size=x.shape), device)
@@ -61,7 +77,7 @@ def test_searches_within_a_step_leave_friction_alone(device):
     assert not result.forces.numpy().any()
 
 
-def test_lists_grow_and_friction_has_to_be_lagged_anew(device):
+def test_growing_lists_require_a_new_lag(device):
     shapes, x = CASES["crossing"]()
     result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
     shifted = upload(x + SLIP, device)
@@ -85,7 +101,7 @@ def test_lists_grow_and_friction_has_to_be_lagged_anew(device):
 
 
 @pytest.mark.parametrize("conditional", [False, True])
-def test_captured_steps(device, conditional):
+def test_captured_steps_equal_uncaptured(device, conditional):
     """Friction is lagged at the end of the last step, also in a conditional node."""
     shapes, x = CASES["crossing"]()
     result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
@@ -118,26 +134,26 @@ def test_captured_steps(device, conditional):
         wp.capture_launch(capture.graph)
         for expected, actual in zip(state(plain), state(result), strict=True):
             assert np.abs(expected - actual).max() <= 1e-13 * np.abs(expected).max()
-        assert np.abs(out.numpy() - times(plain, x)).max() < 1e-12 * np.abs(out.numpy()).max()
+        assert np.abs(out.numpy() - hessian_product(plain, x)).max() < 1e-12 * np.abs(out.numpy()).max()
         assert result.dissipated.numpy()[0] == pytest.approx(plain.dissipated.numpy()[0], rel=1e-12)
         assert result.dissipated.numpy()[0] > 0.0
 
 
 @each_case
 @each_form
-def test_factors_in_single_precision(device, case, form):
-    whole, _, x, _ = rubbed(case, device, form)
-    single, *_ = rubbed(case, device, form, linear=wp.float32)
+def test_float32_factors_keep_forces_and_products(device, case, form):
+    whole, _, x, _ = friction_terms(case, device, form)
+    single, *_ = friction_terms(case, device, form, linear=wp.float32)
     v = np.random.default_rng(6).normal(size=x.shape)
     assert (single.forces.numpy() == whole.forces.numpy()).all()
-    exact = times(whole, v)
-    assert np.abs(times(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
+    exact = hessian_product(whole, v)
+    assert np.abs(hessian_product(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
 
 
 @each_case
-def test_all_in_single_precision(device, case):
+def test_float32_positions(device, case):
     """Float32 positions resolve a slip of 1 mm to 1e-4."""
-    whole, _, x, after = rubbed(case, device, slip=1e-3, velocity=1.0)
+    whole, _, x, after = friction_terms(case, device, slip=1e-3, velocity=1.0)
     positions = upload(x, device, wp.vec3f)
     search = BroadPhase(CASES[case]()[0], positions, reach=REACH, margin=MARGIN)
     single = PairTerms(search, smooth_penalty, **LAWS["penalty"][1], friction=MU, velocity=1.0)
@@ -148,7 +164,7 @@ def test_all_in_single_precision(device, case):
     v = np.random.default_rng(7).normal(size=x.shape)
     for value, exact in (
         (single.forces.numpy(), whole.forces.numpy()),
-        (times(single, v), times(whole, v)),
+        (hessian_product(single, v), hessian_product(whole, v)),
         (single.dissipated.numpy(), whole.dissipated.numpy()),
     ):
         assert np.abs(value - exact).max() < 1e-3 * np.abs(exact).max()
@@ -166,12 +182,12 @@ def test_all_in_single_precision(device, case):
         ({"velocity": 0.0}, r"velocity = 0.0 of friction; it is positive and finite"),
     ],
 )
-def test_wrong_parameters_are_named(device, options, message):
+def test_invalid_parameters_are_refused_by_name(device, options, message):
     with pytest.raises(SceneError, match=message):
         terms(*bundle(), device, **options)
 
 
-def test_rates_that_do_not_fit_are_refused(device):
+def test_rates_of_wrong_size_or_type_are_refused(device):
     result, positions = terms(*bundle(), device, friction=MU)
     result.lag(positions)
     for wrong in (rates(result, 1.0, 2.0), wp.ones(1, dtype=wp.float32, device=device)):

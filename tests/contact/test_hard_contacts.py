@@ -10,9 +10,9 @@ from hard_cases import (
     WEIGHT,
     assert_no_energy_is_made,
     energy,
+    fix_nodes,
     forces_on,
     heap_at_rest,
-    hold,
     least_gap,
     line,
     mass_of_node,
@@ -26,7 +26,7 @@ from ddg_warp.geometry import meshes
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
 @pytest.mark.parametrize("pull", [0.2, 0.6])
-def test_a_rod_in_the_groove_of_two_others_along_it(device, pull, law):
+def test_rod_in_the_groove_of_two_parallel_rods(device, pull, law):
     """Three rods are parallel; both normal forces are N / 2 = W / (2 cos a), and friction is at most mu N.
 
     The rod sticks, creeping below the stick threshold, or slides by T / m - mu N / m.
@@ -34,7 +34,7 @@ def test_a_rod_in_the_groove_of_two_others_along_it(device, pull, law):
     length, velocity, dt = 0.1, 1e-4, 2e-3
     scene = ddg.Scene()
     for name, y in (("left", -1.3 * RADIUS), ("right", 1.3 * RADIUS)):
-        hold(scene, rod(scene, line(0.4, 40, middle=(0.1, y, 0.0)), name), 41)
+        fix_nodes(scene, rod(scene, line(0.4, 40, middle=(0.1, y, 0.0)), name), 41)
     height = np.sqrt(2.2**2 - 1.3**2) * RADIUS
     upper = rod(scene, line(length, 10, middle=(0.0, 0.0, height)), "upper")
     for node in range(11):
@@ -58,7 +58,7 @@ def test_a_rod_in_the_groove_of_two_others_along_it(device, pull, law):
         assert least_gap(model, states[-1]) > 0.0
 
 
-def pair(gap: float, shift: float = 0.0) -> ddg.Scene:
+def parallel_rods(gap: float, shift: float = 0.0) -> ddg.Scene:
     """Return two equal parallel rods above each other."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod(scene, line(0.1, 10), "lower")
@@ -68,12 +68,12 @@ def pair(gap: float, shift: float = 0.0) -> ddg.Scene:
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.005, 0.0025])
-def test_parallel_edges_push_as_their_energy_says(device, shift):
+def test_force_of_parallel_edges_is_the_energy_gradient(device, shift):
     """F = -dE/dgap by central differences, node over node, over the middle of an edge, and between; zero at the range."""
     gap, h = 0.4 * RANGE, 1e-7 * RANGE
 
     def evaluate(gap):
-        model = pair(gap, shift).build(device=device)
+        model = parallel_rods(gap, shift).build(device=device)
         return model, model.contacts(model.state()), model.energies(model.state())["contact"]
 
     force = forces_on(evaluate(gap)[1], 1).sum(0)
@@ -84,17 +84,17 @@ def test_parallel_edges_push_as_their_energy_says(device, shift):
     _, contacts, least = evaluate(RANGE * (1.0 - 1e-9))
     assert np.isfinite(contacts.force).all()
     assert 0.0 <= least < 1e-18 * evaluate(gap)[2]
-    _, _, states = run(pair(RANGE), device, 5, 0.01)
+    _, _, states = run(parallel_rods(RANGE), device, 5, 0.01)
     np.testing.assert_array_equal(states[-1].points(), states[0].points())
 
 
-def test_edges_in_the_same_place_are_refused(device):
-    model = pair(-2.0 * RADIUS).build(device=device)
+def test_coincident_edges_are_refused(device):
+    model = parallel_rods(-2.0 * RADIUS).build(device=device)
     with pytest.raises(ddg.SceneError, match=r"edge \d+ of rod 0 .* and edge \d+ of rod 1 .* overlap by 0.004 m"):
         ddg.Integrator(model).step(model.state(), 0.01)
 
 
-def test_rods_in_one_line_meet_with_their_ends(device):
+def test_collinear_rods_collide_end_to_end(device):
     """The rods bounce along the line and never move sideways; momentum is zero throughout."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod(scene, line(0.1, 10, middle=(-0.05 - 1.5 * RADIUS, 0.0, 0.0)), "left")
@@ -112,7 +112,7 @@ def test_rods_in_one_line_meet_with_their_ends(device):
 
 
 @pytest.mark.parametrize("layers", [8, pytest.param(50, marks=pytest.mark.slow)])
-def test_a_stack_of_sheets(device, layers):
+def test_stacked_sheets_carry_the_weight_above(device, layers):
     """Sheets k and k + 1 exchange (layers - 1 - k) m g, and the floor carries all sheets."""
     thickness, gap, side = 1e-3, 2.5e-4, 0.02
     scene = ddg.Scene(mass_damping=5.0)
@@ -172,7 +172,7 @@ def winding(points: np.ndarray, axis: np.ndarray) -> float:
     return float(((step + np.pi) % (2.0 * np.pi) - np.pi).sum())
 
 
-def test_a_whip_winds_about_a_post(device):
+def test_whip_winds_about_a_post(device):
     """The tip moves 1.7 m in a step. The winding angle is positive, and negative had the rod crossed the post."""
     (model, integrator, states), axis = whip(device, "post", retries=4)
     angles = [winding(state.points()[:21], axis) for state in states]
@@ -184,7 +184,7 @@ def test_a_whip_winds_about_a_post(device):
     np.testing.assert_array_equal(again[-1].points(), states[-1].points())
 
 
-def test_a_whip_hits_another_rod(device):
+def test_whip_hits_another_rod(device):
     """The rods bend. Steps in which centrelines would cross are counted and repeated in substeps."""
     (model, integrator, states), _ = whip(device, "rod", retries=120)
     assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
@@ -194,11 +194,11 @@ def test_a_whip_hits_another_rod(device):
     assert_no_energy_is_made(energy(model, states))
 
 
-def test_a_rod_at_100_metres_a_second_flies_past(device):
+def test_fast_rod_passes_obstacles_beyond_range_unslowed(device):
     """The gaps to an obstacle and to a rod exceed the range, and the rod moves 1.7 m in a step: nothing decelerates it."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod(scene, line(0.1, 10), "shot")
-    hold(scene, rod(scene, line(0.1, 10, (0.0, 1.0, 0.0), (3.0, 0.0, 3.1 * RADIUS)), "gate"), 11)
+    fix_nodes(scene, rod(scene, line(0.1, 10, (0.0, 1.0, 0.0), (3.0, 0.0, 3.1 * RADIUS)), "gate"), 11)
     scene.add_obstacle(ddg.Capsule((2.0, -1.0, -0.0131), (2.0, 1.0, -0.0131), 0.01), name="rail")
     scene.contact(range=RANGE, friction=MU)
     speed = np.zeros((22, 3))
@@ -213,7 +213,7 @@ def test_a_rod_at_100_metres_a_second_flies_past(device):
 
 @pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("young", [1e4, 1e6, 1e9])
-def test_stiff_contact_of_soft_rods_and_the_reverse(device, ratio, young):
+def test_collisions_at_any_stiffness_ratio_lose_energy(device, ratio, young):
     """Contact stiffness over m / dt^2 and Young's modulus vary: colliding rods bounce and only lose energy."""
     dt = 1e-3
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -233,7 +233,7 @@ def test_stiff_contact_of_soft_rods_and_the_reverse(device, ratio, young):
 
 
 @pytest.mark.parametrize("ratio", [1e-3, 1e4])
-def test_stiff_and_soft_contact_carry_what_rests(device, ratio):
+def test_stiff_and_soft_contact_carry_the_weight(device, ratio):
     # a landing on soft contact closes most of the gap at once, and that step is repeated
     model, integrator, states = run(heap_at_rest(ratio, 2e-3), device, 300, 2e-3, retries=int(ratio < 1.0))
     contacts = model.contacts(states[-1])
@@ -241,7 +241,7 @@ def test_stiff_and_soft_contact_carry_what_rests(device, ratio):
     assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] <= contacts.gap.min() + 1e-12
 
 
-def test_contact_too_soft_for_what_it_carries_says_so(device):
+def test_too_soft_contact_is_reported(device):
     """The force k range^2 / gap stays below the weight down to a thousandth of the range."""
     with pytest.raises(
         ddg.SolverError, match=r"no_room .* point \d+ of rod \d .* give their contact a larger stiffness"
@@ -251,12 +251,12 @@ def test_contact_too_soft_for_what_it_carries_says_so(device):
     assert np.isfinite(error.value.state.points()).all()
 
 
-def test_a_rod_on_a_grating_of_sixty(device):
+def test_grating_of_sixty_bars_carries_a_rod_evenly(device):
     """Each inner bar carries the load of one pitch, and all bars together carry the whole load."""
     bars, pitch = 60, 6.0 * RADIUS
     scene = ddg.Scene(mass_damping=10.0)
     for bar in range(bars):
-        hold(scene, rod(scene, line(0.04, 4, (0.0, 1.0, 0.0), ((bar + 1) * pitch, 0.0, 0.0)), "bar"), 5)
+        fix_nodes(scene, rod(scene, line(0.04, 4, (0.0, 1.0, 0.0), ((bar + 1) * pitch, 0.0, 0.0)), "bar"), 5)
     length, edges = (bars + 1) * pitch, 2 * (bars + 1)
     upper = rod(scene, line(length, edges, middle=(0.5 * length, 0.0, 2.3 * RADIUS)), "upper")
     pressed = 50.0 * WEIGHT * length / edges
@@ -274,7 +274,7 @@ def test_a_rod_on_a_grating_of_sixty(device):
 
 
 @pytest.mark.parametrize("speed", [0.0, 1e-3, 1.0])
-def test_what_rubs_is_told_by_the_velocities_of_a_state(device, speed):
+def test_friction_of_a_state_follows_its_velocities(device, speed):
     """A rod within range of a floor moves at 30 degrees to x: friction is mu N (2 / (1 + exp(-15 v / nu)) - 1) against the motion."""
     velocity, direction = 5e-3, np.array([np.cos(np.pi / 6.0), 0.5, 0.0])
     scene = ddg.Scene()
@@ -292,7 +292,7 @@ def test_what_rubs_is_told_by_the_velocities_of_a_state(device, speed):
     np.testing.assert_allclose(sign[:, None] * contacts.friction, expected, rtol=1e-6, atol=1e-12)
 
 
-def test_friction_that_is_told_is_what_slows_a_rod(device):
+def test_reported_friction_decelerates_a_rod(device):
     """A settled rod slides on a floor: over a small step friction alone changes the momentum."""
     scene = ddg.Scene()
     rod(scene, line(0.1, 10, middle=(0.0, 0.0, RADIUS + 0.6 * RANGE)))

@@ -24,7 +24,7 @@ from ddg_warp.geometry import meshes
 LAWS = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
-def collision(friction: float, law: str) -> tuple[ddg.Scene, np.ndarray]:
+def colliding_objects(friction: float, law: str) -> tuple[ddg.Scene, np.ndarray]:
     """Return two rods without twist and a sheet that collide, and velocities."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod(scene, line(0.1, 10, middle=(0.0, 0.01, 0.03)), "first", twist=False)
@@ -39,13 +39,13 @@ def collision(friction: float, law: str) -> tuple[ddg.Scene, np.ndarray]:
 
 @LAWS
 @pytest.mark.parametrize("friction", [0.0, MU])
-def test_internal_contact_keeps_momentum(device, friction, law):
+def test_internal_contact_conserves_momentum(device, friction, law):
     """Contact and friction forces sum to zero to rounding, as do moments of contact; momentum is conserved to the solver's tolerance.
 
     Implicit Euler has sum x1 x m (v1 - v0) = 0 where the moments of all forces vanish. Friction acts between centrelines, whose
     distance is the arm of a couple, so that this holds without friction only.
     """
-    scene, speed = collision(friction, law)
+    scene, speed = colliding_objects(friction, law)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model, rtol=1e-11), model.state(velocities=speed)
     contact, mass = integrator._net.newton.contact, model.net.host.mass[: len(speed), :1]
@@ -90,7 +90,7 @@ def test_friction_never_adds_energy(device, law):
     assert 0.0 < works[-1] < total[0.5][0] - total[0.5][-1]
 
 
-def test_a_rod_rests_for_a_minute_on_a_slope(device):
+def test_rod_on_a_slope_creeps_by_the_friction_law_for_a_minute(device):
     """The rod creeps at nu atanh(tan(slope) / mu) / 7.5, by the logistic law below nu, and does not sink."""
     slope, friction, velocity = 0.3, 0.5, 1e-4
     normal, down = np.array([np.sin(slope), 0.0, np.cos(slope)]), np.array([np.cos(slope), 0.0, -np.sin(slope)])
@@ -106,7 +106,7 @@ def test_a_rod_rests_for_a_minute_on_a_slope(device):
     assert np.abs((last - settled) @ normal).max() < 1e-8 * RADIUS
 
 
-def test_a_heap_rests_for_a_minute(device):
+def test_heap_stays_at_rest_for_a_minute(device):
     """Friction stops bent rods but for a creep of a hundredth of the threshold, 1e-5 m/s."""
     model, integrator, states = run(heap_at_rest(None, 0.05), device, 1200, 0.05)
     moved = np.abs(states[-1].points() - states[200].points()).max()
@@ -118,7 +118,7 @@ def test_a_heap_rests_for_a_minute(device):
 
 
 @pytest.mark.parametrize("cells", [8, pytest.param(16, marks=pytest.mark.slow)])
-def test_a_sheet_is_crumpled_in_a_shrinking_box(device, cells):
+def test_crumpled_sheet_never_crosses_itself(device, cells):
     """Six planes close in to a fifth of the side; the sheet has self-contact all over and crosses itself nowhere."""
     side, thickness, dt, steps, least = 0.1, 1e-3, 0.02, 60, 0.2
     points, triangles = meshes.rectangle(cells, cells, (side, side), "alternating")
@@ -163,7 +163,7 @@ ON_THE_CPU = [
 ]
 
 
-def falls(device, order) -> dict[str, np.ndarray]:
+def drop_objects(device, order) -> dict[str, np.ndarray]:
     """Return positions after 0.3 s by object, added in some order: a sheet falls on a ball and a floor, and rods on the sheet."""
     points, triangles = meshes.rectangle(4, 4, (0.1, 0.1), "alternating")
     scene = ddg.Scene(mass_damping=1.0)
@@ -189,13 +189,13 @@ def falls(device, order) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("order", [NAMES[::-1], ["rod1", "floor", "sheet", "rod2", "rod0", "ball"]])
 def test_the_order_of_objects_does_not_matter(device, order):
-    first = falls(device, NAMES)
-    for name, points in falls(device, order).items():
+    first = drop_objects(device, NAMES)
+    for name, points in drop_objects(device, order).items():
         np.testing.assert_allclose(points, first[name], atol=1e-6 * RADIUS)
 
 
 def test_devices_agree(device):
     """Corners of the sheet and middles of the rods equal a float64 run on one core to a millionth of a radius [m]."""
-    positions = falls(device, NAMES)
+    positions = drop_objects(device, NAMES)
     points = np.concatenate([positions["sheet"][[0, 4, 20, 24]], [positions[f"rod{k}"][5] for k in range(3)]])
     np.testing.assert_allclose(points, ON_THE_CPU, atol=1e-6 * RADIUS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eager_steps import eagerly
+from eager_steps import step_without_capture
 
 import ddg_warp as ddg
 from ddg_warp.errors import SolverError
@@ -12,7 +12,7 @@ from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.tangent import Tangent
 
 
-def test_steps_that_are_cut_end_in_balance(device):
+def test_steps_cut_by_ccd_converge(device):
     """A clamp draws a rod onto a floor almost in contact: CCD cuts the motion to nothing while residuals are large."""
     radius, gap, edges = 2e-3, 2e-5, 40
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -33,7 +33,7 @@ def test_steps_that_are_cut_end_in_balance(device):
     assert list(integrator.statistics()["outcomes"]) == ["converged"]
 
 
-def test_what_a_whole_step_brings_there_is_there(device, monkeypatch):
+def test_whole_step_completes_the_prescribed_motion(device, monkeypatch):
     """A clamp draws a rod onto another, and CCD cuts the predictor: one whole step completes the prescribed motion, despite float32."""
     s = np.linspace(-0.05, 0.05, 13)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -55,7 +55,7 @@ def test_what_a_whole_step_brings_there_is_there(device, monkeypatch):
 
     monkeypatch.setattr(NetContact, "place", watched(place))
     monkeypatch.setattr(NetContact, "hold", watched(hold))
-    eagerly(ddg.Integrator(model, rtol=1e-3), model.state(), 1 / 240)
+    step_without_capture(ddg.Integrator(model, rtol=1e-3), model.state(), 1 / 240)
     predictor, *steps = records
     assert predictor[0] < 1.0 and predictor[2] == ON_THE_WAY
     whole = [driven for fraction, length, driven in steps if fraction == 1.0 and length == 1.0]
@@ -63,7 +63,7 @@ def test_what_a_whole_step_brings_there_is_there(device, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_knot_is_drawn_until_it_locks(device):
+def test_knot_is_tightened_until_it_locks(device):
     """Every step far beyond the loose knot converges, until no room is left. The error names the edges; no rod crosses."""
     scene = overhand_knot.build(tighter=100.0, steps=200)
     model = scene.build(device=device)

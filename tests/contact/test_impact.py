@@ -13,7 +13,7 @@ FRAMES = 2001
 SIDES = {"edges": (2, 2), "point and triangle": (1, 3)}
 
 
-def pairs_apart(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, np.ndarray]:
+def random_pairs(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, np.ndarray]:
     """Return one pair in each of `count` worlds, random in position and motion.
 
     A point is the end of an edge that is itself in no pair.
@@ -36,7 +36,7 @@ def gaps(shapes: Shapes, name: str, x: np.ndarray) -> np.ndarray:
     """Return the gaps (pairs, worlds) of all pairs at x (worlds, nodes, 3)."""
     result = []
     for side in [SIDES["edges"]] + [SIDES["point and triangle"]] * (name != "edges"):
-        for i, j in zip(*brute_force.allowed(shapes, *side), strict=True):
+        for i, j in zip(*brute_force.admissible_pairs(shapes, *side), strict=True):
             nodes_a, radius_a, *_ = shapes.things(side[0])
             nodes_b, radius_b, *_ = shapes.things(side[1])
             corners = [*np.moveaxis(x[:, nodes_a[i]], 1, 0), *np.moveaxis(x[:, nodes_b[j]], 1, 0)]
@@ -46,8 +46,8 @@ def gaps(shapes: Shapes, name: str, x: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", SIDES)
-def test_time_of_impact_is_never_late_and_not_much_too_early(device, name):
-    shapes, x, move = pairs_apart(name, 1, 500)
+def test_time_of_impact_is_conservative_and_tight(device, name):
+    shapes, x, move = random_pairs(name, 1, 500)
     search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), len(x), reach=REACH, margin=MARGIN)
     search.impact(upload(x.reshape(-1, 3), device), upload(move.reshape(-1, 3), device))
     time = search.time.numpy()
@@ -67,7 +67,7 @@ def test_time_of_impact_is_never_late_and_not_much_too_early(device, name):
     assert (time[hit] < 1.0).all()
 
 
-def test_head_on_impact_by_its_closed_form(device):
+def test_head_on_impact_matches_its_closed_form(device):
     """Crossed edges at distance 1 with radii 0.1 approach by 2: contact is at 0.4, and a tenth of the gap of 0.8 is left at 0.36."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 1.0, 1.0]])
     move = np.array([[0.0, 0.0, 1.0]] * 2 + [[0.0, 0.0, -1.0]] * 2)
@@ -121,7 +121,7 @@ def test_crossings_are_counted_exactly(device, offset):
 
 
 @pytest.mark.parametrize("distance", [1e-4, 0.0])
-def test_what_slides_past_close_by_has_not_crossed(device, distance):
+def test_close_sliding_is_no_crossing(device, distance):
     """A rod slides by ten thousand times the distance from another, across or along. Rods at no distance meet."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.5, -1.0, distance], [-0.5, 1.0, distance]])
     shapes = Shapes(points)
@@ -134,7 +134,7 @@ def test_what_slides_past_close_by_has_not_crossed(device, distance):
         assert search.crossed.numpy()[0] == (distance == 0.0)
 
 
-def test_crossings_are_found_whether_candidates_hold_or_not(device):
+def test_crossings_are_found_without_a_new_search(device):
     """A rod falls past another, within half of the margin and farther, without a new search."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 3e-3], [0.0, 1.0, 3e-3]])
     shapes = Shapes(points)
@@ -150,7 +150,7 @@ def test_crossings_are_found_whether_candidates_hold_or_not(device):
     assert search.searches.numpy()[0] == searches
 
 
-def test_crossings_of_random_motion_are_those_of_signed_volumes(device):
+def test_crossings_equal_roots_of_signed_volumes(device):
     """A pair crosses at a root of the volume of four nodes, a cubic in time, if the closest points are interior."""
     rng = np.random.default_rng(3)
     n = 2000

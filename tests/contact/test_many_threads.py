@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from brute_force import listed, scene, upload
+from brute_force import candidate_pairs, scene, upload
 
 import ddg_warp as ddg
 from ddg_warp import arrays
@@ -25,19 +25,19 @@ def many(monkeypatch):
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
-def test_candidates_are_the_same(device, many, worlds):
+def test_candidates_do_not_depend_on_the_thread_mapping(device, many, worlds):
     shapes, points = scene(1, 0.3)
     rng = np.random.default_rng(1)
     x = upload(np.concatenate([points + 1e-3 * rng.normal(size=points.shape) for _ in range(worlds)]), device)
-    one = listed(BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN))
+    one = candidate_pairs(BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN))
     many()
     search = BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN)
     assert max(len(side._found) for side in search.lists) > 4
-    for expected, actual in zip(one, listed(search), strict=True):
+    for expected, actual in zip(one, candidate_pairs(search), strict=True):
         np.testing.assert_array_equal(expected, actual)
 
 
-def test_walks_go_along_a_morton_curve(device):
+def test_walk_order_follows_a_morton_curve(device):
     """Keys of three times ten bits increase, world by world; boxes outside the bounds are clamped to the sides."""
     rng, count = np.random.default_rng(2), 200
     for worlds in (1, 3):
@@ -76,7 +76,7 @@ def crossed_layers() -> ddg.Scene:
     return model
 
 
-def test_steps_are_the_same(device, many):
+def test_steps_do_not_depend_on_the_thread_mapping(device, many):
     """The order of summation differs, and 40 steps with impacts amplify rounding."""
     results = []
     for _ in range(2):

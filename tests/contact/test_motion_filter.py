@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
-from brute_force import SIDES, listed, near, scene, upload
-from motion_cases import MARGIN, REACH, Motion, tangle, units_of
-from test_impact import gaps, pairs_apart
+from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
+from motion_cases import MARGIN, REACH, Motion, ccd_bodies, tangle
+from test_impact import gaps, random_pairs
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
@@ -15,16 +15,16 @@ from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
 
 
-def gone(gap: float) -> float:
+def allowed_closing(gap: float) -> float:
     """Return how far a gap may close at once [m]: to `REST` of the gap, or to `NEAR` of gap or reach where that is more."""
     return gap - max(REST * gap, NEAR * min(gap, REACH))
 
 
-def wish(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
+def random_displacements(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
     """Return random displacements of nodes, or of objects with a tenth of node motion added."""
     move = rng.normal(size=shapes.points.shape)
     if kind != "node":
-        unit, units = units_of(shapes, "object")
+        unit, units = ccd_bodies(shapes, "object")
         move = rng.normal(size=(units, 3))[unit] + 0.1 * move
     return size * move
 
@@ -32,13 +32,13 @@ def wish(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["node", "object", "world"])
 @pytest.mark.parametrize("size", [0.01, 0.5])
 @pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
-def test_no_gap_closes_and_nothing_passes(device, kind, size, dtype):
+def test_limited_motions_close_no_gap_and_never_cross(device, kind, size, dtype):
     """Three motions follow each other, each once to fifty times the margin."""
     shapes, points = tangle(5)
     motion, rng = Motion(shapes, points, device, kind, dtype=dtype), np.random.default_rng(6)
     rounding = 1e-12 if dtype is wp.vec3d else 1e-6
     for _ in range(3):
-        base, move = motion.base.numpy().astype(float), wish(shapes, rng, size, kind)
+        base, move = motion.base.numpy().astype(float), random_displacements(shapes, rng, size, kind)
         landing = motion(move).astype(float)
         search, fractions = motion.search, motion.search.shares.numpy()
         assert (
@@ -51,12 +51,12 @@ def test_no_gap_closes_and_nothing_passes(device, kind, size, dtype):
         )
         for t in np.linspace(0.0, 1.0, 5):
             for side in SIDES:
-                assert not near(shapes, base + t * (landing - base), *side, 0.0)
+                assert not near_pairs(shapes, base + t * (landing - base), *side, 0.0)
         search.crossings(motion.base, upload(landing - base, device, dtype))
         assert search.crossed.numpy()[0] == 0
         # candidates are valid at the end of the motion
-        for side, candidates in zip(SIDES, listed(search), strict=True):
-            assert near(shapes, landing, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
+        for side, candidates in zip(SIDES, candidate_pairs(search), strict=True):
+            assert near_pairs(shapes, landing, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
         searches = search.searches.numpy()[0]
         search.update(upload(landing + 0.49 * MARGIN / np.sqrt(3.0), device, dtype))
         assert search.searches.numpy()[0] == searches
@@ -67,9 +67,9 @@ def test_no_gap_closes_and_nothing_passes(device, kind, size, dtype):
 
 @pytest.mark.parametrize("name", ["edges", "point and triangle"])
 @pytest.mark.parametrize("kind", ["node", "object", "world"])
-def test_pairs_stop_in_time_and_not_much_too_early(device, name, kind):
+def test_random_pairs_stop_in_time_and_close_by(device, name, kind):
     """Random pairs, one in each of 300 worlds, are sampled densely in time: pairs without initial overlap stay separate."""
-    shapes, x, move = pairs_apart(name, 2, 300)
+    shapes, x, move = random_pairs(name, 2, 300)
     motion = Motion(shapes, x.reshape(-1, 3), device, kind, worlds=len(x))
     landing = motion(move.reshape(-1, 3)).reshape(x.shape)
     time = motion.search.time.numpy()
@@ -84,7 +84,7 @@ def test_pairs_stop_in_time_and_not_much_too_early(device, name, kind):
 
 
 @pytest.mark.parametrize("kind", ["node", "object", "world"])
-def test_a_motion_that_all_share_is_not_shortened(device, kind):
+def test_common_translation_is_not_limited(device, kind):
     """The translation is a thousand times the distance of objects, with small random node motion added."""
     shapes, points = tangle(7)
     rng = np.random.default_rng(8)
@@ -95,22 +95,22 @@ def test_a_motion_that_all_share_is_not_shortened(device, kind):
     assert motion.search.time.numpy()[0] == 1.0 and motion.search.limited.numpy()[0] == 0
 
 
-def test_what_goes_together_needs_few_candidates(device):
+def test_common_motion_needs_no_more_candidates_than_rest(device):
     """Separate step fractions need more than 30 times as many candidates for a motion of fifty margins."""
     shapes, points = tangle(9)
     move = np.tile([0.3, 0.4, 0.0], (len(points), 1))
     x, step = upload(points, device), upload(move, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    rest = [candidates.tolist() for candidates in listed(search)]
+    rest = [candidates.tolist() for candidates in candidate_pairs(search)]
     search.search(x, step, wp.ones(1, dtype=int, device=device))
-    assert [candidates.tolist() for candidates in listed(search)] == rest
+    assert [candidates.tolist() for candidates in candidate_pairs(search)] == rest
     search.search(x, step)
     while search.fit(x):
         search.search(x, step)
-    assert len(listed(search)[0]) > 30 * len(rest[0])
+    assert len(candidate_pairs(search)[0]) > 30 * len(rest[0])
 
 
-def test_one_tight_pair_holds_nobody_else(device):
+def test_one_tight_pair_limits_no_other_body(device):
     """A thousand rods side by side sink by three spacings; the first two, crossed by a fixed rod, stop alone."""
     n, spacing = 1000, 0.05
     y = spacing * np.arange(n)
@@ -125,14 +125,14 @@ def test_one_tight_pair_holds_nobody_else(device):
     landing = motion(move)
     fractions = motion.search.shares.numpy()
     # the gap of 0.02 may close by nine tenths
-    assert fractions[:2] == pytest.approx(gone(0.02) / (3.0 * spacing), rel=1e-9)
+    assert fractions[:2] == pytest.approx(allowed_closing(0.02) / (3.0 * spacing), rel=1e-9)
     assert (fractions[2:n] == 1.0).all()
     assert motion.search.limited.numpy()[0] == 3
     assert (landing[4:] == (points + move)[4:]).all()
 
 
 @pytest.mark.parametrize("layers", [40, ROUNDS + 10])
-def test_what_falls_on_what_has_stopped_stops_layer_by_layer(device, layers):
+def test_falling_layers_stop_one_after_another(device, layers):
     """Crossed layers fall on the floor by five spacings: up to `ROUNDS` layers, upper layers go farther than the first."""
     spacing = 0.02
     ends = np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]])
@@ -151,7 +151,7 @@ def test_what_falls_on_what_has_stopped_stops_layer_by_layer(device, layers):
     fractions = motion.search.shares.numpy()[:layers]
     height = landing[: 2 * layers : 2, 2]
     assert (np.diff(height) > 0.008).all() and height[0] > 0.0045
-    first = gone(spacing - 0.0045) / (5.0 * spacing)
+    first = allowed_closing(spacing - 0.0045) / (5.0 * spacing)
     assert fractions[0] == motion.search.time.numpy()[0] == pytest.approx(first, rel=1e-9)
     if layers > ROUNDS:
         assert (fractions == fractions[0]).all()
@@ -159,10 +159,10 @@ def test_what_falls_on_what_has_stopped_stops_layer_by_layer(device, layers):
         assert (fractions[1:] > 1.1 * fractions[0]).all() and fractions[-1] > 2.0 * fractions[0]
 
 
-def test_worlds_have_shares_of_their_own(device):
+def test_worlds_have_separate_step_fractions(device):
     """A world with a common motion has the smallest fraction throughout; a world at rest has fraction 1."""
     shapes, points = tangle(10)
-    move = wish(shapes, np.random.default_rng(11), 0.05, "object")
+    move = random_displacements(shapes, np.random.default_rng(11), 0.05, "object")
     alone = Motion(shapes, points, device)
     landing = alone(move)
     everywhere = np.concatenate([move, move, 0.0 * move])
@@ -180,28 +180,28 @@ def test_worlds_have_shares_of_their_own(device):
 
 
 @pytest.mark.parametrize("together", [False, True])
-def test_a_search_along_a_motion_finds_all_pairs_of_any_shares(device, together):
+def test_search_along_a_motion_finds_pairs_of_any_step_fractions(device, together):
     shapes, points = scene(12, 0.6, rods=20, triangles=60)
     rng = np.random.default_rng(13)
-    move = wish(shapes, rng, 2.0 * MARGIN, "object")
+    move = random_displacements(shapes, rng, 2.0 * MARGIN, "object")
     x, step = upload(points, device), upload(move, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
     flags = wp.full(1, int(together), dtype=int, device=device)
     search.search(x, step, flags)
     if search.fit(x):
         search.search(x, step, flags)
-    candidates = [{tuple(pair) for pair in pairs.tolist()} for pairs in listed(search)]
+    candidates = [{tuple(pair) for pair in pairs.tolist()} for pairs in candidate_pairs(search)]
     for k in range(20):
         fractions = (
             np.full((1, 1), k / 19.0) if together else rng.uniform(size=(len(points), 1)) ** rng.choice([0.2, 1.0, 5.0])
         )
         for side, pairs in zip(SIDES, candidates, strict=True):
-            assert near(shapes, points + fractions * move, *side, REACH + MARGIN) <= pairs
+            assert near_pairs(shapes, points + fractions * move, *side, REACH + MARGIN) <= pairs
 
 
-def test_a_captured_filter_is_that_without_a_graph(device):
+def test_captured_filter_equals_uncaptured(device):
     shapes, points = tangle(14)
-    small, large = (wish(shapes, np.random.default_rng(15), size, "object") for size in (1e-3, 0.05))
+    small, large = (random_displacements(shapes, np.random.default_rng(15), size, "object") for size in (1e-3, 0.05))
 
     def run(captured: bool) -> list:
         motion = Motion(shapes, points, device)
@@ -218,7 +218,7 @@ def test_a_captured_filter_is_that_without_a_graph(device):
         for move in (small, large, 0.5 * small):
             motion.q.assign(motion.base.numpy() + move)
             step()
-            result += motion.results() + [part.tobytes() for part in listed(motion.search)]
+            result += motion.results() + [part.tobytes() for part in candidate_pairs(motion.search)]
             motion.base.assign(motion.q.numpy())
         assert not motion.search.overflow.numpy()[0]
         return [*result, motion.search.searches.numpy()[0]]
@@ -228,12 +228,12 @@ def test_a_captured_filter_is_that_without_a_graph(device):
     assert run(True) == plain
 
 
-def test_nothing_moves_while_pairs_do_not_fit(device):
+def test_overflowing_lists_stop_all_motion(device):
     shapes, points = tangle(16)
     motion = Motion(shapes, points, device)
     for pairs in motion.search.lists:
         pairs.reserve(10)
-    motion.q.assign(points + wish(shapes, np.random.default_rng(17), 0.05, "object"))
+    motion.q.assign(points + random_displacements(shapes, np.random.default_rng(17), 0.05, "object"))
     motion.launch()
     used = motion.unit.numpy() >= 0
     assert (motion.q.numpy()[used] == points[used]).all()
@@ -263,7 +263,7 @@ def test_smallest_gaps(device):
         ({"together": 2}, r"together of a motion: one int32 for each of 1 world\(s\), not"),
     ],
 )
-def test_what_can_not_be_filtered_is_refused_by_name(device, change, message):
+def test_invalid_filter_arguments_are_refused_by_name(device, change, message):
     shapes, points = scene(12, 1.0, rods=3, nodes=20, triangles=4)
     motion = Motion(shapes, points, device)
     arguments = {"unit": motion.unit, "together": motion.together, "units": motion.units, "keep": 1.0}

@@ -37,7 +37,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_obstacles_carry_what_lies_on_them(device, shape):
+def test_obstacles_carry_the_weight_of_a_rod(device, shape):
     """The reaction of an obstacle at rest is the weight, rho A L g."""
     scene = bar(1.3 * RADIUS, friction=0.5)
     scene.add_obstacle(SHAPES[shape])
@@ -51,7 +51,7 @@ def test_obstacles_carry_what_lies_on_them(device, shape):
 
 
 @pytest.mark.parametrize("shape", ["plane", "sphere", "capsule", "box"])
-def test_moved_obstacles_take_along_what_is_in_their_way(device, shape):
+def test_fast_rising_obstacles_lift_a_rod(device, shape):
     """An obstacle that rises by many gaps in a step lifts the rod without a crossing."""
     height = 0.05
     motion = ddg.Motion(translation=lambda t: (0.0, 0.0, height * min(1.0, t / 0.2)))
@@ -81,7 +81,7 @@ ROUND = {
 
 @pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("shape", ROUND)
-def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, drive):
+def test_rotating_surfaces_accelerate_a_rod_by_friction(device, shape, drive):
     """A rod across the top of a rotating body slides by mu N / m up to the surface speed omega R.
 
     The drive exerts the couple mu N R while the rod slides, and none afterwards.
@@ -118,7 +118,7 @@ def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, drive):
     assert abs(couples[-1]) < 0.05 * mu * radius * normal_forces[-1]
 
 
-def test_a_turned_mesh_sweeps_a_rod_aside(device):
+def test_rotating_mesh_sweeps_a_rod_ahead_of_it(device):
     wall = ddg.Mesh([[-0.001, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1], [-0.001, 0, 0.1]], [[0, 1, 2], [0, 2, 3]])
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=20.0)
     s = np.linspace(-0.05, 0.05, 11)
@@ -131,7 +131,7 @@ def test_a_turned_mesh_sweeps_a_rod_aside(device):
     assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
 
 
-def test_a_slope_holds_by_friction_up_to_its_coefficient(device):
+def test_slope_holds_by_friction_up_to_its_coefficient(device):
     """The rod sticks for tan(slope) < mu, creeping below the threshold, and else slides by g (sin - mu cos)."""
     slope, velocity = 0.3, 1e-4
     normal = (np.sin(slope), 0.0, np.cos(slope))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from pair_cases import move, state, terms, times
+from pair_cases import hessian_product, move, state, terms
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact import gather
@@ -27,7 +27,7 @@ def star() -> tuple[Shapes, np.ndarray]:
     return shapes, points
 
 
-def test_a_node_in_thousands_of_pairs(device, monkeypatch):
+def test_thread_mappings_agree_for_a_node_in_thousands_of_pairs(device, monkeypatch):
     """One thread per pair and one for all agree on energies, forces, products and blocks of contact and friction."""
     shapes, x = star()
     v = np.random.default_rng(1).normal(size=x.shape)
@@ -46,7 +46,12 @@ def test_a_node_in_thousands_of_pairs(device, monkeypatch):
                 items = pair_list.items.numpy()[start : start + number]
                 targets = pair_list.factor.nodes.numpy()[items // gather.ITEMS, items % gather.ITEMS]
                 assert (np.diff(items) > 0).all() and (targets == node).all()
-        return [*state(result), times(result, v), times(result, v, positions), result.dissipated.numpy()]
+        return [
+            *state(result),
+            hessian_product(result, v),
+            hessian_product(result, v, positions),
+            result.dissipated.numpy(),
+        ]
 
     one = run()
     monkeypatch.setattr(arrays, "serial", lambda device: False)
@@ -57,7 +62,7 @@ def test_a_node_in_thousands_of_pairs(device, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", [EDGES, POINT_TRIANGLE, Kind(2, 1)])
-def test_items_in_any_order_are_sorted(device, kind):
+def test_incidence_items_are_sorted(device, kind):
     """5,000 pairs have one node in common, at any local index."""
     count, size, rng = 5000, kind.first + kind.second, np.random.default_rng(3)
     nodes = np.column_stack([np.zeros(count, int), rng.integers(1, 4000, (count, size - 1))])

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
-from eager_steps import eagerly
+from eager_steps import step_without_capture
 
 import ddg_warp as ddg
 from ddg_warp.kernels.islands import DROWNED, STATUS, UNBALANCED
@@ -19,7 +19,7 @@ SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
 STRAIGHT = np.linspace(-0.03, 0.03, 9)
 
 
-def crossed(count: int, fastest: float = 3.0) -> tuple[ddg.Scene, np.ndarray]:
+def crossed_pairs(count: int, fastest: float = 3.0) -> tuple[ddg.Scene, np.ndarray]:
     """Return pairs of crossed rods that meet at speeds up to `fastest`, and velocities."""
     scene, velocities = ddg.Scene(), []
     for i, speed in enumerate(np.linspace(0.1, fastest, count)):
@@ -32,13 +32,13 @@ def crossed(count: int, fastest: float = 3.0) -> tuple[ddg.Scene, np.ndarray]:
     return scene, np.concatenate(velocities)
 
 
-def moving(model, velocities):
+def moving_state(model, velocities):
     return model.state(velocities=velocities)
 
 
-def stepped(device, outliers: float, worlds: int = 1):
+def step_residuals(device, outliers: float, worlds: int = 1):
     """Return positions after a step, the largest residual over the tolerance of every body, and Newton iterations."""
-    scene, velocities = crossed(10, fastest=4.0)
+    scene, velocities = crossed_pairs(10, fastest=4.0)
     model = scene.build(device=device, worlds=worlds)
     integrator = ddg.Integrator(model, rtol=RTOL, outliers=outliers, check_every=1)
     state = integrator.step(model.state(velocities=velocities), DT)
@@ -51,21 +51,21 @@ def stepped(device, outliers: float, worlds: int = 1):
     return state.points(), worst, integrator.statistics()["newton_iterations"]["max"]
 
 
-def test_few_are_out_of_balance_and_nearly_in_it(device):
+def test_few_bodies_exceed_the_tolerance_by_a_bounded_factor(device):
     """Without outliers all bodies converge. A fifth lets 4 of 20 rods exceed the tolerance tenfold, in fewer iterations."""
-    _, none, iterations = stepped(device, 0.0)
+    _, none, iterations = step_residuals(device, 0.0)
     assert none.max() <= 1.0
-    _, few, fewer = stepped(device, 0.2)
+    _, few, fewer = step_residuals(device, 0.2)
     assert 0 < (few > 1.0).sum() <= 4 and few.max() <= FARTHEST
     assert fewer < iterations
 
 
-def test_directions_leave_no_more_out_of_balance(device, monkeypatch):
+def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
     """Without CCD cuts, half of the allowed bodies at most exceed the tolerance when linearised, or the solve has reached `limit`.
 
     Conjugate gradients end by a norm of the largest residuals. A tenth of it alone would leave more bodies above the tolerance.
     """
-    scene, velocities = crossed(10, fastest=0.02)
+    scene, velocities = crossed_pairs(10, fastest=0.02)
     model = scene.build(device=device)
     tolerance = 3e-2
     integrator = ddg.Integrator(model, rtol=tolerance, outliers=0.2)
@@ -81,36 +81,36 @@ def test_directions_leave_no_more_out_of_balance(device, monkeypatch):
             records.append((int(newton.outliers.number.numpy()[0]), reduced, limit))
 
     monkeypatch.setattr(NetNewton, "take", record)
-    eagerly(integrator, model.state(velocities=velocities), DT)
+    step_without_capture(integrator, model.state(velocities=velocities), DT)
     assert records
     for number, reduced, limit in records:
         assert number <= SPARE * 4 or reduced <= limit
     assert any(number <= SPARE * 4 and limit < reduced < LOOSEST for number, reduced, limit in records)
 
 
-def test_a_scene_says_it(device):
+def test_scene_and_run_options_set_outliers(device):
     """`Dynamics(outliers=...)` and the options of a run are equivalent."""
     ends = []
     for analysis, options in ((0.2, {}), (0.0, {"outliers": 0.2}), (0.0, {})):
-        scene, velocities = crossed(10)
-        scene.initial = partial(moving, velocities=velocities)
+        scene, velocities = crossed_pairs(10)
+        scene.initial = partial(moving_state, velocities=velocities)
         scene.analysis = ddg.Dynamics(dt=DT, duration=6 * DT, rtol=RTOL, outliers=analysis)
         ends.append(simulate(scene, device=device, options=options, progress=False).state.points())
     assert (ends[0] == ends[1]).all()
     assert (ends[0] != ends[2]).any()
 
 
-def test_each_world_has_its_own(device):
+def test_worlds_have_separate_outliers(device):
     """Two worlds have as many outliers each as a single world."""
-    one, few, _ = stepped(device, 0.2)
-    two, both, _ = stepped(device, 0.2, worlds=2)
+    one, few, _ = step_residuals(device, 0.2)
+    two, both, _ = step_residuals(device, 0.2, worlds=2)
     assert ((both > 1.0).sum(1) == (few > 1.0).sum()).all()
     np.testing.assert_allclose(two.reshape(2, *one.shape), [one, one], rtol=0, atol=1e-9)
 
 
-def test_no_whole_body_is_no_outlier(device):
+def test_less_than_one_body_allows_no_outlier(device):
     """A fraction of less than one body per world changes no bit."""
-    (strict, _, _), (relaxed, _, _) = stepped(device, 0.0), stepped(device, 0.04)
+    (strict, _, _), (relaxed, _, _) = step_residuals(device, 0.0), step_residuals(device, 0.04)
     assert (strict == relaxed).all()
 
 
@@ -125,10 +125,10 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_who_is_excused(device, case):
+def test_outliers_are_accepted_by_number_and_residual(device, case):
     """Two of twenty bodies at most are accepted, with any number of dof blocks."""
     bodies, off, finite, excused = CASES[case]
-    scene, _ = crossed(10)
+    scene, _ = crossed_pairs(10)
     model = scene.build(device=device, precision="float64")
     newton = ddg.Integrator(model, rtol=RTOL, outliers=0.1)._net.newton
     owner, islands, scale = newton.resting.owner.numpy().copy(), newton.islands, 3.0
@@ -150,13 +150,13 @@ def test_who_is_excused(device, case):
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.0, np.nan, "0.1", True, None])
-def test_what_is_no_part_is_refused(device, wrong):
-    scene, _ = crossed(2)
+def test_invalid_fractions_are_refused(device, wrong):
+    scene, _ = crossed_pairs(2)
     with pytest.raises(ddg.SceneError, match="outliers"):
         ddg.Integrator(scene.build(device=device), outliers=wrong)
 
 
-def test_without_contact_it_is_refused(device):
+def test_outliers_require_contact(device):
     """Bodies without contact converge independently."""
     scene = ddg.Scene()
     scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT)

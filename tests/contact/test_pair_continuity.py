@@ -23,7 +23,7 @@ def straight(edges: int, length: float, height: float = 0.0) -> np.ndarray:
     return np.stack([x, 0.0 * x, np.full_like(x, height)], 1)
 
 
-def turned(points: np.ndarray, angle: float) -> np.ndarray:
+def rotated(points: np.ndarray, angle: float) -> np.ndarray:
     """Return points rotated about z."""
     c, s = np.cos(angle), np.sin(angle)
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -34,13 +34,13 @@ def height(law: str) -> float:
 
 
 PATHS = {
-    "turning": lambda s: (turned, 0.1 * s),
-    "turning, off its middle": lambda s: (lambda p, a: turned(p + [0.013, 0.0, 0.0], a), 0.1 * s),
-    "sliding past the ends": lambda s: (lambda p, a: turned(p, 0.01) + [a, 0.0, 0.0], 0.12 * s),
+    "turning": lambda s: (rotated, 0.1 * s),
+    "turning, off its middle": lambda s: (lambda p, a: rotated(p + [0.013, 0.0, 0.0], a), 0.1 * s),
+    "sliding past the ends": lambda s: (lambda p, a: rotated(p, 0.01) + [a, 0.0, 0.0], 0.12 * s),
     "sliding past the ends, parallel": lambda s: (lambda p, a: p + [a, 0.0, 0.0], 0.12 * s),
     "sliding across, parallel": lambda s: (lambda p, a: p + [0.007, a, 0.0], 0.01 * s),
     "rolling into parallel, tilted": lambda s: (
-        lambda p, a: turned(p, 0.5 * a) + [0.0, 0.0, 1.0] * p[:, :1] * a,
+        lambda p, a: rotated(p, 0.5 * a) + [0.0, 0.0, 1.0] * p[:, :1] * a,
         0.02 * s,
     ),
 }
@@ -72,7 +72,7 @@ def test_energy_and_forces_are_continuous(device, law, path, edges):
 
 @each_law
 @pytest.mark.parametrize("edges", [1, 2, 5])
-def test_along_an_edge_each_point_counts_once(device, law, edges):
+def test_nodes_along_an_edge_count_once(device, law, edges):
     """n edges lie along the middle of a longer edge: n - 1 interior nodes count whole, two ends half."""
     shapes, points = two_rods(straight(1, 0.5), straight(edges, 0.1, height(law)))
     result, _ = terms(shapes, points, device, law)
@@ -83,7 +83,7 @@ def test_along_an_edge_each_point_counts_once(device, law, edges):
 
 
 @each_law
-def test_rods_along_each_other_count_each_node_once(device, law):
+def test_parallel_rods_count_each_node_once(device, law):
     """n - 1 nodes of the upper rod count whole and the ends half, at any shift; nodes of the lower rod count within reach."""
     lower, upper = straight(20, 0.4), straight(5, 0.1, height(law))
     shapes, points = two_rods(lower, upper)
@@ -99,15 +99,15 @@ def test_rods_along_each_other_count_each_node_once(device, law):
 
 
 @each_law
-def test_edges_that_cross_count_once(device, law):
-    shapes, points = two_rods(straight(1, 0.1), turned(straight(1, 0.1, height(law)), 0.3))
+def test_crossing_edges_count_once(device, law):
+    shapes, points = two_rods(straight(1, 0.1), rotated(straight(1, 0.1, height(law)), 0.3))
     result, _ = terms(shapes, points, device, law)
     one = LAWS[law][1]["stiffness"] * float(psi(law, np.array(GAP)))
     assert result.energy.numpy()[0] == pytest.approx(one, rel=1e-12)
 
 
 @each_law
-def test_rods_end_to_end_push_each_other(device, law):
+def test_collinear_rods_interact_at_their_ends(device, law):
     """The mollifier of collinear rods is zero: two ends count half each."""
     first = straight(1, 0.1)
     shapes, points = two_rods(first, first + [0.1 + height(law), 0.0, 0.0])

@@ -2,47 +2,57 @@
 
 import numpy as np
 import pytest
-from friction_cases import MU, SLIP, SLIPS, VELOCITY, each_case, each_form, hold_to_differences, rates, rubbed
-from pair_cases import LAWS, assembled, bundle, central, psi, state, terms, times, used_of
+from friction_cases import (
+    MU,
+    SLIP,
+    SLIPS,
+    VELOCITY,
+    assert_central_differences,
+    each_case,
+    each_form,
+    friction_terms,
+    rates,
+)
+from pair_cases import LAWS, assembled_hessian, bundle, central, hessian_product, psi, state, terms, used_pairs
 
 from ddg_warp.solve.contact.shapes import Shapes
 
 
-def shares_of(pair_list) -> np.ndarray:
+def friction_ratios(pair_list) -> np.ndarray:
     """Return friction over mu N of the used pairs."""
-    used = used_of(pair_list)
+    used = used_pairs(pair_list)
     force = pair_list.gradient.numpy()[: pair_list.found.kind.first, used].sum(0)
     return np.linalg.norm(force, axis=1) / pair_list.lagged.bound.numpy()[used]
 
 
-def share(form: str, slip):
+def law_ratio(form: str, slip):
     """Return friction over mu N at a slip over nu h."""
     return np.tanh(7.5 * slip) if form == "logistic" else np.where(slip < 1.0, slip * (2.0 - slip), 1.0)
 
 
 @each_case
 @each_form
-def test_forces_and_products_are_differences(device, case, form):
-    result, positions, _, after = rubbed(case, device, form)
-    assert all(len(used_of(part)) > 5 for part in result.frictions)
-    ratios = np.concatenate([shares_of(part) for part in result.frictions])
+def test_forces_and_products_equal_central_differences(device, case, form):
+    result, positions, _, after = friction_terms(case, device, form)
+    assert all(len(used_pairs(part)) > 5 for part in result.frictions)
+    ratios = np.concatenate([friction_ratios(part) for part in result.frictions])
     assert (ratios < 0.8).sum() > 5 and (ratios > 0.95).sum() > 5
-    hold_to_differences(result, positions, after)
+    assert_central_differences(result, positions, after)
 
 
 @each_case
 @each_form
 def test_matrix_is_symmetric_and_positive(device, case, form):
-    result, *_ = rubbed(case, device, form)
+    result, *_ = friction_terms(case, device, form)
     n = len(result.forces)
-    matrix = assembled(result, n)
+    matrix = assembled_hessian(result, n)
     flat, largest = matrix.reshape(3 * n, 3 * n), np.abs(matrix).max()
     assert np.abs(flat - flat.T).max() < 1e-14 * largest
     assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
 
 
 @each_form
-def test_blocks_and_stiffness_are_those_of_the_matrix(device, form):
+def test_blocks_and_stiffness_equal_the_matrix(device, form):
     """Contact and friction act together, without triangles: blocks between nodes of an edge only have pairs of that edge."""
     shapes, x = bundle()
     for number in range(4):
@@ -53,7 +63,7 @@ def test_blocks_and_stiffness_are_those_of_the_matrix(device, form):
     n, nodes = len(x), shapes.things(2)[0]
     for rate in (None, rates(result)):
         result.evaluate(positions, rate)
-        matrix = assembled(result, n).transpose(0, 2, 1, 3)
+        matrix = assembled_hessian(result, n).transpose(0, 2, 1, 3)
         _, _, diagonal, between = state(result)
         largest = np.abs(matrix).max()
         blocks = matrix[np.arange(n), np.arange(n)]
@@ -104,25 +114,25 @@ def test_coulomb_law(device, scene, form, law):
         result.evaluate(positions, rates(result))
         force = result.forces.numpy()[upper].sum(0)
         assert force == pytest.approx(
-            -MU * contact_force[2] * share(form, y) * direction, rel=1e-10, abs=1e-12 * normal
+            -MU * contact_force[2] * law_ratio(form, y) * direction, rel=1e-10, abs=1e-12 * normal
         )
         assert np.linalg.norm(force) <= MU * contact_force[2] * (1.0 + 1e-14)
         assert result.dissipated.numpy()[0] == pytest.approx(-force @ direction * y * SLIP, rel=1e-9)
         assert 0.0 < result.energy.numpy()[0] < result.dissipated.numpy()[0]
     creep = np.arctanh(0.9) / 7.5 if form == "logistic" else 1.0 - np.sqrt(0.1)
-    assert share(form, creep) == pytest.approx(0.9)  # slip at nine tenths of mu N
+    assert law_ratio(form, creep) == pytest.approx(0.9)  # slip at nine tenths of mu N
 
 
 @each_case
-def test_no_resultant_and_the_moment_of_the_offsets(device, case):
+def test_resultant_is_zero_and_moment_is_that_of_the_offsets(device, case):
     """Forces of a pair act at both centres of pressure, r apart: the moment is r x f, at most |r| mu N."""
-    result, _, _, after = rubbed(case, device)
+    result, _, _, after = friction_terms(case, device)
     forces = result.forces.numpy()
     largest = np.abs(forces).sum()
     assert np.abs(forces.sum(0)).max() < 1e-14 * largest
     moment, most = np.zeros(3), 0.0
     for part in result.frictions:
-        used = used_of(part)
+        used = used_pairs(part)
         weight, bound = part.lagged.weight.numpy()[used], part.lagged.bound.numpy()[used]
         nodes, pull = part.factor.nodes.numpy()[used], -part.gradient.numpy()[:, used]
         first = part.found.kind.first
@@ -137,7 +147,7 @@ def test_no_resultant_and_the_moment_of_the_offsets(device, case):
     assert 0.0 < np.linalg.norm(moment) < most
 
 
-def test_nodes_of_edges_in_line_are_held_by_no_more_than_what_pushes_them(device):
+def test_friction_of_collinear_edges_is_bounded_by_mu_n(device):
     """End forces that nearly cancel move the centre of pressure far away; force and stiffness stay bounded."""
     shapes, x = bundle(6, 10, 1e-6)
     result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
@@ -147,30 +157,30 @@ def test_nodes_of_edges_in_line_are_held_by_no_more_than_what_pushes_them(device
     positions.assign(x + SLIP * np.random.default_rng(1).normal(size=x.shape))
     result.evaluate(positions, rates(result))
     for part, bound in zip(result.frictions, most, strict=True):
-        used = used_of(part)
+        used = used_pairs(part)
         force = np.linalg.norm(part.gradient.numpy(), axis=-1)
         assert (force <= bound * (1.0 + 1e-9))[:, used].all() and (force > 0.1 * bound)[:, used].any()
 
 
 @each_case
 @each_form
-def test_friction_takes_energy(device, case, form):
+def test_friction_work_is_bounded(device, case, form):
     """The work since the start of the step is at least the potential and at most that of Coulomb's law."""
     for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
-        result, _, x, after = rubbed(case, device, form, slip, seed)
+        result, _, x, after = friction_terms(case, device, form, slip, seed)
         taken, energy = result.dissipated.numpy()[0], result.energy.numpy()[0]
         assert taken == pytest.approx(-(result.forces.numpy() * (after - x)).sum(), rel=1e-10)
         assert 0.0 < energy < taken
         most = 0.0
         for part in result.frictions:
-            used = used_of(part)
+            used = used_pairs(part)
             moved = (after - x)[part.factor.nodes.numpy()[used]]
             length = np.linalg.norm(np.einsum("ps,psd->pd", part.lagged.weight.numpy()[used], moved), axis=1)
             most += (part.lagged.bound.numpy()[used] * length).sum()
         assert taken < most
 
 
-def test_rods_along_each_other_rub_with_all_of_their_normal_force(device):
+def test_parallel_rods_slide_with_mu_times_all_normal_forces(device):
     """Near-parallel edges have the energy of many distances: a rod drawn off two neighbours is braked by mu N of each."""
     shapes, x = bundle(jitter=0.0)
     x = x * [1.0, 1.0, 0.0] + [0.0, 0.0, -1.0] * (np.arange(len(x)) >= 15)[:, None]  # rods alone, in one plane
@@ -205,14 +215,14 @@ def test_no_friction_without_rate_or_coefficient(device):
     positions.assign(after)
     none.evaluate(positions, rates(none))
     assert none.energy.numpy()[0] > 0.0
-    wanted = [*state(none), times(none, x)]
+    wanted = [*state(none), hessian_product(none, x)]
     for rate in (None, rates(some, 0.0)):
         some.evaluate(positions, rates(some))
         some.evaluate(positions, rate)
-        assert all((a == b).all() for a, b in zip([*state(some), times(some, x)], wanted, strict=True))
+        assert all((a == b).all() for a, b in zip([*state(some), hessian_product(some, x)], wanted, strict=True))
         assert not some.dissipated.numpy().any()
     some.evaluate(positions, rates(some))
     for part, sizes in zip(some.frictions, ((2, 2), (1, 3)), strict=True):
-        pairs = part.pairs.numpy()[used_of(part)]
+        pairs = part.pairs.numpy()[used_pairs(part)]
         first, second = (groups[shapes.things(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
         assert len(pairs) > 5 and (first != second).all()

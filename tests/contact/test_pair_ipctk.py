@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 from brute_force import edge_edge, point_triangle
-from pair_cases import times, upload
-from test_distance import KINDS, configurations, measured
+from pair_cases import hessian_product, upload
+from test_distance import KINDS, closest_points, configurations
 
 from ddg_warp.kernels.densities.contact import log_barrier
 from ddg_warp.solve.contact.broad_phase import BroadPhase
@@ -25,14 +25,14 @@ STENCILS = {"edge_edge": edge_edge, "point_triangle": point_triangle}
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("case", ["random", "parallel", "near parallel", "flat"])
-def test_distances_of_the_search(device, name, case):
+def test_distances_equal_the_toolkit(device, name, case):
     """Squared distances of lengths about one agree; flat cases have crossing edges. The toolkit loses digits at angles below 1e-7."""
     corners = configurations()[case]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 2]
     sine = np.linalg.norm(np.cross(a, b), axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
     corners = corners[(sine < 1e-15) | (sine > 1e-7)][:COUNT]
     assert len(corners) == COUNT
-    r, _ = measured(KINDS[name][0], corners, device)
+    r, _ = closest_points(KINDS[name][0], corners, device)
     assert (r**2).sum(1) == pytest.approx(
         np.array([DISTANCES[name](*nodes) for nodes in corners]), rel=1e-12, abs=1e-13
     )
@@ -83,7 +83,7 @@ def terms(stencil: str, x: np.ndarray, device, **options) -> tuple[PairTerms, wp
     return result, points
 
 
-def pushed(stencil: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def toolkit_barrier(stencil: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return energy, gradient and Hessian of a pair by the toolkit's barrier of the distance."""
     D, dD, ddD = (
         np.array(getattr(ipctk, f"{stencil}_distance{suffix}")(*corners)) for suffix in ("", "_gradient", "_hessian")
@@ -96,7 +96,7 @@ def pushed(stencil: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return b, first * row, second * np.outer(row, row) + first * bend
 
 
-def rubbed(stencil: str, corners, move, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def toolkit_friction(stencil: str, corners, move, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return energy, gradient and Hessian of the toolkit's friction, with the normal force of the barrier."""
     d = np.sqrt(getattr(ipctk, f"{stencil}_distance")(*corners))
     bound = -MU * STIFFNESS * ipctk.barrier_first_derivative(d, RANGE)
@@ -113,7 +113,7 @@ def rubbed(stencil: str, corners, move, rate: float) -> tuple[np.ndarray, np.nda
     return bound * f0 / rate, bound * force_over_speed * J.T @ u, bound * rate * J.T @ bend @ J
 
 
-def agree(result: PairTerms, points, wanted: list, products: tuple) -> None:
+def assert_agreement(result: PairTerms, points, wanted: list, products: tuple) -> None:
     """Assert that energies, forces and products of each world agree.
 
     For None in `products` the product is of the matrix, for positions of the exact Hessian.
@@ -131,19 +131,19 @@ def agree(result: PairTerms, points, wanted: list, products: tuple) -> None:
     v = np.random.default_rng(8).normal(size=(COUNT, len(points) // COUNT, 3))
     bent = np.einsum("eij,ej->ei", hessian, v[:, :4].reshape(COUNT, 12))
     for product_points in products:
-        assert worst(times(result, v.reshape(-1, 3), product_points), bent) < 1e-7
+        assert worst(hessian_product(result, v.reshape(-1, 3), product_points), bent) < 1e-7
 
 
 @pytest.mark.parametrize("stencil", STENCILS)
-def test_barrier(device, stencil):
+def test_barrier_equals_the_toolkit(device, stencil):
     x = positions(stencil, False)
     result, points = terms(stencil, x, device)
     result.evaluate(points)
-    agree(result, points, [pushed(stencil, corners) for corners in x[:, :4]], (points,))
+    assert_agreement(result, points, [toolkit_barrier(stencil, corners) for corners in x[:, :4]], (points,))
 
 
 @pytest.mark.parametrize("stencil", STENCILS)
-def test_friction(device, stencil):
+def test_friction_equals_the_toolkit(device, stencil):
     """Each world has another rate and sticks or slides."""
     x, rng = positions(stencil, True), np.random.default_rng(9)
     rate = rng.uniform(10.0, 100.0, COUNT)
@@ -153,7 +153,7 @@ def test_friction(device, stencil):
     result.law.stiffness.zero_()
     points.assign((x + move).reshape(-1, 3))
     result.evaluate(points, wp.array(rate, dtype=wp.float64, device=device))
-    wanted = [rubbed(stencil, *each) for each in zip(x[:, :4], move[:, :4], rate, strict=True)]
-    agree(result, points, wanted, (None, points))
+    wanted = [toolkit_friction(stencil, *each) for each in zip(x[:, :4], move[:, :4], rate, strict=True)]
+    assert_agreement(result, points, wanted, (None, points))
     ratio = result.dissipated.numpy() / result.energy.numpy()
     assert 0.2 < (ratio > 1.5).mean() < 0.8  # f1 x / f0 is between 3/2 and 2 for sticking pairs, less for sliding ones

@@ -8,15 +8,15 @@ from pair_cases import (
     LAWS,
     MARGIN,
     REACH,
-    assembled,
-    brute,
+    assembled_hessian,
+    assert_repeatable,
+    brute_force_energy,
     bundle,
     central,
+    hessian_product,
     move,
-    repeats,
     state,
     terms,
-    times,
     upload,
 )
 
@@ -33,10 +33,10 @@ each_law = pytest.mark.parametrize("law", LAWS)
 
 @each_case
 @each_law
-def test_energy_is_that_of_all_pairs(device, case, law):
+def test_energy_equals_brute_force(device, case, law):
     shapes, x = CASES[case]()
     result, _ = terms(shapes, x, device, law)
-    assert result.energy.numpy()[0] == pytest.approx(brute(shapes, x, law), rel=1e-11)
+    assert result.energy.numpy()[0] == pytest.approx(brute_force_energy(shapes, x, law), rel=1e-11)
     assert all(int(part.count.numpy()[0]) > 5 for part in result.lists)
     if case == "parallel":  # both kinds of edge energies occur
         edges = result.lists[0]
@@ -46,7 +46,7 @@ def test_energy_is_that_of_all_pairs(device, case, law):
 
 @each_case
 @each_law
-def test_forces_and_exact_products_are_differences(device, case, law):
+def test_forces_and_exact_products_equal_central_differences(device, case, law):
     shapes, x = CASES[case]()
     result, positions = terms(shapes, x, device, law)
     forces = result.forces.numpy().copy()
@@ -54,7 +54,7 @@ def test_forces_and_exact_products_are_differences(device, case, law):
     rng = np.random.default_rng(1)
     for _ in range(5):
         v = rng.normal(size=x.shape)
-        product = times(result, v, positions)
+        product = hessian_product(result, v, positions)
 
         def quantities(s, v=v):
             move(result, positions, x + s * v)
@@ -68,46 +68,48 @@ def test_forces_and_exact_products_are_differences(device, case, law):
 
 @each_case
 @each_law
-def test_pairs_that_turn(device, case, law):
+def test_geometric_stiffness_completes_the_hessian(device, case, law):
     """The Gauss-Newton matrix with `pair_bend`, and the stored term of near-parallel edges, is the exact Hessian."""
     shapes, x = CASES[case]()
     result, positions = terms(shapes, x, device, law)
     v = np.random.default_rng(4).normal(size=x.shape)
-    exact, plain = times(result, v, positions), times(result, v)
+    exact, plain = hessian_product(result, v, positions), hessian_product(result, v)
     wanted = wp.ones(1, dtype=int, device=device)
     mollified = (result.lists[0].factor.used.numpy() != 0) & (result.lists[0].factor.bend.numpy() == 0.0)
     assert mollified.any() == (case == "parallel")
     assert np.abs(exact - plain).max() > 0.01 * np.abs(exact).max()
-    assert np.abs(times(result, v, positions, wanted) - exact).max() < 1e-10 * np.abs(exact).max()
+    assert np.abs(hessian_product(result, v, positions, wanted) - exact).max() < 1e-10 * np.abs(exact).max()
     wanted.zero_()
-    np.testing.assert_array_equal(times(result, v, positions, wanted), plain)
+    np.testing.assert_array_equal(hessian_product(result, v, positions, wanted), plain)
 
 
 @each_case
 @each_law
-def test_gauss_newton_matrix(device, case, law):
+def test_gauss_newton_matrix_is_symmetric_and_positive(device, case, law):
     """v . H v is psi'' times the squared derivative of distances along v."""
     shapes, x = CASES[case]()
     result, _ = terms(shapes, x, device, law)
     v = np.random.default_rng(2).normal(size=x.shape)
-    assert (times(result, v) * v).sum() == pytest.approx(brute(shapes, x, law, v), rel=1e-6)
+    assert (hessian_product(result, v) * v).sum() == pytest.approx(brute_force_energy(shapes, x, law, v), rel=1e-6)
     n = len(x)
-    matrix = assembled(result, n)
+    matrix = assembled_hessian(result, n)
     flat = matrix.reshape(3 * n, 3 * n)
     largest = np.abs(flat).max()
     assert np.abs(flat - flat.T).max() < 1e-14 * largest
     assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
-    assert np.abs((flat @ v.ravel()).reshape(n, 3) - times(result, v)).max() < 1e-13 * largest * np.abs(v).max()
+    assert (
+        np.abs((flat @ v.ravel()).reshape(n, 3) - hessian_product(result, v)).max() < 1e-13 * largest * np.abs(v).max()
+    )
 
 
 @each_law
-def test_blocks_are_those_of_the_matrix(device, law):
+def test_blocks_equal_the_matrix(device, law):
     shapes, x = bundle()
     for number in range(4):
         shapes.ignore(3, number)  # no triangles: blocks between nodes of an edge only have pairs of that edge
     result, _ = terms(shapes, x, device, law)
     n = len(x)
-    matrix = assembled(result, n).transpose(0, 2, 1, 3)
+    matrix = assembled_hessian(result, n).transpose(0, 2, 1, 3)
     _, _, diagonal, between = state(result)
     nodes = shapes.things(2)[0]
     largest = np.abs(matrix).max()
@@ -130,18 +132,18 @@ def test_forces_have_no_resultant_and_no_moment(device, case, law):
 
 
 @each_case
-def test_two_runs_agree_to_the_bit(device, case):
+def test_runs_agree_bitwise(device, case):
     shapes, x = CASES[case]()
     v = np.random.default_rng(3).normal(size=x.shape)
 
     def run():
         result, _ = terms(shapes, x, device)
-        return [*state(result), times(result, v)]
+        return [*state(result), hessian_product(result, v)]
 
-    repeats(run)
+    assert_repeatable(run)
 
 
-def test_worlds_are_alone(device):
+def test_worlds_are_independent(device):
     shapes, x = CASES["crossing"]()
     rng = np.random.default_rng(4)
     worlds = [x + 1e-3 * rng.normal(size=x.shape) for _ in range(3)]
@@ -152,7 +154,7 @@ def test_worlds_are_alone(device):
     assert len(set(together[0])) == 3
 
 
-def test_lists_grow_and_nothing_is_dropped(device):
+def test_growing_lists_drop_no_pair(device):
     shapes, x = CASES["crossing"]()
     result, positions = terms(shapes, x, device)
     before = state(result)
@@ -188,7 +190,7 @@ def test_the_order_of_objects_does_not_matter(device):
     assert np.abs(second.forces.numpy()[::-1] - forces).max() < 1e-11 * np.abs(forces).max()
 
 
-def test_a_captured_evaluation_follows_motion(device):
+def test_captured_evaluation_follows_motion(device):
     shapes, x = CASES["crossing"]()
     result, positions = terms(shapes, x, device)
     v = np.random.default_rng(5).normal(size=x.shape)
@@ -205,12 +207,16 @@ def test_a_captured_evaluation_follows_motion(device):
     for step in range(1, 5):
         positions.assign(x + step * velocity)
         wp.capture_launch(capture.graph)
-        assert result.energy.numpy()[0] == pytest.approx(brute(shapes, x + step * velocity, "penalty"), rel=1e-11)
-        assert (out.numpy() * v).sum() == pytest.approx(brute(shapes, x + step * velocity, "penalty", v), rel=1e-6)
+        assert result.energy.numpy()[0] == pytest.approx(
+            brute_force_energy(shapes, x + step * velocity, "penalty"), rel=1e-11
+        )
+        assert (out.numpy() * v).sum() == pytest.approx(
+            brute_force_energy(shapes, x + step * velocity, "penalty", v), rel=1e-6
+        )
     assert result.search.searches.numpy()[0] == searches + 2
 
 
-def test_parameters_are_those_of_groups(device):
+def test_parameters_are_per_pair_of_groups(device):
     """The energies of each pair of groups, with all others ignored, add up to the energy of the whole."""
     groups = np.array([0, 0, 1, 1])
     parameters = {
@@ -232,18 +238,18 @@ def test_parameters_are_those_of_groups(device):
     assert whole.energy.numpy()[0] == pytest.approx(total, rel=1e-12)
 
 
-def test_factors_in_single_precision(device):
+def test_float32_factors_keep_forces_and_products(device):
     shapes, x = CASES["parallel"]()
     whole, _ = terms(shapes, x, device)
     single, points = terms(shapes, x, device, linear=wp.float32)
     v = np.random.default_rng(6).normal(size=x.shape)
     assert (single.forces.numpy() == whole.forces.numpy()).all()
     for positions in (None, points):
-        exact = times(whole, v, positions)
-        assert np.abs(times(single, v, positions) - exact).max() < 1e-5 * np.abs(exact).max()
+        exact = hessian_product(whole, v, positions)
+        assert np.abs(hessian_product(single, v, positions) - exact).max() < 1e-5 * np.abs(exact).max()
 
 
-def test_overlaps_and_what_is_not_finite_show_in_the_energy(device):
+def test_energy_is_not_finite_for_overlaps_and_nan(device):
     shapes, x = bundle()
     result, positions = terms(shapes, x, device, "barrier", thickness=0.006, range=0.002)
     assert np.isinf(result.energy.numpy()).all()
@@ -257,7 +263,7 @@ def test_overlaps_and_what_is_not_finite_show_in_the_energy(device):
 
 
 @each_case
-def test_all_in_single_precision(device, case):
+def test_float32_positions(device, case):
     """Positions of 0.3 m err by 1e-8 m, gaps of 1e-3 m by 1e-5 of the gap."""
     shapes, x = CASES[case]()
     points = upload(x, device, wp.vec3f)
@@ -265,12 +271,12 @@ def test_all_in_single_precision(device, case):
     result = PairTerms(search, smooth_penalty, **LAWS["penalty"][1])
     result.evaluate(points)
     assert result.energy.numpy()[0] == pytest.approx(
-        brute(shapes, x.astype(np.float32).astype(float), "penalty"), rel=1e-4
+        brute_force_energy(shapes, x.astype(np.float32).astype(float), "penalty"), rel=1e-4
     )
     v = np.random.default_rng(7).normal(size=x.shape)
     whole, whole_points = terms(shapes, x, device)
-    for positions, exact in ((None, times(whole, v)), (points, times(whole, v, whole_points))):
-        assert np.abs(times(result, v, positions) - exact).max() < 1e-3 * np.abs(exact).max()
+    for positions, exact in ((None, hessian_product(whole, v)), (points, hessian_product(whole, v, whole_points))):
+        assert np.abs(hessian_product(result, v, positions) - exact).max() < 1e-3 * np.abs(exact).max()
 
 
 @pytest.mark.parametrize(
@@ -292,7 +298,7 @@ def test_all_in_single_precision(device, case):
         ({"thickness": 0.0065, "groups": [0, 0, 0, 1]}, r"rod 0 and rod 0 push .* a reach of 0.0045 m"),
     ],
 )
-def test_wrong_parameters_are_named(device, options, message):
+def test_invalid_parameters_are_refused_by_name(device, options, message):
     shapes, x = bundle()
     search = BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN)
     with pytest.raises(SceneError, match=message):

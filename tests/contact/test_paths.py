@@ -39,7 +39,7 @@ def truss(device, law: str, stop: float, reach: float, stiffness: float):
     return Continuation(scene.build(device, "float64"), watch, load_scale=0.3, floor_factor=1.0)
 
 
-def carried(z):
+def truss_load(z):
     """Return the load of the bars with the apex at z.
 
     The load is 2 EA z (1 / l - 1 / l0), l^2 = 1 + z^2.
@@ -47,7 +47,7 @@ def carried(z):
     return 2.0 * z * (1.0 / np.sqrt(1.0 + z**2) - 1.0 / LENGTH)
 
 
-def pushes(model, state) -> float:
+def upward_force(model, state) -> float:
     """Return the upward force of obstacles [N]; a reaction is the force that a support exerts."""
     obstacles = len(model.scene.obstacles)
     return float(sum(reaction.force[2] for reaction in model.reactions(state)[-obstacles:]))
@@ -57,29 +57,29 @@ def pushes(model, state) -> float:
 @pytest.mark.parametrize(
     ("reach", "stiffness"), [(1e-2, 10.0), pytest.param(1e-4, 1e3, marks=pytest.mark.slow), (1e-6, 1e5)]
 )
-def test_a_truss_snaps_onto_a_stop(device, law, reach, stiffness):
+def test_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     """The load falls until bars and ball are in contact, then grows with the force of the ball. The way back is the same."""
     stop = -0.1
     follower = truss(device, law, stop, reach, stiffness)
     path = follower.trace(stop=Stop(load=(-1.0, 0.3)))
     assert path.outcome == "load"
     for point in path.points:
-        ball_force = pushes(follower.model, point.state)
-        assert point.load == pytest.approx(carried(HEIGHT - point.values["drop"]) + ball_force, abs=1e-9)
-    highest = carried(np.sqrt(LENGTH ** (2.0 / 3.0) - 1.0))
+        ball_force = upward_force(follower.model, point.state)
+        assert point.load == pytest.approx(truss_load(HEIGHT - point.values["drop"]) + ball_force, abs=1e-9)
+    highest = truss_load(np.sqrt(LENGTH ** (2.0 / 3.0) - 1.0))
     first, corner = path.limit_points
     assert first.load == pytest.approx(highest, rel=1e-9)
-    assert corner.load == pytest.approx(carried(stop), abs=0.2 * reach + 1e-5)  # within the range, by the slope
+    assert corner.load == pytest.approx(truss_load(stop), abs=0.2 * reach + 1e-5)  # within the range, by the slope
     assert HEIGHT - path.values("drop")[-1] == pytest.approx(stop, abs=reach)
     assert set(path.negative[path.arclength > corner.arclength]) == {0}
     assert set(path.negative[(path.arclength > first.arclength) & (path.arclength < corner.arclength)]) == {1}
     back = follower.trace(path.points[-1].state, start=0.3, direction=-1, stop=Stop(load=(-0.1, 1.0)))
     assert [point.load for point in back.limit_points] == pytest.approx([corner.load, first.load], abs=1e-5)
-    assert carried(HEIGHT - back.values("drop")[-1]) == pytest.approx(-0.1, rel=1e-9)
+    assert truss_load(HEIGHT - back.values("drop")[-1]) == pytest.approx(-0.1, rel=1e-9)
 
 
 @each_law
-def test_what_balances_on_a_ball_falls_off(device, law):
+def test_truss_on_a_ball_bifurcates_sideways(device, law):
     """The apex slides off where the contact force is the lateral stiffness times the distance of the centres.
 
     The bars have the lateral stiffness 2 (EA / l0 cos^2 + N / l sin^2), with axial force N = EA (l / l0 - 1) and slope z over 1.
@@ -90,7 +90,7 @@ def test_what_balances_on_a_ball_falls_off(device, law):
     length = np.hypot(1.0, z)
     sideways = 2.0 * (1.0 / LENGTH + (length / LENGTH - 1.0) / length * z**2) / length**2
     distance = z - (-0.5 - THICK - BALL)
-    assert pushes(follower.model, event.state) == pytest.approx(sideways * distance, rel=1e-6)
+    assert upward_force(follower.model, event.state) == pytest.approx(sideways * distance, rel=1e-6)
     assert np.abs(event.mode_displacements[1]).argmax() == 0
 
 
@@ -112,7 +112,7 @@ def column(device, law: str, n: int):
 
 
 @each_law
-def test_a_column_between_walls(device, law):
+def test_buckled_column_between_walls_matches_its_closed_form(device, law):
     """The column buckles at pi^2 EI / L^2 until the middle meets a wall, which exerts a force R.
 
     Each half is w = A sin k x + B x of P = EI k^2, with w'' = 0 at the hinge. In the middle w = h and w' = 0. The lateral force is P
@@ -135,11 +135,11 @@ def test_a_column_between_walls(device, law):
         h, k = point.values["rise"], np.sqrt(point.load)
         t = 0.5 * k
         exact = -2.0 * point.load * k * h * np.cos(t) / (np.sin(t) - t * np.cos(t))
-        assert -pushes(follower.model, point.state) == pytest.approx(exact, rel=3e-3)
+        assert -upward_force(follower.model, point.state) == pytest.approx(exact, rel=3e-3)
         assert abs(h) == pytest.approx(WALL, abs=2e-4)
 
 
-def test_mode_follow_keeps_what_is_unstable(device):
+def test_mode_follow_keeps_unstable_states(device):
     """A column above Euler's load stays straight by mode "follow" and goes to a wall by mode "minimise", where it stays."""
     model = column(device, "barrier", 20).model
     straight = statics.solve(model, mode="follow", start=0.0, end=15.0)
@@ -200,7 +200,7 @@ def rods_across(scene) -> None:
     scene.clamp(scene.add_rod(points, section=ddg.Circle(RADIUS), material=RUBBER, name="lower"), edges=[0, -1])
 
 
-def joined(scene) -> None:
+def joined_rods(scene) -> None:
     """Add a frame of two rods; the far corner comes down on a plane."""
     rod = cantilever(scene)
     points = np.stack([np.full(7, 0.2), np.linspace(0.0, 0.08, 7), np.zeros(7)], axis=1)
@@ -218,14 +218,14 @@ KINDS = {
     "box": below(ddg.Box((0.15, 0.001, -0.03), (0.03, 0.05, 0.018))),
     "mesh": below(FACE),
     "rods": rods_across,
-    "joined rods": joined,
+    "joined rods": joined_rods,
     "sheet on a ball": sheet_over_a_ball,
     "sheet on a rod": sheet_over_a_rod,
 }
 
 
 @cache
-def kind_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
+def scene_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
     scene = ddg.Scene(gravity=(0.0, 0.3, -9.81))
     KINDS[name](scene)
     scene.contact(law=law, range=1e-3, stiffness=20.0, friction=friction)
@@ -234,9 +234,9 @@ def kind_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
 
 @each_law
 @pytest.mark.parametrize("name", KINDS)
-def test_paths_lead_where_load_steps_do(device, name, law):
+def test_paths_end_at_the_states_of_load_steps(device, name, law):
     """Weight and obstacle motions follow the load parameter: end states and reactions are the same."""
-    model = kind_of(name, law).build(device, "float64")
+    model = scene_of(name, law).build(device, "float64")
     path = Continuation(model).trace(stop=Stop(load=(-1.0, 1.0)))
     end, stepped = path.points[-1].state, statics.solve(model, load_steps=4)
     assert path.points[-1].load == 1.0
@@ -247,14 +247,14 @@ def test_paths_lead_where_load_steps_do(device, name, law):
         np.testing.assert_allclose(traced.force, expected.force, atol=1e-6)
 
 
-def test_what_paths_refuse(device):
-    rough = kind_of("ball", "barrier", 0.3).build(device, "float64")
+def test_refusals(device):
+    rough = scene_of("ball", "barrier", 0.3).build(device, "float64")
     for call in (lambda: Continuation(rough), lambda: statics.solve(rough, mode="follow")):
         with pytest.raises(
             ddg.SceneError, match=r"paths .* know no friction, and it is 0.3 between .*; set friction=0"
         ):
             call()
-    smooth = kind_of("ball", "barrier").build(device, "float64")
+    smooth = scene_of("ball", "barrier").build(device, "float64")
     sunk = smooth.state(points=smooth.state().points() - [0.0, 0.0, 0.02])
     with pytest.raises(ddg.SceneError, match=r"overlap by .* at the start"):
         Continuation(smooth).trace(sunk)

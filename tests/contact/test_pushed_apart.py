@@ -11,7 +11,7 @@ RADIUS, RANGE = 2e-3, 1e-3
 MATERIAL = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
 
 
-def scene_of(*directions, lift: float = 0.0, nodes: int = 4) -> ddg.Scene:
+def rods_through_origin(*directions, lift: float = 0.0, nodes: int = 4) -> ddg.Scene:
     """Return rods through the origin, each higher than the last by `lift`."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     along = np.linspace(-0.1, 0.1, nodes)[:, None]
@@ -22,9 +22,9 @@ def scene_of(*directions, lift: float = 0.0, nodes: int = 4) -> ddg.Scene:
     return scene
 
 
-def test_rods_that_meet_in_a_point_pass_by_each_other(device):
+def test_rods_through_one_point_separate_by_halves(device):
     """Rods move by half of the missing distance each, across both. The nodes of the middle edges move as far."""
-    model = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)).build(device=device, precision="float64")
+    model = rods_through_origin((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)).build(device=device, precision="float64")
     state = model.state()
     before = state.points().copy()
     with pytest.raises(SceneError, match="overlap"):
@@ -40,9 +40,9 @@ def test_rods_that_meet_in_a_point_pass_by_each_other(device):
     ddg.Integrator(model).step(new, 1e-3)
 
 
-def test_what_is_held_stays(device):
+def test_fixed_nodes_stay(device):
     """A rod too deep in the floor is lifted by the missing distance; a fixed rod stays, and the other one moves."""
-    scene = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), lift=0.5 * RADIUS)
+    scene = rods_through_origin((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), lift=0.5 * RADIUS)
     scene.fix(0, [0, 1, 2, 3])
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -RADIUS - 0.5 * RANGE)))
     model = scene.build(device=device, precision="float64")
@@ -51,7 +51,7 @@ def test_what_is_held_stays(device):
     change = new.points() - state.points()
     assert np.abs(change[:4]).max() == 0.0
     assert moved == pytest.approx(1.5 * RADIUS + BEYOND * 0.2 * RANGE, rel=1e-9)
-    sunk = scene_of((1.0, 0.0, 0.0))
+    sunk = rods_through_origin((1.0, 0.0, 0.0))
     sunk.add_obstacle(ddg.Plane((0.0, 0.0, -0.25 * RADIUS)))
     model = sunk.build(device=device, precision="float64")
     new, moved = model.pushed_apart(model.state())
@@ -60,10 +60,10 @@ def test_what_is_held_stays(device):
 
 
 @pytest.mark.parametrize("precision", ["float64", "mixed"])
-def test_a_heap_comes_apart(device, precision):
+def test_heap_is_separated(device, precision):
     """Twelve rods through one point above a sheet, in two worlds, separate to the required gap; steps continue from there."""
     rng = np.random.default_rng(3)
-    scene = scene_of(*rng.normal(size=(12, 3)), lift=1e-4, nodes=16)
+    scene = rods_through_origin(*rng.normal(size=(12, 3)), lift=1e-4, nodes=16)
     sheet = np.array([[-0.2, -0.2, -0.11], [0.2, -0.2, -0.11], [0.0, 0.2, -0.11]])
     scene.add_obstacle(ddg.Mesh(sheet, np.array([[0, 1, 2]]), 1e-3))
     model = scene.build(worlds=2, device=device, precision=precision)
@@ -84,7 +84,7 @@ def test_a_heap_comes_apart(device, precision):
 
 
 def test_refusals(device):
-    scene = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    scene = rods_through_origin((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     for rod in range(2):
         scene.fix(rod, [0, 1, 2, 3])
     model = scene.build(device=device)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eager_steps import eagerly
+from eager_steps import step_without_capture
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -15,7 +15,7 @@ STRAIGHT = np.linspace(-0.03, 0.03, 9)
 APART = 0.2  # m, between pairs of rods
 
 
-def pairs(speeds) -> tuple[ddg.Scene, np.ndarray]:
+def crossed_pairs(speeds) -> tuple[ddg.Scene, np.ndarray]:
     """Return pairs of crossed rods, each meeting at another speed, and velocities."""
     scene, velocities = ddg.Scene(gravity=(0.0, 0.0, 0.0)), []
     for i, speed in enumerate(speeds):
@@ -57,7 +57,7 @@ def rod_on_ball(scene, offset, lift: float) -> float:
     return -RADIUS
 
 
-def watched(device, scene, velocities, worlds: int = 1, linear="chain", **options):
+def record_directions(device, scene, velocities, worlds: int = 1, linear="chain", **options):
     """Launch a step without capture; return the end state, nodes there, and every direction with the nodes before."""
     model = scene.build(device=device, worlds=worlds)
     integrator = ddg.Integrator(model, linear=linear, **options)
@@ -73,14 +73,14 @@ def watched(device, scene, velocities, worlds: int = 1, linear="chain", **option
         records.append((newton.direction.numpy().reshape(worlds, -1, 3)[:, :nodes].astype(float), before))
 
     newton.direct = record
-    end = eagerly(integrator, state, DT)
+    end = step_without_capture(integrator, state, DT)
     return end.state, end.own.net.q.numpy().reshape(worlds, -1, 3)[:, :nodes], records
 
 
-def test_an_island_in_balance_rests(device):
+def test_converged_island_sleeps(device):
     """The first of two pairs to converge sleeps: nodes stay equal bitwise while the other pair iterates."""
-    scene, velocities = pairs([0.05, 3.0])
-    _, end, records = watched(device, scene, velocities, rtol=1e-6)
+    scene, velocities = crossed_pairs([0.05, 3.0])
+    _, end, records = record_directions(device, scene, velocities, rtol=1e-6)
     moved = np.array([[np.abs(d[0, start : start + 18]).max() for start in (0, 18)] for d, _ in records])
     assert moved[0].all()  # both set out
     (first,) = np.flatnonzero(moved[-1] == 0.0)
@@ -90,19 +90,19 @@ def test_an_island_in_balance_rests(device):
     assert (end[0, island] == records[asleep[0]][1][0, island]).all()
 
 
-def test_islands_do_not_change_what_others_find(device):
+def test_islands_converge_independently(device):
     """Three pairs in one world converge as in separate scenes."""
     speeds = [0.1, 3.0, 1.0]
-    scene, velocities = pairs(speeds)
-    _, together, _ = watched(device, scene, velocities, rtol=1e-10)
+    scene, velocities = crossed_pairs(speeds)
+    _, together, _ = record_directions(device, scene, velocities, rtol=1e-10)
     for i, speed in enumerate(speeds):
-        _, alone, _ = watched(device, *pairs([speed]), rtol=1e-10)
+        _, alone, _ = record_directions(device, *crossed_pairs([speed]), rtol=1e-10)
         np.testing.assert_allclose(together[0, 18 * i : 18 * i + 18] - [APART * i, 0, 0], alone[0], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("linear", ["block_jacobi", "chain", "multilevel", "chain_multilevel"])
 @pytest.mark.parametrize("made", [joined_over_beam, sheet_over_beam, rod_on_ball])
-def test_islands_of_all_objects(device, made, linear):
+def test_islands_of_joined_rods_sheets_and_balls(device, made, linear):
     """One of two objects flies as predicted and sleeps while the other meets an object below.
 
     Each ends as in a separate scene.
@@ -117,9 +117,9 @@ def test_islands_of_all_objects(device, made, linear):
         for i in chosen:
             moves = (np.abs(points[:, 0] - APART * i) < 0.5 * APART) & (points[:, 2] > still[0])
             velocities[moves, 2] = -0.04  # no predictor is cut, as no island would sleep then
-        ends.append(watched(device, scene, velocities, linear=linear, rtol=1e-9)[0].points())
+        ends.append(record_directions(device, scene, velocities, linear=linear, rtol=1e-9)[0].points())
         if len(chosen) == 2:
-            _, _, records = watched(device, scene, velocities, linear=linear, rtol=1e-5)
+            _, _, records = record_directions(device, scene, velocities, linear=linear, rtol=1e-5)
             assert len(records) > 2
             near = [np.abs(records[0][1][0, :, 0] - APART * i) < 0.5 * APART for i in chosen]
             moved = np.array([[np.abs(d[0, nodes]).max() for nodes in near] for d, _ in records])
@@ -129,17 +129,17 @@ def test_islands_of_all_objects(device, made, linear):
         np.testing.assert_allclose(ends[0][nodes], alone, rtol=0, atol=1e-8 * APART)
 
 
-def test_worlds_have_islands_of_their_own(device):
+def test_worlds_have_separate_islands(device):
     """Two equal worlds repeat the iterations of one."""
-    scene, velocities = pairs([0.1, 3.0])
-    _, one, records = watched(device, scene, velocities, rtol=1e-6)
-    _, both, more = watched(device, scene, velocities, worlds=2, rtol=1e-6)
+    scene, velocities = crossed_pairs([0.1, 3.0])
+    _, one, records = record_directions(device, scene, velocities, rtol=1e-6)
+    _, both, more = record_directions(device, scene, velocities, worlds=2, rtol=1e-6)
     assert len(more) == len(records)
     for end in both:
         np.testing.assert_allclose(end, one[0], rtol=0, atol=1e-12)
 
 
-def test_islands_are_those_of_the_pairs(device):
+def test_islands_are_connected_components_of_the_pairs(device):
     """Contact pairs join rods, link by link; every island is named by the first body."""
     rng = np.random.default_rng(3)
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from friction_cases import ROLLING, each_form, hold_to_differences, rubbed
-from pair_cases import assembled, repeats
+from friction_cases import ROLLING, assert_central_differences, each_form, friction_terms
+from pair_cases import assembled_hessian, assert_repeatable
 
 import ddg_warp as ddg
 from ddg_warp import statics
@@ -33,7 +33,7 @@ def run(model, steps: int, dt: float = 1e-3, state=None, **options):
 
 @pytest.mark.parametrize(("slope", "mu"), [(0.3, 0.5), (0.3, 0.2), (0.5, 0.1), (0.5, 0.15)])
 @pytest.mark.parametrize("mesh", [False, True])
-def test_down_a_slope(device, slope, mu, mesh):
+def test_cylinder_rolls_or_slides_down_a_slope(device, slope, mu, mesh):
     """A cylinder, I = m r^2 / 2, rolls with 2/3 g sin while tan(slope) <= 3 mu.
 
     Else it slides with g (sin - mu cos), and friction spins it up by 2 mu g cos / r.
@@ -55,7 +55,7 @@ def test_down_a_slope(device, slope, mu, mesh):
 
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
-def test_what_slides_comes_to_roll(device, law):
+def test_sliding_rod_starts_to_roll(device, law):
     """A rod of speed v0 without spin rolls after v0 / (3 mu g) with 2/3 v0, whatever mu; friction has taken a third of the energy."""
     mu, v0 = 0.2, 0.4
     scene = ddg.Scene()
@@ -77,7 +77,7 @@ def test_what_slides_comes_to_roll(device, law):
 
 
 @pytest.mark.parametrize("quasistatic", [True, False])
-def test_a_roller_between_plates(device, quasistatic):
+def test_roller_moves_half_as_far_as_the_plate(device, quasistatic):
     """Rolling has no resistance, so that nothing pulls the upper plate back."""
     scene, far = ddg.Scene(gravity=(0.0, 0.0, 0.0)), 0.02
     rod(scene, ALONG_Y)
@@ -95,7 +95,7 @@ def test_a_roller_between_plates(device, quasistatic):
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-def test_a_shaft_drives_what_lies_on_it(device, parallel):
+def test_rotating_shaft_drives_a_rod(device, parallel):
     """A slipping shaft needs the moment mu N r and moves a rod across at omega r.
 
     A parallel rod that cannot move away counter-rotates as fast.
@@ -123,7 +123,7 @@ def test_a_shaft_drives_what_lies_on_it(device, parallel):
 
 
 @pytest.mark.parametrize(("angle", "load_steps"), [(-0.5, 1), (7.0, 1), (7.0, 5)])
-def test_a_shaft_draws_what_is_held(device, angle, load_steps):
+def test_rotating_shaft_pulls_a_fixed_rod(device, angle, load_steps):
     """The fixed end of the rod across carries mu N, and the shaft needs mu N r, in equilibria as in steps."""
     mu, scene = 0.3, ddg.Scene(gravity=(0.0, 0.0, -G))
     motion = ddg.Motion(angle=lambda t: angle * t, axis=(0.0, 1.0, 0.0))
@@ -160,7 +160,7 @@ def logs(between: float, floor: float) -> ddg.Scene:
 
 @pytest.mark.parametrize(("statically", "near"), [(True, 0.01), (False, 0.02)])
 @pytest.mark.parametrize("floor", [False, True])
-def test_a_pile_of_logs(device, statically, near, floor):
+def test_log_pile_stands_above_the_critical_friction(device, statically, near, floor):
     """The pile stands for friction of at least 2 - sqrt(3) between logs, and a third of that on the floor; else the upper log
     separates the others.
 
@@ -175,7 +175,7 @@ def test_a_pile_of_logs(device, statically, near, floor):
 
 
 @pytest.mark.parametrize("turns_freely", [True, False])
-def test_a_rope_over_a_pulley(device, turns_freely):
+def test_rope_tension_over_free_and_clamped_pulley(device, turns_freely):
     """A drum free to rotate passes tension on unchanged; a clamped drum follows Euler's and Eytelwein's law."""
     slack, mu = 1000.0 * capstan.B / capstan.AROUND**2, 0.3
     points, ends = capstan.wound(np.pi, np.pi * capstan.AROUND / 30, capstan.AROUND)
@@ -205,7 +205,7 @@ def test_a_rope_over_a_pulley(device, turns_freely):
             np.testing.assert_allclose(tension, capstan.expected(mu, np.pi, load * slack), rtol=5e-3)
 
 
-def test_angles_beside_held_nodes(device):
+def test_rolling_edges_next_to_clamped_edges_converge(device):
     """Clamped edges of a sagging rod meet the floor where free edges begin, which roll: the tangent includes the rolling."""
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     x = np.linspace(-0.05, 0.05, 7)
@@ -223,18 +223,18 @@ def test_angles_beside_held_nodes(device):
 
 
 @each_form
-def test_forces_and_products_are_differences(device, form):
-    result, positions, _, after = rubbed(ROLLING, device, form)
+def test_forces_and_products_equal_central_differences(device, form):
+    result, positions, _, after = friction_terms(ROLLING, device, form)
     assert sum((part.factor.angles.numpy()[: int(part.count.numpy()[0])] >= 0).sum() for part in result.frictions) > 20
-    hold_to_differences(result, positions, after)
+    assert_central_differences(result, positions, after)
 
 
 @each_form
-def test_blocks_are_those_of_the_matrix(device, form):
+def test_blocks_equal_the_matrix(device, form):
     """Blocks are of nodes and angles with themselves, of neighbouring angles, and of edges with both nodes."""
-    result, *_ = rubbed(ROLLING, device, form)
+    result, *_ = friction_terms(ROLLING, device, form)
     n, shapes = len(result.forces), result.search.shapes
-    matrix, diagonal = assembled(result, n).transpose(0, 2, 1, 3), result.diagonal.numpy()
+    matrix, diagonal = assembled_hessian(result, n).transpose(0, 2, 1, 3), result.diagonal.numpy()
     largest = np.abs(matrix).max(axis=(0, 1, 2, 3))
     flat = matrix.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
     assert np.abs(flat - flat.T).max() < 1e-14 * largest
@@ -254,8 +254,8 @@ def test_blocks_are_those_of_the_matrix(device, form):
             assert abs(neighbour[e] - matrix[angles[e], angles[e + 1], 0, 0]) < 1e-13 * largest
 
 
-def test_two_runs_and_worlds_agree_to_the_bit(device):
-    repeats(lambda: [rubbed(ROLLING, device)[0].forces.numpy().copy()])
+def test_runs_and_worlds_agree_bitwise(device):
+    assert_repeatable(lambda: [friction_terms(ROLLING, device)[0].forces.numpy().copy()])
     scene = ddg.Scene()
     rod(scene, ALONG_Y + [0.0, 0.0, 5.0 * RADIUS])
     rod(scene, 0.6 * ALONG_Y[:, [1, 0, 2]] + [0.0, 0.0, 8.0 * RADIUS])
@@ -268,7 +268,7 @@ def test_two_runs_and_worlds_agree_to_the_bit(device):
     np.testing.assert_array_equal(first.points()[0], first.points()[1])
 
 
-def test_where_nothing_can_roll_it_is_refused(device):
+def test_rolling_is_refused_without_twist_or_friction(device):
     def scene(**options):
         made = ddg.Scene()
         made.add_rod(ALONG_Y, section=ddg.Circle(RADIUS), material=STIFF, **options)
@@ -288,7 +288,7 @@ def test_where_nothing_can_roll_it_is_refused(device):
 
 
 @pytest.mark.parametrize("rolling, kept, off", [(False, 0.0, 0.01), (True, 4.0e-3 / 4.35e-3, 0.05)])
-def test_angular_momentum_of_a_pair_that_rubs(device, rolling, kept, off):
+def test_rolling_friction_keeps_angular_momentum(device, rolling, kept, off):
     """Two free parallel rods meet and slide across each other, which ends the angular momentum m v d of sliding.
 
     d is the distance of the centrelines. Surface friction replaces the loss by spins, but for the fraction of the gap in d; friction

@@ -47,7 +47,7 @@ def rod_on_rods(scene):
     scene.add_rod(line((0.0, 0.0, 0.011), (0.2, 0.0, 0.011), 7), section=ddg.Circle(0.005), material=stiff)
 
 
-RESTING = {"rod": rod_on_floor, "joined": cross_on_floor, "sheet": sheet_on_floor, "rods": rod_on_rods}
+AT_REST = {"rod": rod_on_floor, "joined": cross_on_floor, "sheet": sheet_on_floor, "rods": rod_on_rods}
 
 
 def on_slope(add, angle: float, **contact) -> ddg.Scene:
@@ -64,11 +64,11 @@ CREEP = {  # speed over nu at which the law has a fraction s of the friction
 
 
 @pytest.mark.parametrize("law", CREEP)
-@pytest.mark.parametrize("name", RESTING)
-def test_what_rests_on_a_slope_creeps(device, name, law):
+@pytest.mark.parametrize("name", AT_REST)
+def test_bodies_on_a_slope_creep_by_the_friction_law(device, name, law):
     """Friction is tan(angle) / mu of the limit everywhere: all nodes creep at one speed, with the load increments as time."""
     mu, angle = 0.5, 0.3
-    model = on_slope(RESTING[name], angle, friction=mu, friction_law=law).build(device, precision="float64")
+    model = on_slope(AT_REST[name], angle, friction=mu, friction_law=law).build(device, precision="float64")
     states = [statics.solve(model, load_steps=steps) for steps in (1, 4)]
     for state in states:
         moved = (state.points() - model.state().points())[-7:, 0]  # of free nodes
@@ -78,7 +78,7 @@ def test_what_rests_on_a_slope_creeps(device, name, law):
 
 
 @pytest.mark.parametrize("sign, mu", [(1.0, 0.3), (-1.0, 0.6)])
-def test_friction_by_direction(device, sign, mu):
+def test_anisotropic_friction_on_a_slope(device, sign, mu):
     """A rod creeps by the coefficient of the direction; nu is smaller by the least coefficient over this one."""
     angle = 0.2
     for law in ("barrier", "penalty"):
@@ -111,7 +111,7 @@ def test_reactions_and_contacts_have_friction(device):
     np.testing.assert_array_equal(model.contacts(again).friction, contacts.friction)
 
 
-def test_what_slides_off_has_no_equilibrium(device):
+def test_sliding_body_has_no_equilibrium(device):
     model = on_slope(rod_on_floor, 0.3, friction=0.3).build(device, precision="float64")
     with pytest.raises(
         SolverError,
@@ -120,14 +120,14 @@ def test_what_slides_off_has_no_equilibrium(device):
         statics.solve(model, max_cuts=1, max_iterations=30)
 
 
-def test_friction_that_has_not_settled_is_no_equilibrium(device):
+def test_unsettled_friction_is_no_equilibrium(device):
     """Two rounds leave an equilibrium with the friction of other normal forces, a sixth off."""
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
     with pytest.raises(SolverError, match="max_iterations"):
         statics.solve(model, max_cuts=1, max_iterations=2)
 
 
-def test_rests_on_in_time(device):
+def test_time_steps_continue_the_equilibrium(device):
     """The first time step from an equilibrium begins at rest, and the creep goes on as slowly."""
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
     state = first = statics.solve(model, load_steps=2)
@@ -156,7 +156,7 @@ def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
 @pytest.mark.parametrize(
     "load_steps", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(8, marks=pytest.mark.slow)]
 )
-def test_a_ladder_stands_from_its_critical_angle_on(device, law, mu, load_steps):
+def test_ladder_stands_above_its_critical_angle(device, law, mu, load_steps):
     """The ends slide at tan(angle) = (1 - mu^2) / (2 mu).
 
     There N (1 + mu^2) = w of the floor, and the moment about the foot is w cos / 2 = mu N (sin + mu cos). With the normal forces of a
@@ -184,7 +184,7 @@ LENGTH, RADIUS, SOFT = 1.0, 0.005, 1e5  # m, m, N/m^2
 WEIGHT = 1000.0 * G * np.pi * RADIUS**2  # N/m
 
 
-def drawn(mu: float, far: float) -> ddg.Scene:
+def drawn_rod(mu: float, far: float) -> ddg.Scene:
     """Return a rod on a floor; the last end is drawn by `far` after t = 1000, and partly back after 1001."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G / 1000.0))  # of load parameters about 1000
     material = ddg.Material(young=SOFT, density=1000.0, poisson=0.5)
@@ -197,7 +197,7 @@ def drawn(mu: float, far: float) -> ddg.Scene:
     return scene
 
 
-def test_a_rod_that_is_drawn_slides_from_its_end(device):
+def test_drawn_rod_slides_from_its_end(device):
     """Tension falls by mu w along the sliding length, so that an end force F moves the end by F^2 / (2 EA mu w).
 
     Drawn back, friction reverses from the end on: the force falls by 2 sqrt(EA mu w du) and depends on the path. Friction dissipates
@@ -209,7 +209,7 @@ def test_a_rod_that_is_drawn_slides_from_its_end(device):
     full = np.sqrt(2.0 * EA * friction * far)
     back = full - 2.0 * np.sqrt(EA * friction * 0.8 * far)
     assert back < 0.0 < np.sqrt(2.0 * EA * friction * 0.2 * far)  # force of a rod that was never drawn farther
-    model = drawn(mu, far).build(device, precision="float64")
+    model = drawn_rod(mu, far).build(device, precision="float64")
     search = Equilibrium(model)
     state = search.load(model.state(), 1, 999.0, 1000.0)
     for end, expected in ((1001.0, full), (1002.0, back)):
@@ -221,7 +221,7 @@ def test_a_rod_that_is_drawn_slides_from_its_end(device):
             )
 
 
-def test_a_rope_about_a_drum(device):
+def test_rope_about_a_drum_follows_euler_eytelwein(device):
     """Euler's and Eytelwein's law, with the bending stiffness of the rod; see the scene."""
     scene = capstan.build(n=30, friction=0.3)
     model = scene.build(device, precision="float64")
@@ -232,7 +232,7 @@ def test_a_rope_about_a_drum(device):
 
 
 @pytest.mark.parametrize("sense", [-1.0, 1.0])
-def test_a_band_brake(device, sense):
+def test_band_brake_tension_and_moment(device, sense):
     """The drum rotates in a rope with one fixed end: by the sense of rotation the fixed end is the tight or the slack side.
 
     The moment on the drum is the difference of both tensions times the radius.
@@ -254,7 +254,7 @@ def test_a_band_brake(device, sense):
 
 
 @pytest.mark.parametrize("load_steps", [1, 3])
-def test_pushed_by_an_obstacle(device, load_steps):
+def test_wall_slides_a_rod_by_mu_times_weight(device, load_steps):
     """A wall moves a rod along the floor over many ranges of contact, by mu of the weight."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     scene.add_rod(line((0.0, -0.1, 0.006), (0.0, 0.1, 0.006), 6), section=ddg.Circle(0.005), material=RUBBER)
@@ -280,7 +280,7 @@ def test_runs_are_bitwise_equal_and_worlds_to_rounding(device):
     np.testing.assert_allclose(first[0], first[1], rtol=0.0, atol=1e-15)
 
 
-def test_friction_needs_an_increment(device):
+def test_friction_needs_a_load_increment(device):
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
     with pytest.raises(ddg.SceneError, match=r"friction .* from 1 to 1 there is none; give start other than end"):
         statics.solve(model, start=1.0)
@@ -313,7 +313,7 @@ def bracket(beyond: float) -> ddg.Scene:
     return scene
 
 
-def test_a_bracket_locks_itself(device):
+def test_bracket_locks_beyond_its_critical_distance(device):
     """A force W at a distance e from a pole is carried where e > h / 2 mu: N = W e / h acts at both heights, with friction 2 mu N."""
     model = bracket(1.03).build(device, precision="float64")
     state = statics.solve(model)
@@ -323,7 +323,7 @@ def test_a_bracket_locks_itself(device):
         statics.solve(bracket(0.97).build(device, precision="float64"), max_cuts=1)
 
 
-def test_less_of_a_way_leads_into_nothing(device):
+def test_relaxation_ends_in_no_overlap(device):
     """Half of a motion around a rod would end in the rod: then the whole motion is taken."""
     scene = ddg.Scene()
     scene.fix(
@@ -343,7 +343,7 @@ def test_less_of_a_way_leads_into_nothing(device):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_pile_at_rest_is_in_equilibrium(device, seed):
+def test_pile_at_rest_is_in_equilibrium(device, seed):
     """A pile at rest in steps, by friction alone, moves in an equilibrium as far as the creep of that time."""
     rng, rods = np.random.default_rng(seed), 12
     scene = ddg.Scene(gravity=(0.0, 0.0, -G), mass_damping=5.0)

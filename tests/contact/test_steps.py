@@ -47,7 +47,7 @@ def momentum(model, state) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
-def test_rods_that_fly_at_each_other_bounce(device, law):
+def test_colliding_rods_bounce_and_conserve_momentum(device, law):
     """Impulses sum to zero (Newton's third law), and contact dissipates kinetic energy."""
     scene, velocities = heap(law)
     model, integrator, states = run(device, scene, velocities, 30, rtol=1e-11)
@@ -64,7 +64,7 @@ def test_rods_that_fly_at_each_other_bounce(device, law):
     assert integrator.statistics()["contact"]["refused_crossings"] == 0
 
 
-def test_what_lies_on_a_beam_weighs_on_it(device):
+def test_contact_forces_carry_the_weight(device):
     """The contact forces on a beam at rest are the weight of the rods on top, m g."""
     scene = ddg.Scene(mass_damping=20.0)
     s = np.linspace(-0.05, 0.05, 11)
@@ -83,7 +83,7 @@ def test_what_lies_on_a_beam_weighs_on_it(device):
     np.testing.assert_allclose(-on_lower.sum(0)[2], weight, rtol=1e-3)
 
 
-def test_two_runs_are_equal(device):
+def test_runs_agree_bitwise(device):
     states = [run(device, *heap())[2][-1].points() for _ in range(2)]
     np.testing.assert_array_equal(*states)
 
@@ -96,7 +96,7 @@ def test_the_order_of_rods_does_not_matter(device):
     np.testing.assert_allclose(second, first[order], atol=1e-6 * RADIUS)
 
 
-def test_worlds_do_not_touch_each_other(device):
+def test_worlds_are_independent(device):
     scene, velocities = heap()
     one = run(device, scene, velocities)[2][-1].points()
     model = scene.build(device=device, worlds=2)
@@ -108,7 +108,7 @@ def test_worlds_do_not_touch_each_other(device):
     np.testing.assert_allclose(state.points()[1], model.state().points()[1], atol=1e-12)
 
 
-def test_more_pairs_than_there_is_room_for(device):
+def test_overflowing_lists_repeat_the_step_at_full_length(device):
     """An overflowing step is repeated with more room and is the same, without shorter attempts."""
     scene, velocities = heap()
     _, usual, states = run(device, scene, velocities)
@@ -128,7 +128,7 @@ def test_more_pairs_than_there_is_room_for(device):
     assert searches[1] <= searches[0] + 8
 
 
-def crossing(distance: float, law: str = "barrier") -> ddg.Scene:
+def crossed_rods(distance: float, law: str = "barrier") -> ddg.Scene:
     scene = ddg.Scene()
     s = np.linspace(-0.05, 0.05, 11)
     for name, points in (
@@ -141,15 +141,15 @@ def crossing(distance: float, law: str = "barrier") -> ddg.Scene:
 
 
 def test_overlaps_at_the_start_are_refused(device):
-    model = crossing(1.9 * RADIUS).build(device=device)
+    model = crossed_rods(1.9 * RADIUS).build(device=device)
     with pytest.raises(ddg.SceneError, match=r"edge \d+ of rod 0 .* and edge \d+ of rod 1 .* overlap by 0.0002 m"):
         ddg.Integrator(model).step(model.state(), 0.01)
 
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
-def test_derivatives_of_the_energy(device, law):
+def test_forces_are_derivatives_of_the_contact_energy(device, law):
     """Contact forces of the host's tangent are central differences of the contact energy."""
-    model = crossing((2.0 if law == "barrier" else 1.9) * RADIUS + 2e-4, law).build(device=device)
+    model = crossed_rods((2.0 if law == "barrier" else 1.9) * RADIUS + 2e-4, law).build(device=device)
     state = model.state()
     q = state.net.q.numpy().copy()
     rng = np.random.default_rng(0)
@@ -168,7 +168,7 @@ def test_derivatives_of_the_energy(device, law):
 
 
 def test_refusals(device):
-    scene = crossing(3 * RADIUS)
+    scene = crossed_rods(3 * RADIUS)
     scene.clamp([0, 1], edges=[0])
     with pytest.raises(ddg.SceneError, match="has contact already"):
         scene.contact()
@@ -179,7 +179,7 @@ def test_refusals(device):
 
 
 @pytest.mark.parametrize("name", ["noodles", "crossed_beams"])
-def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, name):
+def test_substructuring_does_not_depend_on_the_thread_mapping(device, monkeypatch, name):
     """Two eliminations include the contact terms of the bands: motions agree to rounding, iterations to one of hundreds."""
     results = []
     for reduces in (False, True):

@@ -11,7 +11,7 @@ from ddg_warp.run.cli import main
 RADIUS, MU = 2e-3, 0.3
 
 
-def lying(height: float = 5e-4, friction: float = MU) -> ddg.Scene:
+def rod_above_floor(height: float = 5e-4, friction: float = MU) -> ddg.Scene:
     """Return a rod at a height above a floor [m]."""
     scene = ddg.Scene()
     y = np.linspace(-0.05, 0.05, 11)
@@ -22,9 +22,9 @@ def lying(height: float = 5e-4, friction: float = MU) -> ddg.Scene:
     return scene
 
 
-def test_friction_takes_what_the_rod_loses(device):
+def test_friction_work_equals_lost_kinetic_energy(device):
     """Implicit Euler friction F = m (v1 - v0) / h acts along h v1, so that the work is the sum of -m v1 . (v1 - v0)."""
-    model = lying().build(device=device, worlds=2)
+    model = rod_above_floor().build(device=device, worlds=2)
     integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
     for _ in range(40):
         state = integrator.step(state, 0.02)
@@ -47,8 +47,8 @@ def test_friction_takes_what_the_rod_loses(device):
     assert statistics["contacts"]["last"] > 0
 
 
-def test_what_nothing_touches_has_no_gap(device):
-    model = lying(height=1.0, friction=0.0).build(device=device)
+def test_gap_is_infinite_without_contact(device):
+    model = rod_above_floor(height=1.0, friction=0.0).build(device=device)
     integrator = ddg.Integrator(model)
     integrator.step(model.state(), 1e-3)
     statistics = integrator.statistics()["contact"]
@@ -57,9 +57,9 @@ def test_what_nothing_touches_has_no_gap(device):
     assert "friction_work" not in statistics
 
 
-def test_steps_done_again_count_once(device):
+def test_repeated_steps_count_once(device):
     """An overflowing step is undone and counted once."""
-    scene, counts = lying(), []
+    scene, counts = rod_above_floor(), []
     for room in (None, 1):
         model = scene.build(device=device)
         integrator, state = ddg.Integrator(model), model.state()
@@ -76,7 +76,7 @@ def test_steps_done_again_count_once(device):
     assert counts[0]["last"] > 0
 
 
-def test_the_summary_has_it(device, tmp_path, capsys):
+def test_summary_reports_contact(device, tmp_path, capsys):
     assert main(["run", "crossed_beams", "--n", "20", "--device", device, "--out", str(tmp_path / "out")]) == 0
     content = json.loads((tmp_path / "out" / "summary.json").read_text())["contact"]
     assert (content["law"], content["refused_crossings"], content["contacts"]["last"]) == ("barrier", 0, 4)

@@ -15,11 +15,11 @@ from turn_cases import (
     RANGE,
     STIFF,
     THICKNESS,
-    ahead,
-    needed,
-    place,
-    posed,
+    angles_ahead,
+    polar_point,
+    rotation_control,
     scene,
+    substeps_needed,
 )
 
 import ddg_warp as ddg
@@ -32,7 +32,7 @@ RADII = 0.07, 0.1, 0.15, 0.19, 0.198, 0.1995
 QUICK = [(1 / 6, 0.198), (0.75, 0.19), (2.5, 0.1)]
 
 
-def turning(turns: float) -> ddg.Motion:
+def rotating(turns: float) -> ddg.Motion:
     return ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t / DT)
 
 
@@ -69,27 +69,29 @@ def outward(turns: float, radius: float) -> float:
     return (angle - 0.5 * angle % (2.0 * np.pi)) * (THICKNESS + RANGE + radius * angle / DT / DAMPING)
 
 
-def check_pushed(kind: str, turns: float, radius: float, drive: str, device) -> None:
+def assert_swept(kind: str, turns: float, radius: float, drive: str, device) -> None:
     """Assert that a rod halfway along the rotation moves, and that a rod outside the swept angle stays, bitwise.
 
     Wide blades end behind the rod, which drag stops wherever contact ends.
     """
-    motion = turning(turns) if drive == "motion" else ddg.Grip()
-    beyond = place(LAST + BALL + 0.05, -0.5)
-    away = place(radius, 1.5 * np.pi) if turns < 0.7 and kind != "half-space" else beyond
+    motion = rotating(turns) if drive == "motion" else ddg.Grip()
+    beyond = polar_point(LAST + BALL + 0.05, -0.5)
+    away = polar_point(radius, 1.5 * np.pi) if turns < 0.7 and kind != "half-space" else beyond
     made = scene(
-        kind, motion, [place(radius, np.pi * turns), away] if kind != "half-space" else [place(radius, np.pi * turns)]
+        kind,
+        motion,
+        [polar_point(radius, np.pi * turns), away] if kind != "half-space" else [polar_point(radius, np.pi * turns)],
     )
-    integrator, state = step(made, device, posed(turns) if drive == "grip" else None)
+    integrator, state = step(made, device, rotation_control(turns) if drive == "grip" else None)
     points = (
         state.points()[:, :2].reshape(-1, 11, 2) if kind in OBSTACLES else state.points()[:22, :2].reshape(-1, 11, 2)
     )
-    moved = np.linalg.norm(points[0, 5] - place(radius, np.pi * turns))
+    moved = np.linalg.norm(points[0, 5] - polar_point(radius, np.pi * turns))
     statistics = integrator.statistics()["contact"]
     assert moved > 0.1 * THICKNESS
     assert statistics["smallest_gap"] > 0.0
     if kind in WIDE and radius + outward(turns, radius) < LAST:
-        lead = np.sin(ahead(points[0], 2.0 * np.pi * turns)) * np.linalg.norm(points[0], axis=-1)
+        lead = np.sin(angles_ahead(points[0], 2.0 * np.pi * turns)) * np.linalg.norm(points[0], axis=-1)
         side = THICKNESS if kind != "half-space" else RADIUS
         assert (lead > side).all()
         assert (lead < side + 2.0 * RANGE).all()
@@ -99,56 +101,56 @@ def check_pushed(kind: str, turns: float, radius: float, drive: str, device) -> 
 
 @pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_arcs_push_what_chords_would_pass(device, kind, drive):
+def test_contact_follows_arcs_not_chords(device, kind, drive):
     for turns, radius in QUICK:
         radius = radius if kind != "ball" else LAST - BALL
         if swept(kind, turns, radius) and (drive == "motion" or turns <= 0.5):
-            check_pushed(kind, turns, radius, drive, device)
+            assert_swept(kind, turns, radius, drive, device)
 
 
 @pytest.mark.parametrize("kind", ["mesh", "capsule", "fix"])
-def test_a_rod_is_pushed_along_the_arc_at_and_near_the_axis(device, kind):
+def test_rod_near_the_axis_follows_the_arc(device, kind):
     """A blade through the axis moves a dragged rod along the blade's normal, and outwards.
 
     A substep that rotates by a takes a distance d ahead of the blade and r along to r cos(a) + d sin(a).
     """
     turns = 1.0
     for radius in (0.0035, 0.01, 0.05):
-        made = scene(kind, turning(turns), place(radius, 0.5 * np.pi), first=-LAST)
+        made = scene(kind, rotating(turns), polar_point(radius, 0.5 * np.pi), first=-LAST)
         integrator, state = step(made, device)
         angle, x = 2.0 * np.pi * turns, state.points()[5, :2]
-        along, off = x @ place(1.0, angle), x @ place(1.0, angle + 0.5 * np.pi)
+        along, off = x @ polar_point(1.0, angle), x @ polar_point(1.0, angle + 0.5 * np.pi)
         assert THICKNESS < off < THICKNESS + RANGE
-        count = needed(angle, LAST)
+        count = substeps_needed(angle, LAST)
         assert substeps(integrator) == [count]
-        wanted = place(radius, 0.5 * np.pi)
+        wanted = polar_point(radius, 0.5 * np.pi)
         for k in range(1, count + 1):
-            normal = place(1.0, angle * k / count + 0.5 * np.pi)
+            normal = polar_point(1.0, angle * k / count + 0.5 * np.pi)
             wanted = wanted + max(0.0, off - wanted @ normal) * normal
         # drag alpha m v leaves 1 / (1 + alpha s) of the velocity in a substep s
-        assert along == pytest.approx(wanted @ place(1.0, angle), rel=0.05)
+        assert along == pytest.approx(wanted @ polar_point(1.0, angle), rel=0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_arcs_push_what_chords_would_pass_at_any_radius(device, kind, drive):
+def test_contact_follows_arcs_not_chords_at_any_radius(device, kind, drive):
     for turns in TURNS:
         for radius in radii(kind):
             if swept(kind, turns, radius) and (drive == "motion" or turns <= 0.5):
-                check_pushed(kind, turns, radius, drive, device)
+                assert_swept(kind, turns, radius, drive, device)
 
 
-def test_substeps_are_as_many_as_the_sagitta_asks_for(device):
+def test_number_of_substeps_follows_the_sagitta(device):
     """Rotations just below the allowed sagitta are not split. Motions and grips are split alike."""
     limit = 2.0 * np.arccos(1.0 - PART * min(RANGE, THICKNESS) / LAST) / (2.0 * np.pi)
     for turns in (0.99 * limit, 1.01 * limit, 3.9 * limit, 0.4):
-        wanted = needed(2.0 * np.pi * turns, LAST)
-        for motion, controls in ((turning(turns), None), (ddg.Grip(), posed(turns))):
-            integrator, state = step(scene("capsule", motion, place(0.1, -1.5)), device, controls)
+        wanted = substeps_needed(2.0 * np.pi * turns, LAST)
+        for motion, controls in ((rotating(turns), None), (ddg.Grip(), rotation_control(turns))):
+            integrator, state = step(scene("capsule", motion, polar_point(0.1, -1.5)), device, controls)
             assert substeps(integrator) == [wanted]
             assert integrator.statistics()["newton_iterations"]["max"] < 20
-            np.testing.assert_array_equal(state.points()[5, :2], place(0.1, -1.5))
+            np.testing.assert_array_equal(state.points()[5, :2], polar_point(0.1, -1.5))
 
 
 AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
@@ -161,7 +163,7 @@ SYMMETRIC = {
 
 @pytest.mark.parametrize("drive", ["motion", "grip"])
 @pytest.mark.parametrize("shape", SYMMETRIC)
-def test_what_turns_about_its_axis_of_symmetry_needs_no_substeps(device, shape, drive):
+def test_rotation_about_a_symmetry_axis_needs_no_substeps(device, shape, drive):
     """The angle does not matter. A half-space needs as few substeps as a tilt would."""
     angle, pivot = 0.49 * 2.0 * np.pi, (0.1, 0.0, 0.0)
     made = ddg.Scene(gravity=(0, 0, 0))
@@ -176,7 +178,7 @@ def test_what_turns_about_its_axis_of_symmetry_needs_no_substeps(device, shape, 
     assert substeps(integrator) == [16 if shape == "half-space" else 1]
 
 
-def test_a_drum_that_spins_by_half_a_turn_a_step_rubs_as_one_that_spins_slowly(device):
+def test_drum_friction_does_not_depend_on_the_angle_per_step(device):
     """A rod on top slides by m dv / dt = mu N, whatever the drum's angle per step."""
     mu, dt, settled, steps, radius = 0.3, 2e-3, 40, 6, 0.05
     for increment in (0.2, np.pi):
@@ -206,17 +208,17 @@ ORBIT = LAST - BALL
 
 @pytest.mark.parametrize("turns", [1.0, 2.0, 7.0])
 @pytest.mark.parametrize("path", ["orbit", "swing", "vertices"])
-def test_functions_of_time_are_sampled_until_their_arcs_are_resolved(device, path, turns):
+def test_motion_functions_are_sampled_until_arcs_are_resolved(device, path, turns):
     """A ball orbits by translation, a blade swings to and fro, and vertices orbit: all are back at the end."""
     if path == "orbit":
 
         def shift(t):
-            return (*(place(ORBIT, 2.0 * np.pi * turns * t / DT) - [ORBIT, 0.0]), 0.0)
+            return (*(polar_point(ORBIT, 2.0 * np.pi * turns * t / DT) - [ORBIT, 0.0]), 0.0)
 
-        made = scene("ball", ddg.Motion(translation=shift), place(ORBIT, 2.1))
+        made = scene("ball", ddg.Motion(translation=shift), polar_point(ORBIT, 2.1))
     elif path == "swing":
         motion = ddg.Motion(angle=lambda t: 1.5 * np.sin(np.pi * turns * t / DT) ** 2)
-        made = scene("capsule", motion, place(0.19, 0.7))
+        made = scene("capsule", motion, polar_point(0.19, 0.7))
     else:
         points = OBSTACLES["mesh"].points
 
@@ -224,7 +226,7 @@ def test_functions_of_time_are_sampled_until_their_arcs_are_resolved(device, pat
             c, s = np.cos(2.0 * np.pi * turns * t / DT), np.sin(2.0 * np.pi * turns * t / DT)
             return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) - points
 
-        made = scene("mesh", ddg.Motion(translation=shifts), place(0.19, 2.1))
+        made = scene("mesh", ddg.Motion(translation=shifts), polar_point(0.19, 2.1))
     integrator, state = step(made, device)
     model = integrator.model
     moved = np.linalg.norm(state.points()[:11] - model.state().points()[:11], axis=1)
@@ -232,14 +234,14 @@ def test_functions_of_time_are_sampled_until_their_arcs_are_resolved(device, pat
     assert substeps(integrator)[0] > 16
 
 
-def test_a_straight_motion_is_one_step_however_it_is_paced(device):
-    made = scene("capsule", ddg.Motion(translation=lambda t: (0.0, 0.02 * t**3, 0.01 * t**3)), place(0.1, 1.0))
+def test_straight_motion_is_never_split(device):
+    made = scene("capsule", ddg.Motion(translation=lambda t: (0.0, 0.02 * t**3, 0.01 * t**3)), polar_point(0.1, 1.0))
     integrator, _ = step(made, device)
     assert substeps(integrator) == [1]
 
 
-def test_what_substeps_do_not_resolve_is_refused_with_a_step_that_does(device):
-    made = scene("capsule", turning(40.0), place(0.1, -1.5), reach=2e-5)
+def test_unresolved_rotations_are_refused_with_a_sufficient_step(device):
+    made = scene("capsule", rotating(40.0), polar_point(0.1, -1.5), reach=2e-5)
     with pytest.raises(ddg.SolverError, match=r"turned_too_far: obstacle 0 \('blade'\) turns by 40 turns") as error:
         step(made, device)
     assert error.value.outcome == "turned_too_far"
@@ -249,26 +251,26 @@ def test_what_substeps_do_not_resolve_is_refused_with_a_step_that_does(device):
     assert substeps(integrator) == [MOST_PARTS]
     jumping = ddg.Motion(angle=lambda t: 3.0 * (t > 0.4))
     with pytest.raises(ddg.SolverError, match=r"a motion that does not jump, as this one at t = 0\.4, such as a ramp"):
-        step(scene("capsule", jumping, place(0.1, -1.5)), device)
+        step(scene("capsule", jumping, polar_point(0.1, -1.5)), device)
 
 
-def test_a_grip_goes_the_shorter_way_and_no_farther_than_half_a_turn(device):
-    model = scene("mesh", ddg.Grip(), place(0.19, 3.0)).build(device=device)
+def test_grips_rotate_by_at_most_half_a_revolution(device):
+    model = scene("mesh", ddg.Grip(), polar_point(0.19, 3.0)).build(device=device)
     with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.6 turns") as error:
-        ddg.Integrator(model).step(model.state(), DT, posed(0.6))
+        ddg.Integrator(model).step(model.state(), DT, rotation_control(0.6))
     assert error.value.outcome == "turned_too_far"
     # poses may count revolutions, and may restart
     integrator, state = ddg.Integrator(model), model.state()
     for turns in (0.45, 0.9, 0.2):
-        state = integrator.step(state, DT, posed(turns))
-        lead = ahead(state.points()[5:6], 2.0 * np.pi * turns)[0]
+        state = integrator.step(state, DT, rotation_control(turns))
+        lead = angles_ahead(state.points()[5:6], 2.0 * np.pi * turns)[0]
         assert 0.0 < lead < 0.02 if turns != 0.45 else lead == pytest.approx(3.0 - 0.9 * np.pi)
 
 
-def test_a_grip_that_substeps_do_not_resolve_gives_up_its_world_alone(device):
+def test_unresolved_grip_fails_its_world_alone(device):
     turns = np.zeros((2, 1, 6))
     turns[1, 0, 5] = np.pi
-    model = scene("capsule", ddg.Grip(), place(0.1, -1.5), reach=2e-7).build(device=device, worlds=2)
+    model = scene("capsule", ddg.Grip(), polar_point(0.1, -1.5), reach=2e-7).build(device=device, worlds=2)
     integrator = ddg.Integrator(model, failures="flag")
     state = integrator.step(model.state(), DT, ddg.Controls(poses=turns))
     assert integrator.outcomes().tolist() == ["converged", "turned_too_far"]
@@ -284,29 +286,29 @@ def test_a_grip_that_substeps_do_not_resolve_gives_up_its_world_alone(device):
         integrator.check(integrator.step(model.state(), DT, ddg.Controls(poses=turns)))
 
 
-def test_every_world_is_cut_for_itself(device):
+def test_worlds_are_split_independently(device):
     """Each world equals a single world, bitwise."""
     turns, points = (1 / 6, 0.0, 0.4), {}
     for some in (turns, *((each,) for each in turns)):
-        model = scene("capsule", ddg.Grip(), place(0.19, np.pi / 6)).build(device=device, worlds=len(some))
+        model = scene("capsule", ddg.Grip(), polar_point(0.19, np.pi / 6)).build(device=device, worlds=len(some))
         integrator, state = ddg.Integrator(model), model.state()
         for k in range(2):
             poses = np.zeros((len(some), 1, 6))
             poses[:, 0, 5] = 2.0 * np.pi * (k + 1) * np.array(some)
             state = integrator.step(state, DT, ddg.Controls(poses=poses))
         points[some] = state.points().reshape(len(some), -1, 3)
-        assert substeps(integrator) == [needed(2.0 * np.pi * t, LAST) if t else 1 for t in some]
+        assert substeps(integrator) == [substeps_needed(2.0 * np.pi * t, LAST) if t else 1 for t in some]
     for w, each in enumerate(turns):
         np.testing.assert_array_equal(points[turns][w], points[(each,)][0])
 
 
-def test_grips_and_functions_of_time_are_cut_together(device):
+def test_grips_and_motion_functions_are_split_together(device):
     """A ball orbits and a grip rotates an arm, each with a rod in the path. Where the arm is at rest the ball decides."""
 
     def shift(t):
-        return (*(place(ORBIT, 0.3 * np.pi * t / DT) - [ORBIT, 0.0]), 0.0)
+        return (*(polar_point(ORBIT, 0.3 * np.pi * t / DT) - [ORBIT, 0.0]), 0.0)
 
-    made = scene("ball", ddg.Motion(translation=shift), [place(ORBIT, 0.2 * np.pi), place(0.1, 0.3)])
+    made = scene("ball", ddg.Motion(translation=shift), [polar_point(ORBIT, 0.2 * np.pi), polar_point(0.1, 0.3)])
     made.add_obstacle(ddg.Capsule((FIRST, 0, 0), (0.12, 0, 0), HALF), motion=ddg.Grip(), name="arm")
     model = made.build(device=device, worlds=2)
     integrator, poses = ddg.Integrator(model), np.zeros((2, 1, 6))
@@ -316,22 +318,22 @@ def test_grips_and_functions_of_time_are_cut_together(device):
     assert (moved[:, 0] > THICKNESS).all()
     assert moved[0, 1] == 0.0 and moved[1, 1] > THICKNESS
     ends = state.net.q.numpy().reshape(2, -1, 3)[:, model.net.host.obstacles[0]]
-    np.testing.assert_allclose(ends[:, 0, :2], [place(ORBIT, 0.3 * np.pi)] * 2, atol=1e-12)
+    np.testing.assert_allclose(ends[:, 0, :2], [polar_point(ORBIT, 0.3 * np.pi)] * 2, atol=1e-12)
     first, second = substeps(integrator)
-    assert first < second == needed(0.9 * np.pi, 0.12)
+    assert first < second == substeps_needed(0.9 * np.pi, 0.12)
 
 
 @pytest.mark.parametrize(("law", "precision"), [("penalty", "float64"), ("barrier", "mixed")])
-def test_substeps_serve_both_laws_and_precisions(device, law, precision):
-    made = scene("mesh", turning(0.3), place(0.198, 0.3 * np.pi), law=law)
+def test_substeps_work_with_both_laws_and_precisions(device, law, precision):
+    made = scene("mesh", rotating(0.3), polar_point(0.198, 0.3 * np.pi), law=law)
     model = made.build(device=device, precision=precision)
     state = ddg.Integrator(model, rtol=1e-4).step(model.state(), DT)
-    lead = ahead(state.points()[:11], 0.6 * np.pi)
+    lead = angles_ahead(state.points()[:11], 0.6 * np.pi)
     assert (lead > 0.0).all() and (lead < 0.02).all()
 
 
-def test_step_control_cuts_its_steps(device):
-    model = scene("mesh", turning(0.5), place(0.198, 0.5 * np.pi)).build(device=device)
+def test_step_control_splits_its_steps(device):
+    model = scene("mesh", rotating(0.5), polar_point(0.198, 0.5 * np.pi)).build(device=device)
     steps = ddg.StepControl(ddg.Integrator(model), error=1.0, halvings=2)
     state = steps.advance(model.state(), DT)
-    assert 0.0 < ahead(state.points()[5:6], np.pi)[0] < 0.02
+    assert 0.0 < angles_ahead(state.points()[5:6], np.pi)[0] < 0.02

@@ -62,20 +62,20 @@ def scene(kind: str, motion, centres, reach: float | None = None, first: float =
     return made
 
 
-def place(radius: float, angle: float) -> np.ndarray:
+def polar_point(radius: float, angle: float) -> np.ndarray:
     return radius * np.array([np.cos(angle), np.sin(angle)])
 
 
-def ahead(points: np.ndarray, angle: float) -> np.ndarray:
+def angles_ahead(points: np.ndarray, angle: float) -> np.ndarray:
     """Return the angles of points ahead of a blade, between -pi and pi."""
     return (np.arctan2(points[:, 1], points[:, 0]) - angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def posed(turns: float) -> ddg.Controls:
+def rotation_control(turns: float) -> ddg.Controls:
     return ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2.0 * np.pi * turns]]))
 
 
-def needed(angle: float, radius: float, thickness: float = THICKNESS) -> int:
+def substeps_needed(angle: float, radius: float, thickness: float = THICKNESS) -> int:
     """Return 2^k >= angle / a, where the sagitta R (1 - cos(a / 2)) is `PART` of range and thickness."""
     a = 2.0 * np.arccos(1.0 - PART * min(RANGE, thickness) / radius)
     return 2 ** int(np.ceil(np.log2(angle / a)))

@@ -48,7 +48,7 @@ def cap(reverse, device):
     return points, scene.build(device, "float64")
 
 
-def test_poles_rims_and_direction(device):
+def test_energies_do_not_depend_on_the_direction_of_a_meridian(device):
     """A reversed meridian changes the sign of curvatures and the side of pressure, not energies and forces."""
     results = []
     for reverse in (False, True):
@@ -74,7 +74,7 @@ def test_poles_rims_and_direction(device):
     np.testing.assert_allclose(same_slope, slope, atol=1e-12 * np.abs(slope).max())
 
 
-def test_pressure_follows_with_its_exact_derivative():
+def test_pressure_forces_and_derivatives_are_exact():
     """Derivatives of forces equal central differences; forces between fixed rims derive from the enclosed volume of the cones."""
     random = np.random.default_rng(3)
     x = np.column_stack([1.0 + random.random(6), np.zeros(6), np.arange(6.0)]) + 0.1 * random.normal(size=(6, 3))

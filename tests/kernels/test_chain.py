@@ -182,7 +182,7 @@ def second_order(x: np.ndarray, step: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("name", "precision"), [*((name, "float64") for name in KINDS), ("full", "mixed")])
-def test_sweep_is_a_dense_solve(device, name, precision):
+def test_sweep_equals_a_dense_solve(device, name, precision):
     """Direction and predicted decrease agree, from the same factors and forces."""
     problem = Problem(name, device, precision)
     before = problem.iterate_dofs()
@@ -222,7 +222,7 @@ def test_step_follows_the_direction(device, name, noise, inertia):
 
 
 @EVERY_KIND
-def test_rotation_cap(device, name):
+def test_no_edge_rotates_beyond_the_cap(device, name):
     """No edge rotates by more than the cap in an update, and no update is shortened needlessly."""
     cap = 0.02
     problem = Problem(name, device, rotation_cap=cap)
@@ -236,7 +236,7 @@ def test_rotation_cap(device, name):
 
 
 @EVERY_KIND
-def test_too_long_a_step_is_shortened_by_the_energy(device, name):
+def test_overshooting_step_is_backtracked_by_the_energy(device, name):
     """Thrice the Newton step overshoots. The sweep goes back to the minimum of a parabola, which gives the energy change."""
     problem = Problem(name, device, noise=0.05, inertia=1e3)
     newton, start = problem.newton, problem.iterate_dofs()
@@ -292,7 +292,7 @@ def test_accepted_steps_lower_the_energy(device, name):
     assert (iteration > 2).all()
 
 
-def aged(problem, aim) -> np.ndarray:
+def degenerate_frames(problem, aim) -> np.ndarray:
     """Return an iterate with the last two edges of every rod rotated at random until aim(cosine, twist) holds."""
     rng = np.random.default_rng(0)
     start = problem.iterate_dofs()
@@ -321,13 +321,13 @@ AGED = {
 
 
 @pytest.mark.parametrize("case", AGED)
-def test_old_frames_are_lagged_anew(device, case):
+def test_frames_are_updated_before_they_degenerate(device, case):
     """Frames are updated where an edge, the last one too, has rotated by 90 degrees, or the twist nears the jump at pi.
 
     Energies stay, and the step goes downhill in the new frames by the predicted decrease.
     """
     problem = Problem("full", device, noise=0.1)
-    newton, start = problem.newton, aged(problem, AGED[case])
+    newton, start = problem.newton, degenerate_frames(problem, AGED[case])
     energy = problem.energy(start)
     problem.iterate()
     if not arrays.download(newton.islands.step_length).any():
@@ -367,7 +367,7 @@ def test_planar_untwisted_and_full_rods_agree(device):
     np.testing.assert_allclose(planar, full, atol=1e-12)
 
 
-def test_indefinite_by_compression_is_clamped(device):
+def test_indefinite_matrix_drops_compression(device):
     """A rod is loaded beyond the buckling load in one step: the sweep takes the matrix without compression, then goes on."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3))
     points = np.zeros((12, 3))

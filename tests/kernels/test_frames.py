@@ -97,7 +97,7 @@ def test_transport_is_a_rotation(device, real):
 
 
 @REALS
-def test_transport_there_and_back(device, real):
+def test_transport_back_is_the_inverse(device, real):
     t0, t1, d = directions()
     carry = kernels(real)[0]
     back = apply(carry, real, device, apply(carry, real, device, d, t0, t1), t1, t0)
@@ -105,7 +105,7 @@ def test_transport_there_and_back(device, real):
 
 
 @REALS
-def test_rotate(device, real):
+def test_rotation_equals_rodrigues(device, real):
     t, _, _ = directions()
     d = perpendicular(t)
     angle = np.linspace(-7.0, 7.0, len(t))

@@ -85,7 +85,7 @@ def backward_error(A, x, b):
 
 @SIZES
 @REALS
-def test_well_conditioned(device, size, real):
+def test_factors_and_solves_of_well_conditioned_blocks(device, size, real):
     A, B, b = blocks(size, 10.0, real)
     got = solve(A, B, b, real, device)
     tolerance = 100.0 * np.finfo(wp.dtype_to_numpy(real)).eps
@@ -115,7 +115,7 @@ def test_ill_conditioned_blocks_keep_a_small_backward_error(device, size, real, 
 
 @SIZES
 @REALS
-def test_stretching_beside_bending(device, size, real):
+def test_small_bending_pivots_keep_their_digits(device, size, real):
     """A block of a thin rod: stiffness 1e8 along a tangent, 1 across. Its small pivots keep their digits.
 
     The solution loses the digits that the ratio of stiffness costs, and not more.

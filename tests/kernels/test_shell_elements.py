@@ -32,13 +32,13 @@ def patch(supported=True):
 @pytest.mark.parametrize(
     ("bending", "flags"), [("midedge_dof", (1, 1, 0, 0)), ("midedge_boundary", (1, 0, 0, 0)), ("midedge", (0, 0, 0, 0))]
 )
-def test_edges_that_turn(bending, flags):
+def test_edges_with_angles_by_bending_model(bending, flags):
     """Flags are by kind of edge: free, with a neighbour, clamped, symmetry."""
     *_, kinds = patch()
     assert np.array_equal(shells.turning(kinds, bending), np.array(flags, bool)[kinds.kind])
 
 
-def test_second_form_is_the_measure(device):
+def test_second_form_equals_the_measure(device):
     """NumPy and the kernel agree on every kind of edge, with and without angles; the host's rest angles are the kernel's."""
     surface, place, kinds = patch()
     assert set(kinds.kind) == {0, 1, 2, 3}
@@ -65,7 +65,7 @@ def test_second_form_is_the_measure(device):
         ("hinge", "flat"),
     ],
 )
-def test_no_force_at_rest(device, bending, membrane, viscosity):
+def test_rest_shape_bears_no_force(device, bending, membrane, viscosity):
     """A shape with rest="shape" bears no force, supports included; a displaced shape does."""
     surface, place, kinds = patch()
     plate = shells.plate(surface, place, 0.3, UNIT_D, NU, kinds, "shape", viscosity)

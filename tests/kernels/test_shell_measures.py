@@ -45,21 +45,21 @@ def folded(name: str, device: str) -> derivatives.Sample:
         d = a - t * np.sum(a * t, -1, keepdims=True)
         angle = np.radians(random.uniform(90.0, 170.0, COUNT) * random.choice([-1.0, 1.0], COUNT))[:, None]
         if sample.measure.nodes > 3:
-            q[sample.slots[3 + k]] = x[first] + random.uniform(0.2, 0.8, (COUNT, 1)) * e - turned(d, t, angle) * 1.2
+            q[sample.slots[3 + k]] = x[first] + random.uniform(0.2, 0.8, (COUNT, 1)) * e - rotated(d, t, angle) * 1.2
         if sample.measure.data_size:
             kinds, place = (data[0], 1) if sample.measure.nodes == 3 else (data[k], 3 + 3 * k)
-            plane, clamp = turned(unit(d), t, 0.5 * angle), unit(turned(unit(np.cross(e, a)), t, angle) + 0.1 * t)
+            plane, clamp = rotated(unit(d), t, 0.5 * angle), unit(rotated(unit(np.cross(e, a)), t, angle) + 0.1 * t)
             data[place : place + 3] = np.where(kinds > 2.5, plane.T, clamp.T)
     return sample.like({**sample.data, "q": q, "constants": data})
 
 
-def turned(vectors, axes, angles):
+def rotated(vectors, axes, angles):
     """Return vectors rotated about perpendicular axes."""
     return vectors * np.cos(angles) + np.cross(axes, vectors) * np.sin(angles)
 
 
 @pytest.mark.parametrize("name", cases(name for name in SHELLS if name not in FLAT))
-def test_derivatives_of_folds(device, name):
+def test_derivatives_agree_at_sharp_folds(device, name):
     """Reverse mode, differences and the hand-derived Jacobian agree at folds of 90 to 170 degrees."""
     sample = folded(name, device)
     if sample.measure.name in ("hinge_angle", "edge_tilt"):
@@ -96,7 +96,7 @@ def test_tension_completes_the_hessian(device, name):
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", cases(SHELLS))
-def test_degenerate(device, name, precision):
+def test_degenerate_triangles_stay_finite(device, name, precision):
     """Triangles without area, folded onto each other or inverted give finite values; edges keep their length."""
     sample = sample_of(name, device, precision)
     q, (first, second, corner, *opposite) = sample.data["q"].copy(), sample.slots[: sample.measure.nodes]

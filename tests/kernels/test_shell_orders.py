@@ -96,14 +96,14 @@ def test_curved_membrane_bends_without_stretch(device, mesh, shape):
 
 @pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45", "sphere"])
 @pytest.mark.parametrize("mesh", ["crossed", "equilateral"])
-def test_turning_normals_have_order_two(device, mesh, shape):
+def test_mid_edge_angles_have_order_two(device, mesh, shape):
     counts = (6, 12, 24)
     errors = [relative_error(mesh, n, shape, "midedge_dof", device, supported=True) for n in counts]
     assert abs(order(counts, errors) - 2.0) < 0.1
     assert abs(errors[-1]) < chords(mesh, counts[-1])
 
 
-def test_facets_one_behind_the_other(device):
+def test_aligned_facets_have_the_chord_error(device):
     """Cells lie along the cylinder: the error is that of the angles alone, s^2 / (12 R^2) with s the side of a cell."""
     for n in (6, 12, 24):
         error = relative_error("crossed", n, "cylinder 0", "midedge_dof", device, supported=True)
@@ -112,7 +112,7 @@ def test_facets_one_behind_the_other(device):
 
 @pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45", "sphere", "saddle 45"])
 @pytest.mark.parametrize("mesh", ["jittered", pytest.param("delaunay", marks=pytest.mark.slow)])
-def test_turning_normals_converge_on_irregular_meshes(device, mesh, shape):
+def test_mid_edge_angles_converge_on_irregular_meshes(device, mesh, shape):
     """Random meshes have no smooth error, but all of it is below that of their longest facets."""
     for n in (12, 24):
         assert abs(relative_error(mesh, n, shape, "midedge_dof", device, supported=True)) < chords(mesh, n)

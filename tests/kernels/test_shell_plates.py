@@ -45,7 +45,7 @@ def order(counts, errors):
 
 @pytest.mark.parametrize(("case", "size"), [("clamped", 0.024), ("supported", 0.004)])
 @pytest.mark.parametrize("mesh", ["right", "crossed", "jittered"])
-def test_turning_normals_have_order_two(device, mesh, case, size):
+def test_mid_edge_angles_have_order_two(device, mesh, case, size):
     counts = (8, 16, 32)
     errors = [deflection(mesh, n, case, "midedge_dof", device) for n in counts]
     assert abs(order(counts, errors) - 2.0) < 0.1
@@ -53,7 +53,7 @@ def test_turning_normals_have_order_two(device, mesh, case, size):
 
 
 @pytest.mark.parametrize(("case", "size"), [("clamped", 0.012), ("supported", 0.0014)])
-def test_normals_that_turn_at_free_edges_suffice_on_a_structured_mesh(device, case, size):
+def test_boundary_angles_suffice_on_a_structured_mesh(device, case, size):
     counts = (8, 16, 32)
     errors = [deflection("right", n, case, "midedge_boundary", device) for n in counts]
     assert abs(order(counts, errors) - 2.0) < 0.1
@@ -73,7 +73,7 @@ def test_twist_is_exact(device, mesh):
     assert abs(deflection(mesh, 8, "twisted", "midedge_dof", device)) < 1e-10
 
 
-def test_twist_is_exact_with_normals_that_turn_at_free_edges(device):
+def test_twist_is_exact_with_boundary_angles(device):
     assert abs(deflection("right", 8, "twisted", "midedge_boundary", device)) < 1e-10
 
 
