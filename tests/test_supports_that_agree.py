@@ -35,7 +35,12 @@ def test_rotation_about_the_normal_of_a_symmetry_plane():
 
 
 def test_translation_within_a_symmetry_plane():
-    sheet(ddg.Motion(translation=lambda t: (0.1 * t, 0.0, np.sin(t)))).build("cpu")
+    model = sheet(ddg.Motion(translation=lambda t: (0.1 * t, 0.0, np.sin(t)))).build("cpu")
+    state = model.state()
+    edge = state.points()[:, 0] == 0.0
+    expected = state.points()[edge] + [0.01, 0.0, np.sin(0.1)]
+    state = ddg.Integrator(model).step(state, 0.1)
+    np.testing.assert_allclose(state.points()[edge], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
