@@ -1,4 +1,4 @@
-"""The registries: a term is a measure times a density, one line each. Rods run along chains, shells on any elements."""
+"""The registries of energies, one line each: terms, a measure times a density, and potentials of collisions, a kind and a law."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -6,8 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
+from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE, Kind
 from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
-from ddg_warp.kernels.densities.contact import log_barrier, mollified_barrier, mollified_penalty, smooth_penalty
+from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.kernels.densities.damping import damped
 from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
 from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
@@ -17,7 +18,6 @@ from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
 from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
-from ddg_warp.kernels.measures.edge_edge_distance import edge_edge_distance
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
 from ddg_warp.kernels.measures.edge_tilt import edge_tilt
 from ddg_warp.kernels.measures.hinge_angle import hinge_angle
@@ -31,12 +31,9 @@ from ddg_warp.kernels.measures.magnetised_edge import (
 )
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
 from ddg_warp.kernels.measures.midedge_metric import midedge_metric
-from ddg_warp.kernels.measures.obstacle_distance import obstacle_distance
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
-from ddg_warp.kernels.measures.point_distance import point_edge_distance, point_triangle_distance
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 from ddg_warp.kernels.measures.rod_surface_angle import rod_surface_angle
-from ddg_warp.kernels.measures.slip import edge_edge_slip, obstacle_slip, point_edge_slip, point_triangle_slip
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
 from ddg_warp.kernels.measures.turning_angle import (
     curvature_binormal_angle,
@@ -118,6 +115,43 @@ class Term:
         return result
 
 
+@dataclass(frozen=True)
+class Potential:
+    """Potential of one kind of collision, by a law of its distance (`contact.pair_energy`) or of its slip (`contact.pair_friction`).
+
+    Attributes:
+        name: its name in the registry.
+        kind: of collisions.
+        density: the law: of one strain, the distance [m], or of friction of two, the slip [m].
+        text: a line for users.
+    """
+
+    name: str
+    kind: Kind
+    density: Density
+    text: str
+
+    @property
+    def key(self) -> str:
+        """Name in the registries."""
+        return self.name
+
+    @property
+    def frictional(self) -> bool:
+        """True for friction."""
+        return self.density.strains == 2
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters of the law."""
+        return self.density.parameters(self.density.strains)
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+
 def term_key(name: str, by_angle: bool) -> str:
     """Key of a term by its name and whether its curvature is the turning angle."""
     return f"{name}_angle" if by_angle else name
@@ -174,32 +208,23 @@ MAGNETS = {
     )
 }
 
-CONTACT = {
-    term.name: term
-    for term in (
-        Term("penalty_edge_edge", edge_edge_distance, mollified_penalty, "smooth penalty between edges, mollified"),
-        Term("penalty_point_edge", point_edge_distance, smooth_penalty, "smooth penalty between a point and an edge"),
-        Term("penalty_point_triangle", point_triangle_distance, smooth_penalty, "smooth penalty of a triangle"),
-        Term("penalty_obstacle", obstacle_distance, smooth_penalty, "smooth penalty of a half-space or a box"),
-        Term("barrier_edge_edge", edge_edge_distance, mollified_barrier, "log barrier between edges, mollified"),
-        Term("barrier_point_edge", point_edge_distance, log_barrier, "log barrier between a point and an edge"),
-        Term("barrier_point_triangle", point_triangle_distance, log_barrier, "log barrier of a triangle"),
-        Term("barrier_obstacle", obstacle_distance, log_barrier, "log barrier of a half-space or a box"),
-    )
+_COLLISIONS = {
+    "edge_edge": (EDGES, "two edges"),
+    "point_triangle": (POINT_TRIANGLE, "a point and a triangle"),
+    "edge_point": (EDGE_POINT, "an edge and a ball"),
+    "point_plane": (POINT_PLANE, "a point and a half-space"),
 }
-_SLIPS = {
-    "edge_edge": (edge_edge_slip, "between edges"),
-    "point_edge": (point_edge_slip, "between a point and an edge"),
-    "point_triangle": (point_triangle_slip, "between a point and a triangle"),
-    "obstacle": (obstacle_slip, "on an obstacle"),
+LAWS = {"barrier": log_barrier, "penalty": smooth_penalty}
+FRICTION_LAWS = {"logistic": logistic_friction, "polynomial": polynomial_friction}
+CONTACT = {
+    f"{law}_{name}": Potential(f"{law}_{name}", kind, density, f"{density.name.replace('_', ' ')} between {text}")
+    for law, density in LAWS.items()
+    for name, (kind, text) in _COLLISIONS.items()
 }
 FRICTION = {
-    f"friction_{name}{suffix}": Term(f"friction_{name}{suffix}", measure, density, f"Coulomb friction {text}, {kind}")
-    for suffix, density, kind in (
-        ("", logistic_friction, "logistic"),
-        ("_polynomial", polynomial_friction, "polynomial"),
-    )
-    for name, (measure, text) in _SLIPS.items()
+    f"friction_{law}_{name}": Potential(f"friction_{law}_{name}", kind, density, f"Coulomb friction of {text}, {law}")
+    for law, density in FRICTION_LAWS.items()
+    for name, (kind, text) in _COLLISIONS.items()
 }
 
 ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE, **MAGNETS, **CONTACT, **FRICTION}

@@ -6,6 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.ask.inquiry import triangle_fields
 from ddg_warp.geometry import meshes
+from ddg_warp.kernels.terms import CONTACT, FRICTION
 from ddg_warp.run.cli import main
 from ddg_warp.run.record import Recorder
 from ddg_warp.solve.statics import solve
@@ -96,6 +97,26 @@ def test_report_names_terms_of_the_coupled_system(device):
     assert "shell_hinge" in absent
     assert "rigid_joint" in absent
     assert "no angles, no frames" in text
+
+
+@pytest.mark.parametrize("friction_law", [None, "logistic", "polynomial"])
+def test_report_names_the_potentials_of_the_lists_of_pairs(device, friction_law):
+    """Each kind of collisions that is searched for, by the law of the scene, and no other."""
+    friction = {"friction": 0.3, "friction_law": friction_law} if friction_law else {}
+    shapes = {"plane": ddg.Plane((0.0, 0.0, -1.0), (0.0, 0.0, 1.0)), "ball": ddg.Sphere((0.5, 0.0, -0.5), 0.1)}
+    for chosen in ((), ("plane",), ("ball",), ("plane", "ball")):
+        scene = ddg.Scene()
+        scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), section=ddg.Circle(0.01), material=RUBBER)
+        for name in chosen:
+            scene.add_obstacle(shapes[name], name=name)
+        scene.contact(law="penalty", **friction)
+        model = scene.build(device, "float64")
+        present, absent = model.report().split("not in this scene: ")
+        kinds = {pairs.kind for pairs in model.touch.search.lists}
+        laws = "penalty_", f"friction_{friction_law}_"
+        for name, potential in {**CONTACT, **FRICTION}.items():
+            runs = potential.kind in kinds and name.startswith(laws)
+            assert (f"  {name}: " in present, name in absent) == (runs, not runs), (name, chosen)
 
 
 def frames(model, count=6, directory=None, resume=False, color_by=None):

@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ddg_warp.compile.bodies import ROD
 from ddg_warp.kernels.solve import cyclic_reduction
-from ddg_warp.kernels.terms import ALL
+from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, Potential
 from ddg_warp.scene.material import DRAWN
-from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
+from ddg_warp.scene.obstacles import BALL, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.chains.step import DIRECT
 from ddg_warp.solve.choice import automatic, net_preconditioner
@@ -49,8 +48,10 @@ def report(model) -> str:
         lines += net_lines(model)
         present |= {part.term.name for part in model.net.sets}
         if touching := model.net.host.touching:
+            potentials = contact_potentials(touching)
             lines += contact_lines(touching)
-            present |= contact_terms(touching)
+            lines += [f"  {each.name}: {each.density.name}, {each.text}" for each in potentials]
+            present |= {each.name for each in potentials}
     bare = dict.fromkeys(batch.name for batch in model.scene.batches if batch.section.radius is None)
     if bare:
         lines.append(f"drawn {2.0 * DRAWN:g} m thick, as their section has no radius: {', '.join(bare)}")
@@ -92,14 +93,13 @@ def contact_lines(touching) -> list[str]:
     ]
 
 
-def contact_terms(touching) -> set[str]:
-    """Names of the terms that are its: edges always meet edges, and ends of rods in rows of edges; the others what there is."""
+def contact_potentials(touching) -> list[Potential]:
+    """Potentials of the kinds of collisions that the search has lists of: edges always, the others where there are such bodies."""
     law, kinds = touching.law, {body.kind for body in touching.bodies}
-    pairs = {"edge_edge"} | ({"point_edge"} if kinds & {ROD, CAPSULE, BALL} else set())
-    pairs |= {name for kind, name in ((MESH, "point_triangle"), (PLANE, "obstacle")) if kind in kinds}
-    names = {f"{law.law}_{pair}" for pair in pairs}
-    suffix = "_polynomial" if law.friction_law == "polynomial" else ""
-    return names | {f"friction_{pair}{suffix}" for pair in pairs if touching.rubs}
+    others = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
+    pairs = ["edge_edge", *(name for kind, name in others if kind in kinds)]
+    friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if touching.rubs]
+    return [*(CONTACT[f"{law.law}_{pair}"] for pair in pairs), *friction]
 
 
 def _between(values: np.ndarray) -> str:

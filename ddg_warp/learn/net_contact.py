@@ -7,9 +7,9 @@ from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_sums
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
 from ddg_warp.kernels.contact.gather import sum_kernel
+from ddg_warp.kernels.terms import LAWS
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.rolling import turned_by
-from ddg_warp.solve.contact.touch import LAWS
 from ddg_warp.solve.net.exact_contact import ExactContact
 from ddg_warp.solve.net.rubbing import Rubbing
 from ddg_warp.solve.net.system import lists

@@ -30,7 +30,7 @@ class Chain(Sample):
         count: nodes of the rods (R,).
     """
 
-    shape = (6, 2)
+    shape, LEFT_OUT = (6, 2), frozenset({"energy", "resultant"})
 
     def __init__(self, term: Term, kind: ChainKind, *arguments):
         self.chain, self.count = "closed" if kind.closed else "open", np.array([6, 5])

@@ -2,9 +2,11 @@
 
 The state is random and nothing in it is zero (see `ddg_warp.run.samples`). References are central differences, always taken in float64,
 or automatic differentiation of another kernel; errors are relative to the largest reference. e are the strains, w the rest measure
-and q the local dofs of an element:
+and q the local dofs of an element. Collisions (`ddg_warp.run.contact_samples`) are
+checked by the kernels that steps and adjoints launch:
 
     gradient     w J^T psi' scattered to dofs = reverse mode of the energy kernel
+    energy       of collisions instead: the gradient of what steps launch = differences of its energy
     reverse      reverse mode of the gradient kernel, seeded with v, = differences of v . gradient in the dofs
     parameters   the same in every row of the parameter buffer, element by element
     lagged       the same in the lagged frames, the strains of the last step and 1/h, row by row along a random direction
@@ -14,18 +16,21 @@ and q the local dofs of an element:
     factor       F^T F + C of the fused kernel = w J^T psi'' J without what is negative of psi'', and the geometric stiffness under
                  tension, derivatives by differences
     definite     F^T F + C has no negative eigenvalue
-    exact        F^T F + C, compression included, and the second derivatives that measures of rods have = Hessian kernels
+    exact        F^T F + C, compression included, and the second derivatives that measures of rods have = Hessian kernels; of collisions
+                 F^T F and `pair_bend` where no edges are mollified
     rest         no force where strains are those of rest; of a law of rods without any, in straight rods
     invariance   a rigid motion keeps the energy when the lagged data turn too, or when angles make up for the frames
     rigid        the gradient of a chain is orthogonal to translations and infinitesimal rotations
+    resultant    forces of a collision have no resultant, and those of contact no moment
     nonzero      every dof that the energy depends on feels a force, so that no zero passes for agreement
     downcast     energy and gradient feel a relative change of 2^-30 in every input, which no float32 can hold
 """
 
 import numpy as np
 
-from ddg_warp.kernels.terms import ALL, REGISTRY, Term
+from ddg_warp.kernels.terms import ALL, REGISTRY, Potential, Term
 from ddg_warp.run.chain_samples import Chain, chain_of
+from ddg_warp.run.contact_samples import ContactSample, FrictionSample
 from ddg_warp.run.element_samples import Elements
 from ddg_warp.run.samples import Sample, rotation
 
@@ -46,6 +51,11 @@ def largest(errors) -> float:
 def gradient(sample: Sample) -> float:
     adjoint = sample.reverse(0, np.ones(sample.shape))
     return relative(sample.scatter(sample.gradient(sample.real)), adjoint["q"])
+
+
+def energy(sample: Sample) -> float:
+    slopes = sample.local_derivative(lambda **data: sample.energy(**data)[None])[0]
+    return relative(sample.gradient(sample.real), slopes)
 
 
 def reverse(sample: Sample) -> float:
@@ -87,39 +97,7 @@ def evaluate(sample: Sample) -> float:
 
 
 def factor(sample: Sample) -> float:
-    return relative(sample.evaluate()[0], sum(map(_gauss_newton, sample.parts)))
-
-
-def _gauss_newton(sample: Sample) -> np.ndarray:
-    """w J^T psi'' J without what is negative of psi'', and the geometric stiffness under tension (local, local, *shape)."""
-    measure, w = sample.measure, sample.data["buffer"][sample.first]
-    J, S = (
-        np.moveaxis(sample.local_derivative(lambda i=i, **data: sample.strains(**data)[i]), (0, 1), (-2, -1))
-        for i in range(2)
-    )
-    strain, stress = sample.strains()
-    inverse = np.linalg.pinv(J, 1e-9)
-    curvature = J @ inverse @ S @ inverse  # of the strains that the dofs reach
-    if kept := sample.term.density.kept:
-        curvature = curvature * np.outer(np.arange(len(strain)) < kept, np.arange(len(strain)) < kept)
-    if measure.field:  # of a direction n in a field -s what is positive of the curvature along the sphere, -n . s
-        curvature = -(strain[:3] * stress[:3]).sum(0)[:, None, None] * np.diag(np.arange(6) < 3)
-    matrix = w * np.moveaxis(J.swapaxes(-2, -1) @ _positive(curvature) @ J, (-2, -1), (0, 1))
-    if measure.tensions == 3:
-        blocks = w * np.array([[stress[0], 0.5 * stress[1]], [0.5 * stress[1], stress[2]]])
-    elif measure.tensions and measure.revolved:  # the law's root leaves out what stress around the axis adds
-        blocks = w * stress[None, :1]
-    elif measure.tensions:
-        return np.where(stress[0] > 0.0, sample.gradient_derivative, matrix)
-    else:
-        return matrix
-    return matrix + sample.on_edges(_positive(np.moveaxis(blocks, -1, 0)))
-
-
-def _positive(matrix: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (..., n, n) without what is negative."""
-    values, vectors = np.linalg.eigh(matrix)
-    return (vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-2, -1)
+    return relative(sample.evaluate()[0], sum(part.gauss_newton() for part in sample.parts))
 
 
 def definite(sample: Sample) -> float:
@@ -128,7 +106,10 @@ def definite(sample: Sample) -> float:
 
 
 def exact(sample: Sample) -> float:
-    return relative(sample.evaluate(exact=True)[0], sum(part.hessian() for part in sample.parts))
+    where = sample.compared()
+    return relative(
+        sample.evaluate(exact=True)[0][..., where], sum(part.hessian() for part in sample.parts)[..., where]
+    )
 
 
 def rest(sample: Sample) -> float:
@@ -139,7 +120,7 @@ def rest(sample: Sample) -> float:
 def invariance(sample: Sample) -> float:
     sample = sample.isotropic()
     before = sample.energy(sample.real)
-    moved = sample.moved(rotation(sample.measure.dim, 0.4))
+    moved = sample.moved(rotation(sample.dim, 0.4))
     return largest(relative(sample.energy(sample.real, **data), before) for data in moved)
 
 
@@ -154,6 +135,10 @@ def rigid(sample: Chain) -> float:
     return largest(errors)
 
 
+def resultant(sample: ContactSample) -> float:
+    return sample.resultants()
+
+
 def nonzero(sample: Sample) -> float:
     """Share of the dofs without a force."""
     size = np.abs(sample.scatter(sample.gradient(sample.real)))
@@ -162,8 +147,8 @@ def nonzero(sample: Sample) -> float:
 
 def downcast(sample: Sample) -> float:
     errors = []
-    for which, seed in enumerate((np.ones(sample.shape), sample.seed)):
-        value = (sample.energy, sample.gradient)[which]
+    for which in sample.ORDERS:
+        value, seed = (sample.energy, np.ones(sample.shape)) if which == 0 else (sample.gradient, sample.seed)
         adjoint, before = sample.reverse(which, seed), value()
         for name, slopes in adjoint.items():
             for row in range(len(slopes)) if name in ("buffer", "last") else [...]:
@@ -181,6 +166,7 @@ def downcast(sample: Sample) -> float:
 # name -> (error, tolerance in float64, tolerance in float32 or None where that says nothing)
 CHECKS = {
     "gradient": (gradient, 1e-13, 1e-5),
+    "energy": (energy, 1e-8, 1e-5),
     "reverse": (reverse, 1e-8, 1e-5),
     "parameters": (parameters, 1e-8, 1e-5),
     "lagged": (lagged, 1e-8, 1e-5),
@@ -193,19 +179,22 @@ CHECKS = {
     "rest": (rest, 1e-13, 1e-5),
     "invariance": (invariance, 1e-13, 1e-5),
     "rigid": (rigid, 1e-13, 1e-5),
+    "resultant": (resultant, 1e-13, 1e-5),
     "nonzero": (nonzero, 0.0, 0.0),
     "downcast": (downcast, 1e-3, None),
 }
 
 
 def samples_of(
-    term: Term, precision: str = "float64", device: str = "cpu", chains: tuple[bool, ...] = (False, True)
+    term: Term | Potential, precision: str = "float64", device: str = "cpu", chains: tuple[bool, ...] = (False, True)
 ) -> list[Sample]:
-    """The states that a term is checked at: in open and closed `chains`, or as indexed elements.
+    """The states that a term is checked at: in open and closed `chains`, as indexed elements, or of a potential as collisions.
 
     Raises:
         ValueError: a measure in the plane that is not of rods.
     """
+    if isinstance(term, Potential):
+        return [(FrictionSample if term.frictional else ContactSample)(term, None, precision, device)]
     if term.measure in {known.measure for known in REGISTRY.values()}:
         return [Chain(term, chain_of(term, closed), precision, device) for closed in chains]
     if term.measure.dim != 3:
@@ -214,16 +203,18 @@ def samples_of(
 
 
 def checks_of(sample: Sample) -> list[str]:
-    """Checks that make sense: closed rods without rest strains have no rest shape, nor have dipoles."""
-    left_out = set() if isinstance(sample, Chain) else {"rigid"} | (set() if sample.measure.packed else {"exact"})
-    if not sample.term.rest and sample.chain != "open":
+    """Checks of a sample: closed rods without rest strains have no rest shape, nor have dipoles."""
+    left_out = set(sample.LEFT_OUT)
+    if isinstance(sample, Elements) and not sample.measure.packed:
+        left_out.add("exact")
+    if isinstance(sample, Chain | Elements) and not sample.term.rest and sample.chain != "open":
         left_out.add("rest")
     single = sample.precision == "float32"
     return [name for name, check in CHECKS.items() if name not in left_out and not (single and check[2] is None)]
 
 
 def table(
-    term: str | Term | None = None,
+    term: str | Term | Potential | None = None,
     precision: str = "float64",
     device: str = "cpu",
     chains: tuple[bool, ...] = (False, True),
@@ -231,7 +222,7 @@ def table(
     """Rows of the derivative table: term, chain, check, error, tolerance, passed.
 
     Args:
-        term: a term of chains or nets, one's own or one of `kernels.terms.ALL` by key; all of these by default.
+        term: a term or a potential, one's own or one of `kernels.terms.ALL` by key; all of these by default.
         precision: "float64" or "float32", that of the kernels under test.
         device: Warp device.
         chains: of terms of chains, which are tried: open ones (False), closed ones (True), or both.

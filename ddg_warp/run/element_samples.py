@@ -21,7 +21,7 @@ class Elements(Sample):
         felt: which dofs the energy depends on, as q.
     """
 
-    COUNT = 8
+    COUNT, LEFT_OUT = 8, frozenset({"energy", "rigid", "resultant"})
     INPUTS = ("q", "frame", "lag", "last", "rate", "buffer")
 
     def __init__(self, term: Term, *arguments):
@@ -113,15 +113,6 @@ class Elements(Sample):
         )
         values = {name: getattr(given, name).grad.numpy().astype(float) for name in self.INPUTS}
         return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
-
-    def scatter(self, local: np.ndarray) -> np.ndarray:
-        """From the local dofs (local, E) to all (blocks, 3)."""
-        return local.reshape(-1, 3, self.COUNT).transpose(0, 2, 1).reshape(-1, 3)
-
-    def local_derivative(self, function) -> np.ndarray:
-        """Derivative of what function(**data) gives per element (m, E), by its local dofs (m, local, E)."""
-        columns = [self.difference(function, "q", (row, d)) for row in self.slots for d in range(3)]
-        return np.stack(columns, axis=1)
 
     def on_edges(self, blocks: np.ndarray) -> np.ndarray:
         """The matrix (E, n, n) times I between the first n edge vectors, in local dofs (local, local, E)."""

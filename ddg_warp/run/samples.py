@@ -1,6 +1,7 @@
 """What the checks of `ddg_warp.run.derivatives` read: a term at a random state where nothing is zero, and what its kernels make of it.
 
-`chain_samples` gathers along rods, `element_samples` by index, which serves all other measures, one's own among them. An element's
+`chain_samples` gathers along rods, `element_samples` by index, which serves all other measures, one's own among them, and
+`contact_samples` has collisions. An element's
 *local dofs* are what its kernels write derivatives by: the window of a chain, or three reals a slot.
 """
 
@@ -27,14 +28,26 @@ class Sample:
     """
 
     chain = "net"
+    ORDERS = (0, 1)  # of derivatives that have a reverse mode, by the energy and the gradient
+    LEFT_OUT = frozenset()  # checks that make no sense
     STEP = 1e-4  # of differences
 
     def __init__(self, term: Term, kind, precision: str, device: str, data: dict | None = None):
-        self.term, self.measure, self.kind, self.precision, self.device = term, term.measure, kind, precision, device
+        self.term, self.kind, self.precision, self.device = term, kind, precision, device
         self.real = PRECISIONS[precision].real
         self.data = data or self.random_state()
         if self.real == wp.float32:
             self.data = {name: values.astype(np.float32).astype(float) for name, values in self.data.items()}
+
+    @property
+    def measure(self):
+        """Measure of the term."""
+        return self.term.measure
+
+    @property
+    def dim(self) -> int:
+        """Dimension of space."""
+        return self.measure.dim
 
     def like(self, data: dict) -> "Sample":
         """This sample with other data."""
@@ -84,10 +97,46 @@ class Sample:
             ends.append(function(**{name: values}))
         return (8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * h)
 
+    def scatter(self, local: np.ndarray) -> np.ndarray:
+        """Return values of indexed elements at their local dofs (local, E) by all dofs (blocks, 3)."""
+        return local.reshape(-1, 3, self.shape[0]).transpose(0, 2, 1).reshape(-1, 3)
+
+    def local_derivative(self, function) -> np.ndarray:
+        """Differentiate function(**data) of indexed elements (m, E) by their local dofs (m, local, E)."""
+        columns = [self.difference(function, "q", (row, d)) for row in self.slots for d in range(3)]
+        return np.stack(columns, axis=1)
+
     def parameter_rows(self, *families: str) -> list[int]:
         """Rows of the buffer with the parameters of some families, or of all."""
         known = enumerate(self.term.parameters, self.first)
         return [row for row, parameter in known if not families or parameter.family in families]
+
+    def gauss_newton(self) -> np.ndarray:
+        """Return w J^T psi'' J without what is negative of psi'', and the geometric stiffness under tension (local, local, *shape)."""
+        measure, w = self.measure, self.data["buffer"][self.first]
+        J, S = (
+            np.moveaxis(self.local_derivative(lambda i=i, **data: self.strains(**data)[i]), (0, 1), (-2, -1))
+            for i in range(2)
+        )
+        strain, stress = self.strains()
+        inverse = np.linalg.pinv(J, 1e-9)
+        curvature = J @ inverse @ S @ inverse  # of the strains that the dofs reach
+        if measure.field:  # of a direction n in a field -s what is positive of the curvature along the sphere, -n . s
+            curvature = -(strain[:3] * stress[:3]).sum(0)[:, None, None] * np.diag(np.arange(6) < 3)
+        matrix = w * np.moveaxis(J.swapaxes(-2, -1) @ positive(curvature) @ J, (-2, -1), (0, 1))
+        if measure.tensions == 3:
+            blocks = w * np.array([[stress[0], 0.5 * stress[1]], [0.5 * stress[1], stress[2]]])
+        elif measure.tensions and measure.revolved:  # the law's root leaves out what stress around the axis adds
+            blocks = w * stress[None, :1]
+        elif measure.tensions:
+            return np.where(stress[0] > 0.0, self.gradient_derivative, matrix)
+        else:
+            return matrix
+        return matrix + self.on_edges(positive(np.moveaxis(blocks, -1, 0)))
+
+    def compared(self):
+        """Index of the elements whose second derivatives F^T F and its corrections have: all."""
+        return slice(None)
 
     def at_rest(self) -> dict[str, np.ndarray]:
         """Data with which no element feels a force: rest strains, and those of the last step, are the strains."""
@@ -137,6 +186,12 @@ class Sample:
         return [self.turned(turn)]
 
 
+def positive(matrix: np.ndarray) -> np.ndarray:
+    """Return symmetric matrices (..., n, n) without their negative part."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-2, -1)
+
+
 def random_parameters(term: Term, random: np.random.Generator, shape: tuple) -> np.ndarray:
     """Values (parameters, *shape) that have a meaning to the law, all of order one."""
     rows = []
@@ -149,9 +204,9 @@ def random_parameters(term: Term, random: np.random.Generator, shape: tuple) -> 
         if parameter.unit == "1/m":
             value = 8.0 * value  # strains that mean something to a law are as large as those of the sample
         if parameter.family == "thickness":
-            value = 0.1 * value  # points do not lie inside of what they touch,
-        if parameter.family in ("range", "velocity"):
-            value = 3.0 * value  # nor beyond its reach, nor do they slide so fast that friction is constant
+            value = 0.1 * value  # closest points lie outside,
+        if parameter.family == "range":
+            value = 3.0 * value  # and within the range
         rows.append(random_strains(term, random, shape) if parameter.family == "rest" else value)
     return np.array(rows)
 

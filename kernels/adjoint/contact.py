@@ -19,13 +19,13 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.collisions import node_types, tangents_function
 from ddg_warp.kernels.contact.gather import ANGLES, SLOTS
-from ddg_warp.kernels.contact.pair_energy import pair_energy_functions, shape_types
+from ddg_warp.kernels.contact.pair_energy import pair_energy_functions
 from ddg_warp.kernels.contact.pair_friction import directed_basis, rolling_functions, spun_function
 from ddg_warp.kernels.contact.pair_terms import by_rate_function, groups_function, law_struct, read_functions
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
-from ddg_warp.kernels.measures.slip import basis
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
@@ -85,12 +85,12 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
     slots of angles, and by the radii of both things (ROLLED, capacity).
     """
     Law, Sides = law_struct(real), sides_struct(real)
-    X, W, P = shape_types(real)
+    X, W, P = node_types(real)
     V, E = wp.types.vector(3, real), wp.types.vector(2, real)
     D = wp.types.vector(friction.parameter_size(2), real)
     _, _, evaluate, _ = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
-    tangents, groups, along_rod = basis(real), groups_function(real), directed_basis(real)
+    tangents, groups, along_rod = tangents_function(real), groups_function(real), directed_basis(real)
     spun, A = spun_function(real), wp.types.vector(ANGLES, real)
     _, radii, levers = rolling_functions(kind, real)
     leads = directed or rolls
@@ -138,7 +138,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         else:
             t1, t2 = tangents(n)
         u = E(wp.dot(t1, move), wp.dot(t2, move))
-        f = slope_of(u, D(mu * normal, real(1.0), velocity, real(0.0), real(0.0), inverse))
+        f = slope_of(u, D(mu * normal, velocity, inverse))
         return wp.dot(f, E(wp.dot(t1, along), wp.dot(t2, along)))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

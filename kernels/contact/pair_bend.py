@@ -13,8 +13,8 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.collisions import PARALLEL
 from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
-from ddg_warp.kernels.measures.closest_points import PARALLEL
 
 KINDS = EDGES, EDGE_POINT, POINT_TRIANGLE, POINT_PLANE
 TRIANGLES = KINDS.index(POINT_TRIANGLE)

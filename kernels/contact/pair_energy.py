@@ -1,7 +1,8 @@
-"""Energy of a pair of surfaces by their distance, its gradient, and the factor of its Gauss-Newton matrix.
+"""Contact potential: the energy of a collision by a law of its distance, its gradient, and the rows of its Gauss-Newton factor.
 
-Of a point and a triangle, or an edge and a ball, it is psi(d) of their distance (`densities.contact`). The closest points of two edges
-jump where these are parallel. So with m the mollifier of `densities.contact`, 0 where edges a, b are parallel and 1 from some two
+Of a point and a triangle or plane, or an edge and a ball, it is psi(d) of their distance (`contact.collisions`, `densities.contact`).
+The closest points of two edges jump where these are parallel. So with the mollifier m, 0 where edges a, b are parallel and 1 from some
+two
 degrees on, theirs is
 
     m psi(d_ab) + (1 - m) / 2 (G(a0, b) + G(a1, b) + G(b0, a) + G(b1, a)) ,   G(p, b) = psi(d_p,b) - (psi(d_p,b0) + psi(d_p,b1)) / 2 ,
@@ -23,10 +24,15 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, Kind
+from ddg_warp.kernels.contact.collisions import (
+    distance_function,
+    end_function,
+    mollifier_function,
+    node_function,
+    node_types,
+)
+from ddg_warp.kernels.contact.surfaces import EDGES, Kind
 from ddg_warp.kernels.densities import Density
-from ddg_warp.kernels.densities.contact import mollifier_function
-from ddg_warp.kernels.measures import closest_points
 
 ENDS = 4  # ends of two edges
 
@@ -37,129 +43,16 @@ def rows_of(kind: Kind) -> int:
 
 
 @cache
-def shape_types(real):
-    """Nodes of a pair (4, 3), weights of nodes or of what is counted of them, and parameters of the law."""
-    return wp.types.matrix((4, 3), real), wp.types.vector(4, real), wp.types.vector(3, real)
-
-
-@cache
-def distance_function(kind: Kind, real):
-    """near(x) -> (w, d, n): weights, length and direction of what is between the closest points."""
-    if kind == EDGE_POINT:
-        return _edge_point(real)
-    if kind.endless:
-        return _point_plane(real)
-    X, W, V = shape_types(real)
-    Q = wp.types.vector(9, real)
-    closest_of = closest_points.edge_edge if kind == EDGES else closest_points.point_triangle
-    closest = closest_of(real)
-
-    @wp.func
-    def near(x: X):
-        a = x[1] - x[0]
-        b = x[2] - x[1]
-        c = x[3] - x[2]
-        rho, _m, _o = closest(Q(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
-        r = a * rho[0] + b * rho[1] + c * rho[2]
-        d = wp.length(r)
-        return W(-rho[0], rho[0] - rho[1], rho[1] - rho[2], rho[2]), d, r / wp.where(d > real(0.0), d, real(1.0))
-
-    return near
-
-
-def _point_plane(real):
-    """The same of a half-space, with a distance that is below zero inside of it."""
-    X, W, _ = shape_types(real)
-
-    @wp.func
-    def near(x: X):
-        u = x[2] - x[1]
-        v = x[3] - x[1]
-        r = x[0] - x[1]
-        normal = wp.cross(u, v)
-        size = wp.length(normal)
-        n = normal / size
-        b = wp.dot(wp.cross(r, v), n) / size
-        c = wp.dot(wp.cross(u, r), n) / size
-        return W(real(1.0), b + c - real(1.0), -b, -c), wp.dot(r, n), n
-
-    return near
-
-
-@cache
-def point_edge_function(real):
-    """apart(p, a, b) -> (t, d, n): where on edge a b the closest point is, how far from p, and in which direction."""
-    _, _, V = shape_types(real)
-    Q = wp.types.vector(6, real)
-    closest = closest_points.point_edge(real)
-
-    @wp.func
-    def apart(p: V, a: V, b: V):
-        u = a - p
-        e = b - a
-        rho, _m, _o = closest(Q(u[0], u[1], u[2], e[0], e[1], e[2]))
-        r = u + e * rho[1]
-        d = wp.length(r)
-        return rho[1], d, r / wp.where(d > real(0.0), d, real(1.0))
-
-    return apart
-
-
-@cache
-def _edge_point(real):
-    """`near` of an edge and a point, node 2."""
-    X, W, V = shape_types(real)
-    apart = point_edge_function(real)
-
-    @wp.func
-    def near(x: X):
-        t, d, n = apart(x[2], x[0], x[1])
-        return W(real(1.0) - t, t, real(-1.0), real(0.0)), d, n
-
-    return near
-
-
-@cache
-def end_function(real):
-    """end(x, k) -> (w, d, n) of end k of two edges, node k, and the other edge."""
-    X, W, _ = shape_types(real)
-    apart = point_edge_function(real)
-
-    @wp.func
-    def end(x: X, k: int):
-        one, zero = real(1.0), real(0.0)
-        first = wp.where(k < 2, 2, 0)
-        t, d, n = apart(x[k], x[first], x[first + 1])
-        is_first = wp.where(k == 0 or k == 2, one, zero)
-        w = W(-is_first, is_first - one, one - t, t)
-        if k >= 2:
-            w = W(one - t, t, -is_first, is_first - one)
-        return w, d, n
-
-    return end
-
-
-@cache
 def end_functions(density: Density, real):
     """Half of G of end k of two edges: of_end(x, p, inner, k) -> (energy, gradient), row_of_end(x, p, inner, k) -> (w, v).
 
     Zero where it is not counted.
     """
-    X, W, V = shape_types(real)
+    X, W, V = node_types(real)
     E, I = wp.types.vector(1, real), wp.types.vector(4, int)
-    end = end_function(real)
+    end, to_node = end_function(real), node_function(real)
     energy_of, slope_of, curvature_of = density.laws(real, 1)
     others, half = I(2, 2, 0, 0), real(0.5)
-
-    @wp.func
-    def to_node(x: X, k: int, j: int):
-        """(w, d, n) of nodes k and j."""
-        w = W()
-        for i in range(4):
-            w[i] = wp.where(i == j, real(1.0), real(0.0)) - wp.where(i == k, real(1.0), real(0.0))
-        r = x[j] - x[k]
-        d = wp.length(r)
-        return w, d, r / wp.where(d > real(0.0), d, real(1.0))
 
     @wp.func
     def of_end(x: X, p: V, inner: W, k: int):
@@ -201,7 +94,7 @@ def end_functions(density: Density, real):
 @cache
 def bend_function(kind: Kind, density: Density, real):
     """bends(x, p, threshold, d) -> psi' / d where the energy is that of the distance d alone, else 0; see `pair_bend`."""
-    X, W, V = shape_types(real)
+    X, W, V = node_types(real)
     E = wp.types.vector(1, real)
     slope_of = density.laws(real, 1)[1]
 
@@ -228,7 +121,7 @@ def pair_energy_functions(kind: Kind, density: Density, real):
     threshold, inner) -> (energy, gradient); along(x, v, p, threshold, inner): derivative along v, whose reverse is a row of the exact
     Hessian.
     """
-    X, W, V = shape_types(real)
+    X, W, V = node_types(real)
     E = wp.types.vector(1, real)
     near = distance_function(kind, real)
     of_end, row_of_end = end_functions(density, real) if kind == EDGES else (None, None)
@@ -253,7 +146,7 @@ def pair_energy_functions(kind: Kind, density: Density, real):
     @wp.func
     def edges(x: X, w: W, d: real, n: V, p: V, threshold: real, inner: W):
         square, turn = crossing(x)
-        m, first, _second = mollify(square, threshold)
+        m, first = mollify(square, threshold)
         e = energy_of(E(d), p)
         f = slope_of(E(d), p)
         total = e

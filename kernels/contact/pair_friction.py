@@ -40,12 +40,12 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.collisions import tangents_function
 from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, factor_struct, lay_functions
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.division import nonzero_function
-from ddg_warp.kernels.measures.slip import basis
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 ROWS = 2  # directions of the slip
@@ -136,7 +136,7 @@ def directed_basis(real):
     """directed(n, d, way) -> tangents at right angles to n, of slips forwards along d, across, and backwards, as long as `way` says."""
     V, tangents, tiny, nonzero = (
         wp.types.vector(3, real),
-        basis(real),
+        tangents_function(real),
         wp.constant(real(1.0e-12)),
         nonzero_function(real),
     )
@@ -175,7 +175,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(SLOTS, real), lay_functions(real, linear)
     E = wp.types.vector(2, real)
-    tangents, groups, size = basis(real), groups_function(real), kind.first + kind.second
+    tangents, groups, size = tangents_function(real), groups_function(real), kind.first + kind.second
     along_rod, spun = directed_basis(real), spun_function(real)
     angles_of, radii, levers = rolling_functions(kind, real)
 
@@ -347,7 +347,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                         way = 2
                 t1, t2 = lagged.tangent[way, p], lagged.tangent[1, p]
                 u = E(wp.dot(t1, move), wp.dot(t2, move))
-                given = P(bound, real(1.0), velocity, real(0.0), real(0.0), inverse)
+                given = P(bound, velocity, inverse)
                 energy[p] = energy_of(u, given)
                 f = slope_of(u, given)
                 work[p] = wp.dot(f, u)

@@ -4,17 +4,11 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.collisions import SHARE, distance_function, node_types
 from ddg_warp.kernels.contact.gather import PLACED, SLOTS, factor_struct, lay_functions, place_functions
-from ddg_warp.kernels.contact.pair_energy import (
-    bend_function,
-    distance_function,
-    pair_energy_functions,
-    rows_of,
-    shape_types,
-)
+from ddg_warp.kernels.contact.pair_energy import bend_function, pair_energy_functions, rows_of
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.densities import Density
-from ddg_warp.kernels.densities.contact import SHARE
 from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS
 
 
@@ -76,7 +70,7 @@ def by_rate_function(real):
 def read_functions(kind: Kind, real):
     """given(law, sides, pair) -> p, threshold, inner of things (i, j) of all worlds; corners(x, nodes) -> (4, 3)."""
     Law, Sides = law_struct(real), sides_struct(real)
-    _, W, P = shape_types(real)
+    _, W, P = node_types(real)
     V = wp.types.vector(3, real)
     _, _, thickness, _ = pair_functions(kind, real)
     groups = groups_function(real)
@@ -241,7 +235,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
     `unbent`: of those pairs alone that `pair_bend` does not know.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
-    X, *_ = shape_types(real)
+    X, *_ = node_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
     W, (put, _) = wp.types.vector(PLACED, linear), place_functions(linear)
     *_, along = pair_energy_functions(kind, density, real)
@@ -283,7 +277,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
 def columns_kernel(kind: Kind, density: Density, real, linear):
     """Columns of the exact Hessians of the pairs that are chosen, so many, a thread some columns."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
-    X, *_ = shape_types(real)
+    X, *_ = node_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)

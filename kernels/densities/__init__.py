@@ -53,8 +53,6 @@ class Density:
         lagged: True if p ends with the strains of the last step (n) and the reciprocal of the time step (1).
         coupled: True if psi'' is a full matrix.
         quadratic: True if psi'' depends on no strain.
-        kept: for a coupled law, the number of leading strains that the root covers; 0 for all. The remainder of psi'' is left to the
-            exact Hessian.
         own_root: (real, n) -> root(e, p, shift) as in `functions`, if it has a closed form; else computed numerically.
     """
 
@@ -65,7 +63,6 @@ class Density:
     lagged: bool = False
     coupled: bool = False
     quadratic: bool = False
-    kept: int = 0
     own_root: Callable | None = None
     undamped: "Density | None" = None  # the same law without strain-rate damping
 

@@ -1,4 +1,4 @@
-"""Laws of contact: the energy of two surfaces by their gap g, the distance of what lies in their middle less the thickness between.
+"""Laws of contact: the energy of two surfaces by their gap g, the distance of their middles less the thickness between.
 
 Smooth penalty (the implicit contact model: Tong, Choi, Joo and Jawed, Extreme Mech. Lett. 58, 2023, 101924), with K = 15 / delta
 and the range delta:
@@ -18,12 +18,7 @@ matrix keeps, is just what is positive of the Hessian where two points are close
 by 0.14 to 0.18 of that at half the range. In squared distances it is off by 0.6 of it, even of points, as it keeps 4 g^2 b'' of the
 curvature 4 g^2 b'' + 2 b' along the normal.
 
-Both are convex in g: psi'' >= 0. Contact of edges is mollified by the second strain x of `edge_edge_distance`:
-
-    psi(g) m(x / threshold),   m(y) = y (2 - y) for y < 1,   1 beyond   (Li et al., parallel-edge handling),
-
-threshold 1e-3 |e|^2 |f|^2 of the edges at rest. It vanishes where edges are parallel, so that what lies along each other touches by the
-distances of points from edges. Of its second derivative the root keeps m psi'', which is positive; the rest has both signs.
+Both are convex in g, psi'' >= 0, and fall, psi' <= 0, as `contact.pair_energy` takes them to.
 """
 
 from functools import cache
@@ -33,10 +28,9 @@ import warp as wp
 from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
 
 SHARPNESS = 15.0  # K times the range of the smooth penalty
-SHARE = 1.0e-3  # of |e|^2 |f|^2 of edges at rest, which is the threshold of their mollifier
 THICKNESS = Parameter("thickness", "m", NOT_NEGATIVE, default=0.0)
 RANGE = Parameter("range", "m", POSITIVE)
-STIFFNESS = Parameter("stiffness", "N/m per rest measure", NOT_NEGATIVE)
+STIFFNESS = Parameter("stiffness", "N/m", NOT_NEGATIVE)
 
 
 @cache
@@ -128,76 +122,5 @@ def _barrier_laws(real, n):
     return energy, slope, curvature
 
 
-def mollified(density: Density) -> Density:
-    """The law of a gap, of two strains, that of edges: times m of the second."""
-
-    @cache
-    def laws(real, n):
-        return _mollified_laws(density, real)
-
-    return Density(
-        f"{density.name}, mollified",
-        lambda n: (*density.parameters(1), Parameter("threshold", "m^4", POSITIVE)),
-        laws,
-        strains=2,
-        coupled=True,
-        kept=1,
-    )
-
-
-@cache
-def mollifier_function(real):
-    """mollify(x, threshold) -> m and its derivatives m', m'' by x."""
-
-    @wp.func
-    def mollify(x: real, threshold: real):
-        one, two = real(1.0), real(2.0)
-        inverse = one / threshold
-        y = x * inverse
-        if y >= one:
-            return one, real(0.0), real(0.0)
-        return y * (two - y), two * (one - y) * inverse, -two * inverse * inverse
-
-    return mollify
-
-
-def _mollified_laws(density: Density, real):
-    mollify = mollifier_function(real)
-    energy_of, slope_of, curvature_of = density.laws(real, 1)
-    size = len(density.parameters(1))
-    G, O = wp.types.vector(1, real), wp.types.vector(size, real)
-    E, P, M = wp.types.vector(2, real), wp.types.vector(size + 1, real), wp.types.matrix((2, 2), real)
-
-    @wp.func
-    def split(e: E, p: P):
-        """The gap's strain and parameters, and m, m', m''."""
-        own = O()
-        for i in range(wp.static(size)):
-            own[i] = p[i]
-        m, first, second = mollify(e[1], p[wp.static(size)])
-        return G(e[0]), own, m, first, second
-
-    @wp.func
-    def energy(e: E, p: P):
-        g, own, m, _first, _second = split(e, p)
-        return m * energy_of(g, own)
-
-    @wp.func
-    def slope(e: E, p: P):
-        g, own, m, first, _second = split(e, p)
-        f = slope_of(g, own)
-        return E(m * f[0], first * energy_of(g, own))
-
-    @wp.func
-    def curvature(e: E, p: P):
-        g, own, m, first, second = split(e, p)
-        f = slope_of(g, own)
-        c = curvature_of(g, own)
-        return M(m * c[0], first * f[0], first * f[0], second * energy_of(g, own))
-
-    return energy, slope, curvature
-
-
 smooth_penalty = Density("smooth_penalty", lambda n: (STIFFNESS, RANGE, THICKNESS), _penalty_laws, strains=1)
 log_barrier = Density("log_barrier", lambda n: (STIFFNESS, RANGE, THICKNESS), _barrier_laws, strains=1)
-mollified_penalty, mollified_barrier = mollified(smooth_penalty), mollified(log_barrier)

@@ -12,7 +12,6 @@ def root_function(density, real, n: int):
     E, M3 = wp.types.vector(n, real), wp.types.matrix((3, 3), real)
     M = wp.types.matrix((n, n), real)
     P = wp.types.vector(density.parameter_size(n), real)
-    kept = density.kept or n
 
     @wp.func
     def diagonal(e: E, p: P, shift: E):
@@ -26,8 +25,8 @@ def root_function(density, real, n: int):
     def full(e: E, p: P, shift: E):
         c = curvature(e, p)
         wide = M3()
-        for i in range(wp.static(kept)):
-            for j in range(wp.static(kept)):
+        for i in range(wp.static(n)):
+            for j in range(wp.static(n)):
                 wide[i, j] = c[i, j] + wp.where(i == j, shift[i], real(0.0))
         vectors, values = wp.eig3(wide)
         r = M()

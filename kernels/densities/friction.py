@@ -1,4 +1,4 @@
-"""Regularised Coulomb friction: the dissipation potential of a step of length h, by the slip u = e - e^n since its start,
+"""Regularised Coulomb friction: the dissipation potential of a step of length h, by the slip u since its start,
 
     psi = mu N nu h G(|u| / (nu h)),   force -mu N G'(x) u / |u|,   x = |u| / (nu h) the speed over the velocity nu [m/s],
 
@@ -19,6 +19,9 @@ import warp as wp
 from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
 
 STEEPNESS = 7.5
+BOUND = Parameter("bound", "N", NOT_NEGATIVE)  # mu N
+VELOCITY = Parameter("velocity", "m/s", POSITIVE)
+RATE = Parameter("rate", "1/s", NOT_NEGATIVE)  # 1/h
 
 
 @cache
@@ -75,65 +78,43 @@ def _polynomial(real):
     return potential, force, slope
 
 
-def _functions(profile, real):
-    """(energy, slope, curvature, root) of a profile G."""
+def _laws(profile, real):
+    """Return (energy, slope, curvature) of a profile G."""
     potential, force, slope_of = profile(real)
-    E, P = wp.types.vector(2, real), wp.types.vector(6, real)
+    E, P = wp.types.vector(2, real), wp.types.vector(3, real)
 
     @wp.func
-    def slid(e: E, p: P):
-        """Slip, its length over nu h, and mu N / (nu h)."""
-        u = e - E(p[3], p[4])
-        inverse = p[5] / p[2]
-        return u, wp.length(u) * inverse, p[0] * p[1] * inverse
+    def scaled(u: E, p: P):
+        """Return the length of the slip over nu h, and mu N / (nu h)."""
+        inverse = p[2] / p[1]
+        return wp.length(u) * inverse, p[0] * inverse
 
     @wp.func
-    def energy(e: E, p: P):
-        u, x, scale = slid(e, p)
+    def energy(u: E, p: P):
+        x, scale = scaled(u, p)
         return scale * potential(x) * wp.dot(u, u)
 
     @wp.func
-    def slope(e: E, p: P):
-        u, x, scale = slid(e, p)
+    def slope(u: E, p: P):
+        x, scale = scaled(u, p)
         return u * (scale * force(x))
 
     @wp.func
-    def between(u: E, across: real, along: real):
-        """The matrix that is `along` in the direction of the slip, `across` at right angles to it."""
-        unit = wp.normalize(u)
+    def curvature(u: E, p: P):
+        """Return the matrix with G'' along the slip and G' / x at right angles to it."""
+        x, scale = scaled(u, p)
+        across, along, unit = scale * force(x), scale * slope_of(x), wp.normalize(u)
         return wp.diag(E(across, across)) + wp.outer(unit, unit) * (along - across)
 
-    @wp.func
-    def curvature(e: E, p: P):
-        u, x, scale = slid(e, p)
-        return between(u, scale * force(x), scale * slope_of(x))
-
-    @wp.func
-    def root(e: E, p: P, shift: E):
-        u, x, scale = slid(e, p)
-        return between(u, wp.sqrt(scale * force(x)), wp.sqrt(scale * slope_of(x)))
-
-    return energy, slope, curvature, root
+    return energy, slope, curvature
 
 
 def _friction(name: str, profile) -> Density:
     @cache
-    def functions(real):
-        return _functions(profile, real)
+    def laws(real, n):
+        return _laws(profile, real)
 
-    return Density(
-        name,
-        lambda n: (
-            Parameter("friction", "1", NOT_NEGATIVE),
-            Parameter("normal", "N per rest measure", NOT_NEGATIVE),
-            Parameter("velocity", "m/s", POSITIVE),
-        ),
-        lambda real, n: functions(real)[:3],
-        strains=2,
-        lagged=True,
-        coupled=True,
-        own_root=lambda real, n: functions(real)[3],
-    )
+    return Density(name, lambda n: (BOUND, VELOCITY, RATE), laws, strains=2, coupled=True)
 
 
 logistic_friction = _friction("logistic_friction", _logistic)

@@ -5,8 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 
-from ddg_warp.kernels.terms import ALL, REGISTRY
+from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, REGISTRY
 from ddg_warp.run import derivatives
 from ddg_warp.run.catalog import load_file
 from ddg_warp.run.cli import main
@@ -17,10 +18,11 @@ DAILY = {
     *("rod_stretch_damped", "rod_bend_twist", "planar_bend"),
     *("shell_stretch_damped", "shell_stretch_curved", "shell_hinge_damped", "shell_tilt", "shell_isometric"),
     *("axisymmetric_stretch", "axisymmetric_bend", "axisymmetric_rim", "rigid_joint", "glued_edge"),
-    *("penalty_edge_edge", "penalty_point_edge", "penalty_obstacle", "barrier_edge_edge", "barrier_point_triangle"),
-    *("friction_edge_edge", "friction_point_edge_polynomial", "friction_point_triangle", "friction_obstacle"),
+    *("penalty_edge_edge", "penalty_edge_point", "penalty_point_plane", "barrier_edge_edge", "barrier_point_triangle"),
+    *("friction_logistic_edge_edge", "friction_polynomial_edge_point", "friction_logistic_point_triangle"),
+    "friction_logistic_point_plane",
 }
-CONTACTS = ("penalty_", "barrier_", "friction_")
+POTENTIALS = {**CONTACT, **FRICTION}
 SAMPLES = {
     (precision, name, sample.chain): sample
     for precision in ("float64", "float32")
@@ -126,16 +128,18 @@ def test_a_term_of_ones_own_passes(device, own, precision):
 
 
 def test_every_term_has_every_check():
-    """Terms of nets but `rigid`, of which `invariance` is the whole, and `exact` where second derivatives are left out; dipoles and
-    contacts have no rest shape."""
+    """Terms of nets but `rigid`, of which `invariance` is the whole, and `exact` where second derivatives are left out; dipoles have
+    no rest shape, and potentials of collisions neither it nor a reverse mode of the energy. What friction lags is data of its own."""
+    of_terms, of_collisions = {"energy", "resultant"}, {"gradient", "rest", "rigid"}
     for (precision, name, chain), sample in SAMPLES.items():
         left_out = {
-            "open": set(),
-            "closed": set(),
-            "net": {"rigid"} | (set() if name.startswith(("rigid_joint", *CONTACTS)) else {"exact"}),
+            "open": of_terms,
+            "closed": of_terms,
+            "net": of_terms | {"rigid"} | (set() if name.startswith("rigid_joint") else {"exact"}),
+            "pair": of_collisions | ({"symmetry", "factor", "exact"} if name in FRICTION else {"lagged"}),
         }[chain]
         left_out = left_out | ({"downcast"} if precision == "float32" else set())
-        left_out = left_out | ({"rest"} if name.startswith(("magnetic", "dipoles", *CONTACTS)) else set())
+        left_out = left_out | ({"rest"} if name.startswith(("magnetic", "dipoles")) else set())
         assert set(derivatives.CHECKS) - set(derivatives.checks_of(sample)) == left_out
 
 
@@ -144,9 +148,14 @@ def test_every_day_has_every_kind():
     shell_stretch_curved, and magnets, which meet closed forms in test_magnets."""
     terms = {name: term for name, term in ALL.items() if not name.startswith(("magnetic", "dipoles"))}
     assert {ALL[name].density.name for name in DAILY} == {term.density.name for term in terms.values()}
-    measures = {term.measure.name for term in terms.values() if not term.measure.by_angle}
+    measures = {
+        term.measure.name for name, term in terms.items() if name not in POTENTIALS and not term.measure.by_angle
+    }
     left_out = {"edge_stretch_2d", "curvature_binormal", "midedge_curvature", "midedge_curvature_dof"}
-    assert measures - {ALL[name].measure.name for name in DAILY} == left_out
+    assert measures - {ALL[name].measure.name for name in DAILY - POTENTIALS.keys()} == left_out
+    kinds = {potential.kind for potential in POTENTIALS.values()}
+    for potentials in (CONTACT, FRICTION):
+        assert {potentials[name].kind for name in DAILY & potentials.keys()} == kinds
 
 
 @pytest.mark.parametrize("term", ["rod_bend_twist", "rod_stretch_damped"])
@@ -181,12 +190,25 @@ def test_table_has_chains_and_nets(device):
     """The same columns for both, so that one table shows them."""
     chain, net = (derivatives.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
     assert chain[0].keys() == net[0].keys()
-    assert [row["chain"] for row in chain] == ["open"] * len(derivatives.CHECKS) + ["closed"] * len(derivatives.CHECKS)
+    own = len(derivatives.CHECKS) - 2  # those of collisions left out
+    assert [row["chain"] for row in chain] == ["open"] * own + ["closed"] * own
     assert {row["chain"] for row in net} == {"net"}
 
 
+def test_sample_of_collisions_is_general():
+    """Edges with and without their ends, of which some are inside of rods; friction that sticks and slides."""
+    sample = SAMPLES["float64", "barrier_edge_edge", "pair"]
+    _, _, factor = sample._evaluated(wp.float64)
+    ends = (factor.used.numpy() & 0b111100) != 0
+    assert ends.any() and not ends.all() and (sample.compared() == ~ends).all()
+    sample = SAMPLES["float64", "friction_logistic_edge_edge", "pair"]
+    sticking = sample.like({**sample.data, "start": sample.data["q"] - 1e-6})
+    force, most = (np.linalg.norm(of.gradient().reshape(-1, 3, 8)[:2].sum(0), axis=0) for of in (sample, sticking))
+    assert (most < 1e-4 * force).all()
+
+
 def test_measures_are_those_of_chains_or_nets():
-    """What `ddg-warp list` shows, `ddg-warp check` checks: rods open and closed, all else by index."""
+    """What `ddg-warp list` shows, `ddg-warp check` checks: rods open and closed, collisions as pairs, all else by index."""
     for name in ALL:
         chains = {chain for precision, term, chain in SAMPLES if term == name and precision == "float64"}
-        assert chains == ({"open", "closed"} if name in REGISTRY else {"net"})
+        assert chains == ({"open", "closed"} if name in REGISTRY else {"pair" if name in POTENTIALS else "net"})

@@ -12,7 +12,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.contact import gather
 from ddg_warp.kernels.densities import Density
-from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
+from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.friction_elements import FrictionElements
@@ -20,8 +20,6 @@ from ddg_warp.solve.contact.law_tables import at_own_rate, law_tables, table
 from ddg_warp.solve.contact.pair_product import PairProduct
 from ddg_warp.solve.contact.spins import Spins
 from ddg_warp.solve.contact.totals import Totals
-
-FRICTION = {"logistic": logistic_friction, "polynomial": polynomial_friction}
 
 
 class PairTerms:
@@ -309,8 +307,8 @@ class PairTerms:
 
     def _with_friction(self, rubs: bool, ways, law: str, velocity: float, silent) -> list[FrictionElements]:
         """Friction of each list, where there is any."""
-        if law not in FRICTION:
-            raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION)}")
+        if law not in FRICTION_LAWS:
+            raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION_LAWS)}")
         if not 0.0 < velocity < np.inf:
             raise SceneError(f"velocity = {velocity!r} of friction; it is positive and finite [m/s]")
         if not rubs:
@@ -321,7 +319,7 @@ class PairTerms:
         return [
             FrictionElements(
                 part,
-                FRICTION[law],
+                FRICTION_LAWS[law],
                 float(velocity),
                 None if same else np.stack(ways, -1),
                 self.search.shapes,

@@ -4,13 +4,12 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.contact.look import look_kernel
-from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
+from ddg_warp.kernels.terms import LAWS
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.pair_terms import PairTerms
 from ddg_warp.solve.contact.shapes import Shapes
 
-LAWS = {"barrier": log_barrier, "penalty": smooth_penalty}
 KEEP = {"barrier": 1.0, "penalty": 0.0}  # of the thickness, what motion never goes into
 MARGIN = 1.0  # of a typical radius, by which searches go beyond the reach
 SLIDING = 0.999  # of its bound, friction of what does not stick
