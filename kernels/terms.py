@@ -216,10 +216,17 @@ _COLLISIONS = {
 }
 LAWS = {"barrier": log_barrier, "penalty": smooth_penalty}
 FRICTION_LAWS = {"logistic": logistic_friction, "polynomial": polynomial_friction}
+
+
+def contact_potential(law: str, density: Density, collision: str) -> Potential:
+    """Return the potential of a law of the distance, called `law`, of one of the kinds of collisions."""
+    kind, text = _COLLISIONS[collision]
+    return Potential(f"{law}_{collision}", kind, density, f"{density.name.replace('_', ' ')} between {text}")
+
+
 CONTACT = {
-    f"{law}_{name}": Potential(f"{law}_{name}", kind, density, f"{density.name.replace('_', ' ')} between {text}")
-    for law, density in LAWS.items()
-    for name, (kind, text) in _COLLISIONS.items()
+    potential.name: potential
+    for potential in (contact_potential(*law, name) for law in LAWS.items() for name in _COLLISIONS)
 }
 FRICTION = {
     f"friction_{law}_{name}": Potential(f"friction_{law}_{name}", kind, density, f"Coulomb friction of {text}, {law}")

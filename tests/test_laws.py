@@ -9,7 +9,10 @@ import pytest
 from test_readme import BLOCKS
 
 import ddg_warp as ddg
+from ddg_warp.ask import inquiry
+from ddg_warp.geometry import meshes
 from ddg_warp.kernels.densities.quadratic import quadratic
+from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, MAGNETS, REGISTRY
 from ddg_warp.run import derivatives
 from ddg_warp.run.catalog import load_file
@@ -162,12 +165,185 @@ def test_mismatched_laws_are_refused(device, name):
         cantilever(laws, **options).build(device)
 
 
-def test_rigid_joints_refuse_other_laws(device):
+def test_rigid_joints_of_rods_with_laws_ask_for_one(device):
     scene = cantilever(LAW)
     second = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
     scene.join([(0, 0), (second, 0)])
-    with pytest.raises(ddg.SceneError, match="law of its own"):
+    with pytest.raises(ddg.SceneError, match=r"law of its own.*join\(laws="):
         scene.build(device)
+
+
+def elbow(joint=None, rods=None, **options) -> ddg.Scene:
+    """A clamped rod with another one joined rigidly to its end, along it or across."""
+    scene = ddg.Scene(gravity=(0.0, -1.0, -3.0))
+    nodes = np.linspace((0.5, 0.0, 0.0), options.get("end", (0.5, 0.4, 0.0)), 7)
+    rod = scene.add_rod(line(7, (0.5, 0.0, 0.0)), section=SECTION, laws=rods, natural=options.get("natural", "shape"))
+    other = scene.add_rod(nodes, section=SECTION, laws=rods)
+    scene.clamp(rod)
+    scene.join([(rod, -1), (other, 0)], laws=joint)
+    return scene
+
+
+def test_a_joints_law_given_by_hand_is_the_usual_one(device):
+    """In steps, equilibria and worlds, to the bit."""
+    by_hand = {"rigid_joint": ddg.Law(quadratic, stiffness=[2.0, 2.0, 2.0])}
+    usual, same = (moved(elbow(joint), device)[0] for joint in (None, by_hand))
+    np.testing.assert_array_equal(same, usual)
+    usual, same = (solve(elbow(joint).build(device, "float64", worlds=2)).points() for joint in (None, by_hand))
+    np.testing.assert_array_equal(same, usual)
+
+
+def test_joined_rods_with_laws_bend_as_one(device):
+    """Two collinear rods with a law, whose joint has it too, are one rod with it: both half cells of the joint make one vertex."""
+    soft, along = ddg.Law(saturating, modulus=K, limit=0.3), (1.0, 0.0, 0.0)
+    law, joint = {"rod_bend_twist": soft}, {"rigid_joint": soft}
+    joined, stiff = (
+        solve(elbow(*given, end=along, natural="straight").build(device, "float64"), load_steps=4).points()
+        for given in ((joint, law), (None, None))
+    )
+    whole = solve(cantilever(law).build(device, "float64"), load_steps=4).points()
+    error, change = np.abs(np.delete(joined, 7, 0) - whole).max(), np.abs(joined - stiff).max()
+    assert change > 0.01 and error < 0.01 * change
+
+
+def with_laws(name: str) -> ddg.Scene:
+    """Something whose joint or shell has the saturating law."""
+    law = ddg.Law(saturating, modulus=0.2, limit=0.5)
+    return elbow({"rigid_joint": law}) if name == "rigid_joint" else flag({name: law})
+
+
+@pytest.mark.parametrize("name", ["rigid_joint", "shell_bend_dof"])
+def test_parameters_of_laws_of_joints_and_shells_have_gradients(name):
+    """Of a step by the modulus and the limit, against differences."""
+    torch = pytest.importorskip("torch")
+    from ddg_warp.torch import Simulator
+
+    own = Simulator(with_laws(name).build("cpu", "float64"), 0.05, rtol=1e-12)
+    start = own.world_state(own.model.state())
+    for _ in range(2):
+        start = own.step(start)
+    for parameter in ("modulus", "limit"):
+        key = f"{name}.{parameter}"
+        given = own.parameter(key).clone()
+
+        def height(value, key=key):
+            return own.step(start, {key: value}).positions[..., 2].sum()
+
+        asked = given.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(height(asked), asked)
+        difference = (height(1.01 * given) - height(0.99 * given)) / 0.02
+        torch.testing.assert_close((slope * given).sum(), difference, rtol=1e-3, atol=1e-12)
+
+
+def test_a_hinged_joint_has_no_law():
+    with pytest.raises(ddg.SceneError, match="hinged joint has no energy"):
+        scene = cantilever()
+        other = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
+        scene.join([(0, 0), (other, 0)], rigid=False, laws=LAW)
+
+
+RUBBER = ddg.Material(1e6, 0.3, 1000.0)
+
+
+def flag(laws=None, viscosity: float = 0.0, bending: str = "midedge_dof", **options) -> ddg.Scene:
+    """A sheet clamped at one side."""
+    points, triangles = meshes.rectangle(4, 3, (0.4, 0.3))
+    scene = ddg.Scene(gravity=(0.0, 0.0, -3.0))
+    material = replace(RUBBER, viscosity=viscosity)
+    shell = scene.add_shell(points, triangles, thickness=0.01, material=material, bending=bending, laws=laws, **options)
+    scene.clamp_boundary(shell, np.flatnonzero(np.asarray(points)[:, 0] < np.asarray(points)[:, 0].min() + 1e-9))
+    return scene
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.05])
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+def test_a_shells_law_given_by_hand_is_the_usual_one(device, viscosity, bending):
+    """In steps and equilibria, to the bit."""
+    by_hand = {"shell_stretch": ddg.Law(st_venant_kirchhoff)}
+    by_hand |= (
+        {"shell_hinge": ddg.Law(quadratic)} if bending == "hinge" else {"shell_bend_dof": ddg.Law(st_venant_kirchhoff)}
+    )
+    usual, same = (moved(flag(laws, viscosity, bending), device)[0] for laws in (None, by_hand))
+    np.testing.assert_array_equal(same, usual)
+    usual, same = (solve(flag(laws, viscosity, bending).build(device, "float64")).points() for laws in (None, by_hand))
+    np.testing.assert_array_equal(same, usual)
+
+
+@pytest.mark.parametrize("worlds", [1, 2])
+def test_hinges_with_a_law_fold_as_it_says(device, worlds):
+    """A strip of two triangles between fixed corners, pulled up at the free one: its moment is m(t) = K t / sqrt(1 + (t / c)^2).
+
+    With the lever a of the free corner, the force F across it and the edge's length l and weight w it is F a = w m(t).
+    """
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]])
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    law = ddg.Law(saturating, modulus=K, limit=LIMIT)
+    shell = scene.add_shell(
+        points,
+        np.array([[0, 1, 2], [1, 0, 3]]),
+        thickness=0.01,
+        material=ddg.Material(1e9, 0.3),
+        bending="hinge",
+        laws={"shell_hinge": law},
+    )
+    scene.hold(shell, [0, 1, 3])
+    scene.add_vertex_force(shell, [2], (0.0, 0.0, 1.0))
+    model = scene.build(device, "float64", worlds=worlds)
+    state = solve(model, load_steps=4)
+    _, y, z = state.points().reshape(worlds, -1, 3)[:, 2].T
+    fold = np.arctan2(z, y)
+    weight = 1.0 / ((0.5 + 0.5) / 3.0)  # squared length over a third of the areas
+    np.testing.assert_allclose(y, weight * K * fold / np.sqrt(1.0 + (fold / LIMIT) ** 2), rtol=1e-5)
+    assert (fold > 0.1).all()
+
+
+def test_shells_with_and_without_a_law_are_two_sets(device):
+    """Rest shapes reach those of either; what is of no law of the material is refused by name."""
+    scene = flag({"shell_bend_dof": ddg.Law(replace(st_venant_kirchhoff, name="other"))})
+    points, triangles = meshes.rectangle(4, 3, (0.4, 0.3))
+    scene.add_shell(np.asarray(points) + [0.0, 1.0, 0.0], triangles, thickness=0.01, material=RUBBER)
+    model = scene.build(device, "float64")
+    assert len([part for part in model.net.sets if part.term.name == "shell_bend_dof"]) == 2
+    start = model.state().points()
+    for shell in (0, 1):
+        model.set_rest(shell, metric=1.1 * model.net.host.shells[shell].plate.abar)
+    model.set_rest(0, curvature=0.01 * np.ones((len(triangles), 3)))
+    half = len(start) // 2
+    integrator, state = ddg.Integrator(model, rtol=1e-8), model.state()
+    after = integrator.step(state, 0.02).points()
+    assert np.abs(after - start)[:half].max() > 1e-4 and np.abs(after - start)[half:].max() > 1e-4
+
+
+def test_fields_of_triangles_know_the_law_of_the_material_alone(device):
+    model = with_laws("shell_bend_dof").build(device, "float64")
+    with pytest.raises(ValueError, match=r"triangle_fields: shell_bend_dof of shell 0 .* has the law 'saturating'"):
+        inquiry.triangle_fields(model, model.state())
+    assert inquiry.energies(model, model.state())
+
+
+def test_parameters_of_shells_are_of_the_law_of_their_material():
+    pytest.importorskip("torch")
+    from ddg_warp.torch import ShellParameters, Simulator
+
+    model = with_laws("shell_bend_dof").build("cpu", "float64")
+    with pytest.raises(ddg.SceneError, match=r"shell 0 \('shell'\) has a law of its own"):
+        ShellParameters(Simulator(model, 0.02))
+
+
+WRONG_OF_SHELLS = {
+    "term": ({"shell_hinge": ddg.Law(quadratic)}, "shell 'shell': laws: it has no term 'shell_hinge'"),
+    "rest": ({"shell_stretch": ddg.Law(saturating, modulus=K, limit=LIMIT)}, "no strains at rest, and the shell has"),
+    "missing": ({"shell_bend_dof": ddg.Law(saturating, modulus=K)}, "limit is missing"),
+    "shape": ({"shell_bend_dof": ddg.Law(saturating, modulus=np.ones(5), limit=1.0)}, "broadcast to 24 triangles"),
+    "no law": ({"shell_bend_dof": 3.0}, r"give Law\(density"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_OF_SHELLS)
+def test_what_does_not_fit_a_shell_is_refused(device, name):
+    laws, words = WRONG_OF_SHELLS[name]
+    with pytest.raises(ddg.SceneError, match=words):
+        flag(laws).build(device)
 
 
 def test_parameters_of_a_law_change_by_name(device):

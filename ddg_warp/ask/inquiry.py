@@ -273,11 +273,20 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
     - "strain": largest principal value in magnitude of Green's strain.
     - "curvature" [1/m]: likewise of the change of curvature, for shells with mid-edge normals.
     - "energy" [J/m^2]: elastic energy of membrane and mid-edge bending per rest area.
+
+    Raises:
+        ValueError: there are no surfaces, or a shell has a user-defined law.
     """
     _check("triangle_fields", model, state)
     net, surfaces = model.net, model.surfaces
     if surfaces is None:
         raise ValueError("the model has no surfaces to color")
+    for number, shell in enumerate(model.scene.shells):
+        for term, law in shell.laws.items():
+            raise ValueError(
+                f"triangle_fields: {term} of shell {number} ('{shell.name}') has the law {law.density.name!r}, and the fields know "
+                "that of its material; see inquiry.energies"
+            )
     fields = {name: np.zeros((model.worlds, len(surfaces.triangles))) for name in ("strain", "curvature", "energy")}
     for index, part in enumerate(net.sets):
         if not (part.term.name.startswith("shell") and part.term.density.coupled):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ddg_warp.kernels.solve import cyclic_reduction
-from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, Potential
+from ddg_warp.kernels.terms import ALL, FRICTION, Potential, contact_potential
 from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
@@ -89,7 +89,7 @@ def contact_lines(touching) -> list[str]:
     said = [f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers]
     said += ["which rolls rods"] * law.rolling
     return [
-        f"contact: {law.law} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
+        f"contact: {law.name} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
     ]
 
 
@@ -99,7 +99,7 @@ def contact_potentials(touching) -> list[Potential]:
     others = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
     pairs = ["edge_edge", *(name for kind, name in others if kind in kinds)]
     friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if touching.rubs]
-    return [*(CONTACT[f"{law.law}_{pair}"] for pair in pairs), *friction]
+    return [*(contact_potential(law.name, touching.density, pair) for pair in pairs), *friction]
 
 
 def _between(values: np.ndarray) -> str:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ddg_warp.kernels.densities import Density
 from ddg_warp.scene.contact import Contact
 
 ROD = "rod"
@@ -40,6 +41,7 @@ class Touching:
 
     Attributes:
         law: contact description of the scene; bodies: collision bodies, obstacles last.
+        density: contact law as a function of the distance; keep: fraction of the thickness that motion preserves.
         names: names of the groups with common parameters; group (bodies,): index of the group of each body.
         friction, stiffness [N/m], range [m]: parameters of pairs of groups (groups, groups).
         inertia: masses [kg] of pairs of groups (groups, groups). Divided by the step squared, they bound the stiffness of a step that
@@ -49,6 +51,8 @@ class Touching:
     """
 
     law: Contact
+    density: Density
+    keep: float
     bodies: list[Body]
     names: list[str]
     group: np.ndarray

@@ -1,24 +1,31 @@
-"""Derivative check of user-defined laws: slope against energy, curvature against slope."""
+"""User-defined laws: derivative check, parameters of a term, contact laws from laws of the gap."""
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.densities.contact import gap_law
+from ddg_warp.kernels.terms import ALL, LAWS
 
 BASES, SIZES = (0.0, 1.0), (1e-2, 0.3, 5.0)  # centres and offsets of trial strains
 STEPS = (1e-4, 1e-5)  # Steps of differences, over the size of a strain; one must agree.
 TOLERANCE = 1e-3  # Tolerance over the largest derivative.
+GAPS = (0.05, 0.3, 0.7, 0.95)  # trial gaps of contact laws, over the activation distance
+ENDS = 1e-6  # Largest energy and force at the activation distance, over the values at half of it.
 TRIED = (1.0, 0.3, 0.0, -0.3)  # Values for parameters without value or default.
 
 
-def check_law(where: str, law, strains: int) -> None:
+def check_law(where: str, law, strains: int, trials: list[np.ndarray] | None = None) -> None:
     """Refuse a law with wrong derivatives; laws of the package have tests of their own.
 
     Args:
         where: object named in the message.
         law: the `Law`; strains: number of its strains.
+        trials: trial strains (strains,); by default of order one.
 
     Raises:
         SceneError: names the first derivative that differs, both values and the strain.
@@ -28,7 +35,7 @@ def check_law(where: str, law, strains: int) -> None:
         return
     values = _values(law, strains)
     for order, parent in (("slope", "energy"), ("curvature", "slope")):
-        for strain in _strains(strains):
+        for strain in trials or _strains(strains):
             if mismatch := _difference(density, order, strain, values):
                 named_values = dict(zip(_names(law, strains), values.tolist(), strict=False))
                 raise SceneError(
@@ -36,6 +43,124 @@ def check_law(where: str, law, strains: int) -> None:
                     f"derivative of its {parent} {mismatch[1]:.6g}, by parameters {named_values}; correct the {order} or the {parent} "
                     "(`ddg-warp check` compares all derivatives)"
                 )
+
+
+def check_laws(where: str, laws, names) -> None:
+    """Refuse laws of terms outside `names`, and laws with wrong derivatives.
+
+    Raises:
+        SceneError: names the term.
+    """
+    for name, law in laws.items():
+        if name not in names:
+            raise SceneError(f"{where}: it has no term {name!r} to give a law; it has {', '.join(names)}")
+        n = len(ALL[name].measure.strains)
+        if law.density.strains not in (None, n):
+            raise SceneError(f"{where}, {name}: the law {law.density.name!r} is not of {n} strains, as the term is")
+        check_law(f"{where}, {name}", law, n)
+
+
+def bind_law(where: str, term, law, defaults: dict, on_elements: Callable, shape: str) -> dict[str, np.ndarray]:
+    """Return the parameters of a term by name.
+
+    Args:
+        where: object named in messages.
+        law: user's `Law` of the term, or None.
+        defaults: values by family from material and rest shape; families that the law does not take are ignored.
+        on_elements: (family, value) -> values of the law at elements, which override the defaults.
+        shape: shape that values broadcast to, in words.
+
+    Raises:
+        SceneError: a value of the wrong shape, missing, or invalid.
+    """
+    families = {parameter.family for parameter in term.parameters}
+    values = {family: value for family, value in defaults.items() if family in families}
+    for family, value in law.values.items() if law else ():
+        try:
+            values[family] = (
+                [on_elements(family, v) for v in value]
+                if isinstance(value, list | tuple)
+                else on_elements(family, value)
+            )
+        except (TypeError, ValueError):
+            raise SceneError(f"{where}: {family} = {value!r}; give numbers that broadcast to {shape}") from None
+    try:
+        values = term.bind(**values)
+    except TypeError as error:
+        raise SceneError(f"{where}: law {term.density.name!r}: {error}; give it with Law(density, ...)") from None
+    for parameter in term.parameters if law else ():
+        rule, holds = parameter.valid
+        if not np.all(np.isfinite(values[parameter.name]) & holds(values[parameter.name])):
+            raise SceneError(f"{where}: {parameter.name} = {values[parameter.name]}; it is finite and {rule}")
+    return values
+
+
+def contact_law(contact, stiffness: np.ndarray, ranges: np.ndarray, explicit: bool) -> tuple[Density, float]:
+    """Return the contact law of the distance, and the fraction of the thickness that motion preserves.
+
+    The fraction is one for laws with infinite energy at zero gap, else zero.
+
+    Args:
+        contact: `Contact` with the name of a law of the package, or a user's `Law` of the gap.
+        stiffness: of pairs of groups [N/m]; `explicit` if the scene gives it; ranges: activation distances of pairs of groups [m].
+
+    Raises:
+        SceneError: a user's law of the wrong form, with wrong derivatives, attractive, not convex, or nonzero at the range.
+    """
+    if isinstance(contact.law, str):
+        return LAWS[contact.law], float(contact.law == "barrier")
+    law, density = contact.law, contact.law.density
+    where, parameters = f"contact: law {density.name!r}", density.parameters(1)
+    names = [parameter.name for parameter in parameters]
+    if density.strains not in (None, 1) or density.lagged:
+        raise SceneError(f"{where} is no law of one strain, the gap [m]; give one that takes it alone")
+    for name in law.values:
+        if name in ("stiffness", "range"):
+            raise SceneError(f"{where} has a {name} of its own; give contact({name}=...)")
+        if name not in names:
+            raise SceneError(f"{where}: {name} does not fit; it takes {', '.join(names)}")
+    if explicit and "stiffness" not in names:
+        raise SceneError(f"{where} takes no stiffness; leave it out, or give the law a parameter of this name")
+    keep = 0.0
+    for activation in {float(ranges.min()), float(ranges.max())}:
+        values = {**law.values, "stiffness": float(stiffness.max()), "range": activation}
+        constants = tuple(_constant(where, parameter, values) for parameter in parameters)
+        bound = type(law)(density, **dict(zip(names, constants, strict=True)))
+        gaps = [np.array([activation * gap]) for gap in GAPS]
+        check_law(where, bound, 1, gaps)
+        energy, slope, curvature = (
+            _evaluated(
+                density, order, np.array([*gaps, [0.5 * activation], [activation], [0.0]]), np.array(constants)
+            ).reshape(-1)
+            for order in range(3)
+        )
+        for fault, wrong in (("pulls", slope[:4] > 0.0), ("is not convex", curvature[:4] < 0.0)):
+            for k in np.flatnonzero(wrong | np.isnan(slope[:4]))[:1]:
+                raise SceneError(
+                    f"{where} {fault} at a gap of {gaps[k][0]:.3g} m; psi' is to be negative and psi'' positive"
+                )
+        for quantity, samples in (("energy", energy), ("force", slope)):
+            if abs(samples[5]) > ENDS * abs(samples[4]):
+                raise SceneError(
+                    f"{where} has the {quantity} {abs(samples[5]):.3g} at the range, {activation:.3g} m, from which on nothing pushes; "
+                    "let both end there, or give contact(range=...)"
+                )
+        keep = max(keep, float(np.isposinf(energy[6])))
+    fixed = (0.0 if name in ("stiffness", "range") else value for name, value in zip(names, constants, strict=True))
+    return gap_law(density, tuple(fixed)), keep
+
+
+def _constant(where: str, parameter, values: dict) -> float:
+    """Return the value of a parameter of a contact law, one number."""
+    value = values.get(parameter.name, parameter.default)
+    if value is None:
+        raise SceneError(f"{where}: {parameter.name} is missing; give it with Law(density, ...)")
+    if np.ndim(value):
+        raise SceneError(f"{where}: {parameter.name} = {value!r}; of contact it is one number")
+    rule, holds = parameter.valid
+    if not (np.isfinite(value) and holds(float(value))):
+        raise SceneError(f"{where}: {parameter.name} = {value}; it is finite and {rule}")
+    return float(value)
 
 
 def _names(law, strains: int) -> list[str]:

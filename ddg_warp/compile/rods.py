@@ -7,7 +7,7 @@ import numpy as np
 
 from ddg_warp.compile.ghosts import Ghosts, end_director, ghost_node
 from ddg_warp.compile.half_cells import HalfCells
-from ddg_warp.compile.laws import check_law
+from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.chain import ChainKind
@@ -99,14 +99,7 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
     names = [f"{prefix}_stretch"]
     if batch.bend:
         names.insert(0, f"{prefix}_bend_twist" if batch.twist else f"{prefix}_bend")
-    for term in batch.laws:
-        if term not in names:
-            raise SceneError(
-                f"rod {batch.first} ('{batch.name}'): it has no term {term!r} to give a law; it has {', '.join(names)}"
-            )
-    for term, law in batch.laws.items():
-        where = f"rod {batch.first} ('{batch.name}'), {term}"
-        check_law(where, law, len(REGISTRY[term].measure.strains))
+    check_laws(f"rod {batch.first} ('{batch.name}')", batch.laws, names)
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
     keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
     terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
@@ -221,25 +214,7 @@ def _bound(batch: RodBatch, term: Term, inputs: dict, on_edges, cells: HalfCells
     bent = (np.abs((value - unstrained) * inputs["measure"]).max() > 1e-9 for value in inputs["rest"])
     if law is not None and "rest" not in families and any(bent):
         raise SceneError(f"{where}: the law {term.density.name!r} has no strains at rest; give natural='straight'")
-    inputs = {family: value for family, value in inputs.items() if family in families}
-    for family, value in law.values.items() if law else ():
-        try:
-            inputs[family] = (
-                [along(family, v) for v in value] if isinstance(value, list | tuple) else along(family, value)
-            )
-        except (TypeError, ValueError):
-            raise SceneError(
-                f"{where}: {family} = {value!r}; give numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
-            ) from None
-    try:
-        values = term.bind(**inputs)
-    except TypeError as error:
-        raise SceneError(f"{where}: law {term.density.name!r}: {error}; give it with Law(density, ...)") from None
-    for parameter in term.parameters if law else ():
-        rule, holds = parameter.valid
-        if not np.all(np.isfinite(values[parameter.name]) & holds(values[parameter.name])):
-            raise SceneError(f"{where}: {parameter.name} = {values[parameter.name]}; it is finite and {rule}")
-    return values
+    return bind_law(where, term, law, inputs, along, f"the {batch.rods} rods and {batch.edges} edges")
 
 
 def _bending(section, kind: ChainKind) -> list:

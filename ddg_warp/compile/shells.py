@@ -17,12 +17,14 @@ Bending models, with errors against exact shapes and linear plates (tests/kernel
     isometric         hinge energy for small angles, quadratic in the positions: flat, inextensible sheets.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.compile.elements import ElementSet
+from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.shell_forms import (
     CLAMPED,
@@ -54,6 +56,7 @@ class Plate:
         young: Young's modulus (T,) [Pa].
         poisson: Poisson's ratio (T,).
         viscosity: retardation time of strain-rate damping (T,) [s]; None for none.
+        laws: user-defined `Law` by term.
     """
 
     abar: np.ndarray
@@ -63,6 +66,7 @@ class Plate:
     young: np.ndarray
     poisson: np.ndarray
     viscosity: np.ndarray | None
+    laws: Mapping = field(default_factory=dict)
 
     @property
     def area(self) -> np.ndarray:
@@ -87,7 +91,9 @@ class Plate:
         return self.membrane_stiffness * self.thickness**2 / 12.0
 
 
-def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest="shape", viscosity=None) -> Plate:
+def plate(
+    surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest="shape", viscosity=None, laws=None
+) -> Plate:
     """Return the rest shape and material of a shell.
 
     Args:
@@ -98,6 +104,7 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
         rest: "shape" (metric and curvature of the positions), "flat" (metric of the positions, no curvature), or explicit
             arrays (abar, bbar), each (T, 3) [m^2], [m].
         viscosity: retardation time of strain-rate damping, number or one for each triangle [s]; None for none.
+        laws: user-defined `Law` by term; None for none.
 
     Raises:
         SceneError: names the parameter and the triangle.
@@ -130,7 +137,7 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
         if viscosity is None
         else _by_triangle("viscosity", viscosity, count, lambda v: v >= 0.0, "not negative"),
     }
-    made = Plate(abar, bbar, angle, **material)
+    made = Plate(abar, bbar, angle, **material, laws=laws or {})
     for name in ("membrane_stiffness", "bending_stiffness"):
         arguments.sized(name.replace("_", " "), getattr(made, name))
     return made
@@ -244,12 +251,15 @@ def shell_elements(
     if membrane_model == "curved":
         if bending != "midedge_dof":
             raise SceneError(f"membrane 'curved' reads the mid-edge normals of bending 'midedge_dof', not {bending!r}")
-        return [curved_membrane(surface, plate, kinds), mid_edge_bending(surface, plate, kinds, True)]
-    if bending == "hinge":
-        return [membrane(surface, plate), *hinge_bending(surface, plate, kinds)]
-    if bending == "isometric":
-        return [membrane(surface, plate), isometric_bending(surface, plate, kinds)]
-    return [membrane(surface, plate), mid_edge_bending(surface, plate, kinds, bending != "midedge")]
+        sets = [curved_membrane(surface, plate, kinds), mid_edge_bending(surface, plate, kinds, True)]
+    elif bending == "hinge":
+        sets = [membrane(surface, plate), *hinge_bending(surface, plate, kinds)]
+    elif bending == "isometric":
+        sets = [membrane(surface, plate), isometric_bending(surface, plate, kinds)]
+    else:
+        sets = [membrane(surface, plate), mid_edge_bending(surface, plate, kinds, bending != "midedge")]
+    check_laws("laws", plate.laws, [elements.term.name for elements in sets])
+    return sets
 
 
 def triangles_beside(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.ndarray]:
@@ -290,24 +300,39 @@ def _at(table: np.ndarray, triangles: np.ndarray, entry: np.ndarray, values: np.
 
 
 def _term(name: str, plate: Plate):
-    return SHELLS[name].damped(plate.viscosity is not None)
+    return SHELLS[name].of(plate.laws).damped(plate.viscosity is not None)
 
 
 def _law(term, plate: Plate, stiffness: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the parameters of the St. Venant-Kirchhoff law by name."""
-    shape = {"metric": [*plate.abar.T], "rest": [*rest.T]}
-    viscosity = {} if plate.viscosity is None else {"viscosity": plate.viscosity}
-    return term.bind(measure=plate.area, stiffness=stiffness, poisson=plate.poisson, **shape, **viscosity)
+    """Return the parameters of the law of triangles by name; by default the St. Venant-Kirchhoff law."""
+    defaults = {"measure": plate.area, "metric": [*plate.abar.T], "rest": [*rest.T], "stiffness": stiffness}
+    defaults |= {"poisson": plate.poisson} | ({} if plate.viscosity is None else {"viscosity": plate.viscosity})
+    return _bound(term, plate, defaults, np.arange(len(plate.area))[:, None])
 
 
 def _quadratic(term, measure: np.ndarray, plate: Plate, sides: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the parameters of the quadratic hinge law, k = D / 3 of the triangles `sides` (., 1 or 2), by name."""
+    """Return the parameters of the hinge law of triangles `sides` (., 1 or 2) by name; by default quadratic with k = D / 3."""
     D, n = plate.bending_stiffness, len(term.measure.strains)
     stiffness = D[sides].mean(1) / 3.0
-    viscosity = {}
+    defaults = {"measure": measure, "stiffness": [stiffness] * n, "rest": [rest] * n}
     if plate.viscosity is not None:
-        viscosity["viscosity"] = (D * plate.viscosity)[sides].mean(1) / 3.0 / stiffness
-    return term.bind(measure=measure, stiffness=[stiffness] * n, rest=[rest] * n, **viscosity)
+        defaults["viscosity"] = (D * plate.viscosity)[sides].mean(1) / 3.0 / stiffness
+    return _bound(term, plate, defaults, sides)
+
+
+def _bound(term, plate: Plate, defaults: dict, sides: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the parameters of a term by name; elements average values of a law over the triangles `sides`."""
+    count, families = len(plate.area), {parameter.family for parameter in term.parameters}
+    law, bent = plate.laws.get(term.name), np.any([np.any(value) for value in defaults["rest"]])
+    if law is not None and not families & {"rest", "metric"} and bent:
+        raise SceneError(
+            f"{term.name}: the law {term.density.name!r} has no strains at rest, and the shell has; give it a parameter 'rest'"
+        )
+
+    def along(family, value):
+        return np.broadcast_to(np.asarray(value, float), (count,))[sides].mean(1)
+
+    return bind_law(term.name, term, law, defaults, along, f"{count} triangles")
 
 
 def _by_triangle(name: str, values, count: int, valid, text: str) -> np.ndarray:

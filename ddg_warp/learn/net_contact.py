@@ -7,7 +7,6 @@ from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_sums
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
 from ddg_warp.kernels.contact.gather import sum_kernel
-from ddg_warp.kernels.terms import LAWS
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.rolling import turned_by
 from ddg_warp.solve.net.exact_contact import ExactContact
@@ -52,9 +51,8 @@ class ContactAdjoint:
         every = wp.zeros(net.blocks, dtype=wp.uint8, device=device)
         self.lags = contact.law.lags if terms.frictions else 1
         self._rubs = terms.frictions or [None] * len(terms.lists)
-        law = LAWS[contact.law.law]
         kinds = [pairs.kind for pairs in search.lists]
-        self._pull = [pull_kernel(kind, law, real) for kind in kinds]
+        self._pull = [pull_kernel(kind, contact.density, real) for kind in kinds]
         leads = [friction.directions[0] is not None for friction in terms.frictions]
         self._rolls = [friction.rolls for friction in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None

@@ -192,6 +192,11 @@ def _shells(model, names, shells) -> list[tuple]:
         if not 0 <= arguments.index("ShellParameters: shell", shell) < len(model_shells):
             raise SceneError(f"ShellParameters: shell {shell} does not exist; the model has {len(model_shells)} shells")
         bending = model.scene.shells[shell].bending
+        if model.scene.shells[shell].laws:
+            raise SceneError(
+                f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') has a law of its own; learn its parameters by "
+                "name"
+            )
         for name in names:
             if name in FORMS and bending in ("hinge", "isometric"):
                 raise SceneError(

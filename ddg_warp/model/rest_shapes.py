@@ -131,9 +131,9 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         angle = _shaped("angle", angle, (len(surface.edges),))
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
     plate = replace(net_shell.plate, **changes)
-    sets = {part.term.name: part for part in model.net.sets}
+    sets = {part.term.law: part for part in model.net.sets}
     elements_of = shell_terms.shell_elements(surface, plate, net_shell.kinds, bending, membrane)
-    places = [(sets[e.term.name], net_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
+    places = [(sets[e.term.law], net_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
     net_shell.plate = plate  # nothing can fail after this
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))
 

@@ -85,19 +85,19 @@ def load_file(name: str, kind: str = "scene") -> ModuleType:
 
 
 def own_term(file: str, name: str):
-    """Return a user's term from a file, or a term of rods with the user's density.
+    """Return a user's term or potential from a file, or a term of rods with the user's density.
 
     Raises:
-        InputError: There is no such file or name, or the object is no Term or Density.
+        InputError: There is no such file or name, or the object is no Term, Potential or Density.
     """
     from ddg_warp.kernels.densities import Density
-    from ddg_warp.kernels.terms import REGISTRY, Term
+    from ddg_warp.kernels.terms import REGISTRY, Potential, Term
 
     law = getattr(load_file(file, "law's"), name, None)
-    if isinstance(law, Term):
+    if isinstance(law, Term | Potential):
         return law
     if not isinstance(law, Density):
-        raise InputError(f"{file} has no term or law {name!r}; give the name of a Term or a Density")
+        raise InputError(f"{file} has no term or law {name!r}; give the name of a Term, a Potential or a Density")
     for term in ("rod_bend_twist", "rod_stretch"):
         if law.strains in (None, len(REGISTRY[term].measure.strains)):
             return replace(REGISTRY[term], density=law)

@@ -1,8 +1,8 @@
 """What the checks of `ddg_warp.run.derivatives` read: a term at a random state where nothing is zero, and what its kernels make of it.
 
 `chain_samples` gathers along rods, `element_samples` by index, which serves all other measures, one's own among them, and
-`contact_samples` has collisions. An element's
-*local dofs* are what its kernels write derivatives by: the window of a chain, or three reals a slot.
+`contact_samples` has collisions. An element's *local dofs* are what its kernels write derivatives by: the window of a chain, or three
+reals a slot.
 """
 
 from functools import cached_property

@@ -8,6 +8,7 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
+from ddg_warp.scene.descriptions import Law, is_law
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.obstacles import Capsule, Mesh, Obstacle, Plane, Sphere
@@ -22,7 +23,7 @@ ONE = "; contact_between of rods and an obstacle takes one forwards, one backwar
 class Contact:
     """Contact settings of a scene; attributes are the arguments of `Scene.contact`."""
 
-    law: str = "barrier"
+    law: str | Law = "barrier"
     range: float | None = None
     stiffness: float | None = None
     friction: float = 0.0
@@ -33,6 +34,11 @@ class Contact:
     apart: float | None = None
     radius: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     objects: tuple[str, ...] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the law."""
+        return self.law if isinstance(self.law, str) else self.law.density.name
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class Contacts:
     def contact(
         self,
         *,
-        law: str = "barrier",
+        law: str | Law = "barrier",
         range: float | None = None,
         stiffness: float | None = None,
         friction: float = 0.0,
@@ -84,7 +90,9 @@ class Contacts:
         Measured: piles of 12 and 40 rods take 35 and 50 % longer with `rolling`.
 
         Args:
-            law: contact potential, "barrier" or "penalty".
+            law: contact potential, "barrier" or "penalty"; or a `Law` with one strain, the gap [m]. Its parameters "stiffness"
+                and "range" are the arguments below, the others one number each. It is repulsive, convex, and zero from the range on.
+                Surfaces never overlap if its energy is infinite at zero gap.
             range: activation distance: gap below which contact acts [m]; by default half of the smallest radius of a rod or half
                 thickness of a shell.
             stiffness: of the contact potential [N/m]; between two objects the geometric mean. By default ten weights of a
@@ -121,7 +129,7 @@ class Contacts:
             arguments.text(f"{call}a name in radius", name)
             arguments.positive(f"{call}radius of {name!r}", value, "m")
         self.touching = Contact(
-            arguments.choice(f"{call}law", law, LAWS),
+            law if is_law(law) else arguments.choice(f"{call}law", law, LAWS),
             range,
             stiffness,
             _friction(f"{call}friction", friction, ONE),

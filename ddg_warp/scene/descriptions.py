@@ -85,13 +85,14 @@ class Trace:
 
 @dataclass(frozen=True, init=False)
 class Law:
-    """Constitutive law for a term of rods, instead of the quadratic law.
+    """Constitutive law for a term of rods, shells or rigid joints, or for contact, instead of the default.
 
     Attributes:
         density: a `ddg_warp.kernels.densities.Density`, of the package or user-defined.
         values: parameters by family: a number, or an array that broadcasts to (rods, edges), or a list with one for each strain. At
             vertices stiffnesses of both half edges act in series, and other parameters are averaged over them (see
-            `ddg_warp.compile.half_cells`). Defaults come from the rod: stiffnesses of its section, strains at rest, viscosity.
+            `ddg_warp.compile.half_cells`). For shells arrays broadcast to triangles, averaged by elements at edges; for a joint
+            to its half cells. Defaults come from the object: stiffnesses, strains at rest, viscosity.
     """
 
     density: object
@@ -108,7 +109,12 @@ class Law:
         object.__setattr__(self, "values", deepcopy(values))
 
 
-def laws_of(label: str, section, material, laws) -> dict[str, Law]:
+def is_law(law) -> bool:
+    """Return True for a `Law` with a density."""
+    return isinstance(law, Law) and hasattr(law.density, "parameters")
+
+
+def laws_of(label: str, laws, section=None, material=None) -> dict[str, Law]:
     """Return laws by term: laws of the section, overridden by `laws`.
 
     Raises:
@@ -118,7 +124,7 @@ def laws_of(label: str, section, material, laws) -> dict[str, Law]:
     if laws is not None and not isinstance(laws, Mapping):
         raise SceneError(f"{label}: laws = {laws!r}; give a dictionary from terms to Law(density, ...)")
     for term, law in (laws or {}).items():
-        if not isinstance(law, Law) or not hasattr(law.density, "parameters"):
+        if not is_law(law):
             raise SceneError(f"{label}: the law of {term!r} is {law!r}; give Law(density, ...)")
     return {**section_laws, **(laws or {})}
 
@@ -204,6 +210,7 @@ class Shell:
     membrane: str
     rest: object
     name: str
+    laws: Mapping[str, Law] = field(default_factory=dict)  # by term
 
     @property
     def points(self) -> np.ndarray:
@@ -269,6 +276,7 @@ class Joint:
 
     members: tuple[tuple[int, int], ...]
     rigid: bool
+    laws: Mapping[str, Law] = field(default_factory=dict)  # by term
 
 
 @dataclass(frozen=True)

@@ -186,7 +186,7 @@ class Scene(Structures):
             bend,
             name,
             self.rod_count,
-            laws_of(f"rods '{name}'", section, material, laws),
+            laws_of(f"rods '{name}'", laws, section, material),
             curvature,
             not (isinstance(section, Stiffness) or laws),
         )

@@ -1,7 +1,7 @@
 """Shells of a scene with supports and loads, joints of rods, and attachments of rods to shells."""
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 
@@ -17,10 +17,12 @@ from ddg_warp.scene.descriptions import (
     Attachment,
     EdgeCouple,
     Joint,
+    Law,
     Pressure,
     Shell,
     ShellLoad,
     ShellSupport,
+    laws_of,
 )
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.magnets import Magnets
@@ -55,6 +57,7 @@ class Structures(Meridians, Magnets, Contacts):
         membrane: str = "flat",
         rest="shape",
         name: str = "shell",
+        laws: Mapping[str, Law] | None = None,
     ) -> int:
         """Add a triangle mesh as a thin shell.
 
@@ -70,6 +73,7 @@ class Structures(Meridians, Magnets, Contacts):
             rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone. Or two arrays (abar (T, 3)
                 [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
             name: shown in reports and output.
+            laws: a `Law` for terms by name, such as "shell_stretch" or "shell_bend_dof", instead of the material's.
 
         Returns:
             Index of the shell.
@@ -91,8 +95,9 @@ class Structures(Meridians, Magnets, Contacts):
         label = f"shell '{name}': thickness"
         thickness = arguments.array(label, thickness, "give one number, or one a triangle [m]").copy()
         arguments.sized(label, thickness)
+        laws = laws_of(f"shell '{name}'", laws)
         _warn_of_pieces(surface)
-        self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name))
+        self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name, laws))
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None) -> None:
@@ -227,11 +232,21 @@ class Structures(Meridians, Magnets, Contacts):
         dead, amplitude = arguments.flag("add_pressure: dead", dead), arguments.amplitude("add_pressure", amplitude)
         self.pressures.append(Pressure(shell, index, pressure, dead, amplitude))
 
-    def join(self, members: Iterable[tuple[int, int]], rigid: bool = True) -> None:
+    def join(
+        self, members: Iterable[tuple[int, int]], rigid: bool = True, laws: Mapping[str, Law] | None = None
+    ) -> None:
         """Join rods at nodes, (rod, node) each, which coincide at rest.
 
         A rigid joint has rotation dofs, and bends every adjacent edge against this rotation over half a cell, so that two collinear
         rods joined rigidly are one rod. A hinged joint has only a common position.
+
+        Args:
+            members: (rod, node) each.
+            rigid: whether the joint has rotation dofs.
+            laws: of a rigid joint, a `Law` for its term "rigid_joint", instead of the quadratic law with the sections' stiffness.
+
+        Raises:
+            SceneError: invalid members; at `build`, points that do not coincide, or a law that does not fit.
         """
         pairs = []
         for member in members if np.iterable(members) else [members]:
@@ -242,7 +257,12 @@ class Structures(Meridians, Magnets, Contacts):
             pairs.append((int(rods[0]), node))
         if len(set(pairs)) < 2:
             raise SceneError(f"join: {pairs}; a joint has two different members at least, (rod, node) each")
-        self.joints.append(Joint(tuple(pairs), arguments.flag("join: rigid", rigid)))
+        rigid, laws = arguments.flag("join: rigid", rigid), laws_of("join", laws)
+        if laws and not rigid:
+            raise SceneError(
+                "join: a hinged joint has no energy to give a law; leave laws out, or join it with rigid=True"
+            )
+        self.joints.append(Joint(tuple(pairs), rigid, laws))
 
     def attach(self, rod: int, nodes, shell: int, vertices, spin: str = "glued") -> None:
         """Merge nodes of a rod with vertices of a shell, coincident at rest: a stiffener, a rim, a post.

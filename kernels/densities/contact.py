@@ -122,5 +122,65 @@ def _barrier_laws(real, n):
     return energy, slope, curvature
 
 
+@cache
+def gap_law(density: Density, constants: tuple[float, ...]) -> Density:
+    """Return a law of the gap as a law of the distance, as the contact potential takes it.
+
+    Args:
+        density: of one strain, the gap [m]. It counts below the range alone.
+        constants: values of its parameters in their order; those of "stiffness" and "range" are never read, contact has them.
+    """
+
+    @cache
+    def laws(real, n):
+        return _gap_laws(density, constants, real)
+
+    return Density(density.name, lambda n: (STIFFNESS, RANGE, THICKNESS), laws, strains=1)
+
+
+def _gap_laws(density: Density, constants: tuple[float, ...], real):
+    energy_of, slope_of, curvature_of = density.laws(real, 1)
+    names = [parameter.name for parameter in density.parameters(1)]
+    stiffness, reach = (names.index(name) if name in names else -1 for name in ("stiffness", "range"))
+    E, P, Q = wp.types.vector(1, real), wp.types.vector(3, real), wp.types.vector(len(names), real)
+    fixed, coupled = Q(*constants), density.coupled
+
+    @wp.func
+    def own(p: P):
+        q = fixed * real(1.0)
+        if wp.static(stiffness >= 0):
+            q[wp.static(stiffness)] = p[0]
+        if wp.static(reach >= 0):
+            q[wp.static(reach)] = p[1]
+        return q
+
+    @wp.func
+    def energy(e: E, p: P):
+        gap = e[0] - p[2]
+        if gap >= p[1]:
+            return real(0.0)
+        return energy_of(E(gap), own(p))
+
+    @wp.func
+    def slope(e: E, p: P):
+        gap = e[0] - p[2]
+        if gap >= p[1]:
+            return E()
+        return slope_of(E(gap), own(p))
+
+    @wp.func
+    def curvature(e: E, p: P):
+        gap = e[0] - p[2]
+        if gap >= p[1]:
+            return E()
+        c = curvature_of(E(gap), own(p))
+        if wp.static(coupled):
+            return E(c[0, 0])
+        else:
+            return c
+
+    return energy, slope, curvature
+
+
 smooth_penalty = Density("smooth_penalty", lambda n: (STIFFNESS, RANGE, THICKNESS), _penalty_laws, strains=1)
 log_barrier = Density("log_barrier", lambda n: (STIFFNESS, RANGE, THICKNESS), _barrier_laws, strains=1)

@@ -158,6 +158,7 @@ class _Builder:
                     kinds,
                     rest=shell.rest,
                     viscosity=material.viscosity if np.any(np.asarray(material.viscosity) > 0.0) else None,
+                    laws=shell.laws,
                 )
             except SceneError as error:
                 raise SceneError(f"shell '{shell.name}': {error}") from None

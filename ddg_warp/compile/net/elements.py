@@ -1,12 +1,15 @@
 """Element sets of the coupled system by term: rods, rigid joints, magnetised edges, shells, meridians."""
 
 from collections import Counter
+from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.elements import ElementSet
+from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.compile.net.glue import glue_sets
 from ddg_warp.compile.net.magnets import magnet_sets
 from ddg_warp.compile.net.net import Net, NetRod, NetSet
@@ -24,20 +27,21 @@ def element_sets(scene, net: Net, along: bool) -> list[NetSet]:
     return _gather_sets([*rods, *magnets, *_shell_sets(net, scene), *_meridian_sets(net, scene)])
 
 
-def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
-    """Return (node, rotation block, edges) of each rigid joint, edges as (rod, edge with ghosts, sign)."""
+def _joint_places(scene, net: Net) -> list[tuple[int, int, list, Mapping]]:
+    """Return (node, rotation block, edges, laws) of each rigid joint, edges as (rod, edge with ghosts, sign)."""
     by_rod = {rod.rod: rod for rod in net.rods}
     result = []
     for number, joint in enumerate(joint for joint in scene.joints if joint.rigid):
+        check_laws(f"rigid joint {number}", joint.laws, ("rigid_joint",))
         members, node = [], -1
         for index, local_node in joint.members:
             rod = by_rod[index]
             if not rod.edges.size:
                 raise SceneError(f"rigid joint {number}: rod {index} has no twist; join it with rigid=False")
-            if "rod_bend_twist" in rod.piece.batch.laws:
+            if "rod_bend_twist" in rod.piece.batch.laws and not joint.laws:
                 raise SceneError(
                     f"rigid joint {number}: rod {index} bends by a law of its own, and half cells at joints know the quadratic one; "
-                    "join it with rigid=False"
+                    "give the joint a law with join(laws={'rigid_joint': Law(...)}), or join it with rigid=False"
                 )
             k = rod.first + (local_node if local_node >= 0 else len(rod.nodes) + local_node)
             node = rod.all_nodes[k]
@@ -46,13 +50,13 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
                 members.append((rod, k, 1.0))
             if closed or k > 0:
                 members.append((rod, (k - 1) % count, -1.0))
-        result.append((node, net.nodes + net.angles + number, members))
+        result.append((node, net.nodes + net.angles + number, members, joint.laws))
     return result
 
 
 def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
     """Return stretch and bending of rods in the order of nodes, except vertices at rigid joints."""
-    skipped = np.array([rod.rod * net.nodes + node for node, _, members in joints for rod, _, _ in members], int)
+    skipped = np.array([rod.rod * net.nodes + node for node, _, members, _ in joints for rod, _, _ in members], int)
     alike: dict[int, list[NetRod]] = {}
     for rod in net.rods:
         alike.setdefault(id(rod.piece), []).append(rod)
@@ -96,14 +100,19 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
 
     A joint clamps each rod by the rod's frame at the node: between adjacent edges, or extrapolated at an end.
     """
-    members = [(node, spin, *member) for node, spin, edges in joints for member in edges]
-    kinds = [[member for member in members if member[2].piece.batch.by_angle == by_angle] for by_angle in (False, True)]
-    return [_half_cells(net, edges, by_angle) for by_angle, edges in enumerate(kinds) if edges]
+    by_kind: dict[tuple, list] = {}  # (law, edges) by curvature measure and law
+    for node, spin, edges, laws in joints:
+        law = laws.get("rigid_joint")
+        for member in edges:
+            key = member[0].piece.batch.by_angle, None if law is None else id(law)
+            by_kind.setdefault(key, (law, []))[1].append((node, spin, *member))
+    kinds = sorted(by_kind.items(), key=lambda item: item[0][0])
+    return [_half_cells(net, edges, by_angle, law) for (by_angle, _), (law, edges) in kinds]
 
 
-def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
-    """Return the half cells of rods with one curvature measure."""
-    term = JOINTS[term_key("rigid_joint", by_angle)]
+def _half_cells(net: Net, members: list, by_angle: bool, law) -> NetSet:
+    """Return the half cells of rods with one curvature measure and one law, None for the quadratic one."""
+    term = JOINTS[term_key("rigid_joint", by_angle)].of({} if law is None else {"rigid_joint": law})
     node, spin, rods, k, sign = zip(*members, strict=True)
     node, spin, k, sign = map(np.array, (node, spin, k, sign))
     edges = np.array([len(rod.all_edges) for rod in rods])
@@ -129,15 +138,28 @@ def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
             natural = _natural_at(rod.piece, rod.row, k[i] if sign[i] > 0 else k[i] + 1)
             rest[:, i] = natural * [1.0, sign[i], 1.0]
     lag = np.concatenate([director.T, (along * tangent).T, [twist]])
-    parameters = term.bind(measure=half, stiffness=[*net.stiffness[:, edge]], rest=[*rest])
+    where, count = f"rigid joint at rod {rods[0].rod}", len(half)
+    if law is not None and not term.rest and (np.abs(rest) * half > 1e-9).any():
+        raise SceneError(
+            f"{where}: the law {term.density.name!r} has no strains at rest; join rods that are straight there"
+        )
+    defaults = {"measure": half, "stiffness": [*net.stiffness[:, edge]], "rest": [*rest]}
+    parameters = bind_law(where, term, law, defaults, partial(_spread, count), f"{count} half cells")
     blocks = np.array([node, net.ends[edge, np.where(sign > 0, 1, 0)], angles, spin])
     return NetSet(term, blocks, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
+
+
+def _spread(count: int, family: str, value) -> np.ndarray:
+    """Return values of a law at `count` half cells."""
+    return np.broadcast_to(np.asarray(value, float), (count,))
 
 
 def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
     """Return natural curvatures and twist of a rod at a node, at an end of the adjacent vertex [1/m]."""
     for term in piece.kind.terms:
         if term.measure.angles:
+            if not term.rest:  # straight rod with a law without strains at rest
+                return np.zeros(len(term.measure.strains))
             rest = [piece.parameters[f"{term.name}.{name}"] for name in term.rest]
             vertices = len(piece.x[row]) - (0 if piece.kind.closed else 2)
             vertex = (node - 1) % vertices if piece.kind.closed else min(max(node - 1, 0), vertices - 1)
@@ -149,12 +171,16 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     sets, count = [], Counter()
     for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
         models = description.bending, description.membrane
-        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
+        try:
+            shell_sets = shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models)
+        except SceneError as error:
+            raise SceneError(f"shell '{description.name}': {error}") from None
+        for elements in shell_sets:
             sets.append(_bound(elements, shell.nodes, shell.edges, index))
             element, row, edge = elements.normals.T
             sets[-1].normals = np.array([element, row, shell.supports[edge]])
-            shell.first[elements.term.name] = count[elements.term.name]
-            count[elements.term.name] += len(elements)
+            shell.first[elements.term.name] = count[elements.term.law]
+            count[elements.term.law] += len(elements)
         if description.bending in shell_forms.TURNING:
             net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
     return sets

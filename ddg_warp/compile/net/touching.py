@@ -3,6 +3,7 @@
 import numpy as np
 
 from ddg_warp.compile.bodies import ROD, Body, Touching
+from ddg_warp.compile.laws import contact_law
 from ddg_warp.compile.net.net import Net
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.contact import Contact, touching_names
@@ -110,9 +111,12 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
         if between.ignore:
             ignored.append((g, h))
     _refuse_ranges(scene, within, names)
+    explicit = bool(np.isfinite(stiffness).any())
     inertia = np.where(np.isnan(stiffness), inertia, 0.0)
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
-    return Touching(law, bodies, names.tolist(), group, *_by_way(rough), stiffness, within, inertia, ignored)
+    density, keep = contact_law(law, stiffness, within, explicit)
+    ways = _by_way(rough)
+    return Touching(law, density, keep, bodies, names.tolist(), group, *ways, stiffness, within, inertia, ignored)
 
 
 def _refuse_ranges(scene, within: np.ndarray, names) -> None:

@@ -4,13 +4,11 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.contact.look import look_kernel
-from ddg_warp.kernels.terms import LAWS
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.pair_terms import PairTerms
 from ddg_warp.solve.contact.shapes import Shapes
 
-KEEP = {"barrier": 1.0, "penalty": 0.0}  # of the thickness, what motion never goes into
 MARGIN = 1.0  # of a typical radius, by which searches go beyond the reach
 SLIDING = 0.999  # of its bound, friction of what does not stick
 
@@ -37,14 +35,14 @@ class Touch:
         exact: bool = False,
     ):
         self.net, given = net, net.host.touching
-        self.law, self.keep = given.law, KEEP[given.law.law]
+        self.law, self.keep = given.law, given.keep
         self.shapes = shapes_of(net.host)
         margin = margin or MARGIN * max(given.size, given.reach)
         radius = net.touching["radius"]
         self.search = BroadPhase(self.shapes, x, net.worlds, reach=given.reach, margin=margin, radius=radius)
         self.terms = PairTerms(
             self.search,
-            LAWS[self.law.law],
+            given.density,
             stiffness=given.stiffness,
             range=given.range,
             groups=given.group,

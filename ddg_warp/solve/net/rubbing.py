@@ -7,7 +7,7 @@ from scipy import sparse
 from ddg_warp import arrays
 from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, rub_kernel
 from ddg_warp.kernels.contact.gather import ITEMS, SLOTS
-from ddg_warp.kernels.terms import FRICTION_LAWS, LAWS
+from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.contact.rolling import turned_by
 
 
@@ -21,7 +21,7 @@ class Rubbing:
     def __init__(self, net, system):
         self.net, self.system, terms, touching = net, system, system.terms, net.host.touching
         self._velocity = touching.law.velocity
-        law, friction = LAWS[touching.law.law], FRICTION_LAWS[touching.law.friction_law]
+        law, friction = touching.density, FRICTION_LAWS[touching.law.friction_law]
         self._spins = bool(terms.frictions) and terms.spins.any
         self._rolls = any(of.rolls for of in terms.frictions)
         self._leads = any(of.directions[0] is not None for of in terms.frictions)
