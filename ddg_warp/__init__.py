@@ -23,9 +23,10 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.run import bench
     from ddg_warp.run.check import Check
     from ddg_warp.run.record import Recorder
-    from ddg_warp.scene.descriptions import Dynamics, Law, Statics, Trace
+    from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
     from ddg_warp.scene.drag import Granular, Viscous
     from ddg_warp.scene.grip import Grip
+    from ddg_warp.scene.law import Law
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
     from ddg_warp.scene.motion import Motion
     from ddg_warp.scene.obstacles import Box, Capsule, Mesh, Plane, Sphere
@@ -91,7 +92,7 @@ _HOME = {
     "Granular": "scene.drag",
     "Grip": "scene.grip",
     "Integrator": "solve.dynamics",
-    "Law": "scene.descriptions",
+    "Law": "scene.law",
     "Material": "scene.material",
     "Mesh": "scene.obstacles",
     "Model": "model.model",

@@ -8,8 +8,8 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.scene.descriptions import Law, is_law
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.law import Law, is_law
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.obstacles import Capsule, Mesh, Obstacle, Plane, Sphere
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
+from ddg_warp.scene.law import Law
 
 DRAWN = 1e-3  # displayed radius of rods without one [m]
 
@@ -221,7 +222,6 @@ class Ribbon:
     def laws(self, material: Material) -> dict:
         """Return the law of bending and twist, with crossover curvature sqrt(60 / (1 - nu^2)) h / W^2."""
         from ddg_warp.kernels.densities.ribbon import LAWS
-        from ddg_warp.scene.descriptions import Law
 
         crossover = np.sqrt(60.0 / (1.0 - material.poisson**2)) * np.asarray(self.thickness) / np.square(self.width)
         return {"rod_bend_twist": Law(LAWS[self.law], poisson=material.poisson, crossover=crossover)}

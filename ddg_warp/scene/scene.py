@@ -11,8 +11,9 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
-from ddg_warp.scene.descriptions import Dynamics, Law, Load, RodBatch, Statics, Support, Trace, laws_of
+from ddg_warp.scene.descriptions import Dynamics, Load, RodBatch, Statics, Support, Trace
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Stiffness, stiffness_of
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.structures import Structures

@@ -17,14 +17,13 @@ from ddg_warp.scene.descriptions import (
     Attachment,
     EdgeCouple,
     Joint,
-    Law,
     Pressure,
     Shell,
     ShellLoad,
     ShellSupport,
-    laws_of,
 )
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.magnets import Magnets
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.meridians import Meridians
