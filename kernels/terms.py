@@ -1,4 +1,4 @@
-"""The registries of energies, one line each: terms, a measure times a density, and potentials of collisions, a kind and a law."""
+"""Registries of energies: terms, a measure times a density, and potentials, a kind of collision and a law."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ MEASURE = Parameter("measure", "m, m^2, m^3 or m^6", POSITIVE, rest=True)
 
 @dataclass(frozen=True)
 class Term:
-    """An elastic energy: `name` is what users see, whether it is damped or not, and whichever curvature it has."""
+    """Elastic energy. Variants with damping or another curvature measure have the same `name`."""
 
     name: str
     measure: Measure
@@ -56,7 +56,7 @@ class Term:
 
     @property
     def key(self) -> str:
-        """Name in the registries, which hold each term with and without strain-rate damping."""
+        """Name in the registries, different with and without strain-rate damping."""
         return term_key(self.name, self.measure.by_angle) + ("_damped" if self.density.undamped else "")
 
     @cached_property
@@ -66,50 +66,50 @@ class Term:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the parameters."""
         return tuple(parameter.name for parameter in self.parameters)
 
     @cached_property
     def stiffness(self) -> tuple[str, ...]:
-        """Names of its stiffnesses."""
+        """Names of the stiffnesses."""
         return tuple(parameter.name for parameter in self.parameters if parameter.family == "stiffness")
 
     @cached_property
     def rest(self) -> tuple[str, ...]:
-        """Names of its rest strains."""
+        """Names of the rest strains."""
         return tuple(parameter.name for parameter in self.parameters if parameter.family == "rest")
 
     @property
     def law(self) -> tuple:
-        """What elements of one set have in common: name, measure, and law but for its damping."""
+        """Name, measure and undamped law, the key of an element set."""
         return self.name, self.measure, self.density.undamped or self.density
 
     def damped(self, wanted: bool = True) -> "Term":
-        """This term with strain-rate damping, if `wanted`."""
+        """Return the term with strain-rate damping if `wanted`, else unchanged."""
         return replace(self, density=damped(self.density), text=self.text + ", damped") if wanted else self
 
     def of(self, laws: Mapping) -> "Term":
-        """This term with another law (`Law`), if there is one for its name."""
+        """Return the term with the `Law` of the same name, if `laws` has one, else unchanged."""
         return replace(self, density=laws[self.name].density) if self.name in laws else self
 
-    def bind(self, **given) -> dict[str, np.ndarray]:
-        """Values of all parameters by name, in their order, from those of each family: one array, or a list with one a number.
+    def bind(self, **inputs) -> dict[str, np.ndarray]:
+        """Return values of all parameters by name, in order, from one array for each family or a list with one for each number.
 
         Raises:
-            TypeError: a family is missing that has no default, has more or fewer values than parameters, or is not of this law.
+            TypeError: a family is missing without default, has the wrong number of values, or does not belong to the law.
         """
         result, used = {}, {}
         for parameter in self.parameters:
-            family, at = parameter.family, used.setdefault(parameter.family, 0)
+            family, nth = parameter.family, used.setdefault(parameter.family, 0)
             used[family] += 1
-            if family not in given and parameter.default is None:
+            if family not in inputs and parameter.default is None:
                 raise TypeError(f"{self.name}: {family} is missing")
-            values = given.get(family, parameter.default)
+            values = inputs.get(family, parameter.default)
             several = isinstance(values, list | tuple)
-            if several and at >= len(values):
+            if several and nth >= len(values):
                 raise TypeError(f"{self.name}: {family} has {len(values)} values; it takes more")
-            result[parameter.name] = np.asarray(values[at] if several else values, float)
-        wrong = [f for f, v in given.items() if f not in used or (isinstance(v, list | tuple) and len(v) != used[f])]
+            result[parameter.name] = np.asarray(values[nth] if several else values, float)
+        wrong = [f for f, v in inputs.items() if f not in used or (isinstance(v, list | tuple) and len(v) != used[f])]
         if wrong:
             raise TypeError(f"{self.name}: {wrong[0]} does not fit; it takes {', '.join(self.parameter_names)}")
         return result
@@ -117,13 +117,13 @@ class Term:
 
 @dataclass(frozen=True)
 class Potential:
-    """Potential of one kind of collision, by a law of its distance (`contact.pair_energy`) or of its slip (`contact.pair_friction`).
+    """Potential of one kind of collision, of the distance (`contact.pair_energy`) or slip (`contact.pair_friction`).
 
     Attributes:
-        name: its name in the registry.
-        kind: of collisions.
-        density: the law: of one strain, the distance [m], or of friction of two, the slip [m].
-        text: a line for users.
+        name: name in the registry.
+        kind: kind of collision.
+        density: law of one strain, the distance [m], or for friction of two, the slip [m].
+        text: one line for users.
     """
 
     name: str
@@ -153,12 +153,12 @@ class Potential:
 
 
 def term_key(name: str, by_angle: bool) -> str:
-    """Key of a term by its name and whether its curvature is the turning angle."""
+    """Return the key of a term from the name and whether the curvature is the turning angle."""
     return f"{name}_angle" if by_angle else name
 
 
 def _registry(*terms: Term) -> dict[str, Term]:
-    """Terms by key, each with and without damping."""
+    """Return terms by key, each with and without damping."""
     return {each.key: each for term in terms for each in (term, term.damped())}
 
 
@@ -219,7 +219,7 @@ FRICTION_LAWS = {"logistic": logistic_friction, "polynomial": polynomial_frictio
 
 
 def contact_potential(law: str, density: Density, collision: str) -> Potential:
-    """Return the potential of a law of the distance, called `law`, of one of the kinds of collisions."""
+    """Return the potential of a kind of collision with the density of the law named `law`."""
     kind, text = _COLLISIONS[collision]
     return Potential(f"{law}_{collision}", kind, density, f"{density.name.replace('_', ' ')} between {text}")
 

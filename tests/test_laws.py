@@ -174,18 +174,18 @@ def test_rigid_joints_of_rods_with_laws_ask_for_one(device):
 
 
 def elbow(joint=None, rods=None, **options) -> ddg.Scene:
-    """A clamped rod with another one joined rigidly to its end, along it or across."""
+    """Return a clamped rod with a second one joined rigidly to the end, along or across."""
     scene = ddg.Scene(gravity=(0.0, -1.0, -3.0))
     nodes = np.linspace((0.5, 0.0, 0.0), options.get("end", (0.5, 0.4, 0.0)), 7)
     rod = scene.add_rod(line(7, (0.5, 0.0, 0.0)), section=SECTION, laws=rods, natural=options.get("natural", "shape"))
-    other = scene.add_rod(nodes, section=SECTION, laws=rods)
+    second = scene.add_rod(nodes, section=SECTION, laws=rods)
     scene.clamp(rod)
-    scene.join([(rod, -1), (other, 0)], laws=joint)
+    scene.join([(rod, -1), (second, 0)], laws=joint)
     return scene
 
 
 def test_a_joints_law_given_by_hand_is_the_usual_one(device):
-    """In steps, equilibria and worlds, to the bit."""
+    """Default law and explicit law give bitwise equal steps, equilibria and worlds."""
     by_hand = {"rigid_joint": ddg.Law(quadratic, stiffness=[2.0, 2.0, 2.0])}
     usual, same = (moved(elbow(joint), device)[0] for joint in (None, by_hand))
     np.testing.assert_array_equal(same, usual)
@@ -194,12 +194,12 @@ def test_a_joints_law_given_by_hand_is_the_usual_one(device):
 
 
 def test_joined_rods_with_laws_bend_as_one(device):
-    """Two collinear rods with a law, whose joint has it too, are one rod with it: both half cells of the joint make one vertex."""
+    """Two collinear rods joined with their own law bend as one rod: both half cells form one vertex."""
     soft, along = ddg.Law(saturating, modulus=K, limit=0.3), (1.0, 0.0, 0.0)
     law, joint = {"rod_bend_twist": soft}, {"rigid_joint": soft}
     joined, stiff = (
-        solve(elbow(*given, end=along, natural="straight").build(device, "float64"), load_steps=4).points()
-        for given in ((joint, law), (None, None))
+        solve(elbow(*options, end=along, natural="straight").build(device, "float64"), load_steps=4).points()
+        for options in ((joint, law), (None, None))
     )
     whole = solve(cantilever(law).build(device, "float64"), load_steps=4).points()
     error, change = np.abs(np.delete(joined, 7, 0) - whole).max(), np.abs(joined - stiff).max()
@@ -207,46 +207,46 @@ def test_joined_rods_with_laws_bend_as_one(device):
 
 
 def with_laws(name: str) -> ddg.Scene:
-    """Something whose joint or shell has the saturating law."""
+    """Return a scene with the saturating law at a joint or shell."""
     law = ddg.Law(saturating, modulus=0.2, limit=0.5)
     return elbow({"rigid_joint": law}) if name == "rigid_joint" else flag({name: law})
 
 
 @pytest.mark.parametrize("name", ["rigid_joint", "shell_bend_dof"])
 def test_parameters_of_laws_of_joints_and_shells_have_gradients(name):
-    """Of a step by the modulus and the limit, against differences."""
+    """Gradients of a step by modulus and limit equal differences."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
 
-    own = Simulator(with_laws(name).build("cpu", "float64"), 0.05, rtol=1e-12)
-    start = own.world_state(own.model.state())
+    simulator = Simulator(with_laws(name).build("cpu", "float64"), 0.05, rtol=1e-12)
+    start = simulator.world_state(simulator.model.state())
     for _ in range(2):
-        start = own.step(start)
+        start = simulator.step(start)
     for parameter in ("modulus", "limit"):
         key = f"{name}.{parameter}"
-        given = own.parameter(key).clone()
+        nominal = simulator.parameter(key).clone()
 
         def height(value, key=key):
-            return own.step(start, {key: value}).positions[..., 2].sum()
+            return simulator.step(start, {key: value}).positions[..., 2].sum()
 
-        asked = given.clone().requires_grad_()
-        (slope,) = torch.autograd.grad(height(asked), asked)
-        difference = (height(1.01 * given) - height(0.99 * given)) / 0.02
-        torch.testing.assert_close((slope * given).sum(), difference, rtol=1e-3, atol=1e-12)
+        tracked = nominal.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(height(tracked), tracked)
+        difference = (height(1.01 * nominal) - height(0.99 * nominal)) / 0.02
+        torch.testing.assert_close((slope * nominal).sum(), difference, rtol=1e-3, atol=1e-12)
 
 
 def test_a_hinged_joint_has_no_law():
     with pytest.raises(ddg.SceneError, match="hinged joint has no energy"):
         scene = cantilever()
-        other = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
-        scene.join([(0, 0), (other, 0)], rigid=False, laws=LAW)
+        second = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
+        scene.join([(0, 0), (second, 0)], rigid=False, laws=LAW)
 
 
 RUBBER = ddg.Material(1e6, 0.3, 1000.0)
 
 
 def flag(laws=None, viscosity: float = 0.0, bending: str = "midedge_dof", **options) -> ddg.Scene:
-    """A sheet clamped at one side."""
+    """Return a sheet clamped at one side."""
     points, triangles = meshes.rectangle(4, 3, (0.4, 0.3))
     scene = ddg.Scene(gravity=(0.0, 0.0, -3.0))
     material = replace(RUBBER, viscosity=viscosity)
@@ -258,7 +258,7 @@ def flag(laws=None, viscosity: float = 0.0, bending: str = "midedge_dof", **opti
 @pytest.mark.parametrize("viscosity", [0.0, 0.05])
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 def test_a_shells_law_given_by_hand_is_the_usual_one(device, viscosity, bending):
-    """In steps and equilibria, to the bit."""
+    """Default law and explicit law give bitwise equal steps and equilibria."""
     by_hand = {"shell_stretch": ddg.Law(st_venant_kirchhoff)}
     by_hand |= (
         {"shell_hinge": ddg.Law(quadratic)} if bending == "hinge" else {"shell_bend_dof": ddg.Law(st_venant_kirchhoff)}
@@ -271,9 +271,9 @@ def test_a_shells_law_given_by_hand_is_the_usual_one(device, viscosity, bending)
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_hinges_with_a_law_fold_as_it_says(device, worlds):
-    """A strip of two triangles between fixed corners, pulled up at the free one: its moment is m(t) = K t / sqrt(1 + (t / c)^2).
+    """The hinge of two triangles with a loaded free corner follows m(t) = K t / sqrt(1 + (t / c)^2).
 
-    With the lever a of the free corner, the force F across it and the edge's length l and weight w it is F a = w m(t).
+    With the lever a of the free corner, the force F across it and the weight w of the hinge, F a = w m(t).
     """
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]])
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -298,7 +298,7 @@ def test_hinges_with_a_law_fold_as_it_says(device, worlds):
 
 
 def test_shells_with_and_without_a_law_are_two_sets(device):
-    """Rest shapes reach those of either; what is of no law of the material is refused by name."""
+    """Rest shapes of two shells change separate element sets."""
     scene = flag({"shell_bend_dof": ddg.Law(replace(st_venant_kirchhoff, name="other"))})
     points, triangles = meshes.rectangle(4, 3, (0.4, 0.3))
     scene.add_shell(np.asarray(points) + [0.0, 1.0, 0.0], triangles, thickness=0.01, material=RUBBER)

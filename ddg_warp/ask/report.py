@@ -1,4 +1,4 @@
-"""The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
+"""Report of a model: terms, elements, dofs, solver, kernels, memory, and terms that are absent."""
 
 from collections.abc import Callable
 
@@ -24,7 +24,7 @@ SOLVERS = {
 
 
 def report(model) -> str:
-    """A few lines of text for a person; a test compares them with what is launched."""
+    """Return a summary of the model in a few lines of text; a test compares it with kernel launches."""
     rods, nodes = model.scene.rod_count, int(model.curves.counts.sum())
     lines = [f"{rods} rods, {nodes} nodes, worlds {model.worlds}, {model.precision} on {model.device}"]
     present = set()
@@ -67,7 +67,7 @@ def _split_errors(group, s: float) -> np.ndarray:
 
 
 def step_lines(model, errors_of: Callable) -> list[str]:
-    """What the steps of the scene's analysis, if it has any, take beyond the model's precision; `errors_of`: s -> see `suited`."""
+    """Return lines on solver choices for steps of the scene's analysis, if any; `errors_of`: s -> errors, see `suited`."""
     analysis = model.scene.analysis
     if not isinstance(analysis, Dynamics):
         return []
@@ -79,7 +79,7 @@ def step_lines(model, errors_of: Callable) -> list[str]:
 
 
 def contact_lines(touching) -> list[str]:
-    """What may touch, and by which numbers."""
+    """Return a line on collision bodies and contact parameters."""
     law, still = touching.law, sum(body.still for body in touching.bodies)
     numbers = (
         (touching.range, "range", "m"),
@@ -94,10 +94,10 @@ def contact_lines(touching) -> list[str]:
 
 
 def contact_potentials(touching) -> list[Potential]:
-    """Potentials of the kinds of collisions that the search has lists of: edges always, the others where there are such bodies."""
+    """Return the potentials of all pair lists: two edges always, other collisions if such bodies are present."""
     law, kinds = touching.law, {body.kind for body in touching.bodies}
-    others = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
-    pairs = ["edge_edge", *(name for kind, name in others if kind in kinds)]
+    optional = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
+    pairs = ["edge_edge", *(name for kind, name in optional if kind in kinds)]
     friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if touching.rubs]
     return [*(contact_potential(law.name, touching.density, pair) for pair in pairs), *friction]
 
@@ -108,7 +108,7 @@ def _between(values: np.ndarray) -> str:
 
 
 def net_lines(model) -> list[str]:
-    """What the net holds: dofs, terms, the matrix."""
+    """Return lines on dofs, terms and matrix of the coupled system."""
     host, net = model.net.host, model.net
     name, linear = net_preconditioner(net), model.types.linear
     chains = Chains.of(net, name)
@@ -144,7 +144,7 @@ def net_lines(model) -> list[str]:
 
 
 def bytes_per_node(model, group) -> int:
-    """Device memory of states, iterate and solver for one node of a chain."""
+    """Return device memory of states, iterate and solver for one node of a rod group."""
     kind, nb = group.kind, group.kind.block
     real, linear = (4 if t.__name__ == "float32" else 8 for t in (model.types.real, model.types.linear))
     state = 2 * kind.dim + (9 if kind.twist else 0) + (kind.strain_rows if kind.viscous else 0)

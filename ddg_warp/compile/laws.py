@@ -102,7 +102,8 @@ def contact_law(contact, stiffness: np.ndarray, ranges: np.ndarray, explicit: bo
 
     Args:
         contact: `Contact` with the name of a law of the package, or a user's `Law` of the gap.
-        stiffness: of pairs of groups [N/m]; `explicit` if the scene gives it; ranges: activation distances of pairs of groups [m].
+        stiffness: of pairs of groups [N/m]; ranges: activation distances of pairs of groups [m].
+        explicit: whether the scene gives a stiffness.
 
     Raises:
         SceneError: a user's law of the wrong form, with wrong derivatives, attractive, not convex, or nonzero at the range.

@@ -1,4 +1,4 @@
-"""Two rods at a random state where nothing is zero, and what the kernels of chains make of it; for the derivative table."""
+"""Two rods at a random state without zeros, with results of the kernels of rod groups; for the derivative table."""
 
 import numpy as np
 import warp as wp
@@ -13,21 +13,22 @@ from ddg_warp.run.samples import Sample, random_parameters, random_strains
 
 
 def chain_of(term: Term, closed: bool) -> ChainKind:
-    """The chain that a rod with this term is: bending first, then stretch, both damped or neither."""
-    known = ("planar_bend", "planar_stretch") if term.measure.dim == 2 else ("rod_bend_twist", "rod_stretch")
-    bending, stretch = (REGISTRY[name].damped(term.density.lagged) for name in known)
+    """Return the kind of rod with a term: bending first, then stretch, both damped or neither."""
+    names = ("planar_bend", "planar_stretch") if term.measure.dim == 2 else ("rod_bend_twist", "rod_stretch")
+    bending, stretch = (REGISTRY[name].damped(term.density.lagged) for name in names)
     terms = (term, stretch) if term.measure.span == 2 else (bending, term)
     return ChainKind(term.measure.dim, terms[0].measure.angles > 0, closed, terms)
 
 
 class Chain(Sample):
-    """A term in a chain of two rods, of 6 and 5 nodes: bent, stretched and twisted, with frames 25 degrees old, reference twist up
-    to several turns, and parameters of each element.
+    """A term of two rods with 6 and 5 nodes, bent, stretched and twisted, with parameters by element.
+
+    Lagged frames differ from the tangents by 25 degrees; the reference twist is up to several revolutions.
 
     Attributes:
         data: q (n, R, 4), positions of dim reals, angles last; frame (7, n, R), last (strains, n, R), rate (R,), and buffer as
             (rows, n, R).
-        count: nodes of the rods (R,).
+        count: number of nodes of the rods (R,).
     """
 
     shape, LEFT_OUT = (6, 2), frozenset({"energy", "resultant"})
@@ -41,11 +42,11 @@ class Chain(Sample):
 
     @property
     def parts(self) -> list["Chain"]:
-        """Samples of both terms of the chain."""
+        """Samples of both terms of the rods."""
         return [Chain(term, self.kind, self.precision, self.device, self.data) for term in self.kind.terms]
 
     def random_state(self) -> dict[str, np.ndarray]:
-        """See the class."""
+        """Return random data; see the class."""
         random, kind, shape = np.random.default_rng(3), self.kind, self.shape
         q = random.normal(size=(*shape, 4))
         if kind.closed:
@@ -60,8 +61,8 @@ class Chain(Sample):
             t = polyline.unit(self.edges(q))
             frame[:6] = lagged_frames(random, t)
             u = polyline.transport(*np.moveaxis(frame[:6].reshape(2, 3, *shape), 1, -1), t)
-            ahead = self.node(1), self.column
-            twist = polyline.signed_angle(polyline.transport(u, t, t[ahead]), u[ahead], t[ahead])
+            following = self.node(1), self.column
+            twist = polyline.signed_angle(polyline.transport(u, t, t[following]), u[following], t[following])
             frame[6] = twist + 2.0 * np.pi * random.integers(-2, 3, size=shape) + 0.3 * random.normal(size=shape)
         return {
             "q": q,
@@ -72,7 +73,7 @@ class Chain(Sample):
         }
 
     def straight(self) -> dict[str, np.ndarray]:
-        """Dofs and frames of straight rods without twist, with edges as long as the term's elements are at rest."""
+        """Return dofs and frames of straight, untwisted rods with the rest lengths of the term's elements."""
         q, frame = np.zeros((*self.shape, 4)), np.zeros((7, *self.shape))
         along = polyline.unit(np.array([2.0, -1.0, 0.5])[: self.kind.dim])
         q[1:, :, : self.kind.dim] = np.cumsum(self.data["buffer"][self.first, :-1], axis=0)[..., None] * along
@@ -81,31 +82,31 @@ class Chain(Sample):
         return {"q": q, "frame": frame}
 
     def node(self, shift: int) -> np.ndarray:
-        """Node k + shift of every element (n, R); the last one where there is none."""
+        """Return node k + shift of every element (n, R), at most the last node of an open rod."""
         k = np.arange(self.shape[0])[:, None] + shift
         return k % self.count if self.kind.closed else np.minimum(k, self.count - 1)
 
     def exists(self, edge: int) -> np.ndarray:
-        """Whether edge k + edge of every element exists (n, R)."""
+        """Return the mask of elements k with an edge k + edge (n, R)."""
         k = np.arange(self.shape[0])[:, None]
         return np.where(self.kind.closed, k < self.count, k + edge + 1 < self.count)
 
     def edges(self, q: np.ndarray | None = None) -> np.ndarray:
-        """Edge k of every element (n, R, dim); a unit vector where there is none."""
+        """Return edge k of every element (n, R, dim); a unit vector if absent."""
         x = (self.data["q"] if q is None else q)[..., : self.kind.dim]
         edge = x[self.node(1), self.column] - x[self.node(0), self.column]
         return np.where(self.exists(0)[..., None], edge, np.eye(self.kind.dim)[0])
 
     @property
     def felt(self) -> np.ndarray:
-        """Which dofs there are that the energy depends on (n, R, 4)."""
-        felt = np.zeros((*self.shape, 4), bool)
-        felt[..., : self.kind.dim] = (np.arange(self.shape[0])[:, None] < self.count)[..., None]
-        felt[..., 3] |= self.exists(0) & (self.measure.angles > 0)
-        return felt
+        """Mask of the dofs in the energy (n, R, 4)."""
+        mask = np.zeros((*self.shape, 4), bool)
+        mask[..., : self.kind.dim] = (np.arange(self.shape[0])[:, None] < self.count)[..., None]
+        mask[..., 3] |= self.exists(0) & (self.measure.angles > 0)
+        return mask
 
     def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F^T F + c, or the `exact` matrix, on the windows (window, window, n, R), window gradient and energies of the fused kernel."""
+        """Return F^T F + c or the `exact` matrix (window, window, n, R), gradient and energies of the fused kernel, by local dofs."""
         kind, shape, real = self.kind, self.shape, self.real
         dim, window = kind.dim, kind.window
         sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
@@ -115,7 +116,9 @@ class Chain(Sample):
         wp.copy(islands.rate, inputs[4])
         inputs[4:5] = islands.arrays
         clamped = wp.full(2, 0 if exact else 1, dtype=int, device=self.device)
-        wp.launch(kernel, shape, [*inputs, clamped, 0], out, device=self.device, block_dim=128)  # it is bound to that
+        wp.launch(
+            kernel, shape, [*inputs, clamped, 0], out, device=self.device, block_dim=128
+        )  # required by its launch bounds
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
         vertex = rows[:edge_row].reshape(kind.vertex_strains, window, *shape)
@@ -129,13 +132,13 @@ class Chain(Sample):
             matrix[j[i != j], i[i != j]] += geometric[i != j]
         return matrix, force, energy[1]
 
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of the energy (which = 0) or gradient (1) kernel of the term, by input."""
+    def reverse(self, order: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return derivatives of the energy (order 0) or gradient (1) kernel of the term by input, in reverse mode."""
         inputs = self._inputs(self.real)
         adjoints = [wp.zeros_like(array) for array in inputs[:6]]
         seeds = wp.array(seed, dtype=self.real, device=self.device)
         wp.launch(
-            element.term_kernels(self.kind, self.index, self.real, reverse=True)[which],
+            element.term_kernels(self.kind, self.index, self.real, reverse=True)[order],
             self.shape,
             inputs,
             [wp.zeros_like(seeds, requires_grad=True)],
@@ -144,14 +147,14 @@ class Chain(Sample):
             adj_outputs=[seeds],
             device=self.device,
         )
-        x, theta, *others = (array.numpy().astype(float) for array in adjoints)
+        x, theta, *remaining = (array.numpy().astype(float) for array in adjoints)
         q = np.zeros((*self.shape, 4))
         q[..., : self.kind.dim], q[..., 3] = x, theta
         names = (name for name in self.data if name != "q")
-        return {"q": q} | {n: v.reshape(self.data[n].shape) for n, v in zip(names, others, strict=True)}
+        return {"q": q} | {n: v.reshape(self.data[n].shape) for n, v in zip(names, remaining, strict=True)}
 
     def scatter(self, local: np.ndarray) -> np.ndarray:
-        """From derivatives on windows (window, n, R) to dofs (n, R, 4)."""
+        """Return derivatives by local dofs (window, n, R) by all dofs (n, R, 4)."""
         kind, out = self.kind, np.zeros((*self.shape, 4))
         for edge in range(kind.span):
             force = np.moveaxis(local[edge * kind.dim : (edge + 1) * kind.dim], 0, -1)
@@ -162,9 +165,9 @@ class Chain(Sample):
         return out
 
     def local_derivative(self, function) -> np.ndarray:
-        """Derivative of what function(**data) gives per element (m, n, R), on its window (m, window, n, R).
+        """Differentiate function(**data) of elements (m, n, R) by the local dofs (m, window, n, R).
 
-        Moving node k changes edge k alone in element k, and moving node k + 2 edge k + 1 alone.
+        In element k, node k affects only edge k, and node k + 2 only edge k + 1.
         """
         kind, out = self.kind, None
         for j in range(self.shape[0]):
@@ -172,19 +175,19 @@ class Chain(Sample):
                 change = self.difference(function, "q", (j, slice(None), c))
                 out = np.zeros((len(change), kind.window, *self.shape)) if out is None else out
                 for edge in range(kind.span):
-                    at = c + edge * kind.dim if c < kind.dim else kind.dim * kind.span + edge
+                    entry = c + edge * kind.dim if c < kind.dim else kind.dim * kind.span + edge
                     node = self.node(2 * edge if c < kind.dim else edge)
                     sign = 1.0 if c == 3 or edge == 1 else -1.0
                     k, r = np.nonzero((node == j) & self.exists(edge))
-                    out[:, at, k, r] = sign * change[:, k, r]
+                    out[:, entry, k, r] = sign * change[:, k, r]
         return out
 
     def moved(self, turn: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Data at which the energy is what it was: all turned, and with frames that stay and angles that make up for that."""
+        """Return data with equal energy: all rotated, and rotated with unchanged frames and compensating angles."""
         turned = self.turned(turn)
         if not self.kind.twist:
             return [turned]
-        u0, t0 = (np.moveaxis(self.data["frame"][at : at + 3], 0, -1) for at in (0, 3))
+        u0, t0 = (np.moveaxis(self.data["frame"][start : start + 3], 0, -1) for start in (0, 3))
         t = polyline.unit(self.edges())
         turned_u, turned_t = polyline.transport(u0, t0, t) @ turn.T, t @ turn.T
         q = turned["q"].copy()
@@ -192,7 +195,7 @@ class Chain(Sample):
         return [turned, {**turned, "q": q, "frame": self.data["frame"]}]
 
     def rotations(self):
-        """Infinitesimal rotations: velocities of dofs (n, R, 4), and of the strains of the last step."""
+        """Yield infinitesimal rotations: velocities of dofs (n, R, 4) and of the strains of the last step."""
         dim, x, edges = self.kind.dim, self.data["q"][..., : self.kind.dim], self.edges()
         for omega in np.eye(3) if dim == 3 else [np.array([0.0, 0.0, 1.0])]:
             spin = np.cross(omega, np.eye(3), axisb=0, axisc=0)[:dim, :dim]
@@ -208,7 +211,7 @@ class Chain(Sample):
             yield velocity, last
 
     def _inputs(self, real, **changed) -> list[wp.array]:
-        """What the kernels of a term read: x, theta, frame, last, rate, buffer, table, count."""
+        """Return the inputs of the kernels of a term: x, theta, frame, last, rate, buffer, table, count."""
         data, dim = {**self.data, **changed}, self.kind.dim
         q = data["q"]
         values = [q[..., :dim], q[..., 3], data["frame"], data["last"], data["rate"], data["buffer"].ravel()]
@@ -221,16 +224,16 @@ class Chain(Sample):
         table = np.array([(row * n * rods, rods, 1) for row in range(len(data["buffer"]))], np.int32)
         return [*out, *(wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32)))]
 
-    def _launch(self, which: int, real, **changed):
-        """What the energy (0), gradient (1), Hessian (2) or strain (3) kernel gives."""
+    def _launch(self, order: int, real, **changed):
+        """Return results of the energy (0), gradient (1), Hessian (2) or strain (3) kernel."""
         kind, w = self.kind, self.kind.window
-        size = [(), (w,), (w * w,), (kind.strain_rows,)][which]
+        size = [(), (w,), (w * w,), (kind.strain_rows,)][order]
         kernels = element.term_kernels(kind, self.index, real, reverse=True)
-        kernel = element.strain_kernel(kind, real) if which == 3 else kernels[which]
-        out = [wp.zeros((*size, *self.shape), dtype=real, device=self.device) for _ in range(2 if which == 3 else 1)]
-        inputs = [*self._inputs(real, **changed), *[1] * (which == 3)]
-        wp.launch(kernel, (*self.shape, w) if which == 2 else self.shape, inputs, out, device=self.device)
-        found = [array.numpy().astype(float) for array in out]
-        if which == 3:
-            return tuple(values[self.rows] for values in found)
-        return found[0].reshape(w, w, *self.shape) if which == 2 else found[0]
+        kernel = element.strain_kernel(kind, real) if order == 3 else kernels[order]
+        out = [wp.zeros((*size, *self.shape), dtype=real, device=self.device) for _ in range(2 if order == 3 else 1)]
+        inputs = [*self._inputs(real, **changed), *[1] * (order == 3)]
+        wp.launch(kernel, (*self.shape, w) if order == 2 else self.shape, inputs, out, device=self.device)
+        results = [array.numpy().astype(float) for array in out]
+        if order == 3:
+            return tuple(values[self.rows] for values in results)
+        return results[0].reshape(w, w, *self.shape) if order == 2 else results[0]

@@ -1,6 +1,6 @@
-"""Collisions at a random state where nothing is zero, and the energies, forces and matrices that kernels of contact give for them.
+"""Collisions at a random state without zeros, with energies, forces and matrices from the contact kernels.
 
-The kernels are those that steps and adjoints launch; here each of eight collisions is a world of its own.
+The kernels are the ones of steps and adjoints. Each of eight collisions is a world of its own.
 """
 
 import numpy as np
@@ -18,22 +18,20 @@ from ddg_warp.kernels.terms import LAWS, Potential
 from ddg_warp.run.samples import Sample, random_parameters
 
 CROSSING = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.3, -0.5, 0.3], [0.7, 0.5, 0.4]]
-OBLIQUE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.1, 0.1, 0.4], [0.9, 0.5, 0.3]]  # mollified by the squared lengths below
+OBLIQUE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.1, 0.1, 0.4], [0.9, 0.5, 0.3]]  # mollified, by `SQUARE`
 ABOVE = [[0.3, 0.3, 0.4], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
 BESIDE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.3, 0.3]]
-SQUARE, INNER = (
-    30.0,
-    (0.5, 0.0),
-)  # of both edges: squared length at rest, and one node inside of a rod and one at its end
+SQUARE = 30.0  # squared rest length of both edges
+INNER = 0.5, 0.0  # one node in the interior of a rod, one at an end
 VELOCITY = 3.0
-NUMBERED = "stiffness", "range", "thickness", "friction"  # rows of the buffer, as derivatives have them
+NUMBERED = "stiffness", "range", "thickness", "friction"  # rows of the buffer and of derivatives
 
 
 class ContactSample(Sample):
-    """Eight collisions by a law of their distance.
+    """Eight collisions with a law of the distance.
 
     Attributes:
-        data: q (nodes, 3), the first nodes of all collisions first, and buffer (parameters, E).
+        data: q (nodes, 3), first nodes of all collisions first; buffer (parameters, E).
     """
 
     chain, dim, COUNT, ORDERS = "pair", 3, 8, (1,)
@@ -49,7 +47,7 @@ class ContactSample(Sample):
         super().__init__(potential, *arguments)
 
     def random_state(self) -> dict[str, np.ndarray]:
-        """See the class."""
+        """Return random data; see the class."""
         random, kind = np.random.default_rng(11), self.collision
         base = np.array(BESIDE if kind == EDGE_POINT else CROSSING if kind == EDGES else ABOVE)
         nodes = np.repeat(base[:, None], self.COUNT, 1)
@@ -59,43 +57,43 @@ class ContactSample(Sample):
         return {"q": nodes.reshape(-1, 3), "buffer": random_parameters(self.term, random, self.shape)}
 
     def parameter_rows(self, *families: str) -> list[int]:
-        """Rows of the buffer, all of them."""
+        """Return all rows of the buffer."""
         return list(range(len(self.data["buffer"])))
 
     def isotropic(self) -> "ContactSample":
-        """This sample, which knows no directions."""
+        """Return the sample itself, which is isotropic."""
         return self
 
     def moved(self, turn: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Data after a rotation and a translation."""
+        """Return data after a rotation and a translation."""
         return [{**self.data, **{name: self.data[name] @ turn.T + [0.3, -0.2, 0.5] for name in self.POSITIONS}}]
 
     def energy(self, real=wp.float64, **changed) -> np.ndarray:
-        """Energies (E,)."""
+        """Return energies (E,)."""
         return self._evaluated(real, **changed)[0].numpy().astype(float)
 
     def gradient(self, real=wp.float64, **changed) -> np.ndarray:
-        """Derivatives by the nodes (3 nodes, E)."""
+        """Return derivatives by the nodes (3 nodes, E)."""
         return self._flat(self._evaluated(real, **changed)[1])
 
     def hessian(self, real=wp.float64) -> np.ndarray:
-        """Exact second derivatives by the nodes (3 nodes, 3 nodes, E)."""
-        given, (*_, factor), count = self._given(real), self._evaluated(real), self.COUNT
+        """Return exact second derivatives by the nodes (3 nodes, 3 nodes, E)."""
+        arguments, (*_, factor), count = self._given(real), self._evaluated(real), self.COUNT
         chosen = self._put(np.arange(count), int)
         out = wp.zeros((3 * SLOTS, SLOTS, count), dtype=wp.types.vector(3, real), device=self.device)
-        inputs = [*given, factor, chosen, self._put([count], int), 3 * SLOTS * count]
+        inputs = [*arguments, factor, chosen, self._put([count], int), 3 * SLOTS * count]
         kernel = columns_kernel(self.collision, self.law, real, real)
         wp.launch(kernel, 3 * SLOTS * count, [inputs[0], *inputs[2:]], [out], device=self.device)
         return np.stack([self._flat(column) for column in out.numpy()[: 3 * self.nodes]], 1)
 
     def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F^T F (3 nodes, 3 nodes, E), with `exact` with what `pair_bend` adds to it, gradients and energies."""
+        """Return F^T F (3 nodes, 3 nodes, E), gradients and energies; `exact` adds `pair_bend`."""
         energy, gradient, factor = self._evaluated(self.real)
         matrix = self._product(factor) + (self._bent() if exact else 0.0)
         return matrix, self._flat(gradient), energy.numpy().astype(float)
 
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of v . gradient, v = `seed`, by input."""
+    def reverse(self, order: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return derivatives of v . gradient, v = `seed`, by input, in reverse mode."""
         real, kernel = self.real, pull_kernel(self.collision, self.law, self.real)
         pairs, count, *law = self._given(real)
         out = self._parts(real), self._numbers(real)
@@ -104,23 +102,23 @@ class ContactSample(Sample):
         return {"q": self._by_node(out[0]), "buffer": out[1].numpy().astype(float)[: len(self.data["buffer"])]}
 
     def resultants(self) -> float:
-        """Sum of forces and of moments of each collision, over their size."""
+        """Return the largest resultant force or moment of a collision, over the largest component."""
         force, x = (values.reshape(self.nodes, -1, 3) for values in (self.scatter(self.gradient()), self.data["q"]))
         moment = np.cross(x, force)
-        return max(np.abs(of.sum(0)).max() / np.abs(of).max() for of in (force, moment))
+        return max(np.abs(vectors.sum(0)).max() / np.abs(vectors).max() for vectors in (force, moment))
 
     def gauss_newton(self) -> np.ndarray:
-        """Sum over distances of c psi'' times the square of their derivatives, by differences."""
+        """Return the sum over distances of c psi'' times the squared derivative, by differences."""
         curvature = self._distances()[1]
         slopes = self.local_derivative(lambda **data: self._distances(**data)[0])
         return np.einsum("kp,kap,kbp->abp", curvature, slopes, slopes)
 
     def compared(self) -> np.ndarray:
-        """Collisions whose energy is of one distance alone, of which F^T F and `pair_bend` are the exact Hessian (E,)."""
+        """Return the mask of collisions with one distance, where F^T F and `pair_bend` form the exact Hessian (E,)."""
         return self._evaluated(wp.float64)[2].bend.numpy() != 0.0
 
     def _product(self, factor) -> np.ndarray:
-        """F^T F of factors (3 nodes, 3 nodes, E)."""
+        """Return F^T F of factors (3 nodes, 3 nodes, E)."""
         rows, used = factor.row.numpy().astype(float), factor.used.numpy()
         kept = (used >> np.arange(1, len(rows) + 1)[:, None]) & 1
         each = np.einsum("kp,kps,kpd->kpsd", kept, rows[..., WEIGHT : WEIGHT + SLOTS], rows[..., :3])
@@ -128,7 +126,7 @@ class ContactSample(Sample):
         return np.einsum("kpa,kpb->abp", each, each)
 
     def _bent(self) -> np.ndarray:
-        """psi' D'' as `pair_bend` has it (3 nodes, 3 nodes, E)."""
+        """Return psi' D'' of `pair_bend` (3 nodes, 3 nodes, E)."""
         real, kind = self.real, KINDS.index(self.collision)
         near, bend = distance_function(self.collision, real), bend_function(real)
         (_, corners), V = read_functions(self.collision, real), self._vector(real)
@@ -139,11 +137,11 @@ class ContactSample(Sample):
             nodes: wp.array(dtype=wp.vec4i), scale: wp.array(dtype=real), x: wp.array(dtype=V), out: wp.array3d(dtype=V)
         ):
             p, column = wp.tid()
-            at = corners(x, nodes[p])
-            w, _d, _n = near(at)
+            points = corners(x, nodes[p])
+            w, _d, _n = near(points)
             v = Y()
             v[column / 3, column % 3] = real(1.0)
-            y = bend(wp.static(kind), at, w, v)
+            y = bend(wp.static(kind), points, w, v)
             for slot in range(4):
                 out[column, slot, p] = y[slot] * scale[p]
 
@@ -153,13 +151,17 @@ class ContactSample(Sample):
         return np.stack([self._flat(column) for column in out.numpy()], 1)
 
     def _distances(self, **changed) -> tuple[np.ndarray, np.ndarray]:
-        """Distances that the energy is of and c psi'' of each (rows, E), in float64."""
+        """Return the distances of the energy and c psi'' of each (rows, E), in float64."""
         kind, real = self.collision, wp.float64
         near, end, to_node, mollify = (
             distance_function(kind, real),
-            *(of(real) for of in (end_function, node_function, mollifier_function)),
+            *(build(real) for build in (end_function, node_function, mollifier_function)),
         )
-        curvature, (given, corners), V = self.law.laws(real, 1)[2], read_functions(kind, real), self._vector(real)
+        curvature, (parameters_of, corners), V = (
+            self.law.laws(real, 1)[2],
+            read_functions(kind, real),
+            self._vector(real),
+        )
         E, Law, Sides = wp.types.vector(1, real), law_struct(real), sides_struct(real)
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -172,23 +174,23 @@ class ContactSample(Sample):
             out: wp.array3d(dtype=real),
         ):
             i = wp.tid()
-            p, threshold, inner = given(law, sides, pairs[i])
-            at = corners(x, nodes[i])
-            _w, d, _n = near(at)
+            p, threshold, inner = parameters_of(law, sides, pairs[i])
+            points = corners(x, nodes[i])
+            _w, d, _n = near(points)
             c = curvature(E(d), p)
             m = real(1.0)
             if wp.static(kind == EDGES):
-                normal = wp.cross(at[1] - at[0], at[3] - at[2])
+                normal = wp.cross(points[1] - points[0], points[3] - points[2])
                 m, _slope = mollify(wp.dot(normal, normal), threshold)
                 for k in range(wp.static(ENDS)):
-                    _we, de, _ne = end(at, k)
+                    _we, de, _ne = end(points, k)
                     ce = curvature(E(de), p)
                     stiffness = ce[0]
                     for j in range(2):
-                        other = wp.where(k < 2, 2, 0) + j
-                        _wn, dn, _nn = to_node(at, k, other)
+                        node = wp.where(k < 2, 2, 0) + j
+                        _wn, dn, _nn = to_node(points, k, node)
                         cn = curvature(E(dn), p)
-                        stiffness -= inner[other] * cn[0]
+                        stiffness -= inner[node] * cn[0]
                     out[0, k + 1, i] = de
                     out[1, k + 1, i] = real(0.5) * (real(1.0) - m) * wp.max(stiffness, real(0.0))
             out[0, 0, i] = d
@@ -200,7 +202,7 @@ class ContactSample(Sample):
         return tuple(out.numpy())
 
     def _evaluated(self, real, positions: str = "q", **changed) -> tuple:
-        """Energies, gradients by slot and factors of contact, at positions of this name."""
+        """Return energies, gradients by local node index and factors of contact at the named positions."""
         kind, factor = self.collision, self._factor(real, rows_of(self.collision))
         energy, gradient = wp.zeros(self.COUNT, dtype=real, device=self.device), self._parts(real)
         inputs = [1, *self._given(real, positions, **changed)]
@@ -209,7 +211,7 @@ class ContactSample(Sample):
         return energy, gradient, factor
 
     def _given(self, real, positions: str = "q", **changed) -> list:
-        """Pairs, their number, sides, law and positions, as kernels take them."""
+        """Return pairs, pair count, sides, law and positions as kernel inputs."""
         data, law, sides = {**self.data, **changed}, law_struct(real)(), sides_struct(real)()
         for side in (sides.first, sides.second):
             side.object = self._put([0], int)
@@ -223,7 +225,7 @@ class ContactSample(Sample):
         return [pairs, self._put([self.COUNT], int), sides, law, self._put(data[positions], self._vector(real))]
 
     def _factor(self, real, rows: int):
-        """Empty factors of all collisions."""
+        """Return empty factors of all collisions."""
         factor = factor_struct(real)()
         factor.nodes, factor.used = self._places(), wp.zeros(self.COUNT, dtype=int, device=self.device)
         factor.row = wp.zeros((rows, self.COUNT), dtype=wp.types.vector(ROW, real), device=self.device)
@@ -231,7 +233,7 @@ class ContactSample(Sample):
         return factor
 
     def _places(self) -> wp.array:
-        """Nodes of all collisions (E,), the last one repeated."""
+        """Return the nodes of all collisions (E,), with the last node repeated."""
         return self._put(self.slots[np.minimum(np.arange(SLOTS), self.nodes - 1)].T, wp.vec4i)
 
     def _parts(self, real) -> wp.array:
@@ -248,7 +250,7 @@ class ContactSample(Sample):
         return wp.array(np.ascontiguousarray(values, np.int32 if whole else float), dtype=dtype, device=self.device)
 
     def _flat(self, parts) -> np.ndarray:
-        """(slots, E) vectors as (3 nodes, E)."""
+        """Return vectors by local node index (., E) as (3 nodes, E)."""
         values = parts if isinstance(parts, np.ndarray) else parts.numpy()
         return values[: self.nodes].astype(float).transpose(0, 2, 1).reshape(-1, self.COUNT)
 
@@ -257,11 +259,11 @@ class ContactSample(Sample):
 
 
 class FrictionSample(ContactSample):
-    """Friction of eight collisions, whose normal forces are those of the barrier at lagged positions.
+    """Friction of eight collisions, with normal forces of the barrier at lagged positions.
 
     Attributes:
-        data: q, start and lagged: positions now, at the start of the step, and where normal forces are taken (nodes, 3); rate (E,);
-            buffer: of the barrier, and the coefficient.
+        data: q, start and lagged: positions (nodes, 3) of the current state, of the start of the step, and of normal forces.
+            rate (E,). buffer: parameters of the barrier, and the coefficient.
     """
 
     LEFT_OUT = frozenset({"gradient", "rest", "rigid", "symmetry", "factor", "exact"})
@@ -273,7 +275,7 @@ class FrictionSample(ContactSample):
         self.law = LAWS["barrier"]
 
     def random_state(self) -> dict[str, np.ndarray]:
-        """See the class."""
+        """Return random data; see the class."""
         random, data = np.random.default_rng(12), super().random_state()
         barrier = Potential("", self.collision, LAWS["barrier"], "")
         data["buffer"] = np.vstack(
@@ -286,29 +288,29 @@ class FrictionSample(ContactSample):
         return data
 
     def energy(self, real=wp.float64, **changed) -> np.ndarray:
-        """Energies (E,)."""
+        """Return energies (E,)."""
         return self._slid(real, **changed)[0].numpy().astype(float)
 
     def gradient(self, real=wp.float64, **changed) -> np.ndarray:
-        """Derivatives by the nodes (3 nodes, E)."""
+        """Return derivatives by the nodes (3 nodes, E)."""
         return self._flat(self._slid(real, **changed)[1])
 
     def hessian(self, real=wp.float64) -> np.ndarray:
-        """F^T F, which is psi'' where directions are those of slips."""
+        """Return F^T F, equal to psi'' for directions along the slips."""
         return self._product(self._slid(real)[2])
 
     def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F^T F (3 nodes, 3 nodes, E), gradients and energies."""
+        """Return F^T F (3 nodes, 3 nodes, E), gradients and energies."""
         energy, gradient, factor = self._slid(self.real)
         return self._product(factor), self._flat(gradient), energy.numpy().astype(float)
 
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of v . gradient, v = `seed`, by input."""
+    def reverse(self, order: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return derivatives of v . gradient, v = `seed`, by input, in reverse mode."""
         real, device = self.real, self.device
         pairs, count, *law = self._given(real)
         used, vector = self._slid(real)[2].used, self._vector(real)
         lagged, start, w = (
-            self._put(of, vector) for of in (self.data["lagged"], self.data["start"], -self.scatter(seed))
+            self._put(values, vector) for values in (self.data["lagged"], self.data["start"], -self.scatter(seed))
         )
         rate, (no_pair, no_four, no_vector, no_table) = self._put(self.data["rate"], real), self._nothing(real)
         inputs = [1, pairs, count, *law[:2], self._places(), no_pair, used, lagged, start, law[2], w, VELOCITY, rate]
@@ -317,19 +319,19 @@ class FrictionSample(ContactSample):
         kernel = rub_kernel(self.collision, self.law, self.friction, real, False, False, False)
         inputs += [no_pair, no_table, no_four, no_vector]
         wp.launch(kernel, 1, inputs, [*parts, numbers, no_vector, *tables], device=device)
-        found, numbers = (
+        slopes, numbers = (
             dict(zip(self.POSITIONS, map(self._by_node, parts), strict=True)),
             numbers.numpy().astype(float),
         )
-        return {**found, "rate": numbers[RATE], "buffer": numbers[: FRICTION + 1]}
+        return {**slopes, "rate": numbers[RATE], "buffer": numbers[: FRICTION + 1]}
 
     def resultants(self) -> float:
-        """Sum of forces of each collision, over their size."""
+        """Return the largest resultant force of a collision, over the largest component."""
         force = self.scatter(self.gradient()).reshape(self.nodes, -1, 3)
         return np.abs(force.sum(0)).max() / np.abs(force).max()
 
     def _slid(self, real, **changed) -> tuple:
-        """Energies, gradients by slot and factors of friction."""
+        """Return energies, gradients by local node index and factors of friction."""
         data, device, vector = {**self.data, **changed}, self.device, self._vector(real)
         pairs, count, *law, x = self._given(real, "lagged", **changed)
         _, push, contact = self._evaluated(real, "lagged", **changed)
@@ -354,7 +356,7 @@ class FrictionSample(ContactSample):
         return energy, gradient, factor
 
     def _nothing(self, real) -> tuple:
-        """Arrays of what such friction does not read: nodes beside, markers, turns and coefficients by direction."""
+        """Return empty arrays for inputs of directed, spinning and rolling friction."""
         types = (wp.vec2i, wp.vec4i, self._vector(real))
         empty = [wp.zeros(0, dtype=dtype, device=self.device) for dtype in types]
         return *empty, wp.zeros((0, 0), dtype=self._vector(real), device=self.device)

@@ -1,29 +1,28 @@
-"""The derivative table: every derivative of every term against something else that computes it.
+"""Derivative table: every derivative of every term, compared with an independent computation.
 
-The state is random and nothing in it is zero (see `ddg_warp.run.samples`). References are central differences, always taken in float64,
-or automatic differentiation of another kernel; errors are relative to the largest reference. e are the strains, w the rest measure
-and q the local dofs of an element. Collisions (`ddg_warp.run.contact_samples`) are
-checked by the kernels that steps and adjoints launch:
+The state is random, without zeros (see `ddg_warp.run.samples`). References are central differences in float64, or automatic
+differentiation of another kernel. Errors are relative to the largest reference. e are the strains, w the rest measure
+and q the local dofs of an element. Collisions (`ddg_warp.run.contact_samples`) check the kernels of steps and adjoints:
 
     gradient     w J^T psi' scattered to dofs = reverse mode of the energy kernel
-    energy       of collisions instead: the gradient of what steps launch = differences of its energy
+    energy       of collisions instead: gradient kernel of steps = differences of the energy
     reverse      reverse mode of the gradient kernel, seeded with v, = differences of v . gradient in the dofs
-    parameters   the same in every row of the parameter buffer, element by element
-    lagged       the same in the lagged frames, the strains of the last step and 1/h, row by row along a random direction
+    parameters   likewise in every row of the parameter buffer, element by element
+    lagged       likewise in the lagged frames, the strains of the last step and 1/h, row by row along a random direction
     hessian      Hessian kernel = differences of the gradient by the local dofs
     symmetry     Hessian kernel = its transpose
     evaluate     energy and gradient of the fused kernel = sum over the terms' own kernels
-    factor       F^T F + C of the fused kernel = w J^T psi'' J without what is negative of psi'', and the geometric stiffness under
+    factor       F^T F + C of the fused kernel = w J^T psi'' J with the positive part of psi'', and the geometric stiffness under
                  tension, derivatives by differences
     definite     F^T F + C has no negative eigenvalue
-    exact        F^T F + C, compression included, and the second derivatives that measures of rods have = Hessian kernels; of collisions
+    exact        F^T F + C, compression included, and second derivatives of measures of rods = Hessian kernels; of collisions
                  F^T F and `pair_bend` where no edges are mollified
-    rest         no force where strains are those of rest; of a law of rods without any, in straight rods
-    invariance   a rigid motion keeps the energy when the lagged data turn too, or when angles make up for the frames
-    rigid        the gradient of a chain is orthogonal to translations and infinitesimal rotations
-    resultant    forces of a collision have no resultant, and those of contact no moment
-    nonzero      every dof that the energy depends on feels a force, so that no zero passes for agreement
-    downcast     energy and gradient feel a relative change of 2^-30 in every input, which no float32 can hold
+    rest         no force at the rest strains; for laws of rods without rest strains, in straight rods
+    invariance   a rigid motion keeps the energy, with rotated lagged data or with compensating angles
+    rigid        the gradient of a rod is orthogonal to translations and infinitesimal rotations
+    resultant    forces of a collision have no resultant, and contact forces no moment
+    nonzero      every dof in the energy has a force, so that no zero counts as agreement
+    downcast     energy and gradient resolve a relative change of 2^-30 in every input, which float32 cannot represent
 """
 
 import numpy as np
@@ -38,13 +37,13 @@ TRAP = 2.0**-30
 
 
 def relative(value, reference) -> float:
-    """Largest difference over the largest reference; nothing where both are zero."""
+    """Return the largest difference over the largest reference; zero if both are zero."""
     error = np.abs(value - reference).max()
     return 0.0 if error == 0.0 else float(error / max(np.abs(reference).max(), 1e-100))
 
 
 def largest(errors) -> float:
-    """Of all errors; not a number where one is not."""
+    """Return the largest error; NaN if one is NaN."""
     return float(np.max(list(errors)))
 
 
@@ -72,12 +71,12 @@ def parameters(sample: Sample) -> float:
 def lagged(sample: Sample) -> float:
     errors, random = [], np.random.default_rng(9)
     for name in sample.adjoint.keys() - {"q", "buffer"}:
-        found = []
+        pairs = []
         for row, slope in enumerate(np.atleast_2d(sample.adjoint[name])):
             along = np.where(slope < 0.0, -1.0, 1.0) * random.uniform(0.5, 1.5, size=slope.shape)  # nothing cancels
             where = (row,) if sample.data[name].ndim > 1 else ...
-            found.append(((slope * along).sum(), sample.difference(sample.seeded, name, where, along).sum()))
-        errors.append(relative(*np.array(found).T))
+            pairs.append(((slope * along).sum(), sample.difference(sample.seeded, name, where, along).sum()))
+        errors.append(relative(*np.array(pairs).T))
     return largest(errors)
 
 
@@ -140,22 +139,22 @@ def resultant(sample: ContactSample) -> float:
 
 
 def nonzero(sample: Sample) -> float:
-    """Share of the dofs without a force."""
+    """Return the fraction of dofs without a force."""
     size = np.abs(sample.scatter(sample.gradient(sample.real)))
     return float(1.0 - (size > 1e-6 * size.max())[sample.felt].mean())
 
 
 def downcast(sample: Sample) -> float:
     errors = []
-    for which in sample.ORDERS:
-        value, seed = (sample.energy, np.ones(sample.shape)) if which == 0 else (sample.gradient, sample.seed)
-        adjoint, before = sample.reverse(which, seed), value()
+    for order in sample.ORDERS:
+        value, seed = (sample.energy, np.ones(sample.shape)) if order == 0 else (sample.gradient, sample.seed)
+        adjoint, before = sample.reverse(order, seed), value()
         for name, slopes in adjoint.items():
             for row in range(len(slopes)) if name in ("buffer", "last") else [...]:
                 slope = slopes[row] * sample.data[name][row]
                 size = np.abs(slope).sum()
                 if size == 0.0:
-                    continue  # not an input of this term
+                    continue  # no input of this term
                 scaled = sample.data[name].copy()
                 scaled[row] *= 1.0 + TRAP
                 change = (seed * (value(**{name: scaled}) - before)).sum()
@@ -163,7 +162,7 @@ def downcast(sample: Sample) -> float:
     return largest(errors)
 
 
-# name -> (error, tolerance in float64, tolerance in float32 or None where that says nothing)
+# name -> (error, tolerance in float64, tolerance in float32 or None without a check)
 CHECKS = {
     "gradient": (gradient, 1e-13, 1e-5),
     "energy": (energy, 1e-8, 1e-5),
@@ -188,14 +187,14 @@ CHECKS = {
 def samples_of(
     term: Term | Potential, precision: str = "float64", device: str = "cpu", chains: tuple[bool, ...] = (False, True)
 ) -> list[Sample]:
-    """The states that a term is checked at: in open and closed `chains`, as indexed elements, or of a potential as collisions.
+    """Return the samples of a term: open and closed rods (`chains`), indexed elements, or collisions of a potential.
 
     Raises:
-        ValueError: a measure in the plane that is not of rods.
+        ValueError: a planar measure other than the rods'.
     """
     if isinstance(term, Potential):
         return [(FrictionSample if term.frictional else ContactSample)(term, None, precision, device)]
-    if term.measure in {known.measure for known in REGISTRY.values()}:
+    if term.measure in {rod_term.measure for rod_term in REGISTRY.values()}:
         return [Chain(term, chain_of(term, closed), precision, device) for closed in chains]
     if term.measure.dim != 3:
         raise ValueError(f"{term.name}: of the plane are measures of rods alone; give {term.measure.name} dim = 3")
@@ -203,7 +202,7 @@ def samples_of(
 
 
 def checks_of(sample: Sample) -> list[str]:
-    """Checks of a sample: closed rods without rest strains have no rest shape, nor have dipoles."""
+    """Return the checks of a sample; closed rods without rest strains and dipoles have no rest shape."""
     left_out = set(sample.LEFT_OUT)
     if isinstance(sample, Elements) and not sample.measure.packed:
         left_out.add("exact")
@@ -219,13 +218,13 @@ def table(
     device: str = "cpu",
     chains: tuple[bool, ...] = (False, True),
 ) -> list[dict]:
-    """Rows of the derivative table: term, chain, check, error, tolerance, passed.
+    """Return the rows of the derivative table: term, chain, check, error, tolerance, passed.
 
     Args:
-        term: a term or a potential, one's own or one of `kernels.terms.ALL` by key; all of these by default.
-        precision: "float64" or "float32", that of the kernels under test.
+        term: a term or potential, user-defined or by its key in `kernels.terms.ALL`; by default all.
+        precision: precision of the kernels under test, "float64" or "float32".
         device: Warp device.
-        chains: of terms of chains, which are tried: open ones (False), closed ones (True), or both.
+        chains: for terms of rods, open (False) or closed rods (True), or both.
     """
     terms = ALL.values() if term is None else [ALL[term] if isinstance(term, str) else term]
     samples = (sample for one in terms for sample in samples_of(one, precision, device, chains))
@@ -233,14 +232,14 @@ def table(
 
 
 def row(sample: Sample, check: str) -> dict:
-    """One row of the table."""
+    """Return one row of the table."""
     error, *tolerances = CHECKS[check]
-    found, tolerance = error(sample), tolerances[sample.precision == "float32"]
+    value, tolerance = error(sample), tolerances[sample.precision == "float32"]
     return {
         "term": sample.term.key,
         "chain": sample.chain,
         "check": check,
-        "error": found,
+        "error": value,
         "tolerance": tolerance,
-        "passed": bool(found <= tolerance),
+        "passed": bool(value <= tolerance),
     }

@@ -1,4 +1,4 @@
-"""Indexed elements at a random state where nothing is zero, and what the kernels of nets make of them; for the derivative table."""
+"""Indexed elements at a random state without zeros, with results of their kernels; for the derivative table."""
 
 from functools import cached_property
 
@@ -13,12 +13,12 @@ from ddg_warp.run.samples import Sample, random_parameters, random_strains
 
 
 class Elements(Sample):
-    """Eight indexed elements. Every block is of one element, so that a change of it is seen by that element alone.
+    """Eight indexed elements without common dof blocks, so that a dof affects one element only.
 
     Attributes:
         data: q (blocks, 3), frame, lag, last, rate, buffer (rows, E), constants (data, E); see `Measure.sample`.
-        slots: blocks of each element (slots, E): nodes of all elements first, then angles, then rotation vectors.
-        felt: which dofs the energy depends on, as q.
+        slots: dof blocks of each element (local, E): nodes of all elements first, then angles, then rotation vectors.
+        felt: mask of the dofs in the energy, shaped as q.
     """
 
     COUNT, LEFT_OUT = 8, frozenset({"energy", "rigid", "resultant"})
@@ -35,37 +35,40 @@ class Elements(Sample):
         super().__init__(term, *arguments)
 
     def random_state(self) -> dict[str, np.ndarray]:
-        """See the class."""
-        random, measure, count, given = np.random.default_rng(11), self.measure, self.COUNT, self.given
-        steps = np.eye(3)[2 * (np.arange(measure.nodes) - 1) % 3]  # the first to a radius that is positive
-        nodes = given.get("nodes", [2.0, 0.0, 0.0] + np.cumsum(steps, axis=0))
+        """Return random data; see the class."""
+        random, measure, count, provided = np.random.default_rng(11), self.measure, self.COUNT, self.given
+        steps = np.eye(3)[2 * (np.arange(measure.nodes) - 1) % 3]  # the first to a positive radius
+        nodes = provided.get("nodes", [2.0, 0.0, 0.0] + np.cumsum(steps, axis=0))
         x = np.array(nodes)[:, None] + 0.1 * random.normal(size=(measure.nodes, count, 3))
         q = 0.4 * random.normal(size=(self.slots.size, 3))
         q[: self.angle_start] = x.reshape(-1, 3)
         q[self.angle_start : self.angle_end, 1:] = 0.0
         edges = [x[b] - x[a] for a, b in measure.edges[: measure.frames]]
         frame = [lagged_frames(random, edge) for edge in edges] or [np.zeros((6, 1))]
-        own = max(1, measure.lag_size - 6 * measure.frames)
+        lag_rows = max(1, measure.lag_size - 6 * measure.frames)
         return {
             "q": q,
-            "frame": given.get("frame", np.concatenate(frame, axis=1)),
-            "lag": given.get("lag", 6.0 * random.normal(size=(own, count))),
+            "frame": provided.get("frame", np.concatenate(frame, axis=1)),
+            "lag": provided.get("lag", 6.0 * random.normal(size=(lag_rows, count))),
             "last": random_strains(self.term, random, (len(measure.strains), count)),
             "rate": random.uniform(0.6, 1.4, size=1),
             "buffer": random_parameters(self.term, random, (count,)),
-            "constants": given.get("data", random.uniform(0.5, 1.5, size=(max(1, measure.data_size), count))),
+            "constants": provided.get("data", random.uniform(0.5, 1.5, size=(max(1, measure.data_size), count))),
         }
 
     @property
     def felt(self) -> np.ndarray:
-        """Which dofs the energy depends on."""
-        felt = np.repeat(self.given.get("felt", np.ones_like(self.slots)).reshape(-1, 1) > 0, 3, axis=1)
-        felt[self.angle_start : self.angle_end, 1:] = False
-        felt[:, 1] &= not self.measure.revolved  # y of a meridian
-        return felt
+        """Mask of the dofs in the energy."""
+        mask = np.repeat(self.given.get("felt", np.ones_like(self.slots)).reshape(-1, 1) > 0, 3, axis=1)
+        mask[self.angle_start : self.angle_end, 1:] = False
+        mask[:, 1] &= not self.measure.revolved  # y of a meridian
+        return mask
 
     def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F^T F + C (local, local, E), gradient and energies of the fused kernel; `exact`: with compression and second derivatives."""
+        """Return F^T F + C (local, local, E), gradient and energies of the fused kernel.
+
+        `exact` adds compression and second derivatives.
+        """
         n, slots, count, real = len(self.measure.strains), self.measure.slots, self.COUNT, self.real
         vector, tensions, packed = wp.types.vector(3, real), self.measure.tensions, self.measure.packed
         shapes = [
@@ -86,8 +89,8 @@ class Elements(Sample):
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)
         if tensions:
-            at = [[0]] if tensions == 1 else [[0, 1], [1, 2]]
-            matrix += self.on_edges(np.moveaxis(tension[at], -1, 0))
+            entries = [[0]] if tensions == 1 else [[0, 1], [1, 2]]
+            matrix += self.on_edges(np.moveaxis(tension[entries], -1, 0))
         if exact and packed:
             i, j = np.triu_indices(self.measure.size)
             local = np.zeros((count, self.measure.size, self.measure.size))
@@ -95,33 +98,33 @@ class Elements(Sample):
             matrix += np.einsum("ia,eij,jb->abe", self.incidence, local, self.incidence)
         return matrix, _flat(gradient), energy[1]
 
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of the energy (which = 0) or gradient (1) kernel, by input."""
-        given, dtype = self._elements(self.real), wp.types.vector(3, self.real) if which else self.real
-        if which:
+    def reverse(self, order: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return derivatives of the energy (order 0) or gradient (1) kernel by input, in reverse mode."""
+        elements, dtype = self._elements(self.real), wp.types.vector(3, self.real) if order else self.real
+        if order:
             seed = seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1)
         seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
         wp.launch(
-            net_elements.term_kernels(self.term, self.real, reverse=True)[which],
+            net_elements.term_kernels(self.term, self.real, reverse=True)[order],
             self.COUNT,
-            [given],
+            [elements],
             [wp.zeros_like(seeds, requires_grad=True)],
             adjoint=True,
             adj_inputs=[net_elements.elements_type(self.real)()],
             adj_outputs=[seeds],
             device=self.device,
         )
-        values = {name: getattr(given, name).grad.numpy().astype(float) for name in self.INPUTS}
+        values = {name: getattr(elements, name).grad.numpy().astype(float) for name in self.INPUTS}
         return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
 
     def on_edges(self, blocks: np.ndarray) -> np.ndarray:
-        """The matrix (E, n, n) times I between the first n edge vectors, in local dofs (local, local, E)."""
+        """Return blocks (E, n, n) times I between the first n edge vectors, in local dofs (local, local, E)."""
         incidence = self.incidence[: 3 * blocks.shape[1]]
         return np.einsum("ia,eij,jb->abe", incidence, np.kron(blocks, np.eye(3)), incidence)
 
     @cached_property
     def incidence(self) -> np.ndarray:
-        """Matrix from the slots of an element to the dofs of the measure (size, 3 slots)."""
+        """Matrix from local dof blocks of an element to the dofs of the measure (size, 3 blocks)."""
         measure = self.measure
         axes, slot = np.eye(3), np.eye(measure.slots)
         edges = [np.kron(slot[b] - slot[a], axes) for a, b in measure.edges]
@@ -131,8 +134,8 @@ class Elements(Sample):
         )
 
     def _elements(self, real, **changed):
-        """What kernels read; see `kernels.net.elements.elements_type`."""
-        data, given = {**self.data, **changed}, net_elements.elements_type(real)()
+        """Return the elements as kernel inputs; see `kernels.net.elements.elements_type`."""
+        data, elements = {**self.data, **changed}, net_elements.elements_type(real)()
 
         def put(values, dtype):
             return wp.array(
@@ -141,31 +144,31 @@ class Elements(Sample):
 
         for name in self.INPUTS:
             values = data[name].ravel() if name == "buffer" else data[name]
-            setattr(given, name, put(values, wp.types.vector(3, real) if name == "q" else real))
+            setattr(elements, name, put(values, wp.types.vector(3, real) if name == "q" else real))
         table = [(row * self.COUNT, 1, 0) for row in range(len(data["buffer"]))]
-        given.table, given.slots = put(np.array(table, np.int32), int), put(self.slots.astype(np.int32), int)
-        given.data, given.blocks = put(data["constants"], real), self.slots.size
-        given.angle_start, given.edges = self.angle_start, self.angle_end - self.angle_start
-        given.elements = self.COUNT
-        return given
+        elements.table, elements.slots = put(np.array(table, np.int32), int), put(self.slots.astype(np.int32), int)
+        elements.data, elements.blocks = put(data["constants"], real), self.slots.size
+        elements.angle_start, elements.edges = self.angle_start, self.angle_end - self.angle_start
+        elements.elements = self.COUNT
+        return elements
 
-    def _launch(self, which: int, real, **changed):
-        """What the energy (0), gradient (1), Hessian (2) or strain (3) kernel gives."""
+    def _launch(self, order: int, real, **changed):
+        """Return results of the energy (0), gradient (1), Hessian (2) or strain (3) kernel."""
         measure, count, device = self.measure, self.COUNT, self.device
         n, size = len(measure.strains), measure.size
-        shape = [(count,), (measure.slots, count), (count, size, size), (n, count)][which]
-        dtype = wp.types.vector(3, real) if which == 1 else real
-        out = [wp.zeros(shape, dtype=dtype, device=device) for _ in range(2 if which == 3 else 1)]
-        extra = [[], [], [wp.zeros((n, count), dtype=real, device=device)], [1]][which]
-        kernel = net_elements.term_kernels(self.term, real, reverse=True)[which]
-        grid = (count, size) if which == 2 else count
+        shape = [(count,), (measure.slots, count), (count, size, size), (n, count)][order]
+        dtype = wp.types.vector(3, real) if order == 1 else real
+        out = [wp.zeros(shape, dtype=dtype, device=device) for _ in range(2 if order == 3 else 1)]
+        extra = [[], [], [wp.zeros((n, count), dtype=real, device=device)], [1]][order]
+        kernel = net_elements.term_kernels(self.term, real, reverse=True)[order]
+        grid = (count, size) if order == 2 else count
         wp.launch(kernel, grid, [self._elements(real, **changed), *extra], out, device=device)
-        found = [array.numpy().astype(float) for array in out]
-        if which == 2:
-            return np.einsum("ia,eij,jb->abe", self.incidence, found[0], self.incidence)
-        return _flat(found[0]) if which == 1 else tuple(found) if which == 3 else found[0]
+        results = [array.numpy().astype(float) for array in out]
+        if order == 2:
+            return np.einsum("ia,eij,jb->abe", self.incidence, results[0], self.incidence)
+        return _flat(results[0]) if order == 1 else tuple(results) if order == 3 else results[0]
 
 
 def _flat(values: np.ndarray) -> np.ndarray:
-    """(slots, E, 3) as (3 slots, E)."""
+    """Return vectors (local, E, 3) as (3 local, E)."""
     return values.transpose(0, 2, 1).reshape(-1, values.shape[1])

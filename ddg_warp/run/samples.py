@@ -1,8 +1,8 @@
-"""What the checks of `ddg_warp.run.derivatives` read: a term at a random state where nothing is zero, and what its kernels make of it.
+"""Samples for the checks of `ddg_warp.run.derivatives`: a term at a random state without zeros, with results of its kernels.
 
-`chain_samples` gathers along rods, `element_samples` by index, which serves all other measures, one's own among them, and
-`contact_samples` has collisions. An element's *local dofs* are what its kernels write derivatives by: the window of a chain, or three
-reals a slot.
+`chain_samples` covers rods, `element_samples` indexed elements of all other measures, user-defined ones included, and `contact_samples`
+collisions. The *local dofs* of an element are the dofs by which kernels write derivatives: the window of a rod, or three reals for each
+local dof block.
 """
 
 from functools import cached_property
@@ -15,22 +15,22 @@ from ddg_warp.kernels.terms import Term
 
 
 class Sample:
-    """A term at its random state. Kernels run in float64, that of references, unless they are given another type.
+    """A term at a random state. Kernels run in float64, the precision of references, unless given another type.
 
     Attributes:
-        chain: "open", "closed", or "net" for indexed elements.
-        real: the type under test.
-        shape: of all that has one value an element: (E,), in chains (n, R).
-        data: inputs of the kernels by name, all of order one: q, the dofs, and the lagged data, parameters and constants.
-        first: row of the term's first parameter in the buffer.
-        rows: of its strains among those of the last step.
-        parts: samples of all the terms that the fused kernel sums up, this one among them.
+        chain: "open", "closed", "net" for indexed elements, or "pair" for collisions.
+        real: type under test.
+        shape: shape of arrays with one value for each element: (E,), for rods (n, R).
+        data: inputs of the kernels by name, all of order one: dofs q, lagged data, parameters and constants.
+        first: row of the first parameter of the term in the buffer.
+        rows: rows of the term's strains among the strains of the last step.
+        parts: samples of all terms in the fused kernel, this one included.
     """
 
     chain = "net"
-    ORDERS = (0, 1)  # of derivatives that have a reverse mode, by the energy and the gradient
-    LEFT_OUT = frozenset()  # checks that make no sense
-    STEP = 1e-4  # of differences
+    ORDERS = (0, 1)  # orders of derivatives with a reverse mode: energy, gradient
+    LEFT_OUT = frozenset()  # checks that do not apply
+    STEP = 1e-4  # step of differences
 
     def __init__(self, term: Term, kind, precision: str, device: str, data: dict | None = None):
         self.term, self.kind, self.precision, self.device = term, kind, precision, device
@@ -50,23 +50,23 @@ class Sample:
         return self.measure.dim
 
     def like(self, data: dict) -> "Sample":
-        """This sample with other data."""
+        """Return the sample with other data."""
         return type(self)(self.term, self.kind, self.precision, self.device, data)
 
     def energy(self, real=wp.float64, **changed) -> np.ndarray:
-        """Energies of the elements."""
+        """Return energies of the elements."""
         return self._launch(0, real, **changed)
 
     def gradient(self, real=wp.float64, **changed) -> np.ndarray:
-        """Derivatives by the local dofs (local, *shape)."""
+        """Return derivatives by the local dofs (local, *shape)."""
         return self._launch(1, real, **changed)
 
     def hessian(self, real=wp.float64) -> np.ndarray:
-        """Second derivatives by the local dofs (local, local, *shape)."""
+        """Return second derivatives by the local dofs (local, local, *shape)."""
         return self._launch(2, real)
 
     def strains(self, **changed) -> tuple[np.ndarray, np.ndarray]:
-        """Strains and stresses (strains, *shape)."""
+        """Return strains and stresses (strains, *shape)."""
         return self._launch(3, wp.float64, **changed)
 
     @cached_property
@@ -85,11 +85,11 @@ class Sample:
         return self.local_derivative(self.gradient)
 
     def seeded(self, **changed) -> np.ndarray:
-        """v . gradient of every element."""
+        """Return v . gradient of every element."""
         return (self.seed * self.gradient(**changed)).sum(0)
 
     def difference(self, function, name: str, where, direction=1.0) -> np.ndarray:
-        """Central difference of fourth order of function(**data) along data[name][where]."""
+        """Return the central difference of fourth order of function(**data) along data[name][where]."""
         h, ends = self.STEP, []
         for step in (h, -h, 2.0 * h, -2.0 * h):
             values = self.data[name].copy()
@@ -98,21 +98,21 @@ class Sample:
         return (8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * h)
 
     def scatter(self, local: np.ndarray) -> np.ndarray:
-        """Return values of indexed elements at their local dofs (local, E) by all dofs (blocks, 3)."""
+        """Return values at local dofs of indexed elements (local, E) by dof blocks (blocks, 3)."""
         return local.reshape(-1, 3, self.shape[0]).transpose(0, 2, 1).reshape(-1, 3)
 
     def local_derivative(self, function) -> np.ndarray:
-        """Differentiate function(**data) of indexed elements (m, E) by their local dofs (m, local, E)."""
+        """Differentiate function(**data) of indexed elements (m, E) by the local dofs (m, local, E)."""
         columns = [self.difference(function, "q", (row, d)) for row in self.slots for d in range(3)]
         return np.stack(columns, axis=1)
 
     def parameter_rows(self, *families: str) -> list[int]:
-        """Rows of the buffer with the parameters of some families, or of all."""
-        known = enumerate(self.term.parameters, self.first)
-        return [row for row, parameter in known if not families or parameter.family in families]
+        """Return the buffer rows of the parameters of some families, or of all."""
+        numbered = enumerate(self.term.parameters, self.first)
+        return [row for row, parameter in numbered if not families or parameter.family in families]
 
     def gauss_newton(self) -> np.ndarray:
-        """Return w J^T psi'' J without what is negative of psi'', and the geometric stiffness under tension (local, local, *shape)."""
+        """Return w J^T psi'' J with the positive part of psi'', and the stiffness of tension (local, local, *shape)."""
         measure, w = self.measure, self.data["buffer"][self.first]
         J, S = (
             np.moveaxis(self.local_derivative(lambda i=i, **data: self.strains(**data)[i]), (0, 1), (-2, -1))
@@ -120,13 +120,13 @@ class Sample:
         )
         strain, stress = self.strains()
         inverse = np.linalg.pinv(J, 1e-9)
-        curvature = J @ inverse @ S @ inverse  # of the strains that the dofs reach
-        if measure.field:  # of a direction n in a field -s what is positive of the curvature along the sphere, -n . s
+        curvature = J @ inverse @ S @ inverse  # in the range of J
+        if measure.field:  # for a direction n in a field -s: curvature along the sphere, -n . s
             curvature = -(strain[:3] * stress[:3]).sum(0)[:, None, None] * np.diag(np.arange(6) < 3)
         matrix = w * np.moveaxis(J.swapaxes(-2, -1) @ positive(curvature) @ J, (-2, -1), (0, 1))
         if measure.tensions == 3:
             blocks = w * np.array([[stress[0], 0.5 * stress[1]], [0.5 * stress[1], stress[2]]])
-        elif measure.tensions and measure.revolved:  # the law's root leaves out what stress around the axis adds
+        elif measure.tensions and measure.revolved:  # the root of the law omits the hoop stress
             blocks = w * stress[None, :1]
         elif measure.tensions:
             return np.where(stress[0] > 0.0, self.gradient_derivative, matrix)
@@ -135,11 +135,11 @@ class Sample:
         return matrix + self.on_edges(positive(np.moveaxis(blocks, -1, 0)))
 
     def compared(self):
-        """Index of the elements whose second derivatives F^T F and its corrections have: all."""
+        """Return the index of elements with exact second derivatives: all."""
         return slice(None)
 
     def at_rest(self) -> dict[str, np.ndarray]:
-        """Data with which no element feels a force: rest strains, and those of the last step, are the strains."""
+        """Return data without forces: rest strains and strains of the last step equal the strains."""
         data = {} if self.term.rest else self.straight()
         strain = self.strains(**data)[0]
         buffer, last = self.data["buffer"].copy(), self.data["last"].copy()
@@ -150,7 +150,7 @@ class Sample:
         return {**data, "buffer": buffer, "last": last}
 
     def isotropic(self) -> "Sample":
-        """This sample; with equal stiffness and no rest strain where strains are components of a vector in space."""
+        """Return an isotropic sample: for strains that form a vector, equal stiffness and no rest strain."""
         if not self.measure.vector:
             return self
         buffer = self.data["buffer"].copy()
@@ -161,28 +161,28 @@ class Sample:
         return self.like({**self.data, "buffer": buffer})
 
     def turned(self, turn: np.ndarray) -> dict[str, np.ndarray]:
-        """All data after a rotation; of a shell of revolution, which cannot turn, after a shift along its axis."""
+        """Return all data after a rotation, or for a shell of revolution after a shift along the axis."""
         measure, data = self.measure, {name: values.copy() for name, values in self.data.items()}
         if measure.revolved:
             data["q"][:, 1:] += 0.4
             return data
         for where in self.vectors:
             data["q"][where] = data["q"][where] @ turn.T
-        own = measure.lag_size - 6 * measure.frames
+        lag_rows = measure.lag_size - 6 * measure.frames
         starts = [("frame", 0), ("frame", 3)] if measure.frames else []
-        starts += [("lag", row) if row < own else ("constants", row - own) for row in measure.vectors]
+        starts += [("lag", row) if row < lag_rows else ("constants", row - lag_rows) for row in measure.vectors]
         starts += [("last", self.rows.start)] if measure.vector and self.term.density.lagged else []
         if measure.field:
             first = measure.data_size - measure.field
             starts.append(("constants", first))
             slope = data["constants"][first + 3 :].reshape(3, 3, -1)
             data["constants"][first + 3 :] = np.einsum("ia,abe,jb->ije", turn, slope, turn).reshape(9, -1)
-        for name, at in starts:
-            data[name][at : at + 3] = np.einsum("ij,j...->i...", turn, data[name][at : at + 3])
+        for name, start in starts:
+            data[name][start : start + 3] = np.einsum("ij,j...->i...", turn, data[name][start : start + 3])
         return data
 
     def moved(self, turn: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Data at which the energy is what it was, by a rotation."""
+        """Return rotated data, with equal energy."""
         return [self.turned(turn)]
 
 
@@ -193,18 +193,18 @@ def positive(matrix: np.ndarray) -> np.ndarray:
 
 
 def random_parameters(term: Term, random: np.random.Generator, shape: tuple) -> np.ndarray:
-    """Values (parameters, *shape) that have a meaning to the law, all of order one."""
+    """Return valid values of parameters (parameters, *shape), of order one."""
     rows = []
     for parameter in term.parameters:
         value = random.uniform(0.6, 1.4, size=shape)
         if not parameter.valid[1](value).all():
             value = 0.5 * value  # a Poisson's ratio
         if len(set(parameter.number)) > 1:
-            value = 0.2 * value  # beside the diagonal of a positive definite tensor
+            value = 0.2 * value  # off the diagonal of a positive definite tensor
         if parameter.unit == "1/m":
-            value = 8.0 * value  # strains that mean something to a law are as large as those of the sample
+            value = 8.0 * value  # curvatures of the size of the sample's
         if parameter.family == "thickness":
-            value = 0.1 * value  # closest points lie outside,
+            value = 0.1 * value  # closest points lie outside
         if parameter.family == "range":
             value = 3.0 * value  # and within the range
         rows.append(random_strains(term, random, shape) if parameter.family == "rest" else value)
@@ -212,12 +212,12 @@ def random_parameters(term: Term, random: np.random.Generator, shape: tuple) -> 
 
 
 def random_strains(term: Term, random: np.random.Generator, shape: tuple) -> np.ndarray:
-    """Strains about those without deformation, one a row of `shape`."""
+    """Return strains of `shape` near the undeformed ones."""
     return float(term.measure.strains[0].startswith("stretch")) + 0.4 * random.normal(size=shape)
 
 
 def rotation(dim: int, angle: float) -> np.ndarray:
-    """A rotation matrix (dim, dim)."""
+    """Return a rotation matrix (dim, dim)."""
     axis = np.array([2.0, -1.0, 2.0]) / 3.0 if dim == 3 else np.array([0.0, 0.0, 1.0])
     spin = np.cross(axis, np.eye(3), axisb=0, axisc=0)
     return (np.eye(3) + np.sin(angle) * spin + (1.0 - np.cos(angle)) * spin @ spin)[:dim, :dim]

@@ -1,18 +1,18 @@
-"""Reverse of contact and friction in a step of a net, pair by pair; see `kernels.variation` for what is differentiated.
+"""Reverse mode of contact and friction in a step of the coupled system, pair by pair; see `kernels.variation`.
 
-Of a loss with w from H^T w = g, what contact brings is the derivative of -w . dE/dx, E the energy of pairs (`contact.pair_energy`) at
-the solution x, by x, stiffness, range and thickness. Friction is a function of what it lags, too (`contact.pair_friction`): with the
-gradient g of contact at lagged positions y, which is one of y and of the same numbers, its force along w is
+For a loss with the solution w of H^T w = g, contact contributes the derivative of -w . dE/dx by x, stiffness, range and thickness. E is
+the energy of pairs (`contact.pair_energy`) at the solution x. Friction also depends on lagged data (`contact.pair_friction`). The
+gradient g of contact at lagged positions y depends on y and the same parameters. The friction force along w is
 
-    w . f = sum_i weight_i w_i . (t1, t2) psi'(u; mu N) ,   N, n = sum g_i of the first thing,   weight_i = g_i . n / N ,
-    u = (t1, t2) . sum_i weight_i (x_i - x_i^n) ,
+    w . f = sum_i weight_i w_i . (t1, t2) psi'(u; mu N) ,   N, n = sum of g_i over the first primitive,   weight_i = g_i . n / N ,
+    u = (t1, t2) . sum_i weight_i (x_i - x_i^n) .
 
-and its reverse goes through normal force, normal and weights at y, through the slip from the start x^n of the step to x, and to
-coefficient and rate; through the directions of rods at y, where friction is directed or rolls them; and through how far obstacles that
-spin and rods that roll have turned. The matrix of all this by x is symmetric, as what is lagged is no function of x.
+Its reverse yields derivatives by normal force, normal and weights at y, by the slip from the start x^n to x, and by coefficient and
+rate. Directed or rolling friction adds the directions of rods at y. Spinning obstacles and rolling rods add their rotations. The matrix
+by x is symmetric, since lagged data do not depend on x.
 
-At first y is x^n. With more `lags` it is the solution before, so that a step is a chain of solves: the derivative by y of the last one
-is the g of the one before it, and so on, each with a matrix of its own.
+Initially y is x^n. With `lags` > 1, y is the previous solution, so that a step is a sequence of solves. The derivative by y of one
+solve is the g of the solve before, each with its own matrix.
 """
 
 from functools import cache
@@ -29,19 +29,19 @@ from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
-NUMBERS = 5  # of a pair, that derivatives are by
-TURN, ARM = 0, 3  # of what spins: how far it has turned (3), and its radius
+NUMBERS = 5  # parameters of a pair
+TURN, ARM = 0, 3  # rows of a spinning object: rotation (3), radius
 SPUN = 4
-ROLLED = 2  # of what rolls: radii of both things
+ROLLED = 2  # rows of a rolling pair: radii of both primitives
 
 
 @cache
 def pull_kernel(kind: Kind, density: Density, real):
-    """pull(...): what pairs bring by slot, and by their numbers (`NUMBERS`, capacity)."""
+    """Build the kernel of derivatives of contact by local node index, and by parameters of pairs (`NUMBERS`, capacity)."""
     Law, Sides = law_struct(real), sides_struct(real)
     V = wp.types.vector(3, real)
     *_, along = pair_energy_functions(kind, density, real)
-    given, corners = read_functions(kind, real)
+    parameters_of, corners = read_functions(kind, real)
     by_rate_of = by_rate_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -58,7 +58,7 @@ def pull_kernel(kind: Kind, density: Density, real):
         numbers: wp.array2d(dtype=real),
     ):
         for pair in range(wp.tid(), count[0], threads):
-            p, threshold, inner = given(law, sides, pairs[pair])
+            p, threshold, inner = parameters_of(law, sides, pairs[pair])
             n = nodes[pair]
             dx, _dv, dp, _dt, _ds = wp.grad(along)(corners(x, n), -corners(w, n), p, threshold, inner)
             for slot in range(wp.static(SLOTS)):
@@ -77,19 +77,18 @@ def pull_kernel(kind: Kind, density: Density, real):
 
 @cache
 def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool, rolls: bool):
-    """rub(...): what friction brings by slot of the solution, of the start and of what was lagged, and by the numbers of pairs, as
-    `pull_kernel` has it.
+    """Build the kernel of derivatives of friction by local node index of the solution, the start and the lagged positions.
 
-    Where it is `directed`, or rods roll, by the directions of rods (capacity,), too, from `beside` by `ways` as of
-    `pair_friction.lag_kernel`; where something `spins`, by `TURN` and `ARM` of what does (SPUN, capacity); where a rod `rolls`, by
-    slots of angles, and by the radii of both things (ROLLED, capacity).
+    Derivatives by parameters of pairs are as in `pull_kernel`. `directed` or `rolls`: also by the directions of rods (capacity,);
+    `rod_nodes` and `multipliers` are as in `pair_friction.lag_kernel`. `spins`: also by `TURN` and `ARM` of the object
+    (SPUN, capacity). `rolls`: also by twist angles, and by radii of both primitives (ROLLED, capacity).
     """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = node_types(real)
     V, E = wp.types.vector(3, real), wp.types.vector(2, real)
     D = wp.types.vector(friction.parameter_size(2), real)
     _, _, evaluate, _ = pair_energy_functions(kind, density, real)
-    given, corners = read_functions(kind, real)
+    parameters_of, corners = read_functions(kind, real)
     tangents, groups, along_rod = tangents_function(real), groups_function(real), directed_basis(real)
     spun, A = spun_function(real), wp.types.vector(ANGLES, real)
     _, radii, levers = rolling_functions(kind, real)
@@ -102,7 +101,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         moved: X,
         v: X,
         d: V,
-        way: V,
+        multiplier: V,
         p: P,
         threshold: real,
         inner: W,
@@ -116,7 +115,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         rolled: A,
         v_rolled: A,
     ):
-        """The derivative along v of the potential of friction that was lagged at y, by what has `moved` since the start."""
+        """Return the derivative along v of the friction potential lagged at y, for displacements `moved` since the start."""
         _e, g = evaluate(y, p, threshold, inner)
         push = V()
         for slot in range(wp.static(kind.first)):
@@ -133,8 +132,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
             move += lever[0] * rolled[0] + lever[1] * rolled[1]
             along += lever[0] * v_rolled[0] + lever[1] * v_rolled[1]
         if wp.static(directed):
-            ahead, t2, back = along_rod(n, d, way)
-            t1 = wp.where(wp.dot(ahead + back, move) < real(0.0), back, ahead)
+            forwards, t2, back = along_rod(n, d, multiplier)
+            t1 = wp.where(wp.dot(forwards + back, move) < real(0.0), back, forwards)
         else:
             t1, t2 = tangents(n)
         u = E(wp.dot(t1, move), wp.dot(t2, move))
@@ -157,8 +156,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         w: wp.array(dtype=V),
         velocity: real,
         rate: wp.array(dtype=real),
-        beside: wp.array(dtype=wp.vec2i),
-        ways: wp.array2d(dtype=V),
+        rod_nodes: wp.array(dtype=wp.vec2i),
+        multipliers: wp.array2d(dtype=V),
         spinning: wp.array(dtype=wp.vec4i),
         turns: wp.array(dtype=V),
         parts: wp.array2d(dtype=V),
@@ -182,12 +181,12 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                     spun_out[i, pair] = real(0.0)
             if used[pair] != 0:
                 world, i, j, a, b = groups(law, sides, pairs[pair])
-                d, way = V(), V()
+                d, multiplier = V(), V()
                 if wp.static(leads):
                     first = world * sides.first.nodes_a_world
-                    d = lagged[beside[i][1] + first] - lagged[beside[i][0] + first]
+                    d = lagged[rod_nodes[i][1] + first] - lagged[rod_nodes[i][0] + first]
                 if wp.static(directed):
-                    way = ways[a, b]
+                    multiplier = multipliers[a, b]
                 turned, r, rolled, v_rolled = wp.vec2i(-1, -1), A(), A(), A()
                 if wp.static(rolls):
                     turned = angles[pair]
@@ -196,12 +195,12 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                         if turned[side] >= 0:
                             rolled[side] = x[turned[side]][0] - start[turned[side]][0]
                             v_rolled[side] = -w[turned[side]][0]
-                of, turn, arm = int(-1), V(), real(0.0)
+                spinning_object, turn, arm = int(-1), V(), real(0.0)
                 if wp.static(spins):
-                    of, arm = spun(sides, spinning, world, i, j)
-                    if of >= 0:
-                        turn = turns[of]
-                p, threshold, inner = given(law, sides, pairs[pair])
+                    spinning_object, arm = spun(sides, spinning, world, i, j)
+                    if spinning_object >= 0:
+                        turn = turns[spinning_object]
+                p, threshold, inner = parameters_of(law, sides, pairs[pair])
                 n = nodes[pair]
                 dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr, dturn, darm, _da, dradii, drolled, _dw2 = wp.grad(
                     force
@@ -210,7 +209,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                     corners(x, n) - corners(start, n),
                     -corners(w, n),
                     d,
-                    way,
+                    multiplier,
                     p,
                     threshold,
                     inner,
@@ -240,7 +239,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                         parts[wp.static(SLOTS) + side, pair] = V(drolled[side], real(0.0), real(0.0))
                         start_parts[wp.static(SLOTS) + side, pair] = V(-drolled[side], real(0.0), real(0.0))
                 if wp.static(spins):
-                    if of >= 0:
+                    if spinning_object >= 0:
                         for i in range(3):
                             spun_out[wp.static(TURN) + i, pair] = dturn[i]
                         spun_out[wp.static(ARM), pair] = darm

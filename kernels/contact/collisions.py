@@ -1,14 +1,13 @@
 """Collisions: two primitives with their closest points, as weights of their nodes, a distance and a direction.
 
-A collision has four nodes x_i. The vector between its closest points is r = sum_i w_i x_i with sum_i w_i = 0, so that the distance
-d = |r| has the gradient w_i n, n = r / d. The weights are continuous in the nodes wherever the closest points are, and the derivative
-of the distance is (w_i n)_i in every region of closest points.
+A collision has four nodes x_i. The vector between its closest points is r = sum_i w_i x_i with sum_i w_i = 0, so that the distance d =
+|r| has the gradient w_i n, n = r / d, in every region of closest points. The weights are continuous wherever the closest points are.
 
-Two lines are closest where r is along a x b. Both crossings are found by products with it, which lose no digits where the lines are
-nearly parallel, as differences of squared lengths do (Ericson, Real-Time Collision Detection, 2005, 5.1.9, for the clamping).
+Two lines are closest where r is along a x b. Products with a x b give both crossings without the cancellation of differences of squared
+lengths for nearly parallel lines (Ericson, Real-Time Collision Detection, 2005, 5.1.9, for the clamping).
 
-The closest points of two edges jump along them where these are parallel. Their mollifier (Li et al., ACM Trans. Graph. 39, 2020, 49,
-parallel-edge handling) is
+The closest points of two parallel edges jump. The mollifier of two edges (Li et al., ACM Trans. Graph. 39, 2020, 49, parallel-edge
+handling) is
 
     m(y) = y (2 - y) for y < 1, 1 beyond,   y = |a x b|^2 / threshold,   threshold = 1e-3 |a|^2 |b|^2 at rest.
 """
@@ -19,20 +18,20 @@ import warp as wp
 
 from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, Kind
 
-# Square of the sine of the angle below which lines count as parallel, of which any point is as close as any other.
+# Squared sine of the angle below which lines count as parallel.
 PARALLEL = {wp.float64: 1.0e-20, wp.float32: 1.0e-10}
-SHARE = 1.0e-3  # of |a|^2 |b|^2 of edges at rest, the threshold of their mollifier
+SHARE = 1.0e-3  # threshold of the mollifier over |a|^2 |b|^2 at rest
 
 
 @cache
 def node_types(real):
-    """Return the types of the nodes of a collision (4, 3), of a number for each node (4,), and of a vector (3,)."""
+    """Return the types of nodes of a collision (4, 3), of scalars by node (4,), and of vectors (3,)."""
     return wp.types.matrix((4, 3), real), wp.types.vector(4, real), wp.types.vector(3, real)
 
 
 @cache
 def distance_function(kind: Kind, real):
-    """Build `near(x)`: return weights w (4,), distance d [m] and direction n of a collision with nodes x (4, 3)."""
+    """Return the device function `near(x) -> (w, d, n)`: weights (4,), distance [m] and direction of a collision, x (4, 3)."""
     if kind == EDGE_POINT:
         return _edge_point(real)
     if kind.endless:
@@ -55,9 +54,9 @@ def distance_function(kind: Kind, real):
 
 @cache
 def _edge_edge(real):
-    """Build `closest(a, b, c)`: return the coefficients rho of the closest points of edges 0 1 and 2 3.
+    """Return the device function `closest(a, b, c) -> rho` of edges 0 1 and 2 3, with r = rho . (a, b, c).
 
-    Here r = rho . (a, b, c), with the vectors a, b, c from each of nodes 0 1 2 3 to the next.
+    The vectors a, b, c lead from each of nodes 0 1 2 3 to the next.
     """
     V = wp.types.vector(3, real)
     parallel = PARALLEL[real]
@@ -79,13 +78,13 @@ def _edge_edge(real):
 
 @cache
 def _point_triangle(real):
-    """Build `closest(a, b, c)`: return the coefficients rho of node 0 and triangle 1 2 3; see `_edge_edge`."""
+    """Return the device function `closest(a, b, c) -> rho` of node 0 and triangle 1 2 3; see `_edge_edge`."""
     V = wp.types.vector(3, real)
     parallel = PARALLEL[real]
 
     @wp.func
     def along(a: V, e: V):
-        """Return the t between 0 and 1 at which a + t e is shortest."""
+        """Return the t between 0 and 1 that minimises |a + t e|."""
         return wp.clamp(-wp.dot(a, e) / wp.dot(e, e), real(0.0), real(1.0))
 
     @wp.func
@@ -117,7 +116,7 @@ def _point_triangle(real):
 
 @cache
 def _point_plane(real):
-    """Build `near` of a point and a half-space, whose distance is negative inside."""
+    """Return the device function `near` of a point and a half-space, with negative distances inside."""
     X, W, _ = node_types(real)
 
     @wp.func
@@ -137,11 +136,14 @@ def _point_plane(real):
 
 @cache
 def point_edge_function(real):
-    """Build `apart(p, a, b)`: return the closest point of edge a b as t, its distance from p, and the direction from p."""
+    """Return the device function `nearest(p, a, b) -> (t, d, n)` of point p and edge a b.
+
+    t: parameter of the closest point of the edge. d: distance. n: direction from p.
+    """
     _, _, V = node_types(real)
 
     @wp.func
-    def apart(p: V, a: V, b: V):
+    def nearest(p: V, a: V, b: V):
         u = a - p
         e = b - a
         t = wp.clamp(-wp.dot(u, e) / wp.dot(e, e), real(0.0), real(1.0))
@@ -149,18 +151,18 @@ def point_edge_function(real):
         d = wp.length(r)
         return t, d, r / wp.where(d > real(0.0), d, real(1.0))
 
-    return apart
+    return nearest
 
 
 @cache
 def _edge_point(real):
-    """Build `near` of an edge and a point, node 2."""
+    """Return the device function `near` of an edge and a point, node 2."""
     X, W, V = node_types(real)
-    apart = point_edge_function(real)
+    nearest = point_edge_function(real)
 
     @wp.func
     def near(x: X):
-        t, d, n = apart(x[2], x[0], x[1])
+        t, d, n = nearest(x[2], x[0], x[1])
         return W(real(1.0) - t, t, real(-1.0), real(0.0)), d, n
 
     return near
@@ -168,15 +170,15 @@ def _edge_point(real):
 
 @cache
 def end_function(real):
-    """Build `end(x, k)`: return weights, distance and direction between end k of two edges, node k, and the other edge."""
+    """Return the device function `end(x, k) -> (w, d, n)` between node k of two edges and the other edge."""
     X, W, _ = node_types(real)
-    apart = point_edge_function(real)
+    nearest = point_edge_function(real)
 
     @wp.func
     def end(x: X, k: int):
         one, zero = real(1.0), real(0.0)
         first = wp.where(k < 2, 2, 0)
-        t, d, n = apart(x[k], x[first], x[first + 1])
+        t, d, n = nearest(x[k], x[first], x[first + 1])
         is_first = wp.where(k == 0 or k == 2, one, zero)
         w = W(-is_first, is_first - one, one - t, t)
         if k >= 2:
@@ -188,7 +190,7 @@ def end_function(real):
 
 @cache
 def node_function(real):
-    """Build `to_node(x, k, j)`: return weights, distance and direction between nodes k and j."""
+    """Return the device function `to_node(x, k, j) -> (w, d, n)` between nodes k and j."""
     X, W, _ = node_types(real)
 
     @wp.func
@@ -205,7 +207,7 @@ def node_function(real):
 
 @cache
 def mollifier_function(real):
-    """Build `mollify(x, threshold)`: return m and its derivative by x = |a x b|^2 [m^4]."""
+    """Return the device function `mollify(x, threshold) -> (m, m')` of x = |a x b|^2 [m^4]."""
 
     @wp.func
     def mollify(x: real, threshold: real):
@@ -221,7 +223,7 @@ def mollifier_function(real):
 
 @cache
 def tangents_function(real):
-    """Build `tangents(n)`: return two unit vectors at right angles to each other and to the unit vector n.
+    """Return the device function `tangents(n) -> (t1, t2)` that completes a unit vector n to an orthonormal basis.
 
     Source: Duff et al., J. Comput. Graph. Tech. 6, 2017.
     """

@@ -1,12 +1,12 @@
-"""What the turning of a pair brings to the Hessian of its energy, beside its Gauss-Newton matrix.
+"""Geometric stiffness of a pair, the Hessian of its energy minus the Gauss-Newton matrix.
 
-Of the distance D = |r|, r = sum_i w_i x_i, whose weights w are those of the closest points and change with the free parameters t_k of
-these along edges and in triangles, w = w^0 + sum_k t_k c_k, as the closest they make r at right angles to e_k = sum_i c_k,i x_i,
+The distance is D = |r|, r = sum_i w_i x_i. The weights w of the closest points depend on free parameters t_k along edges and in
+triangles: w = w^0 + sum_k t_k c_k. The closest points make r orthogonal to e_k = sum_i c_k,i x_i, so that
 
     D D'' = w w^T (1 - n n^T) - B A^-1 B^T ,   B_k,i = w_i e_k + c_k,i r ,   A_kl = e_k . e_l ,
 
-which is exact where no parameter is at an end. The energy psi(D) has psi' D'' of it beside psi'' D' D'^T: with forces that push,
-psi' < 0, it takes stiffness away, most of it across the line of the closest points, where what touches at a point slides off.
+which is exact if no parameter is at an end. The Hessian of psi(D) is psi' D'' + psi'' D' D'^T. Repulsion, psi' < 0, makes the first
+term negative, mostly across the line of the closest points, where point contacts slide off.
 """
 
 from functools import cache
@@ -22,12 +22,15 @@ TRIANGLES = KINDS.index(POINT_TRIANGLE)
 
 @cache
 def bend_function(linear):
-    """bend(kind, x, w, v) -> D D'' v of nodes x (4, 3) with weights w, times a movement v (4, 3); `kind` is a place in `KINDS`."""
+    """Return the device function `bend(kind, x, w, v)`: D D'' v of nodes x (4, 3) with weights w and displacements v (4, 3).
+
+    `kind` is an index of `KINDS`.
+    """
     Y, W = wp.types.matrix((4, 3), linear), wp.types.vector(4, linear)
 
     @wp.func
     def free(kind: int, w: W):
-        """c_0 and c_1, zero where there is no such parameter."""
+        """Return c_0 and c_1, zero for parameters that are absent."""
         zero, one = linear(0.0), linear(1.0)
         c0, c1 = W(), W()
         if kind < wp.static(TRIANGLES):
@@ -58,11 +61,11 @@ def bend_function(linear):
         b0 = wp.dot(e0, s) + wp.dot(r, total(c0, v))
         b1 = wp.dot(e1, s) + wp.dot(r, total(c1, v))
         a00, a11, a01 = wp.dot(e0, e0), wp.dot(e1, e1), wp.dot(e0, e1)
-        if a00 == linear(0.0):  # without a parameter its row is zero
+        if a00 == linear(0.0):  # absent parameter with a zero row
             a00 = linear(1.0)
         if a11 == linear(0.0):
             a11 = linear(1.0)
-        # over squared lengths, so that at no scale products of them are lost: 1 less the square of the cosine
+        # scaled by squared lengths against underflow: 1 minus the squared cosine
         k0, k1, u0, u1 = a01 / a00, a01 / a11, b0 / a00, b1 / a11
         sine = wp.max(linear(1.0) - k0 * k1, linear(wp.static(PARALLEL[linear])))
         g0, g1 = (u0 - k0 * u1) / sine, (u1 - k1 * u0) / sine

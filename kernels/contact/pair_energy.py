@@ -1,23 +1,21 @@
-"""Contact potential: the energy of a collision by a law of its distance, its gradient, and the rows of its Gauss-Newton factor.
+"""Contact potential: energy of a collision by its distance, gradient, and rows of the Gauss-Newton factor.
 
-Of a point and a triangle or plane, or an edge and a ball, it is psi(d) of their distance (`contact.collisions`, `densities.contact`).
-The closest points of two edges jump where these are parallel. So with the mollifier m, 0 where edges a, b are parallel and 1 from some
-two
-degrees on, theirs is
+For a point and a triangle or plane, or an edge and a ball, the energy is psi(d) (`contact.collisions`, `densities.contact`). The
+closest points of two edges jump where the edges are parallel. So with the mollifier m, 0 for parallel edges a, b and 1 beyond about two
+degrees, the energy of two edges is
 
     m psi(d_ab) + (1 - m) / 2 (G(a0, b) + G(a1, b) + G(b0, a) + G(b1, a)) ,   G(p, b) = psi(d_p,b) - (psi(d_p,b0) + psi(d_p,b1)) / 2 ,
 
-where the last sum has those ends of b only that are inside of its rod. Both parts have continuous slopes, the first as m ends the jump,
-the second as a point has one closest point on an edge. Along straight rows of edges all is counted once: a node inside a rod ends two
-edges, each of which brings half of it; and the G of a point add up to psi of its distance from the row, even where that is from a node,
-which two edges have in common. Along an edge the halves are the trapezoidal rule. G >= 0, as psi falls. Where edges cross at an angle
-their ends do not count; each two edges do that are near, which close to nodes are up to four. Points against edges of shells are left
-out: their distances from triangles have them.
+where the last sum covers only ends of b in the interior of its rod. Both terms have continuous slopes: m removes the jump from the
+first, and a point has one closest point on an edge. Along straight rows of edges all is counted once. A node in the interior of a rod
+ends two edges, each of which contributes half. The G of a point add up to psi of its distance from the row, also at nodes shared by two
+edges. Along an edge the halves are the trapezoidal rule. G >= 0, as psi decreases. Ends of edges that cross at an angle do not count.
+Up to four pairs of edges count near nodes. Points against edges of shells are omitted, since point-triangle distances cover them.
 
-A distance is |r| with r = sum_i w_i x_i over the four nodes, sum_i w_i = 0, and has the derivative w_i r / |r|: forces have no
-resultant and, r being along them, no moment. What psi'' >= 0 brings to the Hessian is a row sqrt(c psi'') w_i r / |r| for each
-distance, c its share in the energy; the product of these rows is positive semi-definite by form. Of G the row is that of d_p,b, with
-what is positive of the second derivative of G if all three changed alike, as they do where they are all but equal.
+A distance is |r| with r = sum_i w_i x_i over the four nodes, sum_i w_i = 0, and has the derivative w_i r / |r|. So forces have no
+resultant and, being along r, no moment. psi'' >= 0 adds a factor row sqrt(c psi'') w_i r / |r| for each distance, with its weight c in
+the energy. The product of these rows is positive semi-definite. The row of G is that of d_p,b. Its size follows from the second
+derivative of G, if positive, for equal changes of all three distances, which is accurate where they are nearly equal.
 """
 
 from functools import cache
@@ -38,34 +36,35 @@ ENDS = 4  # ends of two edges
 
 
 def rows_of(kind: Kind) -> int:
-    """Distances that the energy of a pair depends on."""
+    """Return the number of distances in the energy of a pair."""
     return 1 + ENDS * (kind == EDGES)
 
 
 @cache
 def end_functions(density: Density, real):
-    """Half of G of end k of two edges: of_end(x, p, inner, k) -> (energy, gradient), row_of_end(x, p, inner, k) -> (w, v).
+    """Return the device functions of half of G of end k of two edges, zero if not counted: `of_end` and `row_of_end`.
 
-    Zero where it is not counted.
+    - `of_end(x, p, inner, k) -> (energy, gradient)`.
+    - `row_of_end(x, p, inner, k) -> (w, v)`.
     """
     X, W, V = node_types(real)
     E, I = wp.types.vector(1, real), wp.types.vector(4, int)
     end, to_node = end_function(real), node_function(real)
     energy_of, slope_of, curvature_of = density.laws(real, 1)
-    others, half = I(2, 2, 0, 0), real(0.5)
+    opposite, half = I(2, 2, 0, 0), real(0.5)
 
     @wp.func
     def of_end(x: X, p: V, inner: W, k: int):
         e = real(0.0)
         g = X()
-        if inner[others[k]] >= real(0.0):
+        if inner[opposite[k]] >= real(0.0):
             w, d, n = end(x, k)
             f = slope_of(E(d), p)
             e = half * energy_of(E(d), p)
             g = wp.outer(w, n * (half * f[0]))
             if not wp.isinf(e):
                 for i in range(2):
-                    j = others[k] + i
+                    j = opposite[k] + i
                     wj, dj, nj = to_node(x, k, j)
                     fj = slope_of(E(dj), p)
                     e -= half * inner[j] * energy_of(E(dj), p)
@@ -76,12 +75,12 @@ def end_functions(density: Density, real):
     def row_of_end(x: X, p: V, inner: W, k: int):
         w = W()
         v = V()
-        if inner[others[k]] >= real(0.0):
+        if inner[opposite[k]] >= real(0.0):
             w, d, n = end(x, k)
             stiffness = curvature_of(E(d), p)
             c = stiffness[0]
             for i in range(2):
-                j = others[k] + i
+                j = opposite[k] + i
                 _w, dj, _n = to_node(x, k, j)
                 less = curvature_of(E(dj), p)
                 c -= inner[j] * less[0]
@@ -93,7 +92,10 @@ def end_functions(density: Density, real):
 
 @cache
 def bend_function(kind: Kind, density: Density, real):
-    """bends(x, p, threshold, d) -> psi' / d where the energy is that of the distance d alone, else 0; see `pair_bend`."""
+    """Return the device function `bends(x, p, threshold, d)`: psi' / d for an energy of the distance d alone, else 0.
+
+    See `pair_bend`.
+    """
     X, W, V = node_types(real)
     E = wp.types.vector(1, real)
     slope_of = density.laws(real, 1)[1]
@@ -112,14 +114,16 @@ def bend_function(kind: Kind, density: Density, real):
 
 @cache
 def pair_energy_functions(kind: Kind, density: Density, real):
-    """Functions of nodes x, parameters p and, of edges, the threshold [m^4] of the mollifier and `inner`.
+    """Return the device functions of the contact energy: `about`, `row`, `evaluate` and `along`.
 
-    `inner`, of the four nodes: 1/2 inside of a rod, 0 at its ends, -1 at edges of shells, against which no ends are counted.
+    Arguments are nodes x, parameters p and, for edges, the threshold [m^4] of the mollifier and `inner` of the four nodes. It is 1/2 in
+    the interior of a rod, 0 at its ends, and -1 at edges of shells, for which no ends count.
 
-    about(x, w, d, n, p, threshold, inner) -> (energy [J], gradient (4, 3) [N], m), of closest points (w, d, n) as `distance_function`
-    has them, with the mollifier m; row(x, w, d, n, m, p, inner, k) -> (w, v), the k-th row w_i v of the factor; evaluate(x, p,
-    threshold, inner) -> (energy, gradient); along(x, v, p, threshold, inner): derivative along v, whose reverse is a row of the exact
-    Hessian.
+    - `about(x, w, d, n, p, threshold, inner) -> (energy [J], gradient (4, 3) [N], m)`: for closest points (w, d, n) of
+      `distance_function`, with the mollifier m.
+    - `row(x, w, d, n, m, p, inner, k) -> (w, v)`: the k-th row w_i v of the factor.
+    - `evaluate(x, p, threshold, inner) -> (energy, gradient)`.
+    - `along(x, v, p, threshold, inner)`: derivative along v; its reverse is a row of the exact Hessian.
     """
     X, W, V = node_types(real)
     E = wp.types.vector(1, real)
@@ -130,7 +134,7 @@ def pair_energy_functions(kind: Kind, density: Density, real):
 
     @wp.func
     def crossing(x: X):
-        """|a x b|^2 of two edges and its derivative."""
+        """Return |a x b|^2 of two edges and the derivative."""
         a = x[1] - x[0]
         b = x[3] - x[2]
         normal = wp.cross(a, b)

@@ -1,39 +1,39 @@
-"""Friction of pairs: what is lagged at the start of a step, and energy, gradient and factor by the slip since then.
+"""Friction of pairs: lagged data, and energy, gradient and Gauss-Newton factor by the slip.
 
-Of the gradient g_i of a pair by its nodes at the lagged positions, the sum over the first thing's nodes is N n, with the normal force N
-and a unit vector n. The weights
+The gradient g_i of a pair by its nodes at the lagged positions sums to N n over the nodes of the first primitive. N is the normal
+force, n a unit vector. The weights
 
-    w_i = g_i . n / N ,   their sum 1 over the first thing and -1 over the second,
+    w_i = g_i . n / N ,   with sums 1 over the first primitive and -1 over the second,
 
-are those of the centre of pressure on either side, whatever distances the energy is made of: of one distance they are those of the
-closest points, of edges along each other those of all their ends that push. With t1, t2 at right angles to n, the slip since x^n and
-the dissipation potential (`densities.friction`) are
+belong to the centres of pressure. For an energy of one distance they are the weights of the closest points; for edges along each other
+they cover all active ends. With tangents t1, t2 at right angles to n, the slip since x^n and the dissipation potential
+(`densities.friction`) are
 
     u = (t1, t2) . sum_i w_i (x_i - x_i^n) ,   psi = mu N nu h G(|u| / (nu h)) ,
 
-with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. They have no resultant; with r = sum_i w_i x_i, from one centre of pressure
-to the other, their moment is that of -f at r. What would balance it turns surfaces about their middle, where friction here is applied.
-Where the forces of a pair on one side all but cancel, weights are large; still |f_i| <= mu |g_i . n|.
+with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. Forces have no resultant. With r = sum_i w_i x_i between the centres of
+pressure, their moment is that of -f at r, since friction acts on centrelines and midsurfaces. Weights are large where the forces of a
+pair on one side nearly cancel; still |f_i| <= mu |g_i . n|.
 
-Surfaces of obstacles that are round move where their nodes stay: one of radius R that has turned by phi (`kernels.contact.spins`) adds
-phi x R n to the slip, whichever side it is on, and is turned by the couple -R n x f. So does a rod of radius R that friction may
-roll: its edge with the direction d adds R d x n times what its angle has changed by.
+Round obstacles rotate while their nodes stay. A rotation phi of a radius R (`kernels.contact.spins`) adds phi x R n to the slip, on
+either side, and receives the couple -R n x f. For a rolling rod of radius R, the edge with direction d adds R d x n times the change of
+its twist angle.
 
-Rods on obstacles may have one coefficient forwards, one backwards and one across: `directed`. Then mu is the smallest that is not zero,
-t1 lies along the rod, and t1 and t2 are as long as the coefficients of their directions over mu, t1 by the sense of the slip. So psi is
-convex with a continuous slope; forces are at most those whose components, over the most along and across, have squares with a sum of 1,
-and among these those that take most energy (Michalowski and Mroz, Arch. Mech. 30, 1978, 259). For a rod that is inclined to the surface
-the component of the slip along the rod counts as along, the rest as across.
+Rods on obstacles may have anisotropic coefficients: forwards, backwards and across (`directed`). Then mu is the smallest nonzero one.
+t1 lies along the rod, and the lengths of t1 and t2 are their coefficients over mu, t1 by the sense of the slip. So psi is convex with a
+continuous slope. Forces lie within the ellipse of the coefficients along and across, with maximal dissipation (Michalowski and Mroz,
+Arch. Mech. 30, 1978, 259). For a rod inclined to the surface, the slip component along the rod counts as along, the remainder as
+across.
 
-The potential has all but a kink at u = 0, and Newton's steps that know its second derivative alone overshoot it. So the matrix is that
-of the equations u = w phi(|u|), phi = mu N |u| / psi'(|u|), for the slip and the direction of friction w, |w| <= 1, as an unknown of
-its own (Chan, Golub and Mulet, SIAM J. Sci. Comput. 20, 1999, for the total variation):
+The potential nearly has a kink at u = 0, which Newton steps with psi'' overshoot. So the matrix belongs to the equations
+u = w phi(|u|), phi = mu N |u| / psi'(|u|), for the slip and the direction of friction w, |w| <= 1, as an extra unknown (Chan, Golub and
+Mulet, SIAM J. Sci. Comput. 20, 1999, for the total variation):
 
-    mu N / phi (1 - beta (w u^T + u w^T) / (2 |u|)) ,   beta = phi'(|u|) ,
+    mu N / phi (1 - beta (w u^T + u w^T) / (2 |u|)) ,   beta = phi'(|u|) .
 
-positive semi-definite; forces stay those of the potential. With w = 0, at first, it is the secant's stiffness, which never overshoots;
-w goes to mu N w = psi' and the matrix to psi''. A step du moves w by that of the linearised equation, (u + du - w phi - w beta (u . du)
-/ |u|) / phi.
+It is positive semi-definite; forces stay the derivatives of the potential. Initially w = 0, and the matrix is the secant stiffness,
+which never overshoots. At convergence mu N w = psi', and the matrix is psi''. A step du updates w by the linearised equation, (u + du -
+w phi - w beta (u . du) / |u|) / phi.
 """
 
 from functools import cache
@@ -53,11 +53,11 @@ ROWS = 2  # directions of the slip
 
 @cache
 def lagged_struct(real):
-    """What is lagged of pairs (capacity,): mu N [N], zero where there is no friction, weights of nodes, and tangents (2, capacity).
+    """Return the struct of lagged friction data of pairs (capacity,).
 
-    Tangents that are directed are of slips forwards; in a third row there is the first one of slips backwards.
-    Where there are objects that spin (`kernels.contact.spins`): which one of all worlds a pair has, `spinning`, below zero for none,
-    and its radius along the normal, `arm` [m]. Where rods roll: what both angles of a pair add to the slip, `lever` (2, capacity) [m].
+    bound: mu N [N], zero without friction. weight: weights of nodes. tangent: (2, capacity), for forward slip if directed; a third row
+    is the first tangent of backward slip. spinning: index of the spinning object (`kernels.contact.spins`) over all worlds, negative
+    for none. arm: its radius along the normal [m]. lever: slip by the angles of rolling rods (2, capacity) [m].
     """
     V, W = wp.types.vector(3, real), wp.types.vector(SLOTS, real)
 
@@ -75,30 +75,36 @@ def lagged_struct(real):
 
 @cache
 def spun_function(real):
-    """spun(sides, spinning, w, i, j) -> which object of things i and j spins, of all in all worlds, and its radius; or -1."""
+    """Return the device function `spun(sides, spinning, w, i, j) -> (object, radius)` of a pair of primitives.
+
+    The object is the spinning one, indexed over all worlds, or -1.
+    """
     Sides = sides_struct(real)
 
     @wp.func
     def spun(sides: Sides, spinning: wp.array(dtype=wp.vec4i), w: int, i: int, j: int):
         a, b = sides.first.object[i], sides.second.object[j]
-        of, radius = int(-1), real(0.0)
+        spinning_object, radius = int(-1), real(0.0)
         if spinning[a][0] >= 0:
-            of = a + w * sides.objects
+            spinning_object = a + w * sides.objects
             radius += sides.first.radius[w, a]
         elif spinning[b][0] >= 0:
-            of = b + w * sides.objects
+            spinning_object = b + w * sides.objects
             radius += sides.second.radius[w, b]
-        return of, radius
+        return spinning_object, radius
 
     return spun
 
 
 @cache
 def rolling_functions(kind: Kind, real):
-    """angles_of(first_angles, second_angles, i, j, offset) -> blocks of both angles of a pair; radii(sides, w, i, j) -> of both things;
-    levers(one, two, n, radii, angles) -> what both angles add to the slip, by the directions of both rods.
+    """Return the device functions of rolling rods: `angles_of`, `radii` and `levers`.
 
-    The angles are those of both edges, or of those before and after a point, half of each.
+    - `angles_of(first_angles, second_angles, i, j, offset)`: dof blocks of both twist angles of a pair.
+    - `radii(sides, w, i, j)`: radii of both primitives.
+    - `levers(one, two, n, radii, angles)`: slip by both angles, from the directions of both rods.
+
+    The angles belong to both edges, or to the edges before and after a point, half of each.
     """
     Sides, V, A = sides_struct(real), wp.types.vector(3, real), wp.types.vector(ANGLES, real)
 
@@ -118,14 +124,14 @@ def rolling_functions(kind: Kind, real):
     @wp.func
     def levers(one: V, two: V, n: V, r: A, angles: wp.vec2i):
         t, share = wp.normalize(one), real(1.0)
-        u, other = t, r[0]
+        u, second_radius = t, r[0]
         if wp.static(kind == EDGES):
             u = wp.normalize(two)
-            other = r[1]
+            second_radius = r[1]
         else:
             share = wp.where(wp.min(angles[0], angles[1]) >= 0, real(0.5), real(1.0))
         a = wp.where(angles[0] >= 0, r[0] * share, real(0.0))
-        b = wp.where(angles[1] >= 0, other * share, real(0.0))
+        b = wp.where(angles[1] >= 0, second_radius * share, real(0.0))
         return wp.matrix_from_rows(wp.cross(t, n) * a, wp.cross(u, n) * b)
 
     return angles_of, radii, levers
@@ -133,7 +139,10 @@ def rolling_functions(kind: Kind, real):
 
 @cache
 def directed_basis(real):
-    """directed(n, d, way) -> tangents at right angles to n, of slips forwards along d, across, and backwards, as long as `way` says."""
+    """Return the device function `directed(n, d, multiplier) -> (forwards, across, backwards)` of anisotropic friction.
+
+    The tangents are at right angles to n, along and across d, with the lengths of `multiplier`.
+    """
     V, tangents, tiny, nonzero = (
         wp.types.vector(3, real),
         tangents_function(real),
@@ -143,34 +152,34 @@ def directed_basis(real):
 
     @wp.func
     def root(square: real):
-        """Whose reverse is a number at zero, too."""
+        """Return the square root, with a finite reverse derivative at zero."""
         return wp.where(square > real(0.0), wp.sqrt(nonzero(square)), real(0.0))
 
     @wp.func
-    def directed(n: V, d: V, way: V):
+    def directed(n: V, d: V, multiplier: V):
         t1, _t = tangents(n)
         d = wp.normalize(d)
         flat = d - n * wp.dot(n, d)
         share = wp.min(wp.dot(flat, flat), real(1.0))
         if share > tiny:
             t1 = flat / wp.sqrt(share)
-        across = way[2] * way[2] * (real(1.0) - share)
-        forwards = root(way[0] * way[0] * share + across)
-        backwards = root(way[1] * way[1] * share + across)
-        return t1 * forwards, wp.cross(n, t1) * way[2], t1 * backwards
+        across = multiplier[2] * multiplier[2] * (real(1.0) - share)
+        forwards = root(multiplier[0] * multiplier[0] * share + across)
+        backwards = root(multiplier[1] * multiplier[1] * share + across)
+        return t1 * forwards, wp.cross(n, t1) * multiplier[2], t1 * backwards
 
     return directed
 
 
 @cache
 def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: bool):
-    """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact.
+    """Build the kernel that lags friction of pairs, from factors and gradients of contact.
 
-    x: lagged positions; beside (things,): the two nodes that say where the rod of a first thing of one world leads; ways: by groups,
-    coefficients forwards, backwards and across over `friction`. All three are read where friction is directed. spinning (objects,):
-    where objects have markers, below zero without; read where some of them spin. more (worlds,): what friction counts
-    beside normal forces [N]. first_angles, second_angles (things,): see
-    `Shapes.angles`; read where rods roll, as x and beside are.
+    x: lagged positions. rod_nodes (primitives,): the two nodes that give the direction of the rod of a first primitive of one world.
+    multipliers: by groups, coefficients forwards, backwards and across over `friction`. Directed friction reads all three.
+    spinning (objects,): blocks of the markers of an object, negative without. It is read if objects spin.
+    more (worlds,): addition to normal forces [N].
+    first_angles, second_angles (primitives,): see `Shapes.angles`; read if rods roll, like x and rod_nodes.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(SLOTS, real), lay_functions(real, linear)
@@ -187,14 +196,14 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
         sides: Sides,
         law: Law,
         x: wp.array(dtype=V),
-        beside: wp.array(dtype=wp.vec2i),
-        ways: wp.array2d(dtype=V),
+        rod_nodes: wp.array(dtype=wp.vec2i),
+        multipliers: wp.array2d(dtype=V),
         spinning: wp.array(dtype=wp.vec4i),
         first_angles: wp.array(dtype=wp.vec2i),
         second_angles: wp.array(dtype=wp.vec2i),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
-        onward: int,
+        continued: int,
         more: wp.array(dtype=real),
         before: wp.array(dtype=int),
         pairs_out: wp.array(dtype=wp.vec2i),
@@ -203,9 +212,9 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
         slip: wp.array2d(dtype=E),
         along: wp.array2d(dtype=E),
     ):
-        """Where a search goes on, `onward`, iterates of pairs that are as `before`, so many, keep slips and directions."""
+        """Lag pairs; if `continued`, pairs equal to the `before[0]` earlier ones keep slips and directions."""
         for p in range(wp.tid(), count[0], threads):
-            same = onward != 0 and p < before[0] and pairs_out[p] == pairs[p]
+            same = continued != 0 and p < before[0] and pairs_out[p] == pairs[p]
             pairs_out[p] = pairs[p]
             if not same:
                 for row in range(2):
@@ -222,14 +231,14 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
             for slot in range(wp.static(kind.first)):
                 push += gradient[slot, p]
             normal = wp.length(push)
-            # what is no number shows in the energy
+            # NaN appears in the energy
             if not (mu * normal <= real(0.0)):
                 n = push / normal
                 if wp.static(directed or rolls):
                     first = w * sides.first.nodes_a_world
-                    d = x[beside[i][1] + first] - x[beside[i][0] + first]
+                    d = x[rod_nodes[i][1] + first] - x[rod_nodes[i][0] + first]
                 if wp.static(directed):
-                    t1, t2, back = along_rod(n, d, ways[a, b])
+                    t1, t2, back = along_rod(n, d, multipliers[a, b])
                     lagged.tangent[2, p] = back
                 else:
                     t1, t2 = tangents(n)
@@ -242,8 +251,8 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
                     lagged.lever[0, p] = lever[0]
                     lagged.lever[1, p] = lever[1]
                 if wp.static(spins):
-                    of, radius = spun(sides, spinning, w, i, j)
-                    lagged.spinning[p] = of
+                    spinning_object, radius = spun(sides, spinning, w, i, j)
+                    lagged.spinning[p] = spinning_object
                     lagged.arm[p] = n * radius
                 lagged.bound[p] = mu * (normal + more[w])
                 lagged.weight[p] = weight
@@ -257,11 +266,11 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
 
 @cache
 def friction_kernel(density: Density, real, linear, directed: bool, spins: bool, rolls: bool):
-    """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
+    """Build the kernel of energy, work, gradient by local node index and factor of each pair at x, by the slip since `start`.
 
-    things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
-    both rows of `slip` and `along` are the accepted iterate's, and how many there were; none, and w is that of the slip, without them.
-    onward: not zero where those before the first one count, too. turns: of objects that spin, in all worlds.
+    first_count: first primitives of one world. velocity: nu [m/s]. rate (worlds,): 1/h [1/s]. accepted, iteration (worlds,): row of
+    `slip` and `along` of the accepted iterate, and the number of iterates. If they are empty, w follows from the slip.
+    continued: nonzero if iterates before the first one count, too. turns: rotations of spinning objects of all worlds.
     """
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
     V, (aim, _) = wp.types.vector(3, real), lay_functions(real, linear)
@@ -272,7 +281,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
 
     @wp.func
     def secant(u: E, bound: real, p: P):
-        """mu N / phi, beta and u / |u|."""
+        """Return mu N / phi, beta and u / |u|."""
         n = wp.normalize(u)
         f = slope_of(u, p)
         c = curvature_of(u, p)
@@ -286,7 +295,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
 
     @wp.func
     def turned(w: E, u: E, new: E, bound: real, p: P):
-        """w after a step from u to `new`."""
+        """Return w after a step from u to `new`."""
         stiffness, beta, n = secant(u, bound, p)
         inverse = stiffness / bound
         v = w + (new - w * (one / inverse + beta * wp.dot(n, new - u))) * inverse
@@ -294,7 +303,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
 
     @wp.func
     def root_of(m: M):
-        """Of a positive semi-definite matrix."""
+        """Return the square root of a positive semi-definite matrix."""
         s = wp.sqrt(wp.max(wp.determinant(m), real(0.0)))
         trace = wp.trace(m) + real(2.0) * s
         return (m + wp.diag(E(s, s))) / wp.sqrt(wp.where(trace > real(0.0), trace, one))
@@ -304,13 +313,13 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
-        things: int,
+        first_count: int,
         lagged: Lagged,
         velocity: real,
         rate: wp.array(dtype=real),
         accepted: wp.array(dtype=int),
         iteration: wp.array(dtype=int),
-        onward: int,
+        continued: int,
         x: wp.array(dtype=V),
         start: wp.array(dtype=V),
         turns: wp.array(dtype=V),
@@ -322,7 +331,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
         gradient: wp.array2d(dtype=V),
     ):
         for p in range(wp.tid(), count[0], threads):
-            world = pairs[p][0] / things
+            world = pairs[p][0] / first_count
             inverse = rate[world]
             bound = lagged.bound[p]
             used = int(0)
@@ -341,15 +350,15 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                         angle = factor.angles[p][side]
                         if angle >= 0:
                             move += lagged.lever[side, p] * (x[angle][0] - start[angle][0])
-                way = int(0)
+                forward_row = int(0)
                 if wp.static(directed):
                     if wp.dot(lagged.tangent[0, p] + lagged.tangent[2, p], move) < real(0.0):
-                        way = 2
-                t1, t2 = lagged.tangent[way, p], lagged.tangent[1, p]
+                        forward_row = 2
+                t1, t2 = lagged.tangent[forward_row, p], lagged.tangent[1, p]
                 u = E(wp.dot(t1, move), wp.dot(t2, move))
-                given = P(bound, velocity, inverse)
-                energy[p] = energy_of(u, given)
-                f = slope_of(u, given)
+                parameters = P(bound, velocity, inverse)
+                energy[p] = energy_of(u, parameters)
+                f = slope_of(u, parameters)
                 work[p] = wp.dot(f, u)
                 for slot in range(wp.static(SLOTS)):
                     gradient[slot, p] = (t1 * f[0] + t2 * f[1]) * weight[slot]
@@ -361,11 +370,11 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                 if accepted.shape[0] > 0:
                     old = accepted[world]
                     w = E()
-                    if iteration[world] > 0 or onward != 0:
-                        w = turned(along[old, p], slip[old, p], u, bound, given)
+                    if iteration[world] > 0 or continued != 0:
+                        w = turned(along[old, p], slip[old, p], u, bound, parameters)
                     slip[1 - old, p] = u
                     along[1 - old, p] = w
-                stiffness, beta, n = secant(u, bound, given)
+                stiffness, beta, n = secant(u, bound, parameters)
                 between = wp.outer(w, n)
                 root = root_of(
                     wp.diag(E(stiffness, stiffness)) - (between + wp.transpose(between)) * (half * beta * stiffness)

@@ -1,4 +1,4 @@
-"""Contact on lists of pairs: energies, gradients and factors a pair, and products with a vector; see `pair_energy`."""
+"""Kernels of contact on lists of pairs: energies, gradients, Gauss-Newton factors, products with a vector; see `pair_energy`."""
 
 from functools import cache
 
@@ -14,13 +14,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS
 
 @cache
 def law_struct(real):
-    """Parameters of pairs by the groups of both objects (worlds, groups, groups): stiffness [N/m], range and thickness [m], the latter
-    below zero for the sum of radii, and the coefficient of friction.
+    """Return the struct of contact parameters by the groups of both objects (worlds, groups, groups).
 
-    The stiffness of a pair is that or inertia (groups, groups) [kg] times the square of the rate (worlds,) [1/s], 1/h of a step,
-    whichever is larger.
-
-    group (objects,); square (edges,): squared lengths of edges at rest [m^2]; inner (edges,): of both nodes, see `pair_energy`.
+    stiffness [N/m]. range [m]. thickness [m], negative for the sum of radii. friction: coefficient. inertia: (groups, groups) [kg].
+    rate: (worlds,) [1/s], 1/h of a step. Inertia times the squared rate bounds the stiffness from below.
+    group (objects,). square (edges,): squared rest lengths of edges [m^2]. inner (edges,): of both nodes, see `pair_energy`.
     """
     U = wp.types.vector(2, real)
 
@@ -41,12 +39,12 @@ def law_struct(real):
 
 @cache
 def groups_function(real):
-    """groups(law, sides, pair) -> world w of a pair of all worlds, i and j in it, and the groups of both."""
-    Law, Sides, things = law_struct(real), sides_struct(real), things_function(real)
+    """Return the device function `groups(law, sides, pair) -> (w, i, j, a, b)`: world, primitives in it and groups of a pair."""
+    Law, Sides, primitives = law_struct(real), sides_struct(real), things_function(real)
 
     @wp.func
     def groups(law: Law, sides: Sides, pair: wp.vec2i):
-        w, i, j = things(sides, pair)
+        w, i, j = primitives(sides, pair)
         return w, i, j, law.group[sides.first.object[i]], law.group[sides.second.object[j]]
 
     return groups
@@ -54,7 +52,10 @@ def groups_function(real):
 
 @cache
 def by_rate_function(real):
-    """by_rate(law, sides, pair) -> the derivative of the stiffness of a pair by the rate [N s/m], zero where inertia is none of it."""
+    """Return the device function `by_rate(law, sides, pair)`: derivative of the stiffness by the rate [N s/m].
+
+    It is zero if inertia does not determine the stiffness.
+    """
     Law, Sides, groups = law_struct(real), sides_struct(real), groups_function(real)
 
     @wp.func
@@ -68,7 +69,11 @@ def by_rate_function(real):
 
 @cache
 def read_functions(kind: Kind, real):
-    """given(law, sides, pair) -> p, threshold, inner of things (i, j) of all worlds; corners(x, nodes) -> (4, 3)."""
+    """Return the device functions that read the data of a pair: `parameters_of` and `corners`.
+
+    - `parameters_of(law, sides, pair) -> (p, threshold, inner)`: parameters of a pair over all worlds.
+    - `corners(x, nodes)`: positions (4, 3).
+    """
     Law, Sides = law_struct(real), sides_struct(real)
     _, W, P = node_types(real)
     V = wp.types.vector(3, real)
@@ -76,7 +81,7 @@ def read_functions(kind: Kind, real):
     groups = groups_function(real)
 
     @wp.func
-    def given(law: Law, sides: Sides, pair: wp.vec2i):
+    def parameters_of(law: Law, sides: Sides, pair: wp.vec2i):
         w, i, j, a, b = groups(law, sides, pair)
         both = law.thickness[w, a, b]
         if both < real(0.0):
@@ -85,8 +90,8 @@ def read_functions(kind: Kind, real):
         inner = W()
         if wp.static(kind == EDGES):
             threshold = real(wp.static(SHARE)) * law.square[i] * law.square[j]
-            one, other = law.inner[i], law.inner[j]
-            inner = W(one[0], one[1], other[0], other[1])
+            one, two = law.inner[i], law.inner[j]
+            inner = W(one[0], one[1], two[0], two[1])
         stiffness = wp.max(law.stiffness[w, a, b], law.inertia[a, b] * law.rate[w] * law.rate[w])
         return P(stiffness, law.range[w, a, b], both), threshold, inner
 
@@ -94,27 +99,28 @@ def read_functions(kind: Kind, real):
     def corners(x: wp.array(dtype=V), nodes: wp.vec4i):
         return wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]])
 
-    return given, corners
+    return parameters_of, corners
 
 
 @cache
 def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
-    """sieve(...) candidates for those that push each other; pack(...) these, one after the other, in their order; and evaluate(...).
+    """Build the kernels of active pairs: `sieve`, `pack` and `evaluate`.
 
-    One thread alone packs as it sieves. Packed are pairs, their nodes, and of each first thing where its pairs start and how many they
-    are, as of the candidates.
+    - `sieve`: mark candidates within range; with one thread also pack them.
+    - `pack`: compact the marked candidates in order: pairs, nodes, and first index and count of the pairs of each first primitive.
+    - `evaluate`: evaluate the packed pairs.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     V, (aim, weigh) = wp.types.vector(3, real), lay_functions(real, linear)
     near = distance_function(kind, real)
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
-    given, corners = read_functions(kind, real)
-    (slots, *_), things, rows = pair_functions(kind, real), things_function(real), rows_of(kind)
+    parameters_of, corners = read_functions(kind, real)
+    (slots, *_), primitives, rows = pair_functions(kind, real), things_function(real), rows_of(kind)
 
     @wp.func
     def nodes_of(sides: Sides, pair: wp.vec2i):
-        w, i, j = things(sides, pair)
+        w, i, j = primitives(sides, pair)
         n = slots(sides, i, j, w)
         return wp.vec4i(n[0], n[1], n[2], n[3])
 
@@ -134,30 +140,30 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         partners_out: wp.array(dtype=int),
         count_out: wp.array(dtype=int),
     ):
-        """Lowers the smallest gap [m] of each world to those of candidates, too; `partners_out` are zero before one thread packs."""
-        found = int(0)
+        """Mark active candidates and reduce the smallest gap [m] of each world; one thread needs `partners_out` zero."""
+        packed = int(0)
         for k in range(wp.tid(), count[0], threads):
             pair = pairs[k]
-            p, _threshold, _inner = given(law, sides, pair)
+            p, _threshold, _inner = parameters_of(law, sides, pair)
             nodes = nodes_of(sides, pair)
             _w, d, _n = near(corners(x, nodes))
             world = pair[0] / sides.counts[0]
             if d - p[2] < gap[world]:
                 wp.atomic_min(gap, world, d - p[2])
-            # ends of edges are no nearer; what is no number shows in the energy
+            # ends of edges are no nearer; NaN appears in the energy
             pushes = p[0] > real(0.0) and not (d >= p[1] + p[2])
             if wp.static(serial):
                 if pushes:
-                    pairs_out[found] = pair
-                    nodes_out[found] = nodes
+                    pairs_out[packed] = pair
+                    nodes_out[packed] = nodes
                     if partners_out[pair[0]] == 0:
-                        starts_out[pair[0]] = found
+                        starts_out[pair[0]] = packed
                     partners_out[pair[0]] = partners_out[pair[0]] + 1
-                    found += 1
+                    packed += 1
             else:
                 marks[k] = wp.where(pushes, 1, 0)
         if wp.static(serial):
-            count_out[0] = found
+            count_out[0] = packed
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pack(
@@ -175,7 +181,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         partners_out: wp.array(dtype=int),
         count_out: wp.array(dtype=int),
     ):
-        """Of candidates those that are marked, `before` each of which so many are; and of first things."""
+        """Compact marked candidates, with `before` the number of marked ones before each."""
         most = count[0]
         for k in range(wp.tid(), most, threads):
             if marks[k] != 0:
@@ -206,40 +212,40 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         energy: wp.array(dtype=real),
         gradient: wp.array2d(dtype=V),
     ):
-        """Energy, gradient by slot and factor of each pair."""
+        """Write energy, gradient by local node index and factor of each pair."""
         for pair in range(wp.tid(), count[0], threads):
-            p, threshold, inner = given(law, sides, pairs[pair])
-            at = corners(x, factor.nodes[pair])
-            w, d, n = near(at)
-            e, g, m = about(at, w, d, n, p, threshold, inner)
+            p, threshold, inner = parameters_of(law, sides, pairs[pair])
+            points = corners(x, factor.nodes[pair])
+            w, d, n = near(points)
+            e, g, m = about(points, w, d, n, p, threshold, inner)
             energy[pair] = e
             for slot in range(wp.static(SLOTS)):
                 gradient[slot, pair] = g[slot]
             used = int(1)
             for k in range(wp.static(rows)):
-                weight, v = row_of(at, w, d, n, m, p, inner, k)
+                weight, v = row_of(points, w, d, n, m, p, inner, k)
                 if wp.dot(v, v) > real(0.0):
                     used |= 2 << k
                     aim(factor.row, k, pair, v)
                     weigh(factor.row, k, pair, weight)
             factor.used[pair] = used
-            factor.bend[pair] = linear(bends(at, p, threshold, d))
+            factor.bend[pair] = linear(bends(points, p, threshold, d))
 
     return sieve, pack, evaluate
 
 
 @cache
 def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: bool = False):
-    """Product of the exact Hessian of each pair with v, by rank (see `gather.set_struct`): the reverse of the derivative along v.
+    """Build the product of the exact Hessian of each pair with v, by rank (see `gather.set_struct`).
 
-    `unbent`: of those pairs alone that `pair_bend` does not know.
+    The product is the reverse of the derivative along v. `unbent`: restrict to pairs that `pair_bend` does not cover.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = node_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
-    W, (put, _) = wp.types.vector(PLACED, linear), place_functions(linear)
+    W, (place, _) = wp.types.vector(PLACED, linear), place_functions(linear)
     *_, along = pair_energy_functions(kind, density, real)
-    given, corners = read_functions(kind, real)
+    parameters_of, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
@@ -259,7 +265,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
             if wp.static(unbent):
                 asked = factor.bend[pair] == linear(0.0)
             if asked:
-                p, threshold, inner = given(law, sides, pairs[pair])
+                p, threshold, inner = parameters_of(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
                 move = X()
                 for slot in range(wp.static(SLOTS)):
@@ -268,19 +274,19 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
                 dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, nodes), move, p, threshold, inner)
                 for slot in range(wp.static(SLOTS)):
                     value = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
-                    put(placed, ranks[pair][slot], value)
+                    place(placed, ranks[pair][slot], value)
 
     return product
 
 
 @cache
 def columns_kernel(kind: Kind, density: Density, real, linear):
-    """Columns of the exact Hessians of the pairs that are chosen, so many, a thread some columns."""
+    """Build the kernel of columns of exact Hessians of `number` chosen pairs, one thread for some columns."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = node_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
     *_, along = pair_energy_functions(kind, density, real)
-    given, corners = read_functions(kind, real)
+    parameters_of, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def differentiate(
@@ -298,7 +304,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
             m = i / 12
             column = i - 12 * m
             pair = chosen[m]
-            p, threshold, inner = given(law, sides, pairs[pair])
+            p, threshold, inner = parameters_of(law, sides, pairs[pair])
             move = X()
             move[column / 3, column % 3] = real(1.0)
             dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, factor.nodes[pair]), move, p, threshold, inner)
@@ -310,7 +316,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
 
 @cache
 def mark_kernel(linear):
-    """mark(...) pairs of edges that `pair_bend` does not know, in the worlds that want it: those all but parallel."""
+    """Build the kernel that marks nearly parallel edge pairs, which `pair_bend` does not cover, in the `wanted` worlds."""
     Factor = factor_struct(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -318,13 +324,13 @@ def mark_kernel(linear):
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
-        things: int,
+        first_count: int,
         wanted: wp.array(dtype=int),
         factor: Factor,
         marks: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
-            asked = factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0
+            asked = factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / first_count] != 0
             marks[p] = wp.where(asked, 1, 0)
 
     return mark

@@ -1,15 +1,15 @@
-"""Regularised Coulomb friction: the dissipation potential of a step of length h, by the slip u since its start,
+"""Regularised Coulomb friction: dissipation potential of a step of length h, by the slip u since the start,
 
     psi = mu N nu h G(|u| / (nu h)),   force -mu N G'(x) u / |u|,   x = |u| / (nu h) the speed over the velocity nu [m/s],
 
-with the coefficient mu and the normal force N, which is lagged, so that this is a potential in the step. It is zero without slip and
-convex, and so takes energy, no more than the mu N |u| of Coulomb's law.
+with the coefficient mu and the lagged normal force N, so that it is a potential in the step. It is zero without slip, convex and
+dissipative, at most mu N |u|, the dissipation of Coulomb's law.
 
     logistic     G' = 2 / (1 + exp(-15 x)) - 1 = tanh(7.5 x)     (Tong, Choi, Joo and Jawed, Extreme Mech. Lett. 58, 2023, 101924)
     polynomial   G' = x (2 - x) for x < 1, 1 beyond              (Li et al., ACM Trans. Graph. 39, 2020, 49: f_1)
 
-What sticks creeps: at the share f of mu N the speed is nu atanh(f) / 7.5, or nu (1 - sqrt(1 - f)). Without a rate, in statics, 1/h = 0
-and there is no friction.
+Sticking contacts creep: under a fraction f of mu N the speed is nu atanh(f) / 7.5, or nu (1 - sqrt(1 - f)). In statics, with the rate
+1/h = 0, there is no friction.
 """
 
 from functools import cache
@@ -26,12 +26,12 @@ RATE = Parameter("rate", "1/s", NOT_NEGATIVE)  # 1/h
 
 @cache
 def _logistic(real):
-    """Device functions of x: G / x^2, G' / x and G''."""
+    """Return the device functions G / x^2, G' / x and G'' of x of the logistic profile."""
     a = wp.constant(real(STEEPNESS))
 
     @wp.func
     def potential(x: real):
-        """ln cosh z / z^2 by its series near zero, where the difference would lose all digits."""
+        """Return a ln cosh z / z^2, near zero by series, since the difference cancels."""
         z = a * x
         y = z * z
         if z < real(0.1):
@@ -57,7 +57,7 @@ def _logistic(real):
 
 @cache
 def _polynomial(real):
-    """The same."""
+    """Return the device functions of the polynomial profile; see `_logistic`."""
 
     @wp.func
     def potential(x: real):
@@ -101,7 +101,7 @@ def _laws(profile, real):
 
     @wp.func
     def curvature(u: E, p: P):
-        """Return the matrix with G'' along the slip and G' / x at right angles to it."""
+        """Return the matrix with G'' along the slip and G' / x across."""
         x, scale = scaled(u, p)
         across, along, unit = scale * force(x), scale * slope_of(x), wp.normalize(u)
         return wp.diag(E(across, across)) + wp.outer(unit, unit) * (along - across)

@@ -1,4 +1,4 @@
-"""Collisions of a thousand pairs: closest points against brute force, forces across regions, and degenerate pairs."""
+"""Collisions of 1,000 pairs: closest points against brute force, forces across regions, degenerate pairs."""
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ KINDS = {
 
 
 class Pairs(ContactSample):
-    """A thousand collisions, each a world."""
+    """1,000 collisions, each a world."""
 
     COUNT = COUNT
 
     def at(self, nodes: np.ndarray, **parameters) -> "Pairs":
-        """Return these at other positions (nodes, COUNT, 3) and with other parameters by name."""
+        """Return the pairs at positions (nodes, COUNT, 3), with parameters by name."""
         buffer = self.data["buffer"].copy()
         for name, value in parameters.items():
             buffer[self.term.parameter_names.index(name)] = value
@@ -32,16 +32,16 @@ class Pairs(ContactSample):
 
 
 def positions(name: str, family: str) -> np.ndarray:
-    """Nodes (nodes, COUNT, 3): of all regions, edges 3e-3 to 0.03 from parallel, or 0.01 to 0.02 apart."""
+    """Return nodes (nodes, COUNT, 3) of all regions, of edges 3e-3 to 0.03 from parallel, or at distances of 0.01 to 0.02."""
     random = np.random.default_rng(3)
     if name == "edge_edge" and family != "general":
         near = family == "parallel"
         angle = 10.0 ** random.uniform(-2.5, -1.5, COUNT) if near else random.uniform(0.3, 2.8, COUNT)
-        apart = random.uniform(0.2, 0.4, COUNT) if near else random.uniform(0.01, 0.02, COUNT)
+        distance = random.uniform(0.2, 0.4, COUNT) if near else random.uniform(0.01, 0.02, COUNT)
         e, f = np.zeros((2, COUNT, 3))
         e[:, 0], f[:, 0], f[:, 1] = 1.0, np.cos(angle), np.sin(angle)
         shift = random.uniform(-0.4, 0.4, (COUNT, 1)) * e + random.uniform(-0.4, 0.4, (COUNT, 1)) * f
-        shift[:, 2] = apart
+        shift[:, 2] = distance
         turn = np.linalg.qr(random.normal(size=(COUNT, 3, 3)))[0]
         return np.einsum("nij,kni->knj", turn, np.stack([-0.5 * e, 0.5 * e, shift - 0.5 * f, shift + 0.5 * f]))
     if name == "edge_edge":
@@ -57,7 +57,7 @@ def positions(name: str, family: str) -> np.ndarray:
 
 
 def measured(name: str, nodes: np.ndarray, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights (COUNT, 4), distances (COUNT,) and directions (COUNT, 3)."""
+    """Return weights (COUNT, 4), distances (COUNT,) and directions (COUNT, 3)."""
     near, (X, W, V) = distance_function(CONTACT[f"penalty_{name}"].kind, wp.float64), node_types(wp.float64)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -71,16 +71,16 @@ def measured(name: str, nodes: np.ndarray, device: str) -> tuple[np.ndarray, np.
         direction[i] = n
 
     four = nodes[np.minimum(np.arange(4), len(nodes) - 1)].transpose(1, 0, 2)
-    given = wp.array(np.ascontiguousarray(four), dtype=X, device=device)
+    inputs = wp.array(np.ascontiguousarray(four), dtype=X, device=device)
     out = [wp.zeros(COUNT, dtype=dtype, device=device) for dtype in (W, wp.float64, V)]
-    wp.launch(measure, COUNT, [given], out, device=device)
+    wp.launch(measure, COUNT, [inputs], out, device=device)
     return tuple(array.numpy() for array in out)
 
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("family", ["general", "touching", "parallel"])
 def test_closest_points(device, name, family):
-    """Distances are those of brute force, and what is between the weighted points is as long, along the direction."""
+    """Distances equal brute force, and weights give the vector of that length along the direction."""
     nodes = positions(name, family)
     w, d, n = measured(name, nodes, device)
     np.testing.assert_allclose(d, KINDS[name](*nodes), rtol=1e-10)
@@ -90,7 +90,7 @@ def test_closest_points(device, name, family):
 
 
 def over_triangle(t):
-    """A point that circles above the edges and vertices of a triangle, in and out."""
+    """Return a point that circles above the edges and vertices of a triangle, in and out."""
     angle, radius = 2.0 * np.pi * t, 0.3 + 0.6 * np.cos(10.0 * np.pi * t) ** 2
     point = np.stack([0.3 + radius * np.cos(angle), 0.3 + radius * np.sin(angle), np.full_like(t, 0.2)], 1)
     return np.stack([point, *(np.broadcast_to(corner, point.shape) for corner in RIGHT)])
@@ -103,7 +103,7 @@ def over_edge(t):
 
 @pytest.mark.parametrize(("name", "path"), [("edge_point", over_edge), ("point_triangle", over_triangle)])
 def test_forces_are_continuous_where_regions_meet(device, name, path):
-    """Through all regions: where the force has its kinks, steps 24.5 times as short change it that much less."""
+    """Across kinks of the force, steps 24.5 times as short change it 24.5 times less."""
     pairs = Pairs(CONTACT[f"penalty_{name}"], None, "float64", device)
 
     def forces(t):
@@ -122,9 +122,9 @@ def test_forces_are_continuous_where_regions_meet(device, name, path):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_centres_that_meet_have_no_direction(device, name):
-    """Deep in the penalty, where distances are zero to rounding, all is finite and forces cancel."""
+    """All is finite and forces cancel at zero distance, deep in the penalty."""
     nodes = positions(name, "touching")
-    if name == "edge_edge":  # they cross in their middles
+    if name == "edge_edge":  # crossing at midpoints
         nodes[2:] += 0.5 * (nodes[0] + nodes[1] - nodes[2] - nodes[3])
     elif name == "edge_point":
         nodes[2] = nodes[:2].mean(0)
@@ -153,8 +153,8 @@ def test_mollifier_is_that_of_the_toolkit(device):
         out[1, i] = slope
 
     out = wp.zeros((2, COUNT), dtype=wp.float64, device=device)
-    given = wp.array(square, dtype=wp.float64, device=device)
-    wp.launch(evaluate, COUNT, [given, threshold], [out], device=device)
+    squares = wp.array(square, dtype=wp.float64, device=device)
+    wp.launch(evaluate, COUNT, [squares, threshold], [out], device=device)
     m, slope = out.numpy()
     wanted = np.array([ipctk.edge_edge_mollifier(*nodes[:, i], threshold) for i in range(COUNT)])
     np.testing.assert_allclose(m, wanted, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Laws of contact of one's own: closed forms, the laws of the package given by hand, and what is refused."""
+"""User-defined contact laws: closed forms, laws of the package as user laws, and refusals."""
 
 from dataclasses import replace
 from functools import cache
@@ -19,7 +19,7 @@ RUBBER = ddg.Material(1e6, 0.3, 1000.0)
 
 @cache
 def _power(real, n):
-    """psi = k r^2 (1 - g / r)^p / p."""
+    """Return the functions of psi = k r^2 (1 - g / r)^p / p."""
     E, P = wp.types.vector(1, real), wp.types.vector(3, real)
     one = wp.constant(real(1.0))
 
@@ -67,7 +67,7 @@ wrong = Density("wrong", parameters, _wrong, strains=1)
 
 
 def sheet_on_floor(law, stiffness: float | None = STIFFNESS, gap: float = 0.8 * RANGE, **options) -> ddg.Scene:
-    """A sheet whose vertices slide up and down alone, over a floor."""
+    """Return a sheet over a floor, with vertices that move only vertically."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     points, triangles = meshes.rectangle(3, 3, (0.1, 0.1))
     points = np.asarray(points) + [0.0, 0.0, 0.5 * HEIGHT + gap]
@@ -79,12 +79,12 @@ def sheet_on_floor(law, stiffness: float | None = STIFFNESS, gap: float = 0.8 * 
 
 
 def rods(law, friction: float = 0.3) -> ddg.Scene:
-    """Rods that fall across each other onto a floor."""
+    """Return rods that fall across each other onto a floor."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     for k, angle in enumerate((0.0, 1.0, 1.02)):
-        way = 0.05 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        half = 0.05 * np.array([np.cos(angle), np.sin(angle), 0.0])
         middle = np.array([0.0, 0.002 * k, 0.0062 + 0.0115 * k])
-        scene.add_rod(np.linspace(middle - way, middle + way, 7), section=ddg.Circle(0.005), material=RUBBER)
+        scene.add_rod(np.linspace(middle - half, middle + half, 7), section=ddg.Circle(0.005), material=RUBBER)
     scene.add_obstacle(ddg.Plane(), name="floor")
     scene.contact(law=law, friction=friction)
     return scene
@@ -100,8 +100,8 @@ def moved(scene: ddg.Scene, device, steps: int = 20, **options) -> np.ndarray:
 
 
 @pytest.mark.parametrize("exponent", [2.0, 3.0])
-def test_a_weight_rests_at_the_gap_of_its_law(device, exponent):
-    """Each vertex weighs w = k r (1 - g / r)^(p - 1); the sheet stays flat but for the vertices' areas, so that this is summed."""
+def test_a_weight_has_the_gap_of_its_law(device, exponent):
+    """The weight of all vertices equals the sum of k r (1 - g / r)^(p - 1)."""
     scene = sheet_on_floor(ddg.Law(power, power=exponent))
     model = scene.build(device, "float64")
     gap = statics.solve(model).points()[:, 2] - 0.5 * HEIGHT
@@ -111,7 +111,7 @@ def test_a_weight_rests_at_the_gap_of_its_law(device, exponent):
 
 
 def test_a_law_without_end_may_overlap(device):
-    """The quadratic law is finite without a gap: what is soft is pushed into the floor, by as much as it says."""
+    """The quadratic law is finite at zero gap, so that a soft contact penetrates by the closed form."""
     scene = sheet_on_floor(ddg.Law(power, power=2.0), 9.0)
     gap = statics.solve(scene.build(device, "float64")).points()[:, 2] - 0.5 * HEIGHT
     weight = 0.1 * 0.1 * HEIGHT * 1000.0 * G
@@ -121,7 +121,7 @@ def test_a_law_without_end_may_overlap(device):
 
 @pytest.mark.parametrize(("law", "density"), [("barrier", log_barrier), ("penalty", smooth_penalty)])
 def test_laws_of_the_package_given_by_hand_are_the_same(device, law, density):
-    """To the bit, with friction, over steps in which rods lie on each other and on the floor."""
+    """Laws by name and by hand give bitwise equal steps with friction, of rods on each other and on the floor."""
     usual, by_hand = (moved(rods(each), device) for each in (law, ddg.Law(density)))
     np.testing.assert_array_equal(by_hand, usual)
     start = rods(law).build(device, "float64").state().points()
@@ -129,25 +129,25 @@ def test_laws_of_the_package_given_by_hand_are_the_same(device, law, density):
 
 
 def test_worlds_and_gradients(device):
-    """Each world has its own stiffness, and derivatives of a step by it are differences."""
+    """Each world has its own stiffness, and gradients of a step by stiffness equal differences."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
 
     law = ddg.Law(power, power=3.0)
     model = sheet_on_floor(law, gap=0.5 * RANGE).build(device, "float64", worlds=2)
-    own = Simulator(model, 2e-3, rtol=1e-12)
-    start, k = own.world_state(model.state()), own.parameter("contact.stiffness").clone()
+    simulator = Simulator(model, 2e-3, rtol=1e-12)
+    start, k = simulator.world_state(model.state()), simulator.parameter("contact.stiffness").clone()
     k[1] *= 2.0
 
     def heights(k):
-        return own.step(start, {"contact.stiffness": k}).positions[..., 2].sum(1)
+        return simulator.step(start, {"contact.stiffness": k}).positions[..., 2].sum(1)
 
     alone = Simulator(sheet_on_floor(law, 2.0 * STIFFNESS, gap=0.5 * RANGE).build(device, "float64"), 2e-3, rtol=1e-12)
-    found = heights(k)
-    assert found[1].item() == alone.step(alone.world_state(alone.model.state())).positions[..., 2].sum().item()
-    assert (found[1] - found[0]).item() > 1e-7
-    given = k.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(heights(given).sum(), given)
+    sums = heights(k)
+    assert sums[1].item() == alone.step(alone.world_state(alone.model.state())).positions[..., 2].sum().item()
+    assert (sums[1] - sums[0]).item() > 1e-7
+    stiffness = k.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(heights(stiffness).sum(), stiffness)
     h = 1e-3 * STIFFNESS
     difference = (heights(k + h) - heights(k - h)) / (2.0 * h)
     torch.testing.assert_close(slope.sum(1), difference, rtol=1e-5, atol=0.0)
@@ -174,23 +174,23 @@ def test_what_does_not_fit_is_refused(device, name):
 
 
 def test_a_law_that_pulls_is_refused(device):
-    """The spring of the package pulls beyond its length at rest."""
+    """The quadratic law of the package is attractive beyond the rest length."""
     from ddg_warp.kernels.densities.quadratic import quadratic
 
     law = ddg.Law(quadratic, rest=0.5 * RANGE)
     with pytest.raises(ddg.SceneError, match=r"'quadratic' pulls at a gap of 0.0014 m"):
         sheet_on_floor(law).build(device)
-    flat = ddg.Law(quadratic, rest=RANGE)  # ends where the range does
+    flat = ddg.Law(quadratic, rest=RANGE)  # zero at the range
     usual, same = (moved(sheet_on_floor(each), device, 5) for each in (ddg.Law(power, power=2.0), flat))
     np.testing.assert_allclose(same, usual, atol=1e-12)
 
 
 def test_one_law_is_compiled_once_for_all_numbers_of_contact(device):
-    """Stiffness and range are no constants of kernels; the law's own numbers are."""
-    law, other = (ddg.Law(power, power=exponent) for exponent in (2.0, 3.0))
+    """Kernels take stiffness and range as arguments, and other parameters of the law as constants."""
+    law, cubic = (ddg.Law(power, power=exponent) for exponent in (2.0, 3.0))
     touching = [
-        sheet_on_floor(*given).build(device, "float64").net.host.touching.density
-        for given in ((law, 40.0), (law, 50.0), (other, 40.0))
+        sheet_on_floor(*arguments).build(device, "float64").net.host.touching.density
+        for arguments in ((law, 40.0), (law, 50.0), (cubic, 40.0))
     ]
     assert touching[0] is touching[1]
     assert touching[0] is not touching[2]

@@ -42,11 +42,11 @@ def _kernel(density, n: int, real):
 
 
 def law(density, strains, device, real=wp.float64, **parameters):
-    """psi (N,), psi' (N, n) and psi'' (N, n, n) at strains (N, n) or (N,)."""
+    """Return psi (N,), psi' (N, n) and psi'' (N, n, n) at strains (N, n) or (N,)."""
     strains = np.reshape(strains, (len(strains), -1))
     n = strains.shape[1]
     evaluate, E, P, M = _kernel(density, n, real)
-    values = [parameters[known.name] for known in density.parameters(n)]
+    values = [parameters[parameter.name] for parameter in density.parameters(n)]
     p = np.stack(np.broadcast_arrays(*values, strains[:, 0])[:-1], 1)
     inputs = [wp.array(np.ascontiguousarray(v), dtype=t, device=device) for v, t in ((strains, E), (p, P))]
     out = [wp.zeros(len(strains), dtype=t, device=device) for t in (real, E, M)]
@@ -55,7 +55,7 @@ def law(density, strains, device, real=wp.float64, **parameters):
 
 
 def differences(function, strains: np.ndarray, step) -> np.ndarray:
-    """Central differences of fourth order of function(strains) (N, ...) by each strain (N, ..., n)."""
+    """Return central differences of fourth order of function(strains) (N, ...) by each strain (N, ..., n)."""
     columns = []
     for i in range(strains.shape[1]):
         h = np.eye(strains.shape[1])[i] * step
@@ -65,7 +65,7 @@ def differences(function, strains: np.ndarray, step) -> np.ndarray:
 
 
 def agree(value, reference, tolerance=1e-6):
-    """Whether each of many agrees relative to its own largest component."""
+    """Assert agreement of each row relative to its largest component."""
     value, reference = (np.reshape(v, (len(v), -1)) for v in (value, reference))
     assert (np.abs(value - reference).max(1) <= tolerance * np.abs(reference).max(1)).all()
 
@@ -75,8 +75,8 @@ def test_derivatives_of_gaps(device, density):
     random = np.random.default_rng(1)
     strains = random.uniform(*GAPS[density], (COUNT, 1)) + PENALTY["thickness"]
 
-    def part(which):
-        return lambda e: law(density, e, device, **PENALTY)[which]
+    def part(order):
+        return lambda e: law(density, e, device, **PENALTY)[order]
 
     energy, slope, curvature = law(density, strains, device, **PENALTY)
     agree(slope, differences(part(0), strains, np.array([1e-6])), 1e-6)
@@ -85,14 +85,14 @@ def test_derivatives_of_gaps(device, density):
 
 
 def published(gap, delta, stiffness):
-    """Energy of the implicit contact model, as printed."""
+    """Return the energy of the implicit contact model, as printed."""
     K = 15.0 / delta
     soft = stiffness * (np.log(1.0 + np.exp(-K * np.maximum(gap, -delta))) / K) ** 2
     return np.where(gap <= -delta, stiffness * gap**2, np.where(gap < delta, soft, 0.0))
 
 
 def test_the_penalty_is_the_published_one(device):
-    """It differs from k gap^2 inside of -delta only, by less than what the published one jumps by there, and ends at delta."""
+    """Below -delta the penalty differs from k gap^2 by less than the jump of the published law; it ends at delta."""
     delta, k = PENALTY["range"], PENALTY["stiffness"]
     gap = np.linspace(-5.0, 1.5, COUNT) * delta
     energy, slope, *_ = law(smooth_penalty, gap + PENALTY["thickness"], device, **PENALTY)
@@ -104,7 +104,7 @@ def test_the_penalty_is_the_published_one(device):
     assert np.all(energy[gap > delta] == 0.0) and np.all(slope[gap > delta] == 0.0)
     inner = np.log1p(np.exp(15.0)) / 15.0
     outer = np.log1p(np.exp(-15.0)) / 15.0
-    assert inner**2 - 1.0 == pytest.approx(4.1e-8, rel=0.01)  # jumps of energy and slope as published, at -delta
+    assert inner**2 - 1.0 == pytest.approx(4.1e-8, rel=0.01)  # published jumps of energy and slope at -delta
     assert 1.0 - inner / (1.0 + np.exp(-15.0)) == pytest.approx(2.9e-7, rel=0.02)
     assert outer**2 == pytest.approx(4.2e-16, rel=0.02)  # and at delta, over k delta^2
     assert 2.0 * outer / (1.0 + np.exp(15.0)) == pytest.approx(1.25e-14, rel=0.02)
@@ -126,28 +126,28 @@ def test_the_barrier_is_smooth_at_its_end_and_infinite_at_contact(device):
 
 @pytest.mark.parametrize("density", [logistic_friction, polynomial_friction], ids=lambda density: density.name)
 def test_friction(device, density):
-    """At 1,000 slips from 1e-8 to 30 times what the velocity makes in a step: derivatives, convexity, and Coulomb's bound."""
+    """Derivatives, convexity and Coulomb's bound at 1,000 slips of 1e-8 to 30 times velocity times step."""
     random, step = np.random.default_rng(2), 0.005
     scale, limit = FRICTION["velocity"] * step, FRICTION["bound"]
     angle, size = random.uniform(0.0, 2.0 * np.pi, COUNT), scale * 10.0 ** random.uniform(-8.0, 1.5, COUNT)
     slip = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
 
-    def part(which):
-        return lambda e: law(density, e, device, rate=1.0 / step, **FRICTION)[which]
+    def part(order):
+        return lambda e: law(density, e, device, rate=1.0 / step, **FRICTION)[order]
 
     energy, slope, curvature = (part(i)(slip) for i in range(3))
     h = 1e-4 * scale
-    found, reference = differences(part(0), slip, h), slope
-    np.testing.assert_allclose(found, reference, atol=1e-6 * limit)
+    slopes, reference = differences(part(0), slip, h), slope
+    np.testing.assert_allclose(slopes, reference, atol=1e-6 * limit)
     bends = differences(part(1), slip, h)
     smooth = np.ones(COUNT, bool)
-    if density is polynomial_friction:  # its second derivative has a tip at zero and jumps where the force is full
+    if density is polynomial_friction:  # psi'' has a tip at zero and jumps at the full force
         smooth = (np.abs(size / scale - 1.0) > 1e-3) & (size > 0.01 * scale)
     np.testing.assert_allclose(curvature[smooth], bends[smooth], atol=1e-6 * np.abs(curvature).max())
     assert np.linalg.eigvalsh(curvature).min() >= -1e-14 * np.abs(curvature).max()
     force = np.linalg.norm(slope, axis=1)
     assert (energy > 0.0).all() and (energy <= limit * size).all() and (force <= limit * (1.0 + 1e-15)).all()
-    assert ((slope * slip).sum(1) > 0.0).all()  # it takes work
+    assert ((slope * slip).sum(1) > 0.0).all()  # dissipative
     assert (energy <= (slope * slip).sum(1) * (1.0 + 1e-12)).all()  # convex: psi(0) = 0 lies above the tangent
     x = size / scale
     share = {
@@ -161,7 +161,7 @@ def test_friction(device, density):
 @pytest.mark.parametrize("density", [logistic_friction, polynomial_friction], ids=lambda density: density.name)
 @pytest.mark.parametrize("real", [wp.float64, wp.float32])
 def test_friction_without_slip_and_without_rate(device, density, real):
-    """Without slip no force and the stiffness of sticking; without a rate nothing at all."""
+    """Zero slip gives zero force and the sticking stiffness; a zero rate gives zero."""
     slip = np.array([[0.0, 0.0], [1e-30, 0.0], [1.0, 2.0]])
     energy, slope, curvature = law(density, slip, device, real, rate=200.0, **FRICTION)
     assert energy[0] == 0.0 and not slope[0].any()
@@ -172,8 +172,8 @@ def test_friction_without_slip_and_without_rate(device, density, real):
         assert not values.any()
 
 
-def test_what_sticks_creeps_as_stated(device):
-    """A steady force of the share f of mu N is held at nu atanh(f) / 7.5, or nu (1 - sqrt(1 - f))."""
+def test_sticking_creeps_as_stated(device):
+    """Creep speed under a steady force f mu N: nu atanh(f) / 7.5, or nu (1 - sqrt(1 - f))."""
     f = 0.6
     for density, speed in ((logistic_friction, np.arctanh(f) / 7.5), (polynomial_friction, 1.0 - np.sqrt(1.0 - f))):
         slip = np.array([[speed * FRICTION["velocity"] * 0.01, 0.0]])
@@ -186,5 +186,5 @@ def test_single_precision(device, density):
     strains = np.random.default_rng(1).uniform(*GAPS[density], COUNT) + PENALTY["thickness"]
     strains = strains.astype(np.float32).astype(float)
     single, double = (law(density, strains, device, real, **PENALTY) for real in (wp.float32, wp.float64))
-    for found, reference in zip(single, double, strict=True):
-        np.testing.assert_allclose(found, reference, rtol=1e-3, atol=1e-5 * np.abs(reference).max())
+    for value, reference in zip(single, double, strict=True):
+        np.testing.assert_allclose(value, reference, rtol=1e-3, atol=1e-5 * np.abs(reference).max())

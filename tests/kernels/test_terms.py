@@ -1,5 +1,4 @@
-"""Every derivative of every term, in chains open and closed and on indexed elements, in both precisions, against something else
-that computes it; and that the table finds a wrong one."""
+"""Derivative table of every term and potential in both precisions, and its detection of wrong derivatives."""
 
 from functools import cache
 
@@ -12,8 +11,8 @@ from ddg_warp.run import derivatives
 from ddg_warp.run.catalog import load_file
 from ddg_warp.run.cli import main
 
-# Each has kernels of its own: every day every density and every sort of element, and in chains edges and vertices, with damping, in
-# space and in the plane. (A stretch has its measure in common with the damped one, and its density with bending.)
+# Terms with kernels of their own, tested daily: every density and element kind, for rods edges and vertices, damped, in space and in
+# the plane. (A stretch has the measure of the damped one and the density of bending.)
 DAILY = {
     *("rod_stretch_damped", "rod_bend_twist", "planar_bend"),
     *("shell_stretch_damped", "shell_stretch_curved", "shell_hinge_damped", "shell_tilt", "shell_isometric"),
@@ -39,7 +38,7 @@ CASES = [
     for key, sample in SAMPLES.items()
     for check in derivatives.checks_of(sample)
 ]
-# Terms of one's own, as a user has them in a file: one right, one with an error of 0.1 % in an entry of the Jacobian.
+# User-defined terms in a file: one right, one with an error of 0.1 % in an entry of the Jacobian.
 OWN = """
 from dataclasses import replace
 from functools import cache
@@ -84,7 +83,7 @@ plane = replace(right, measure=replace(right.measure, dim=2))
 
 @cache
 def sample_on(device: str, precision: str, term: str, chain: str) -> derivatives.Sample:
-    """The sample on the device under test."""
+    """Return the sample on the device under test."""
     closed = {"open": (False,), "closed": (True,)}.get(chain, ())
     (sample,) = derivatives.samples_of(ALL[term], precision, device, closed)
     return sample
@@ -97,20 +96,20 @@ def test_derivative(device, precision, term, chain, check):
 
 
 @pytest.fixture
-def own(tmp_path):
+def own_term_file(tmp_path):
     path = tmp_path / "own_term.py"
     path.write_text(OWN)
     return path
 
 
-def test_a_wrong_derivative_fails(device, own, capsys):
-    """Forces and factor come from the Jacobian, energy and strains do not; the Hessian is unsymmetric."""
-    assert main(["check", f"{own}:wrong", "--device", device]) == 1
+def test_a_wrong_derivative_fails(device, own_term_file, capsys):
+    """The wrong Jacobian affects forces and factor, not energy and strains; the Hessian is unsymmetric."""
+    assert main(["check", f"{own_term_file}:wrong", "--device", device]) == 1
     rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
     assert {row[2] for row in rows if row[-1] == "FAILED"} == {"gradient", "hessian", "symmetry", "factor"}
     error = {row[2]: float(row[3]) for row in rows}
     assert 1e-5 < error["gradient"] < 1e-2
-    assert main(["check", f"{own}:plane", "--device", device]) == 2
+    assert main(["check", f"{own_term_file}:plane", "--device", device]) == 2
     assert "give product dim = 3" in capsys.readouterr().err
 
 
@@ -121,15 +120,17 @@ def test_what_is_no_number_fails():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_a_term_of_ones_own_passes(device, own, precision):
-    term = load_file(str(own)).right
+def test_a_term_of_ones_own_passes(device, own_term_file, precision):
+    term = load_file(str(own_term_file)).right
     for row in derivatives.table(term, precision, device):
         assert row["passed"], row
 
 
 def test_every_term_has_every_check():
-    """Terms of nets but `rigid`, of which `invariance` is the whole, and `exact` where second derivatives are left out; dipoles have
-    no rest shape, and potentials of collisions neither it nor a reverse mode of the energy. What friction lags is data of its own."""
+    """Checks left out: for indexed elements `rigid`, covered by `invariance`, and `exact` without second derivatives.
+
+    Dipoles have no rest shape. Potentials have no rest shape and no reverse mode of the energy. Only friction has lagged data.
+    """
     of_terms, of_collisions = {"energy", "resultant"}, {"gradient", "rest", "rigid"}
     for (precision, name, chain), sample in SAMPLES.items():
         left_out = {
@@ -144,8 +145,11 @@ def test_every_term_has_every_check():
 
 
 def test_every_day_has_every_kind():
-    """Every density, and every measure but: curvature by the angle and of rods without twist, mid-edge normals, which are part of
-    shell_stretch_curved, and magnets, which meet closed forms in test_magnets."""
+    """Daily terms cover every density, every kind of collision, and every measure with few exceptions.
+
+    Exceptions: curvature by the turning angle and of rods without twist. Mid-edge normals are covered by shell_stretch_curved, magnets
+    by closed forms in test_magnets.
+    """
     terms = {name: term for name, term in ALL.items() if not name.startswith(("magnetic", "dipoles"))}
     assert {ALL[name].density.name for name in DAILY} == {term.density.name for term in terms.values()}
     measures = {
@@ -160,7 +164,7 @@ def test_every_day_has_every_kind():
 
 @pytest.mark.parametrize("term", ["rod_bend_twist", "rod_stretch_damped"])
 def test_sample_of_chains_is_general(term):
-    """Nothing of the state is zero, frames are old, and twist has passed several turns: no check passes by accident."""
+    """The state has no zeros, frames differ by 25 degrees, and twist exceeds a revolution, so that no check passes by accident."""
     sample = SAMPLES["float64", term, "closed"]
     inside = np.arange(6)[:, None] < sample.count
     for name, values in sample.data.items():
@@ -172,7 +176,7 @@ def test_sample_of_chains_is_general(term):
 
 
 def test_sample_of_nets_is_general():
-    """All kinds of edges, both signs of a joint, frames that are old."""
+    """Samples have all kinds of edges, both signs of a joint, and old frames."""
     bend, joint, glue = (SAMPLES["float64", name, "net"] for name in ("shell_bend_dof", "rigid_joint", "glued_edge"))
     assert set(bend.data["constants"][:3].ravel()) == {0.0, 1.0, 2.0, 3.0}
     assert set(joint.data["constants"][0]) == {-1.0, 1.0}
@@ -187,28 +191,28 @@ def test_sample_of_nets_is_general():
 
 @pytest.mark.slow
 def test_table_has_chains_and_nets(device):
-    """The same columns for both, so that one table shows them."""
+    """Rows of rods and indexed elements have equal columns, so that one table shows them."""
     chain, net = (derivatives.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
     assert chain[0].keys() == net[0].keys()
-    own = len(derivatives.CHECKS) - 2  # those of collisions left out
-    assert [row["chain"] for row in chain] == ["open"] * own + ["closed"] * own
+    count = len(derivatives.CHECKS) - 2  # without the checks of collisions
+    assert [row["chain"] for row in chain] == ["open"] * count + ["closed"] * count
     assert {row["chain"] for row in net} == {"net"}
 
 
 def test_sample_of_collisions_is_general():
-    """Edges with and without their ends, of which some are inside of rods; friction that sticks and slides."""
+    """Samples have edges with and without active ends, and sliding friction."""
     sample = SAMPLES["float64", "barrier_edge_edge", "pair"]
     _, _, factor = sample._evaluated(wp.float64)
     ends = (factor.used.numpy() & 0b111100) != 0
     assert ends.any() and not ends.all() and (sample.compared() == ~ends).all()
     sample = SAMPLES["float64", "friction_logistic_edge_edge", "pair"]
     sticking = sample.like({**sample.data, "start": sample.data["q"] - 1e-6})
-    force, most = (np.linalg.norm(of.gradient().reshape(-1, 3, 8)[:2].sum(0), axis=0) for of in (sample, sticking))
+    force, most = (np.linalg.norm(each.gradient().reshape(-1, 3, 8)[:2].sum(0), axis=0) for each in (sample, sticking))
     assert (most < 1e-4 * force).all()
 
 
 def test_measures_are_those_of_chains_or_nets():
-    """What `ddg-warp list` shows, `ddg-warp check` checks: rods open and closed, collisions as pairs, all else by index."""
+    """Every listed term has samples: open and closed rods, collisions as pairs, other terms by index."""
     for name in ALL:
         chains = {chain for precision, term, chain in SAMPLES if term == name and precision == "float64"}
         assert chains == ({"open", "closed"} if name in REGISTRY else {"pair" if name in POTENTIALS else "net"})

@@ -115,8 +115,10 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
     inertia = np.where(np.isnan(stiffness), inertia, 0.0)
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
     density, keep = contact_law(law, stiffness, within, explicit)
-    ways = _by_way(rough)
-    return Touching(law, density, keep, bodies, names.tolist(), group, *ways, stiffness, within, inertia, ignored)
+    multipliers = _by_way(rough)
+    return Touching(
+        law, density, keep, bodies, names.tolist(), group, *multipliers, stiffness, within, inertia, ignored
+    )
 
 
 def _refuse_ranges(scene, within: np.ndarray, names) -> None:

@@ -23,50 +23,52 @@ from ddg_warp.solve.contact.totals import Totals
 
 
 class PairTerms:
-    """Contact of all pairs of a `BroadPhase`, in one law with parameters by pairs of groups of objects, and their friction.
+    """Contact of all pairs of a `BroadPhase`, with one law, parameters by pairs of groups of objects, and friction.
 
-    Friction is that of the pairs that push each other when `lag` is called, at the start of a step, and of its normal forces; searches
-    within the step leave it alone.
+    Friction acts on the pairs that are active when `lag` is called, at the start of a step, with their normal forces. Searches
+    within the step leave it unchanged.
 
-    `lag`, `evaluate`, `product` and `join` read nothing back and can be captured, on the CPU too; graphs that hold them have
-    to be captured anew whenever `version` of the search grows, after `fit` of the search and of this, beginning with `lag`. While pairs
-    do not fit energies are infinite.
+    `lag`, `evaluate`, `product` and `join` read nothing back and can be captured, on the CPU too. Capture their graphs again whenever
+    `version` of the search grows, after `fit` of the search and of the terms, starting with `lag`. While pairs do not fit, energies are
+    infinite.
 
     Args:
         search: candidates; to be updated before each `evaluate`.
-        law: `densities.contact.smooth_penalty` or `log_barrier`.
-        stiffness: [N/m], not negative; range: gap below which surfaces push each other [m], positive, at most the reach of the search;
-            thickness: distance at which the gap is zero [m], by default the sum of both radii. Numbers, or symmetric (groups, groups).
-        groups: of each object (objects,), from 0; by default all are in one.
+        law: `densities.contact.smooth_penalty`, `log_barrier` or a `gap_law`.
+        stiffness: [N/m], not negative. Stiffness, range and thickness are numbers, or symmetric (groups, groups).
+        range: activation distance [m], positive, at most the reach of the search.
+        thickness: distance of zero gap [m], by default the sum of both radii.
+        groups: group of each object (objects,), from 0; by default one group.
         friction: coefficient mu, a number or symmetric (groups, groups), not negative; None or 0: no friction is built.
-        ways: multiples of it (groups, groups, 3), not negative, of a rod, the first of two objects, that slides forwards, towards its
-            last node, backwards, and across; by default it is the same all ways.
+        `ways`: anisotropic friction multipliers (groups, groups, 3), not negative, for sliding of a rod, the first object: forwards,
+            towards its last node, backwards, and across. By default friction is isotropic.
         friction_law: "logistic" or "polynomial", see `densities.friction`.
-        velocity: nu [m/s], positive: what sticks creeps with a share of it.
-        linear: type of factors and of vectors of products, by default that of positions.
-        silent: nodes of a world that forces and products need not be told of, which may be in thousands of pairs.
-        inertia: masses [kg], not negative, a number or symmetric (groups, groups): the stiffness is at least that times the square of
-            the rates of `law`; None or 0: it is as given.
-        shared: by name of what is by groups, arrays (worlds, groups, groups) that the law has in place of its own.
-        exact: whether products with what turns are exact for edges that are all but parallel, too, however many these are.
+        velocity: stick threshold nu [m/s], positive; sticking contacts creep at a fraction of it.
+        linear: type of factors and of vectors of products, by default the type of positions.
+        silent: nodes of a world that need no forces and products, and may be in thousands of pairs.
+        inertia: masses [kg], not negative, a number or symmetric (groups, groups). Times the squared rates of `law` they bound the
+            stiffness from below; None or 0: no bound.
+        shared: arrays (worlds, groups, groups) by name that replace parameters of the law.
+        exact: whether products with geometric stiffness are exact for nearly parallel edges, too, however many.
 
     Attributes:
-        energy: (worlds,) [J], that of contact and the potential of friction; forces: (worlds times nodes,) [N].
-        gap: (worlds,) the smallest of all candidates [m], at most the reach of the search; touching, dissipated: see `Totals`.
-        diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
-            between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
-            an edge, is in both, positive semi-definite together. See `join`.
-        rolls: whether friction turns rods; turned: then of each edge's angle that with the first and with the second node [N], and with
-            the angle of the next edge of the rod [N m]; those with themselves are among `diagonal`.
+        energy: (worlds,) [J], of contact and the potential of friction; forces: (worlds times nodes,) [N].
+        gap: (worlds,) smallest gap of all candidates [m], at most the reach of the search; touching, dissipated: see `Totals`.
+        diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m].
+        between: (worlds times edges,) blocks between the first and the second node of edges, in the order of `shapes.things(2)`. A
+            pair contributes the 6 x 6 block of each of its edges to both, positive semi-definite. See `join`.
+        rolls: whether friction rotates rods.
+        turned: for rolling, blocks of each edge angle with the first and second node [N], and with the angle of the next edge
+            of the rod [N m]. Diagonal blocks of angles are in `diagonal`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
-        start: positions and angles that slip starts from (worlds times nodes,), if not from others; more: what friction counts beside
-            normal forces (worlds,) [N], none but where what meets is to stick.
-        law: `law_struct`, on the device, with rates of inertia (worlds,) [1/s], zero at first; lag_law: the one by
-            which friction was lagged last; products: the `PairProduct` of all lists.
-        spins: how far objects that spin have turned since slips started.
+        start: positions and angles at the start of slip (worlds times nodes,), unless given to `evaluate`.
+        more: addition to normal forces in friction (worlds,) [N], zero except for forced sticking.
+        law: `law_struct`, on the device, with rates of inertia (worlds,) [1/s], initially zero; lag_law: law of the last friction lag.
+        products: the `PairProduct` of all lists.
+        spins: rotations of spinning objects since the start of slip.
 
     Raises:
-        SceneError: names the parameter, the pair of objects where there is one, and the remedy.
+        SceneError: names the parameter, the pair of objects if any, and the remedy.
     """
 
     def __init__(
@@ -90,14 +92,14 @@ class PairTerms:
     ):
         self.search, self.device, self.real = search, search.device, search.real
         self.linear = linear or self.real
-        given = {
+        inputs = {
             "stiffness": stiffness,
             "range": range,
             "thickness": thickness,
             "friction": friction,
             "inertia": inertia,
         }
-        self.law, rubs = law_tables(search, given, groups, shared or {})
+        self.law, rubs = law_tables(search, inputs, groups, shared or {})
         self.heavy = inertia is not None and bool(np.any(inertia))
         self.lag_law, self._law_before = self.law, at_own_rate(self.law, self.real) if self.heavy and rubs else None
         nodes = len(search.shapes.points) * search.worlds
@@ -111,15 +113,15 @@ class PairTerms:
         self._told, self._told_edges = (
             wp.zeros(len(array), dtype=wp.uint8, device=self.device) for array in (self.forces, self.between)
         )
-        told_not = np.zeros(len(search.shapes.points), np.uint8)
-        told_not[[] if silent is None else silent] = 1
-        told_not = wp.array(told_not, dtype=wp.uint8, device=self.device)
+        silenced = np.zeros(len(search.shapes.points), np.uint8)
+        silenced[[] if silent is None else silent] = 1
+        silenced = wp.array(silenced, dtype=wp.uint8, device=self.device)
         self.lists = [
-            ContactElements(pairs, law, nodes, self.real, self.linear, told_not, exact) for pairs in search.lists
+            ContactElements(pairs, law, nodes, self.real, self.linear, silenced, exact) for pairs in search.lists
         ]
         self._version, self._lagged = search.version, -1
         self.spins = Spins(search)
-        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
+        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
         made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
@@ -131,30 +133,30 @@ class PairTerms:
         self._angles = wp.array(angles if self.rolls else angles[:0], dtype=int, device=self.device)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
-        self._totals = told = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
-        self.energy, self.touching, self.dissipated = told.energy, told.touching, told.dissipated
+        self._totals = totals = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
+        self.energy, self.touching, self.dissipated = totals.energy, totals.touching, totals.dissipated
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        own = [
+        kernels = [
             self._collect,
             self._join,
             *([self._roll] if self.rolls else []),
             *(self.spins.kernels if self.frictions else []),
         ]
-        return [*own, *self.products.kernels, *self._totals.kernels, *parts]
+        return [*kernels, *self.products.kernels, *self._totals.kernels, *parts]
 
     @property
     def _parts(self) -> list:
         return [*self.lists, *self.frictions]
 
     def fit(self) -> bool:
-        """Make as much room as the lists of the search have; whether there was less. Not in a capture.
+        """Grow buffers to the capacity of the lists of the search, and return whether they grew. Not in a capture.
 
-        If so, the step is to be done again from its `lag` on.
+        After growth, repeat the step from its `lag`.
         """
         if self._version == self.search.version:
             return False
@@ -167,21 +169,21 @@ class PairTerms:
         return True
 
     def brace(self, rate: wp.array | None) -> None:
-        """Set the rates of `law` (worlds,) [1/s], by which inertia counts in the stiffness; to zero without."""
+        """Set the rates of `law` (worlds,) [1/s] for the inertial stiffness; None for zero."""
         if self.heavy and rate is not None:
             wp.copy(self.law.rate, rate)
         elif self.heavy:
             self.law.rate.zero_()
 
     def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None) -> None:
-        """Take pairs, normal forces and tangents of friction from contact at x, and x as where slip starts.
+        """Lag friction: take pairs, normal forces and tangents from contact at x, the start of slip.
 
-        Slip still starts from where it did if friction is lagged `again`. Does nothing where there is no friction.
+        If friction is lagged `again`, slip keeps its start. Without friction this is a no-op.
 
         Args:
             x: positions (worlds times nodes,).
-            again: whether a search goes on.
-            rate: by which inertia counts in the stiffness at x (worlds,) [1/s]; by default that of `law`.
+            again: whether the line search continues.
+            rate: rate of the inertial stiffness at x (worlds,) [1/s]; by default the rate of `law`.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`.
@@ -211,13 +213,13 @@ class PairTerms:
         start: wp.array | None = None,
         iterates: tuple[wp.array, wp.array] | None = None,
     ) -> None:
-        """Energies, forces, factors and the smallest gaps at positions x; with rates, those of friction too.
+        """Compute energies, forces, factors and smallest gaps at positions x; with rates, also of friction.
 
         Args:
             rate: 1/h of each world (worlds,) [1/s]; no friction where it is 0.
-            start: positions that slip starts from, by default those of `lag`.
-            iterates: of each world, which of two iterates is the accepted one, 0 or 1, and how many there were; then the matrix of
-                friction is that of its direction as an unknown of its own, see `kernels.contact.pair_friction`.
+            start: positions at the start of slip, by default the positions of `lag`.
+            iterates: index of the accepted one of two iterates, 0 or 1, and number of iterates, by world. Then the friction matrix
+                has the direction as an extra unknown, see `kernels.contact.pair_friction`.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`, or friction was not lagged since then, or rates do not fit.
@@ -243,17 +245,17 @@ class PairTerms:
         arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
 
     def _start_anew(self) -> None:
-        """No gap was seen yet."""
+        """Reset the smallest gaps, and refuse lists that have grown since `fit`."""
         if self._version != self.search.version:
             raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
         self.gap.fill_(self.search.reach)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
-        """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
+        """Add H v of the last `evaluate` to `out`, vectors of 3 (worlds times nodes,).
 
-        H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian. Of
-        friction both are the same. With `wanted` (worlds,), H has at x what of the exact one comes of pairs that turn
-        (`kernels.contact.pair_bend`), in worlds where that is not zero, once `prepare` was called there.
+        H is the Gauss-Newton matrix, positive semi-definite by construction; with the positions x of that `evaluate`, the exact
+        Hessian. For friction both are equal. With `wanted` (worlds,), H includes the geometric stiffness at x
+        (`kernels.contact.pair_bend`) in worlds where that is nonzero, after `prepare`.
         """
         if x is None or wanted is not None:
             self.products(v, out, x, wanted)
@@ -265,24 +267,24 @@ class PairTerms:
         self.products.gather(out)
 
     def meet(self) -> None:
-        """What `settle` takes of the last `evaluate`: which nodes are in pairs."""
+        """Mark the nodes in pairs of the last `evaluate`, for `settle`."""
         self.products.meet()
 
     def prepare(self, x: wp.array, wanted: wp.array) -> None:
-        """What products take that have at x what comes of pairs that turn, in worlds where `wanted` (worlds,) is not zero."""
+        """Prepare products with geometric stiffness at x, in worlds with nonzero `wanted` (worlds,)."""
         self.products.prepare(x, wanted)
 
     def place(self, v: wp.array, x: wp.array, wanted: wp.array | None) -> None:
-        """What pairs bring to nodes of `product`, for `settle`."""
+        """Write the contributions of pairs to `product` at nodes, for `settle`."""
         self.products.place(v, x, wanted)
 
     def settle(self, v: wp.array, out: wp.array, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """`product` as it was placed, on dofs that are not barred, in worlds that are `busy` (1), and v . out for nodes in pairs.
+        """Gather the `product` written by `place` on active dofs, in worlds that are `busy` (1), and v . out for nodes in pairs.
 
-        After `meet`.
+        Requires `meet`.
 
         Args:
-            barred: of each node, bits of the dofs whose product is not asked for; dots: (worlds, nodes).
+            `barred`: bits of inactive dofs of each node; dots: (worlds, nodes).
         """
         self.products.settle(v, out, barred, busy, dots)
 
@@ -296,7 +298,7 @@ class PairTerms:
             arrays.sweep(self._roll, len(self.between), inputs, self.turned, self.device)
 
     def _check(self, rate: wp.array) -> None:
-        """Refuse rates that do not fit, and friction that was not lagged."""
+        """Refuse rates of the wrong shape or type, and friction without `lag`."""
         if rate.shape != (self.search.worlds,) or rate.dtype is not self.real:
             raise SolverError(
                 f"rates of contact are {self.search.worlds} of {self.real.__name__}, one a world,"
@@ -305,8 +307,8 @@ class PairTerms:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
 
-    def _with_friction(self, rubs: bool, ways, law: str, velocity: float, silent) -> list[FrictionElements]:
-        """Friction of each list, where there is any."""
+    def _with_friction(self, rubs: bool, multipliers, law: str, velocity: float, silent) -> list[FrictionElements]:
+        """Return the friction of each list, none without friction."""
         if law not in FRICTION_LAWS:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION_LAWS)}")
         if not 0.0 < velocity < np.inf:
@@ -314,14 +316,20 @@ class PairTerms:
         if not rubs:
             return []
         number = self.law.friction.shape[1]
-        same = ways is None or (np.asarray(ways) == 1.0).all()
-        ways = None if same else [table("ways", way, number, False) for way in np.moveaxis(np.asarray(ways), -1, 0)]
+        same = multipliers is None or (np.asarray(multipliers) == 1.0).all()
+        multipliers = (
+            None
+            if same
+            else [
+                table("ways", multiplier, number, False) for multiplier in np.moveaxis(np.asarray(multipliers), -1, 0)
+            ]
+        )
         return [
             FrictionElements(
                 part,
                 FRICTION_LAWS[law],
                 float(velocity),
-                None if same else np.stack(ways, -1),
+                None if same else np.stack(multipliers, -1),
                 self.search.shapes,
                 self.spins,
                 len(self.forces),
