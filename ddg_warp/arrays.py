@@ -34,6 +34,19 @@ def upload(values: np.ndarray, dtype, device) -> wp.array:
     return wp.array(turned, dtype=dtype, device=device).transpose(order)
 
 
+def columns(array: wp.array, *rows: int) -> wp.array:
+    """Return a view [row][column] of an array [row][node][rod], with columns in the order of its memory.
+
+    Args:
+        rows: shape of the rows, if it is to be another one.
+    """
+    rows = rows or array.shape[:-2]
+    if array.is_contiguous:
+        return array.reshape((*rows, -1))
+    base = array.transpose(tuple(reversed(range(array.ndim))))
+    return base.reshape((-1, *reversed(rows))).transpose(tuple(reversed(range(len(rows) + 1))))
+
+
 def assign(array: wp.array, values: np.ndarray) -> None:
     """Copy host values of the same logical shape into a device array."""
     copy(array, upload(np.asarray(values), array.dtype, array.device))

@@ -13,8 +13,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
-from ddg_warp.kernels.element import term_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type, term_functions
 from ddg_warp.kernels.islands import PROGRESS, RATE, STATUS
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS

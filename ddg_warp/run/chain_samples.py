@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import element, evaluate
-from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels import element_path
+from ddg_warp.kernels.chain import ChainKind, rod_elements_type, rod_storage
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.terms import REGISTRY, Term
@@ -31,6 +31,7 @@ class Chain(Sample):
     """
 
     shape = (6, 2)
+    INPUTS = ("x", "theta", "frame", "last", "rate", "buffer")
 
     def __init__(self, term: Term, kind: ChainKind, *arguments):
         self.chain, self.count = "closed" if kind.closed else "open", np.array([6, 5])
@@ -110,12 +111,14 @@ class Chain(Sample):
         dim, window = kind.dim, kind.window
         sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
-        kernel = evaluate.evaluate_kernel(kind, real, real, 0 if exact else None)
-        inputs, islands = self._inputs(real), Islands(2, real, self.device)
-        wp.copy(islands.rate, inputs[4])
-        inputs[4:5] = islands.arrays
-        clamped = wp.full(2, 0 if exact else 1, dtype=int, device=self.device)
-        wp.launch(kernel, shape, [*inputs, clamped, 0], out, device=self.device, block_dim=128)  # it is bound to that
+        kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, 0 if exact else None)
+        islands, found = Islands(2, real, self.device), element_path.results_type(real, real)()
+        islands.clamped.fill_(0 if exact else 1)
+        rows = [array.reshape((*array.shape[:-2], -1)) for array in out]
+        found.factor, found.second, found.gradient, found.energy, found.stiffness = rows
+        found.tension = found.factor
+        inputs = [self._inputs(real), *islands.arrays]
+        wp.launch(kernel, shape, inputs, [found], device=self.device, block_dim=128)  # it is bound to that
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
         vertex = rows[:edge_row].reshape(kind.vertex_strains, window, *shape)
@@ -131,20 +134,19 @@ class Chain(Sample):
 
     def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
         """Reverse mode of the energy (which = 0) or gradient (1) kernel of the term, by input."""
-        inputs = self._inputs(self.real)
-        adjoints = [wp.zeros_like(array) for array in inputs[:6]]
-        seeds = wp.array(seed, dtype=self.real, device=self.device)
+        given, kind, real = self._inputs(self.real), self.kind, self.real
+        seeds = wp.array(seed.reshape(*seed.shape[:-2], -1), dtype=real, device=self.device)
         wp.launch(
-            element.term_kernels(self.kind, self.index, self.real, reverse=True)[which],
+            element_path.term_kernels(rod_storage(kind, real), self.index, real, reverse=True)[which],
             self.shape,
-            inputs,
+            [given],
             [wp.zeros_like(seeds, requires_grad=True)],
             adjoint=True,
-            adj_inputs=[*adjoints, None, None],
+            adj_inputs=[rod_elements_type(kind.dim, real)()],
             adj_outputs=[seeds],
             device=self.device,
         )
-        x, theta, *others = (array.numpy().astype(float) for array in adjoints)
+        x, theta, *others = (getattr(given, name).grad.numpy().astype(float) for name in self.INPUTS)
         q = np.zeros((*self.shape, 4))
         q[..., : self.kind.dim], q[..., 3] = x, theta
         names = (name for name in self.data if name != "q")
@@ -207,11 +209,12 @@ class Chain(Sample):
                 last[self.rows] = np.einsum("ij,jnr->inr", spin, self.data["last"][self.rows])
             yield velocity, last
 
-    def _inputs(self, real, **changed) -> list[wp.array]:
-        """What the kernels of a term read: x, theta, frame, last, rate, buffer, table, count."""
+    def _inputs(self, real, **changed):
+        """What the kernels of a term read; see `kernels.chain.rod_elements_type`."""
         data, dim = {**self.data, **changed}, self.kind.dim
         q = data["q"]
-        values = [q[..., :dim], q[..., 3], data["frame"], data["last"], data["rate"], data["buffer"].ravel()]
+        last = data["last"].reshape(len(data["last"]), -1)
+        values = [q[..., :dim], q[..., 3], data["frame"], last, data["rate"], data["buffer"].ravel()]
         types = [wp.types.vector(dim, real), *[real] * 5]
         out = [
             wp.array(np.ascontiguousarray(v), dtype=t, device=self.device, requires_grad=True)
@@ -219,18 +222,21 @@ class Chain(Sample):
         ]
         n, rods = self.shape
         table = np.array([(row * n * rods, rods, 1) for row in range(len(data["buffer"]))], np.int32)
-        return [*out, *(wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32)))]
+        out += [wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32))]
+        given = rod_elements_type(dim, real)()
+        for name, values in zip((*self.INPUTS, "table", "count"), out, strict=True):
+            setattr(given, name, values)
+        return given
 
     def _launch(self, which: int, real, **changed):
         """What the energy (0), gradient (1), Hessian (2) or strain (3) kernel gives."""
-        kind, w = self.kind, self.kind.window
-        size = [(), (w,), (w * w,), (kind.strain_rows,)][which]
-        kernels = element.term_kernels(kind, self.index, real, reverse=True)
-        kernel = element.strain_kernel(kind, real) if which == 3 else kernels[which]
-        out = [wp.zeros((*size, *self.shape), dtype=real, device=self.device) for _ in range(2 if which == 3 else 1)]
-        inputs = [*self._inputs(real, **changed), *[1] * (which == 3)]
+        kind, w, storage = self.kind, self.kind.window, rod_storage(self.kind, real)
+        size, count = [(), (w,), (w, w), (kind.strain_rows,)][which], self.shape[0] * self.shape[1]
+        kernels = element_path.term_kernels(storage, self.index, real, reverse=True)
+        kernel = element_path.strain_kernel(storage, real) if which == 3 else kernels[which]
+        out = [wp.zeros((*size, count), dtype=real, device=self.device) for _ in range(2 if which == 3 else 1)]
+        more = [[], [], [wp.zeros((0, 0), dtype=real, device=self.device)], [1]][which]
+        inputs = [self._inputs(real, **changed), *more]
         wp.launch(kernel, (*self.shape, w) if which == 2 else self.shape, inputs, out, device=self.device)
-        found = [array.numpy().astype(float) for array in out]
-        if which == 3:
-            return tuple(values[self.rows] for values in found)
-        return found[0].reshape(w, w, *self.shape) if which == 2 else found[0]
+        found = [array.numpy().astype(float).reshape(*size, *self.shape) for array in out]
+        return tuple(values[self.rows] for values in found) if which == 3 else found[0]

@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from ddg_warp.kernels import element_path
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.net import elements as net_elements
@@ -80,8 +81,10 @@ class Elements(Sample):
         out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
         search = Islands(1, real, self.device)
         search.clamped.fill_(0 if exact else 1)
-        kernel = net_elements.evaluate_kernel(self.term, real, real, 0 if exact and packed else None)
-        wp.launch(kernel, count, [self._elements(real), *search.arrays], out, device=self.device)
+        kernel = element_path.evaluate_kernel(self._storage(real), real, real, 0 if exact and packed else None)
+        found = element_path.results_type(real, real, True)()
+        found.factor, found.tension, found.second, found.gradient, found.energy, found.stiffness = out
+        wp.launch(kernel, (1, count), [self._elements(real), *search.arrays], [found], device=self.device)
         factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)
@@ -102,8 +105,8 @@ class Elements(Sample):
             seed = seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1)
         seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
         wp.launch(
-            net_elements.term_kernels(self.term, self.real, reverse=True)[which],
-            self.COUNT,
+            element_path.term_kernels(self._storage(self.real), 0, self.real, reverse=True)[which],
+            (1, self.COUNT),
             [given],
             [wp.zeros_like(seeds, requires_grad=True)],
             adjoint=True,
@@ -139,6 +142,9 @@ class Elements(Sample):
             [*edges, np.kron(angles, axes[:1]), np.kron(spins, axes), np.kron(slot[: measure.points], axes)]
         )
 
+    def _storage(self, real):
+        return net_elements.coupled_storage(self.term, real)
+
     def _elements(self, real, **changed):
         """What kernels read; see `kernels.net.elements.elements_type`."""
         data, given = {**self.data, **changed}, net_elements.elements_type(real)()
@@ -165,10 +171,12 @@ class Elements(Sample):
         shape = [(count,), (measure.slots, count), (count, size, size), (n, count)][which]
         dtype = wp.types.vector(3, real) if which == 1 else real
         out = [wp.zeros(shape, dtype=dtype, device=device) for _ in range(2 if which == 3 else 1)]
-        extra = [[], [], [wp.zeros((n, count), dtype=real, device=device)], [1]][which]
-        kernel = net_elements.term_kernels(self.term, real, reverse=True)[which]
-        grid = (count, size) if which == 2 else count
-        wp.launch(kernel, grid, [self._elements(real, **changed), *extra], out, device=device)
+        extra = [[], [], [wp.zeros((0, 0), dtype=real, device=device)], [1]][which]
+        kernels = element_path.term_kernels(self._storage(real), 0, real, reverse=True)
+        kernel = element_path.strain_kernel(self._storage(real), real) if which == 3 else kernels[which]
+        grid = (1, count, size) if which == 2 else (1, count)
+        views = [out[0].transpose((1, 2, 0))] if which == 2 else out
+        wp.launch(kernel, grid, [self._elements(real, **changed), *extra], views, device=device)
         found = [array.numpy().astype(float) for array in out]
         if which == 2:
             return np.einsum("ia,eij,jb->abe", self.incidence, found[0], self.incidence)

@@ -10,8 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.balance import node_functions
-from ddg_warp.kernels.chain import ChainKind, gather_functions
-from ddg_warp.kernels.element import term_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions, term_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.variation import carried_function, variation_functions
 

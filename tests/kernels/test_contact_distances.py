@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 from contact_cases import COUNT, RIGHT, Pairs, closest_by_features, pairs, positions, worst
 
-from ddg_warp.kernels.net.elements import elements_type, term_kernels
+from ddg_warp.kernels.element_path import term_kernels
+from ddg_warp.kernels.net.elements import coupled_storage, elements_type
 from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION
 
 STENCILS = ("edge_edge", "point_edge", "point_triangle")
@@ -166,8 +167,8 @@ def test_poses_of_obstacles_have_gradients(device, term):
     sample = Pairs(ALL[term], None, "float64", device)
     given, seeds = sample._elements(wp.float64), wp.ones(COUNT, dtype=wp.float64, device=device)
     wp.launch(
-        term_kernels(sample.term, wp.float64, reverse=True)[0],
-        COUNT,
+        term_kernels(coupled_storage(sample.term, wp.float64), 0, wp.float64, reverse=True)[0],
+        (1, COUNT),
         [given],
         [wp.zeros_like(seeds, requires_grad=True)],
         adjoint=True,
