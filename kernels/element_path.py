@@ -386,7 +386,9 @@ def evaluate_kernel(
             at = column_of(inputs, island, e)
             whole = whole_of(inputs, island, e)
             q, s = read(inputs, island, e, whole)
-            if wp.static(stale is not None):  # before the terms: after them, dofs would be kept in 30 to 50 registers more
+            if wp.static(
+                stale is not None
+            ):  # before the terms: after them, dofs would be kept in 30 to 50 registers more
                 if whole and stale(q, s):
                     flags[STALE, island] = 1
             energy = real(0.0)
@@ -416,14 +418,14 @@ def evaluate_kernel(
 def term_kernels(storage: ElementStorage, index: int, real, reverse: bool = False):
     """Build the kernels of the energy, the gradient and the exact Hessian of one term.
 
-    `energy`: write energies (columns,). `gradient`: write derivatives with respect to the window. `hessian`: add Hessians on the window
-    [dof][dof][column], a column of the matrix a thread.
+    `energy`: write energies (columns,). `gradient`: write derivatives with respect to the window. `hessian`: write Hessians on the
+    window [dof][dof][column], a column of the matrix a thread; where elements have several terms, add them.
 
     Args:
         reverse: whether the first two have an adjoint, which doubles the time that they take to compile.
     """
     own, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
-    term, span, size = own.term, own.term.measure.span, storage.Window._length_
+    term, span, size, several = own.term, own.term.measure.span, storage.Window._length_, len(storage.terms) > 1
     Q, _, E, _ = term.measure.types(real)
     n = len(term.measure.strains)
     P = wp.types.vector(term.density.parameter_size(n), real)
@@ -485,7 +487,10 @@ def term_kernels(storage: ElementStorage, index: int, real, reverse: bool = Fals
             dq, _ds, _dw, _dp, _dv, _de = wp.grad(along)(local(q), short(s), w, p, local(v), more)
             f = spread(dq)
             for m in range(wp.static(size)):
-                hessian_out[m, column, at] = hessian_out[m, column, at] + f[m]
+                if wp.static(several):
+                    hessian_out[m, column, at] = hessian_out[m, column, at] + f[m]
+                else:
+                    hessian_out[m, column, at] = f[m]
 
     return energy, gradient, hessian
 

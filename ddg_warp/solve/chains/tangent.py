@@ -210,17 +210,17 @@ class ChainTangent(Part):
 
     def _launch(self, state, index: int, which: int, out: wp.array, parameters: ParameterTable | None = None) -> None:
         group, data, real = self.group, self.data(state), self.model.types.real
-        w, device = group.kind.window, self.model.wp_device
+        window, device = group.kind.window, self.model.wp_device
         kernel = element_path.term_kernels(rod_storage(group.kind, real), index, real)[which]
-        given, grid, found = (
-            group.element_inputs(data, data.last, self.rate, parameters),
-            (group.elements, group.columns),
-            [],
-        )
-        if which == 2:
-            grid, found = (*grid, w), [wp.zeros((0, 0), dtype=real, device=device)]
-        out = arrays.columns(out, w, w) if which == 2 else arrays.columns(out)
-        wp.launch(kernel, grid, [given, *found], [out], device=device)
+        inputs, grid = [group.element_inputs(data, data.last, self.rate, parameters)], (group.elements, group.columns)
+        rows = ()
+        if which == 2:  # by the stresses of the law alone
+            inputs, grid, rows = (
+                [*inputs, wp.zeros((0, 0), dtype=real, device=device)],
+                (*grid, window),
+                (window, window),
+            )
+        wp.launch(kernel, grid, inputs, [arrays.columns(out, *rows)], device=device)
 
 
 def _incidence(group) -> sparse.csr_matrix:

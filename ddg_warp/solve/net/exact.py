@@ -128,7 +128,6 @@ class ExactSystem:
         self._launch(self._begin, every, read, [self.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
             given = self.net.elements(state, i, rate=rate)
-            hessian.zero_()
             grid = self.net.worlds, self.net.sets[i].elements, hessian.shape[1]
             self._launch(kernel, grid, [given, self._no_stress], [hessian.transpose((1, 2, 0))])
             read = [hessian, *table.adds[i], self._ends[i], self.net.sets[i].term.measure.slots, flags, table.positions]
