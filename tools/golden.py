@@ -3,7 +3,8 @@
     DDG_WARP_FP_CONTRACT=off python tools/golden.py write FILE [SCENE ...]
     DDG_WARP_FP_CONTRACT=off python tools/golden.py compare FILE [SCENE ...]
 
-`write` keeps all arrays of the state after a few steps, and the counts of Newton and PCG iterations. `compare` prints, by scene, the
+`write` keeps all arrays of the state after a few steps, and the counts of Newton and PCG iterations; with torch, also gradients of a
+loss by what steps read, of objects of `ddg_warp.learn.gradient_objects`. `compare` prints, by scene, the
 largest difference over the largest entry of the array that differs most, and fails where iteration counts differ or differences exceed
 1e-9. Without fused multiply-adds (DDG_WARP_FP_CONTRACT=off) versions that compute the same are equal bit for bit.
 """
@@ -11,6 +12,8 @@ largest difference over the largest entry of the array that differs most, and fa
 import argparse
 import sys
 from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -172,8 +175,35 @@ CASES: dict[str, tuple[Callable[[], ddg.Scene], str, float, dict]] = {
 }
 
 
+# Name -> object of `ddg_warp.learn.gradient_objects`, analysis.
+GRADIENTS = {
+    "grad_rod": ("rod", "implicit_euler"),
+    "grad_midpoint": ("rod", "implicit_midpoint"),
+    "grad_planar": ("planar rod", "implicit_euler"),
+    "grad_closed": ("closed rod", "implicit_euler"),
+    "grad_joined": ("rods joined rigidly", "implicit_midpoint"),
+    "grad_shell": ("shell, midedge", "implicit_euler"),
+    "grad_contact": ("rods in contact", "implicit_euler"),
+    "grad_static": ("rod", "statics"),
+    "grad_static_net": ("rods joined rigidly", "statics"),
+}
+
+
+def gradient(name: str) -> tuple[dict[str, np.ndarray], str]:
+    """Return the derivatives of a loss by everything that steps, or equilibria, of an object read."""
+    from ddg_warp.learn.gradient_cases import Case
+
+    found = {}
+    for own in Case(*GRADIENTS[name], "cpu").inputs():
+        with suppress(ddg.SceneError):  # where equilibria are searched from has no gradient
+            found[own.name] = np.array(own.found())
+    return found | {"counts": np.zeros(3)}, ""
+
+
 def record(name: str) -> tuple[dict[str, np.ndarray], str]:
     """Return all arrays of the state after `STEPS` steps with the iteration counts, and which linear solvers were used."""
+    if name in GRADIENTS:
+        return gradient(name)
     build, precision, dt, options = CASES[name]
     model = build().build("cpu", precision, worlds=2)
     integrator, state = ddg.Integrator(model, check_every=1, **options), model.state()
@@ -200,10 +230,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("write", "compare"))
     parser.add_argument("file", type=Path, help="NumPy archive of recorded states")
-    parser.add_argument("scene", nargs="*", help=f"of {', '.join(CASES)} (default: all)")
+    parser.add_argument("scene", nargs="*", help=f"of {', '.join((*CASES, *GRADIENTS))} (default: all)")
     chosen = parser.parse_args()
     wp.config.quiet = True
-    names, failed = chosen.scene or list(CASES), False
+    names, failed = chosen.scene or [*CASES, *(GRADIENTS if find_spec("torch") else [])], False
     print(f"floating-point contraction: {CONTRACTION}")
     if chosen.action == "write":
         found = {}
