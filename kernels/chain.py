@@ -189,6 +189,33 @@ def gather_functions(kind: ChainKind, real):
 
 
 @cache
+def displaced_function(kind: ChainKind, real):
+    """Build `displaced(v, k, count, whole, r)`: return the window of a displacement [component of a node][node][rod]."""
+    W = wp.types.vector(kind.window, real)
+    along_node, *_ = gather_functions(kind, real)
+    dim, span, twist = kind.dim, kind.span, kind.twist
+
+    @wp.func
+    def displaced(v: wp.array3d(dtype=real), k: int, count: int, whole: bool, r: int):
+        q = W()
+        b = along_node(k + 1, count)
+        for d in range(wp.static(dim)):
+            q[d] = v[d, b, r] - v[d, k, r]
+        if wp.static(twist):
+            q[wp.static(dim * span)] = v[wp.static(dim), k, r]
+        if wp.static(span == 2):
+            if whole:
+                c = along_node(k + 2, count)
+                for d in range(wp.static(dim)):
+                    q[wp.static(dim) + d] = v[d, c, r] - v[d, b, r]
+                if wp.static(twist):
+                    q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
+        return q
+
+    return displaced
+
+
+@cache
 def rod_elements_type(dim: int, real):
     """Return the struct that kernels of elements read: dofs, lagged data, parameters and number of nodes of every rod."""
     V = wp.types.vector(dim, real)
@@ -251,7 +278,7 @@ def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
         kind.closed,
         kind.serial,
     )
-    _, window, lagged, _ = gather_functions(kind, real)
+    (_, window, lagged, _), displaced = gather_functions(kind, real), displaced_function(kind, real)
 
     @wp.func
     def items(first: int, r: int):
@@ -280,6 +307,10 @@ def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
         n = inputs.count[r]
         return window(inputs.x, inputs.theta, k, n, all, r), lagged(inputs.frame, k, n, all, r)
 
+    @wp.func
+    def displacement(inputs: Inputs, w: wp.array3d(dtype=real), r: int, k: int, all: bool):
+        return displaced(w, k, inputs.count[r], all, r)
+
     def launch_bounds(curved: bool):
         # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200; second derivatives in
         # float64 need more, and take a quarter less time with two
@@ -296,6 +327,8 @@ def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
         column=column,
         whole=whole,
         read=read,
+        displacement=displacement,
+        Displacements=wp.array3d(dtype=real),
         stiffness_dofs=kind.dim,
         clears_active=True,
         launch_bounds=launch_bounds,

@@ -54,6 +54,8 @@ class ElementStorage:
         column: (inputs, island, e) -> column of element e.
         whole: (inputs, island, e) -> True if the element has all edges of its window.
         read: (inputs, island, e, whole) -> (window, lagged).
+        displacement: (inputs, w, island, e, whole) -> window of a displacement w of all dofs.
+        Displacements: type of the array of such a w.
         slots: (f, slot) -> derivative with respect to a dof block; None where derivatives stay those of the window.
         num_slots: number of dof blocks of an element, zero without `slots`.
         stiffness_dofs: number of leading dofs by which the stiffness is measured; None for all.
@@ -71,6 +73,8 @@ class ElementStorage:
     column: Callable
     whole: Callable
     read: Callable
+    displacement: Callable
+    Displacements: Any
     slots: Callable | None = None
     num_slots: int = 0
     stiffness_dofs: int | None = None
@@ -99,31 +103,37 @@ def results_type(real, linear, slots: bool = False):
 
 
 @cache
-def write_function(storage: ElementStorage, scalar, real):
-    """Build `write(out, first, f, at)`: write a derivative with respect to the window as rows from `first` on."""
+def write_function(storage: ElementStorage, scalar, real, adds: bool = False):
+    """Build `write(out, first, f, at)`: write a derivative with respect to the window as rows from `first` on, or add it."""
     slots, count, W = storage.slots, storage.num_slots, storage.Window
     if not slots:
-        return write_rows_function(W, scalar, real)
+        return write_rows_function(W, scalar, real, adds)
     X = wp.types.vector(3, scalar)
 
     @wp.func
     def write(out: wp.array2d(dtype=X), first: int, f: W, at: int):
         for i in range(wp.static(count)):
             v = slots(f, i)
-            out[first + i, at] = X(scalar(v[0]), scalar(v[1]), scalar(v[2]))
+            x = X(scalar(v[0]), scalar(v[1]), scalar(v[2]))
+            if wp.static(adds):
+                x += out[first + i, at]
+            out[first + i, at] = x
 
     return write
 
 
 @cache
-def write_rows_function(Q, scalar, real):
-    """Build `write(out, first, f, at)`: write the components of a vector as rows from `first` on."""
+def write_rows_function(Q, scalar, real, adds: bool = False):
+    """Build `write(out, first, f, at)`: write the components of a vector as rows from `first` on, or add them."""
     size = Q._length_
 
     @wp.func
     def write(out: wp.array2d(dtype=scalar), first: int, f: Q, at: int):
         for i in range(wp.static(size)):
-            out[first + i, at] = scalar(f[i])
+            x = scalar(f[i])
+            if wp.static(adds):
+                x += out[first + i, at]
+            out[first + i, at] = x
 
     return write
 

@@ -2,8 +2,8 @@
 
     python tools/bench_elements.py --base TREE [--out DIR]
 
-Builds the kernel of a Newton iteration of several kinds of elements for sm_90, and reads registers, stack [B] and code [kB] of a thread
-from the binaries. On the CPU it times that kernel alone, and whole steps, each the least of many, in processes of both checkouts by
+Builds the kernels of a Newton iteration and of the adjoint of several kinds of elements for sm_90. From the binaries it reads registers,
+stack [B] and code [kB]. On the CPU it times that kernel alone, and whole steps, each the least of many, in processes of both checkouts by
 turns. TREE is another checkout with its kernels and scenes beside the package (links `ddg_warp/kernels` and `ddg_warp/scenes`).
 Prints two tables; writes elements_registers.csv, elements_cpu.csv and their .json.
 """
@@ -23,6 +23,8 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import arrays
+from ddg_warp.learn.chains import ChainAdjoint
+from ddg_warp.learn.net import NetAdjoint
 from ddg_warp.run.summary import machine, table, write_table
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
@@ -60,6 +62,7 @@ KINDS = (
     ("twist-free", "float32"),
     ("twist-free", "mixed"),
     ("planar", "mixed"),
+    ("planar", "float64"),
     ("net", "mixed"),
     ("net exact", "mixed"),
     ("net exact", "float64"),
@@ -103,14 +106,23 @@ def registers() -> list[dict]:
     rows = []
     for kind, precision in KINDS:
         model = scene(kind, 2, 9).build("cpu", precision)
-        newton = newton_of(ddg.Integrator(model))
-        own = newton._evaluate
-        terms = [part.term.name for part in model.net.sets] if isinstance(own, list) else [""]
-        for kernel, term in zip(own if isinstance(own, list) else [own], terms, strict=True):
+        integrator = ddg.Integrator(model)
+        if model.net is not None:
+            terms, kernels = [part.term for part in model.net.sets], newton_of(integrator)._evaluate
+            reverse = NetAdjoint(model, "implicit_euler")._pull
+        else:
+            (group,) = model.groups
+            terms, kernels = group.kind.terms, [newton_of(integrator)._evaluate]
+            reverse = ChainAdjoint(model, group, "implicit_euler")._pull
+        of_terms = [f" {term.name}" for term in terms]
+        named = list(zip(of_terms if len(kernels) == len(terms) > 1 else [""], kernels, strict=True))
+        if precision == "float64":
+            named += zip([f"{term}, adjoint" for term in of_terms], reverse, strict=True)
+        for name, kernel in named:
             with tempfile.TemporaryDirectory() as folder:
                 wp.compile_aot_module(kernel.module, arch=90, module_dir=folder, use_ptx=False)
                 (path,) = Path(folder).rglob("*.cubin")
-                rows.append({"kernel": f"{kind} {term}".strip(), "precision": precision} | cubin(path.read_bytes()))
+                rows.append({"kernel": f"{kind}{name}", "precision": precision} | cubin(path.read_bytes()))
     return rows
 
 

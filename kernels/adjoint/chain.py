@@ -10,36 +10,9 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.balance import node_functions
-from ddg_warp.kernels.chain import ChainKind, gather_functions, term_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.variation import carried_function, variation_functions
-
-
-@cache
-def displaced_function(kind: ChainKind, real):
-    """displaced(v, k, count, whole, r): the window of a displacement, which lies as right-hand sides do."""
-    W = wp.types.vector(kind.window, real)
-    along_node, *_ = gather_functions(kind, real)
-    dim, span, twist = kind.dim, kind.span, kind.twist
-
-    @wp.func
-    def displaced(v: wp.array3d(dtype=real), k: int, count: int, whole: bool, r: int):
-        q = W()
-        b = along_node(k + 1, count)
-        for d in range(wp.static(dim)):
-            q[d] = v[d, b, r] - v[d, k, r]
-        if wp.static(twist):
-            q[wp.static(dim * span)] = v[wp.static(dim), k, r]
-        if wp.static(span == 2):
-            if whole:
-                c = along_node(k + 2, count)
-                for d in range(wp.static(dim)):
-                    q[wp.static(dim) + d] = v[d, c, r] - v[d, b, r]
-                if wp.static(twist):
-                    q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
-        return q
-
-    return displaced
+from ddg_warp.kernels.variation import carried_function
 
 
 @cache
@@ -56,122 +29,6 @@ def put_function(kind: ChainKind, real, first: bool):
                 out[i, k, r] = out[i, k, r] + f[i]
 
     return put
-
-
-@cache
-def pull_kernel(kind: ChainKind, index: int, real):
-    """pull(...): what the elements of a term bring, -w . dE/dq, by their inputs.
-
-    Those by the window; by the lagged data of its two edges; by the rest measure and the parameters, in the rows that the term has in
-    the table, of viscous rods beside those of `strain_kernel`; by the strains of the last step; adds those by the rate.
-    """
-    term = kind.terms[index]
-    measure, density = term.measure, term.density
-    n, size = len(measure.strains), density.parameter_size(len(measure.strains))
-    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
-    E = wp.types.vector(n, real)
-    _, window, lagged, _ = gather_functions(kind, real)
-    displaced, put = displaced_function(kind, real), put_function(kind, real, index == 0)
-    load, local, short, spread = term_functions(kind, index, real)
-    along, _ = variation_functions(term, real)
-    row, _, _, strain_row = kind.places()[index]
-    static_size, missing = len(term.parameter_names) - 1, 0 if kind.closed else measure.span
-    frames, lagged_density = measure.lag_size > 0, density.lagged
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
-        last: wp.array3d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
-        w: wp.array3d(dtype=real),
-        window_out: wp.array3d(dtype=real),
-        lag_out: wp.array3d(dtype=real),
-        parameter_out: wp.array3d(dtype=real),
-        last_out: wp.array3d(dtype=real),
-        rate_out: wp.array2d(dtype=real),
-    ):
-        k, r = wp.tid()
-        nodes = count[r]
-        if k >= nodes - wp.static(missing):
-            put(window_out, k, r, W())
-            return
-        whole = wp.static(measure.span) == 2
-        measured, p = load(buffer, table, last, rate[r], k, r)
-        q = local(window(x, theta, k, nodes, whole, r))
-        s = short(lagged(frame, k, nodes, whole, r))
-        v = -local(displaced(w, k, nodes, whole, r))
-        dq, ds, dmeasure, dp, _dv, _de = wp.grad(along)(q, s, measured, p, v, E())
-        put(window_out, k, r, spread(dq))
-        if wp.static(frames):
-            for i in range(13):
-                lag_out[i, k, r] = ds[i]
-        if wp.static(kind.viscous):
-            dmeasure += parameter_out[wp.static(row), k, r]
-        parameter_out[wp.static(row), k, r] = dmeasure
-        for i in range(wp.static(static_size)):
-            parameter_out[wp.static(row + 1) + i, k, r] = dp[i]
-        if wp.static(lagged_density):
-            for i in range(wp.static(n)):
-                last_out[wp.static(strain_row) + i, k, r] = dp[wp.static(static_size) + i]
-            rate_out[k, r] = rate_out[k, r] + dp[wp.static(size - 1)]
-
-    return pull
-
-
-@cache
-def strain_kernel(kind: ChainKind, index: int, real):
-    """pull(...): from the derivative by a term's strains at a state to those by window, lagged data and rest measure."""
-    term = kind.terms[index]
-    measure = term.measure
-    n = len(measure.strains)
-    V, E = wp.types.vector(kind.dim, real), wp.types.vector(n, real)
-    W, put = wp.types.vector(kind.window, real), put_function(kind, real, index == 0)
-    _, window, lagged, _ = gather_functions(kind, real)
-    load, local, short, spread = term_functions(kind, index, real)
-    _, strained = variation_functions(term, real)
-    row, _, _, strain_row = kind.places()[index]
-    missing, frames = 0 if kind.closed else measure.span, measure.lag_size > 0
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
-        last: wp.array3d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
-        given: wp.array3d(dtype=real),
-        window_out: wp.array3d(dtype=real),
-        lag_out: wp.array3d(dtype=real),
-        parameter_out: wp.array3d(dtype=real),
-    ):
-        k, r = wp.tid()
-        nodes = count[r]
-        if k >= nodes - wp.static(missing):
-            put(window_out, k, r, W())
-            return
-        whole = wp.static(measure.span) == 2
-        measured, _p = load(buffer, table, last, rate[r], k, r)
-        q = local(window(x, theta, k, nodes, whole, r))
-        s = short(lagged(frame, k, nodes, whole, r))
-        f = E()
-        for i in range(wp.static(n)):
-            f[i] = given[wp.static(strain_row) + i, k, r]
-        dq, ds, dmeasure, _df = wp.grad(strained)(q, s, measured, f)
-        put(window_out, k, r, spread(dq))
-        if wp.static(frames):
-            for i in range(13):
-                lag_out[i, k, r] = ds[i]
-        parameter_out[wp.static(row), k, r] = dmeasure
-
-    return pull
 
 
 @cache

@@ -223,7 +223,7 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
         slots: whether derivatives are vectors [slot][element], instead of reals of the local dofs.
         serial: whether a thread takes all elements of a world.
     """
-    measure, Inputs = term.measure, elements_type(real)
+    measure, Inputs, V = term.measure, elements_type(real), wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
     place, spread = place_function(measure, real), functions(term, real)[1]
 
@@ -255,6 +255,11 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
     def read(inputs: Inputs, world: int, e: int, all: bool):
         return place(inputs, inputs.q, world, e)
 
+    @wp.func
+    def displacement(inputs: Inputs, w: wp.array(dtype=V), world: int, e: int, all: bool):
+        q, _s = place(inputs, w, world, e)
+        return q
+
     return ElementStorage(
         terms=(TermAccess(term, same, same_lagged, same, slack=measure.tensions),),
         Inputs=Inputs,
@@ -266,6 +271,8 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
         column=column,
         whole=whole,
         read=read,
+        displacement=displacement,
+        Displacements=wp.array(dtype=V),
         slots=spread if slots else None,
         num_slots=measure.slots if slots else 0,
     )
