@@ -2,9 +2,10 @@
 
     python tools/bench_elements.py --base TREE [--out DIR]
 
-Builds the kernels of a Newton iteration and of the adjoint of several kinds of elements for sm_90. From the binaries it reads registers,
-stack [B] and code [kB]. On the CPU it times that kernel alone, and whole steps, each the least of many, in processes of both checkouts by
-turns. TREE is another checkout with its kernels and scenes beside the package (links `ddg_warp/kernels` and `ddg_warp/scenes`).
+Builds the kernels of a Newton iteration and of the adjoint of several kinds of elements for sm_90. From the binaries it reads
+registers, stack [B] and code [kB]. On the CPU it times the first of these alone, and whole steps, each the least of many, in processes
+of both checkouts by turns. TREE is another checkout with its kernels and scenes beside the package (links `ddg_warp/kernels` and
+`ddg_warp/scenes`).
 Prints two tables; writes elements_registers.csv, elements_cpu.csv and their .json.
 """
 

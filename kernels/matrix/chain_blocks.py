@@ -13,14 +13,14 @@ from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION
 from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, place_functions
 from ddg_warp.kernels.matrix.sliced import second_function
 from ddg_warp.kernels.net.elements import part_function
-from ddg_warp.kernels.net.places import along_type, one_function
+from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import first_of
 
 
 @cache
 def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...], split: bool = False):
-    """add(along..., k, c, w, late) -> D, E, F of what the last of the terms, and by calling itself those before, add at a place."""
+    """add(sets, k, c, w, late) -> D, E, F of what the last of the terms, and by calling itself those before, add at a place."""
     term, curved = terms[-1], exact[-1]
     measure, nb = term.measure, place_dofs(twist, split)
     B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(real, linear)
@@ -33,7 +33,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     )
     second_of = second_function(measure, linear) if curved else None
     before = sum_function(terms[:-1], twist, real, linear, exact[:-1], split) if len(terms) > 1 else None
-    first, one = len(terms) == 1, one_function(len(terms) - 1, real, linear)
+    first, which = len(terms) == 1, len(terms) - 1
     part = part_function(measure, linear)
 
     @wp.func
@@ -110,13 +110,11 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
         return D, E, F
 
     @wp.func
-    def add(
-        own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int, late: bool
-    ):
-        own = one(own0, own1, own2, own3, own4, own5)
+    def add(sets: wp.array(dtype=Along), k: int, c: int, w: int, late: bool):
+        own = sets[wp.static(which)]
         D, E, F = own_sum(own, k, c, w, late)
         if wp.static(not first):
-            D1, E1, F1 = before(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            D1, E1, F1 = before(sets, k, c, w, late)
             D += D1
             E += E1
             F += F1
@@ -176,12 +174,7 @@ def blocks_function(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        sets: wp.array(dtype=Along),
         k: int,
         c: int,
         w: int,
@@ -197,7 +190,7 @@ def blocks_function(
         if wp.static(add is not None):
             # what is wanted has been counted as an iteration since it was evaluated
             late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-            D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            D, E, F = add(sets, k, c, w, late)
             for part in range(wp.static(parts)):
                 at = layout.places[part, k, c]
                 if at >= 0:
@@ -223,7 +216,7 @@ def blocks_function(
         if listed:
             D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
         if wp.static(split):
-            t, slack = behind(own0, own1, own2, own3, own4, own5, k, c, w)
+            t, slack = behind(sets, k, c, w)
             D[wp.static(nb - 1), wp.static(nb - 1)] = linear(-1.0)
             if slack > linear(0.0):
                 D[wp.static(nb - 1), wp.static(nb - 1)] = -slack
@@ -237,7 +230,7 @@ def blocks_function(
             if listed:
                 E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
             if wp.static(split):
-                t, slack = behind(own0, own1, own2, own3, own4, own5, k + 1, c, w)
+                t, slack = behind(sets, k + 1, c, w)
                 if slack > linear(0.0):
                     for d in range(3):
                         E[d, wp.static(nb - 1)] = -t[d]

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.net.places import along_type, one_function
+from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import first_of
 
@@ -144,18 +144,18 @@ def splits(term: Term) -> bool:
 
 @cache
 def behind_function(terms: tuple[Term, ...], real, linear):
-    """behind(along..., k, c, w) -> row and slack of the edge that ends at a place, no slack where it has no tension of its own."""
+    """behind(sets, k, c, w) -> row and slack of the edge that ends at a place, no slack where it has no tension of its own."""
     H, Along = wp.types.vector(3, linear), along_type(real, linear)
-    first, one, own_splits = len(terms) == 1, one_function(len(terms) - 1, real, linear), splits(terms[-1])
+    first, which, own_splits = len(terms) == 1, len(terms) - 1, splits(terms[-1])
     before = None if first else behind_function(terms[:-1], real, linear)
 
     @wp.func
-    def behind(own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int):
-        own = one(own0, own1, own2, own3, own4, own5)
+    def behind(sets: wp.array(dtype=Along), k: int, c: int, w: int):
+        own = sets[wp.static(which)]
         t = H()
         slack = linear(0.0)
         if wp.static(not first):
-            t, slack = before(own0, own1, own2, own3, own4, own5, k, c, w)
+            t, slack = before(sets, k, c, w)
         if wp.static(own_splits):
             e = own.at[1, k, c]
             if e >= 0:

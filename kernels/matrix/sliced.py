@@ -158,7 +158,9 @@ def inertia_function(real, linear, drag: bool):
     return inertia_of
 
 
-SETS = 6  # sets that one launch sums
+# Sets that one launch sums, each an argument of its own. As one array of structs, which is read from memory instead of the constants of
+# a launch, the kernel took 64 registers for sm_90 instead of 48, and 3 % longer on the CPU.
+SETS = 6
 
 
 @cache

@@ -50,12 +50,7 @@ def walk_kernel(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        sets: wp.array(dtype=Along),
         right: wp.array(dtype=H),
         blocks: int,
         factors: wp.array3d(dtype=linear),
@@ -77,7 +72,7 @@ def walk_kernel(
         before = B()
         before2 = B()
         for k in range(n):
-            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, own0, own1, own2, own3, own4, own5, k, c, w)
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, sets, k, c, w)
             L, inverse, lost_here = factor(D - minus)
             bad += lost_here
             Zb = lower(L, E - minus_couple)
