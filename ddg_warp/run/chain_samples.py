@@ -35,7 +35,11 @@ class Chain(Sample):
 
     def __init__(self, term: Term, kind: ChainKind, *arguments):
         self.chain, self.count = "closed" if kind.closed else "open", np.array([6, 5])
-        self.index, self.column = kind.terms.index(term), np.broadcast_to(np.arange(2), self.shape)
+        self.index, self.grid, self.column = (
+            kind.terms.index(term),
+            self.shape,
+            np.broadcast_to(np.arange(2), self.shape),
+        )
         self.first, *_, row = kind.places()[self.index]
         self.rows, self.vectors = slice(row, row + len(term.measure.strains)), [np.s_[..., : kind.dim]]
         super().__init__(term, kind, *arguments)
@@ -117,7 +121,7 @@ class Chain(Sample):
         rows = [array.reshape((*array.shape[:-2], -1)) for array in out]
         found.factor, found.second, found.gradient, found.energy, found.stiffness = rows
         found.tension = found.factor
-        inputs = [self._inputs(real), *islands.arrays]
+        inputs = [self.inputs(real), *islands.arrays]
         wp.launch(kernel, shape, inputs, [found], device=self.device, block_dim=128)  # it is bound to that
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
@@ -131,26 +135,6 @@ class Chain(Sample):
             matrix[i, j] += geometric
             matrix[j[i != j], i[i != j]] += geometric[i != j]
         return matrix, force, energy[1]
-
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of the energy (which = 0) or gradient (1) kernel of the term, by input."""
-        given, kind, real = self._inputs(self.real), self.kind, self.real
-        seeds = wp.array(seed.reshape(*seed.shape[:-2], -1), dtype=real, device=self.device)
-        wp.launch(
-            element_path.term_kernels(rod_storage(kind, real), self.index, real, reverse=True)[which],
-            self.shape,
-            [given],
-            [wp.zeros_like(seeds, requires_grad=True)],
-            adjoint=True,
-            adj_inputs=[rod_elements_type(kind.dim, real)()],
-            adj_outputs=[seeds],
-            device=self.device,
-        )
-        x, theta, *others = (getattr(given, name).grad.numpy().astype(float) for name in self.INPUTS)
-        q = np.zeros((*self.shape, 4))
-        q[..., : self.kind.dim], q[..., 3] = x, theta
-        names = (name for name in self.data if name != "q")
-        return {"q": q} | {n: v.reshape(self.data[n].shape) for n, v in zip(names, others, strict=True)}
 
     def scatter(self, local: np.ndarray) -> np.ndarray:
         """From derivatives on windows (window, n, R) to dofs (n, R, 4)."""
@@ -209,8 +193,26 @@ class Chain(Sample):
                 last[self.rows] = np.einsum("ij,jnr->inr", spin, self.data["last"][self.rows])
             yield velocity, last
 
-    def _inputs(self, real, **changed):
-        """What the kernels of a term read; see `kernels.chain.rod_elements_type`."""
+    def storage(self, real):
+        """Return the element storage of the chain."""
+        return rod_storage(self.kind, real)
+
+    def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
+        """Return derivatives by the window as (window, ..., n, R)."""
+        return values.reshape(*values.shape[:-1], *self.shape)
+
+    def as_written(self, seed: np.ndarray, which: int) -> np.ndarray:
+        """Return weights of energies or gradients as kernels write these."""
+        return seed.reshape(*seed.shape[:-2], -1)
+
+    def by_data(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return derivatives by what kernels read as those by `data`."""
+        q = np.zeros((*self.shape, 4))
+        q[..., : self.kind.dim], q[..., 3] = values["x"], values["theta"]
+        return {"q": q} | {name: values[name].reshape(own.shape) for name, own in self.data.items() if name != "q"}
+
+    def inputs(self, real, **changed):
+        """Return what the kernels of a term read; see `kernels.chain.rod_elements_type`."""
         data, dim = {**self.data, **changed}, self.kind.dim
         q = data["q"]
         last = data["last"].reshape(len(data["last"]), -1)
@@ -227,16 +229,3 @@ class Chain(Sample):
         for name, values in zip((*self.INPUTS, "table", "count"), out, strict=True):
             setattr(given, name, values)
         return given
-
-    def _launch(self, which: int, real, **changed):
-        """What the energy (0), gradient (1), Hessian (2) or strain (3) kernel gives."""
-        kind, w, storage = self.kind, self.kind.window, rod_storage(self.kind, real)
-        size, count = [(), (w,), (w, w), (kind.strain_rows,)][which], self.shape[0] * self.shape[1]
-        kernels = element_path.term_kernels(storage, self.index, real, reverse=True)
-        kernel = element_path.strain_kernel(storage, real) if which == 3 else kernels[which]
-        out = [wp.zeros((*size, count), dtype=real, device=self.device) for _ in range(2 if which == 3 else 1)]
-        more = [[], [], [wp.zeros((0, 0), dtype=real, device=self.device)], [1]][which]
-        inputs = [self._inputs(real, **changed), *more]
-        wp.launch(kernel, (*self.shape, w) if which == 2 else self.shape, inputs, out, device=self.device)
-        found = [array.numpy().astype(float).reshape(*size, *self.shape) for array in out]
-        return tuple(values[self.rows] for values in found) if which == 3 else found[0]

@@ -28,6 +28,7 @@ class Elements(Sample):
     def __init__(self, term: Term, *arguments):
         measure = term.measure
         self.shape, self.first, self.rows, self.parts = (self.COUNT,), 0, slice(0, len(measure.strains)), [self]
+        self.grid, self.index = (1, self.COUNT), 0
         self.slots = np.arange(measure.slots * self.COUNT).reshape(-1, self.COUNT)
         self.angle_start = measure.nodes * self.COUNT
         self.angle_end = self.angle_start + measure.angles * self.COUNT
@@ -81,10 +82,10 @@ class Elements(Sample):
         out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
         search = Islands(1, real, self.device)
         search.clamped.fill_(0 if exact else 1)
-        kernel = element_path.evaluate_kernel(self._storage(real), real, real, 0 if exact and packed else None)
+        kernel = element_path.evaluate_kernel(self.storage(real), real, real, 0 if exact and packed else None)
         found = element_path.results_type(real, real, True)()
         found.factor, found.tension, found.second, found.gradient, found.energy, found.stiffness = out
-        wp.launch(kernel, (1, count), [self._elements(real), *search.arrays], [found], device=self.device)
+        wp.launch(kernel, (1, count), [self.inputs(real), *search.arrays], [found], device=self.device)
         factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)
@@ -97,25 +98,6 @@ class Elements(Sample):
             local[:, i, j] = local[:, j, i] = second.T
             matrix += np.einsum("ia,eij,jb->abe", self.incidence, local, self.incidence)
         return matrix, _flat(gradient), energy[1]
-
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of the energy (which = 0) or gradient (1) kernel, by input."""
-        given, dtype = self._elements(self.real), wp.types.vector(3, self.real) if which else self.real
-        if which:
-            seed = seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1)
-        seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
-        wp.launch(
-            element_path.term_kernels(self._storage(self.real), 0, self.real, reverse=True)[which],
-            (1, self.COUNT),
-            [given],
-            [wp.zeros_like(seeds, requires_grad=True)],
-            adjoint=True,
-            adj_inputs=[net_elements.elements_type(self.real)()],
-            adj_outputs=[seeds],
-            device=self.device,
-        )
-        values = {name: getattr(given, name).grad.numpy().astype(float) for name in self.INPUTS}
-        return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
 
     def scatter(self, local: np.ndarray) -> np.ndarray:
         """From the local dofs (local, E) to all (blocks, 3)."""
@@ -142,11 +124,26 @@ class Elements(Sample):
             [*edges, np.kron(angles, axes[:1]), np.kron(spins, axes), np.kron(slot[: measure.points], axes)]
         )
 
-    def _storage(self, real):
+    def storage(self, real):
+        """Return the element storage of the term."""
         return net_elements.coupled_storage(self.term, real)
 
-    def _elements(self, real, **changed):
-        """What kernels read; see `kernels.net.elements.elements_type`."""
+    def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
+        """Return gradients (slots, E, 3) and Hessians by the dofs of the measure as those by three reals a slot."""
+        if which == 2:
+            return np.einsum("ia,ije,jb->abe", self.incidence, values, self.incidence)
+        return _flat(values) if which == 1 else values
+
+    def as_written(self, seed: np.ndarray, which: int) -> np.ndarray:
+        """Return weights of energies or gradients as kernels write these."""
+        return seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1) if which else seed
+
+    def by_data(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return derivatives by what kernels read as those by `data`."""
+        return {name: own.reshape(self.data[name].shape) for name, own in values.items()}
+
+    def inputs(self, real, **changed):
+        """Return what kernels read; see `kernels.net.elements.elements_type`."""
         data, given = {**self.data, **changed}, net_elements.elements_type(real)()
 
         def put(values, dtype):
@@ -163,24 +160,6 @@ class Elements(Sample):
         given.angle_start, given.edges = self.angle_start, self.angle_end - self.angle_start
         given.elements = self.COUNT
         return given
-
-    def _launch(self, which: int, real, **changed):
-        """What the energy (0), gradient (1), Hessian (2) or strain (3) kernel gives."""
-        measure, count, device = self.measure, self.COUNT, self.device
-        n, size = len(measure.strains), measure.size
-        shape = [(count,), (measure.slots, count), (count, size, size), (n, count)][which]
-        dtype = wp.types.vector(3, real) if which == 1 else real
-        out = [wp.zeros(shape, dtype=dtype, device=device) for _ in range(2 if which == 3 else 1)]
-        extra = [[], [], [wp.zeros((0, 0), dtype=real, device=device)], [1]][which]
-        kernels = element_path.term_kernels(self._storage(real), 0, real, reverse=True)
-        kernel = element_path.strain_kernel(self._storage(real), real) if which == 3 else kernels[which]
-        grid = (1, count, size) if which == 2 else (1, count)
-        views = [out[0].transpose((1, 2, 0))] if which == 2 else out
-        wp.launch(kernel, grid, [self._elements(real, **changed), *extra], views, device=device)
-        found = [array.numpy().astype(float) for array in out]
-        if which == 2:
-            return np.einsum("ia,eij,jb->abe", self.incidence, found[0], self.incidence)
-        return _flat(found[0]) if which == 1 else tuple(found) if which == 3 else found[0]
 
 
 def _flat(values: np.ndarray) -> np.ndarray:

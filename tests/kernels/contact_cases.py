@@ -36,7 +36,7 @@ class Pairs(Elements):
     def touched(self) -> "Pairs":
         """These with the lagged data of where they are."""
         out = wp.zeros((self.measure.lag_size, COUNT), dtype=wp.float64, device=self.device)
-        given, moved = self._elements(wp.float64), wp.full(1, 1, dtype=int, device=self.device)
+        given, moved = self.inputs(wp.float64), wp.full(1, 1, dtype=int, device=self.device)
         kernel = lag_kernel(self.measure, wp.float64, False)
         wp.launch(kernel, COUNT, [given, moved, 1, 0, given.lag], [out], device=self.device)
         return self.like({**self.data, "lag": out.numpy()})

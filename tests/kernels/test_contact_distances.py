@@ -165,7 +165,7 @@ def test_obstacles_are_what_they_are_called(device):
 def test_poses_of_obstacles_have_gradients(device, term):
     """Reverse mode by what places the obstacle, and by its half lengths, = differences, as an adjoint needs it."""
     sample = Pairs(ALL[term], None, "float64", device)
-    given, seeds = sample._elements(wp.float64), wp.ones(COUNT, dtype=wp.float64, device=device)
+    given, seeds = sample.inputs(wp.float64), wp.ones(COUNT, dtype=wp.float64, device=device)
     wp.launch(
         term_kernels(coupled_storage(sample.term, wp.float64), 0, wp.float64, reverse=True)[0],
         (1, COUNT),
