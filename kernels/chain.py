@@ -333,35 +333,3 @@ def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
         clears_active=True,
         launch_bounds=launch_bounds,
     )
-
-
-@cache
-def term_functions(kind: ChainKind, index: int, real):
-    """Build `load(buffer, table, last, rate, k, r)`: return rest measure and parameters of a term from single arrays.
-
-    It comes with the functions `local`, `short` and `spread` of its `TermAccess`.
-    """
-    own, (*_, parameter) = _term_access(kind, index, real), gather_functions(kind, real)
-    n, density, first, strain = len(own.term.measure.strains), own.term.density, own.parameter, own.strain
-    size, static_size, lagged = density.parameter_size(n), len(own.term.parameter_names) - 1, density.lagged
-    P = wp.types.vector(size, real)
-
-    @wp.func
-    def load(
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        last: wp.array3d(dtype=real),
-        rate: real,
-        k: int,
-        r: int,
-    ):
-        p = P()
-        for i in range(wp.static(static_size)):
-            p[i] = parameter(buffer, table, wp.static(first + 1) + i, k, r)
-        if wp.static(lagged):
-            for i in range(wp.static(n)):
-                p[wp.static(static_size) + i] = last[wp.static(strain) + i, k, r]
-            p[wp.static(size - 1)] = rate
-        return parameter(buffer, table, wp.static(first), k, r), p
-
-    return load, own.local, own.short, own.spread

@@ -3,6 +3,12 @@
 A kernel reads the local dofs of an element, evaluates strains and Jacobian, and writes columns. Storages differ in where dofs lie and
 which thread takes which element. An `ElementStorage` holds these as Warp functions that are chosen when a kernel is built.
 `kernels.chain.rod_storage` is that of uncoupled rods, `kernels.net.elements.coupled_storage` that of the coupled system.
+`kernels.adjoint.elements` and `kernels.energy` are written over the same storages.
+
+Alternative: one source for what surrounds elements. It is kept apart where the algorithms differ. Residuals have other stopping rules:
+sums over a whole rod, or over a tree of parts. The line search of rods is fused with their sweep, one thread a rod and one launch an
+iteration. Their frames are updated two edges a vertex in one kernel, those of the coupled system edge by edge. Matrix blocks and
+eliminations are those of a rod, or bands and slices with joints. Conjugate gradients of rods serve closed ones alone.
 """
 
 from collections.abc import Callable

@@ -160,6 +160,7 @@ CASES: dict[str, tuple[Callable[[], ddg.Scene], str, float, dict]] = {
     "twisted": (twisted, "float64", 0.01, {}),
     "twisted_mixed": (twisted, "mixed", 0.01, {}),
     "midpoint": (twisted, "float64", 0.002, {"scheme": "implicit_midpoint"}),
+    "midpoint_joined": (joined, "float64", 0.002, {"scheme": "implicit_midpoint"}),
     "planar": (planar, "float64", 0.01, {}),
     "curved": (curved, "float64", 0.02, {}),
     "project": (curved, "float64", 0.02, {"psd": "project"}),
@@ -210,9 +211,10 @@ def record(name: str) -> tuple[dict[str, np.ndarray], str]:
     for _ in range(STEPS):
         state = integrator.step(state, dt)
     found = integrator.statistics()
-    newton = found["newton_iterations"]
+    newton, energy = found["newton_iterations"], found.get("energy", {})
     counts = np.array([newton["mean"], newton["max"], found["pcg_iterations"]])
-    return {**state.snapshot(), "counts": counts}, ", ".join(found["linear"])
+    account = {f"energy {key}": np.array(value) for key, value in energy.items()}
+    return {**state.snapshot(), **account, "counts": counts}, ", ".join(found["linear"])
 
 
 def difference(one: np.ndarray, other: np.ndarray) -> float:

@@ -23,7 +23,8 @@ def follow(net, state, angles: bool, rates: bool) -> None:
         if rates:
             net.strains(state, index, strain, stress)
             inputs = [net.elements(state, index), state.v]
-            wp.launch(linear_stress_kernel(TERM, net.real), edges.size, inputs, [next_stress], device=net.device)
+            grid = net.worlds, part.elements
+            wp.launch(linear_stress_kernel(TERM, net.real), grid, inputs, [next_stress], device=net.device)
             slip = (next_stress.numpy() - stress.numpy()).reshape(shape) / np.where(stiffness > 0.0, stiffness, 1.0)
             _turn(state.v, edges, np.where(free, -slip, 0.0))
 

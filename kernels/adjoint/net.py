@@ -8,8 +8,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import block_inertia
-from ddg_warp.kernels.net import elements
-from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
+from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function, spread_function
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -23,7 +22,7 @@ def lag_kernel(term: Term, real):
     own = measure.lag_size - FRAME * measure.frames
     L = wp.types.vector(own, real)
     place, advance = place_function(measure, real), measure.advance(real)
-    _, spread = elements.functions(term, real)
+    spread = spread_function(measure, real)
     slots, data = measure.slots, measure.lag_size + measure.data_size
 
     @wp.func

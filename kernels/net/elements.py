@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element_path import ElementStorage, TermAccess
+from ddg_warp.kernels.element_path import ElementStorage, TermAccess, parameter_function, write_rows_function
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
@@ -103,33 +103,12 @@ def place_function(measure: Measure, real):
 
 
 @cache
-def functions(term: Term, real):
-    """gather(given, q, world, e) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
-    Elements = elements_type(real)
-    measure, density = term.measure, term.density
+def spread_function(measure: Measure, real):
+    """Build `spread(f, slot)`: return the part of a derivative by the local dofs that belongs to the dof block of a slot."""
     V = wp.types.vector(3, real)
     Q, _, _, _ = measure.types(real)
-    n = len(measure.strains)
-    P = wp.types.vector(density.parameter_size(n), real)
-    static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
     nodes, angles, spins, edge_count = measure.nodes, measure.angles, measure.spins, len(measure.edges)
     points, (angle_row, spin_row, point_row), (first, second) = measure.points, measure.starts, edge_ends(measure)
-    lagged = density.lagged
-    place = place_function(measure, real)
-
-    @wp.func
-    def gather(given: Elements, q: wp.array(dtype=V), world: int, e: int):
-        local, s = place(given, q, world, e)
-        tid = e + world * given.elements
-        p = P()
-        for i in range(wp.static(static_size)):
-            row = i + 1
-            p[i] = given.buffer[given.table[row, 0] + e * given.table[row, 1] + world * given.table[row, 2]]
-        if wp.static(lagged):
-            for i in range(wp.static(n)):
-                p[wp.static(static_size) + i] = given.last[i, tid]
-            p[wp.static(size - 1)] = given.rate[world]
-        return local, s, given.buffer[given.table[0, 0] + e * given.table[0, 1] + world * given.table[0, 2]], p
 
     @wp.func
     def spread(f: Q, slot: int):
@@ -156,29 +135,7 @@ def functions(term: Term, real):
                 )
         return v
 
-    return gather, spread
-
-
-@cache
-def linear_stress_kernel(term: Term, real):
-    """Build the kernel of stresses at the strains that a step gives to first order, e + J step."""
-    Elements, V, n = elements_type(real), wp.types.vector(3, real), len(term.measure.strains)
-    _, jacobian_of, *_ = term.measure.functions(real)
-    _, slope_of, _ = term.density.functions(real, n)
-    gather, _ = functions(term, real)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
-    def linear_stress(given: Elements, step: wp.array(dtype=V), stress_out: wp.array2d(dtype=real)):
-        tid = wp.tid()
-        world = tid / given.elements
-        x, s, w, p = gather(given, given.q, world, tid - world * given.elements)
-        d, _s, _w, _p = gather(given, step, world, tid - world * given.elements)
-        e, jacobian = jacobian_of(x, s, w)
-        stress = slope_of(e + jacobian * d, p)
-        for i in range(wp.static(n)):
-            stress_out[i, tid] = stress[i]
-
-    return linear_stress
+    return spread
 
 
 def factor_type(linear, local: bool):
@@ -225,7 +182,7 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
     """
     measure, Inputs, V = term.measure, elements_type(real), wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
-    place, spread = place_function(measure, real), functions(term, real)[1]
+    place, spread = place_function(measure, real), spread_function(measure, real)
 
     @wp.func
     def same(q: Q):
@@ -276,3 +233,29 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
         slots=spread if slots else None,
         num_slots=measure.slots if slots else 0,
     )
+
+
+@cache
+def linear_stress_kernel(term: Term, real):
+    """Build the kernel of stresses at the strains that a step gives to first order, e + J step."""
+    storage, V, n = coupled_storage(term, real), wp.types.vector(3, real), len(term.measure.strains)
+    Inputs, items, read = storage.Inputs, storage.items, storage.read
+    displacement, column_of = storage.displacement, storage.column
+    _, jacobian_of, *_ = term.measure.functions(real)
+    _, slope_of, _ = term.density.functions(real, n)
+    parameters, write = (
+        parameter_function(storage, 0, real),
+        write_rows_function(term.measure.types(real)[2], real, real),
+    )
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def linear_stress(inputs: Inputs, step: wp.array(dtype=V), stress_out: wp.array2d(dtype=real)):
+        i, j = wp.tid()
+        world, element = items(i, j)
+        at = column_of(inputs, world, element)
+        w, p = parameters(inputs, world, element, at)
+        q, s = read(inputs, world, element, True)
+        e, jacobian = jacobian_of(q, s, w)
+        write(stress_out, 0, slope_of(e + jacobian * displacement(inputs, step, world, element, True), p), at)
+
+    return linear_stress

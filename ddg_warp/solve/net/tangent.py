@@ -136,7 +136,7 @@ class NetTangent(Part):
             out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
             given = self.net.elements(state.net, i, rate=self.rate)
             kernel = linear_stress_kernel(part.term, self.net.real)
-            wp.launch(kernel, shape[1], [given, change], [out], device=self.net.device)
+            wp.launch(kernel, (self.net.worlds, part.elements), [given, change], [out], device=self.net.device)
             result.append(out.numpy().astype(np.float64))
         return result
 
