@@ -38,13 +38,12 @@ def columns(array: wp.array, *rows: int) -> wp.array:
     """Return a view [row][column] of an array [row][node][rod], with columns in the order of its memory.
 
     Args:
-        rows: shape of the rows, if it is to be another one.
+        rows: shape of the rows, where they are split.
     """
     rows = rows or array.shape[:-2]
     if array.is_contiguous:
         return array.reshape((*rows, -1))
-    base = array.transpose(tuple(reversed(range(array.ndim))))
-    return base.reshape((-1, *reversed(rows))).transpose(tuple(reversed(range(len(rows) + 1))))
+    return _turned(array).reshape((-1, *rows)).transpose((*range(1, len(rows) + 1), 0))
 
 
 def assign(array: wp.array, values: np.ndarray) -> None:
