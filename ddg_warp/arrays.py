@@ -38,6 +38,18 @@ def upload(values: np.ndarray, dtype, device) -> wp.array:
     return wp.array(reordered, dtype=dtype, device=device).transpose(order)
 
 
+def columns(array: wp.array, *rows: int) -> wp.array:
+    """Return a view [row][column] of an array [row][node][rod], with columns in the order of its memory.
+
+    Args:
+        rows: shape of the rows, where they are split.
+    """
+    rows = rows or array.shape[:-2]
+    if array.is_contiguous:
+        return array.reshape((*rows, -1))
+    return _turned(array).reshape((-1, *rows)).transpose((*range(1, len(rows) + 1), 0))
+
+
 def assign(array: wp.array, values: np.ndarray) -> None:
     """Copy host values of the same logical shape into a device array."""
     copy(array, upload(np.asarray(values), array.dtype, array.device))

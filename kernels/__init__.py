@@ -1,4 +1,4 @@
-"""Every Warp kernel of ddg_warp. Read `measures/edge_stretch.py`, then `element.py`, then `solve/sweep.py`."""
+"""Every Warp kernel of ddg_warp. Read `measures/edge_stretch.py`, then `element_path.py`, then `solve/sweep.py`."""
 
 import os
 

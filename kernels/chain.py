@@ -1,11 +1,22 @@
-"""Chains, rods of one kind side by side: what they have, and how a thread reads its window of one."""
+"""Uncoupled rods of one kind, side by side: their layout, local dofs and element storage.
+
+Arrays run [component][node][rod]. Element k of a rod starts at its node k; edge k runs from node k to node k + 1, modulo the nodes
+of a closed rod. The *window* of an element holds its local dofs, q = [edge k, edge k + 1, theta k, theta k + 1], cut to what the rods
+have. Element forces and factors are derivatives with respect to the window; forces on nodes are differences of them.
+
+Parameters of all terms lie in one buffer. Row i of `table` is (offset, stride along the rod, stride across rods), so that one
+number, one a rod, one an element or one each are read by the same code.
+"""
 
 from dataclasses import dataclass
 from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.element_path import ElementStorage, TermAccess
+from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import until_function
 
 
 @dataclass(frozen=True)
@@ -175,3 +186,150 @@ def gather_functions(kind: ChainKind, real):
         return buffer[table[row, 0] + k * table[row, 1] + r * table[row, 2]]
 
     return along, window, lagged, parameter
+
+
+@cache
+def displaced_function(kind: ChainKind, real):
+    """Build `displaced(v, k, count, whole, r)`: return the window of a displacement [component of a node][node][rod]."""
+    W = wp.types.vector(kind.window, real)
+    along_node, *_ = gather_functions(kind, real)
+    dim, span, twist = kind.dim, kind.span, kind.twist
+
+    @wp.func
+    def displaced(v: wp.array3d(dtype=real), k: int, count: int, whole: bool, r: int):
+        q = W()
+        b = along_node(k + 1, count)
+        for d in range(wp.static(dim)):
+            q[d] = v[d, b, r] - v[d, k, r]
+        if wp.static(twist):
+            q[wp.static(dim * span)] = v[wp.static(dim), k, r]
+        if wp.static(span == 2):
+            if whole:
+                c = along_node(k + 2, count)
+                for d in range(wp.static(dim)):
+                    q[wp.static(dim) + d] = v[d, c, r] - v[d, b, r]
+                if wp.static(twist):
+                    q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
+        return q
+
+    return displaced
+
+
+@cache
+def rod_elements_type(dim: int, real):
+    """Return the struct that kernels of elements read: dofs, lagged data, parameters and number of nodes of every rod."""
+    V = wp.types.vector(dim, real)
+
+    @wp.struct
+    class RodElements:
+        x: wp.array2d(dtype=V)
+        theta: wp.array2d(dtype=real)
+        frame: wp.array3d(dtype=real)
+        last: wp.array2d(dtype=real)  # strains of the last step, a column an element
+        rate: wp.array(dtype=real)
+        buffer: wp.array(dtype=real)
+        table: wp.array2d(dtype=int)
+        count: wp.array(dtype=int)
+
+    return RodElements
+
+
+@cache
+def _term_access(kind: ChainKind, index: int, real) -> TermAccess:
+    """Return the access of term `index` to the window, and to its rows among those of all terms."""
+    term, measure = kind.terms[index], kind.terms[index].measure
+    Q, S, _, _ = measure.types(real)
+    W, L, lag_size = wp.types.vector(kind.window, real), wp.types.vector(13, real), measure.lag_size
+    dofs = [*range(kind.dim * measure.span), *(kind.dim * kind.span + i for i in range(measure.angles))]
+    size, where = measure.size, wp.types.vector(measure.size, int)(*dofs)
+    second = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
+    parameter, factor, tension, strain = kind.places()[index]
+
+    @wp.func
+    def local(w: W):
+        q = Q()
+        for i in range(wp.static(size)):
+            q[i] = w[where[i]]
+        return q
+
+    @wp.func
+    def short(s: L):
+        if wp.static(lag_size > 0):
+            return s
+        else:
+            return S()
+
+    @wp.func
+    def spread(f: Q):
+        w = W()
+        for i in range(wp.static(size)):
+            w[where[i]] = f[i]
+        return w
+
+    return TermAccess(term, local, short, spread, parameter, strain, factor, tension, kind.factor_rows, second)
+
+
+@cache
+def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
+    """Return the storage of uncoupled rods: an island is a rod, and all terms share one window."""
+    Inputs, missing, closed, serial = (
+        rod_elements_type(kind.dim, real),
+        0 if kind.closed else 1,
+        kind.closed,
+        kind.serial,
+    )
+    (_, window, lagged, _), displaced = gather_functions(kind, real), displaced_function(kind, real)
+
+    @wp.func
+    def items(first: int, r: int):
+        return r, first
+
+    @wp.func
+    def count(inputs: Inputs, r: int):
+        return inputs.count[r] - wp.static(missing)
+
+    @wp.func
+    def column(inputs: Inputs, r: int, k: int):
+        """Return the column of `arrays.columns`: elements of a rod in a row on the CPU, of all rods on a GPU.
+
+        It is not below 0, as in `first_of`.
+        """
+        if wp.static(serial):
+            return wp.max(r * inputs.x.shape[0] + k, 0)
+        return wp.max(k * inputs.x.shape[1] + r, 0)
+
+    @wp.func
+    def whole(inputs: Inputs, r: int, k: int):
+        return wp.static(closed) or k < inputs.count[r] - 2
+
+    @wp.func
+    def read(inputs: Inputs, r: int, k: int, all: bool):
+        n = inputs.count[r]
+        return window(inputs.x, inputs.theta, k, n, all, r), lagged(inputs.frame, k, n, all, r)
+
+    @wp.func
+    def displacement(inputs: Inputs, w: wp.array3d(dtype=real), r: int, k: int, all: bool):
+        return displaced(w, k, inputs.count[r], all, r)
+
+    def launch_bounds(curved: bool):
+        # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200; second derivatives in
+        # float64 need more, and take a quarter less time with two
+        return 128, 2 if curved and linear == wp.float64 else 3
+
+    return ElementStorage(
+        terms=tuple(_term_access(kind, index, real) for index in range(len(kind.terms))),
+        Inputs=Inputs,
+        Window=wp.types.vector(kind.window, real),
+        Lagged=wp.types.vector(13, real),
+        items=items,
+        last_item=until_function(kind.serial),
+        count=count,
+        column=column,
+        whole=whole,
+        read=read,
+        displacement=displacement,
+        Displacements=wp.array3d(dtype=real),
+        stiffness_dofs=kind.dim,
+        clears_active=True,
+        launch_bounds=launch_bounds,
+    )

@@ -13,8 +13,8 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
-from ddg_warp.kernels.element import term_functions
+from ddg_warp.kernels.chain import ChainKind, inertia_type, rod_storage
+from ddg_warp.kernels.element_path import ElementStorage, parameter_function
 from ddg_warp.kernels.islands import PROGRESS, RATE, STATUS
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -63,69 +63,61 @@ def balance_function(term: Term, real):
 
 
 @cache
-def window_function(kind: ChainKind, index: int, real):
-    """at(window0, lagged0, window, lagged, ...) of the terms 0 to `index` of a chain: the sum of their rows of element k of rod r.
+def rows_function(storage: ElementStorage, index: int, real):
+    """Build `rows_at`: return the rows of an element, summed over the terms 0 to `index` that it has.
 
     It calls itself for those before the last: a loop over functions would generate all code whenever the kernel is defined.
     """
-    term = kind.terms[index]
-    everywhere = term.measure.span == 1
-    before = window_function(kind, index - 1, real) if index else None
-    load, local, short, _ = term_functions(kind, index, real)
-    balance = balance_function(term, real)
-    W, S, B = wp.types.vector(kind.window, real), wp.types.vector(13, real), wp.types.vector(ROWS, real)
+    own, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
+    everywhere = own.term.measure.span != 2 or len(storage.terms) == 1
+    before = rows_function(storage, index - 1, real) if index else None
+    local, short, parameters = own.local, own.short, parameter_function(storage, index, real)
+    balance, B = balance_function(own.term, real), wp.types.vector(ROWS, real)
 
     @wp.func
-    def at(
+    def rows_at(
+        inputs: Inputs,
         window0: W,
-        lagged0: S,
+        lagged0: L,
         window: W,
-        lagged: S,
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        last: wp.array3d(dtype=real),
-        rate: real,
+        lagged: L,
         whole: bool,
         reach: real,
         floor: real,
-        k: int,
-        r: int,
+        island: int,
+        e: int,
+        at: int,
     ):
         rows = B()
         if wp.static(index > 0):
-            rows += before(window0, lagged0, window, lagged, buffer, table, last, rate, whole, reach, floor, k, r)
+            rows += before(inputs, window0, lagged0, window, lagged, whole, reach, floor, island, e, at)
         if whole or wp.static(everywhere):
-            w, p = load(buffer, table, last, rate, k, r)
+            w, p = parameters(inputs, island, e, at)
             rows += balance(local(window0), short(lagged0), local(window), short(lagged), w, p, reach, floor)
         return rows
 
-    return at
+    return rows_at
 
 
 @cache
 def chain_kernel(kind: ChainKind, real, linear):
-    """Rows of a step of every rod, summed over ranges: range i holds the nodes i, i + ranges, ... (see `kernels.parallel_search`)."""
-    V, B = wp.types.vector(kind.dim, real), wp.types.vector(ROWS, real)
-    _, window, lagged, _ = gather_functions(kind, real)
-    rows_of_all = window_function(kind, len(kind.terms) - 1, real)
+    """Build the kernel of the rows of a step of every rod, summed over ranges.
+
+    Range i holds the nodes i, i + ranges, ...; see `kernels.parallel_search`.
+    """
+    V, B, storage = wp.types.vector(kind.dim, real), wp.types.vector(ROWS, real), rod_storage(kind, real)
+    Inputs, read, column_of, whole_of = storage.Inputs, storage.read, storage.column, storage.whole
+    rows_of_all = rows_function(storage, len(kind.terms) - 1, real)
     twist, closed, drag, Inertia = kind.twist, kind.closed, kind.drag, inertia_type(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        x0: wp.array2d(dtype=V),
+        start: Inputs,
+        middle: Inputs,
         v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
         omega0: wp.array2d(dtype=real),
-        frame0: wp.array3d(dtype=real),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
-        last: wp.array3d(dtype=real),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
         mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
         load: wp.array2d(dtype=V),
@@ -140,23 +132,23 @@ def chain_kernel(kind: ChainKind, real, linear):
         rows_out: wp.array3d(dtype=real),
     ):
         """`load` and `load_angle` are those of the iterate, those `there` those that the step was solved with."""
-        start, r = wp.tid()
+        first, r = wp.tid()
         if scalars[PROGRESS, r] >= real(1.0):
             return
-        n = count[r]
+        n = middle.count[r]
         total = B()
-        for k in range(start, n, ranges):
+        for k in range(first, n, ranges):
             if wp.static(drag):
                 m = mass[k, r].mass
             else:
                 m = mass[k, r]
-            here = x[k, r]
-            moved = here - x0[k, r]
+            here = middle.x[k, r]
+            moved = here - start.x[k, r]
             v = moved * (real(2.0) * scalars[RATE, r]) - v0[k, r]
             kinetic = real(0.5) * m * wp.length_sq(v)
             damped = real(2.0) * damping[0] * scalars[RATE, r] * m * wp.length_sq(moved)
             if wp.static(twist):
-                turned = theta[k, r] - theta0[k, r]
+                turned = middle.theta[k, r] - start.theta[k, r]
                 spin = turned * (real(2.0) * scalars[RATE, r]) - omega0[k, r]
                 kinetic += real(0.5) * rotary[k, r] * spin * spin
                 damped += real(2.0) * damping[0] * scalars[RATE, r] * rotary[k, r] * turned * turned
@@ -171,22 +163,21 @@ def chain_kernel(kind: ChainKind, real, linear):
                 made = wp.dot(load_there[k, r] - load[k, r], moved)
                 worked = wp.abs(wp.dot(load[k, r], moved))
                 if wp.static(twist):
-                    turned = theta[k, r] - theta0[k, r]
+                    turned = middle.theta[k, r] - start.theta[k, r]
                     made += (load_angle_there[k, r] - load_angle[k, r]) * turned
                     worked += wp.abs(load_angle[k, r] * turned)
             total += B(real(2.0) * made, real(2.0) * floor * worked, kinetic, damped)
             if wp.static(closed) or k < n - 1:
-                whole = wp.static(closed) or k < n - 2
+                whole = whole_of(middle, r, k)
                 reach = wp.max(wp.abs(here))
-                q0 = window(x0, theta0, k, n, whole, r)
-                q = window(x, theta, k, n, whole, r)
-                s0 = lagged(frame0, k, n, whole, r)
-                s = lagged(frame, k, n, whole, r)
-                total += rows_of_all(q0, s0, q, s, buffer, table, last, scalars[RATE, r], whole, reach, floor, k, r)
+                q0, s0 = read(start, r, k, whole)
+                q, s = read(middle, r, k, whole)
+                at = column_of(middle, r, k)
+                total += rows_of_all(middle, q0, s0, q, s, whole, reach, floor, r, k, at)
                 least = floor * reach
                 total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[k, r]) * least * least
         for i in range(wp.static(ROWS)):
-            rows_out[i, start, r] = total[i]
+            rows_out[i, first, r] = total[i]
 
     return measure
 

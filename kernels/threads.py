@@ -1,16 +1,21 @@
 """How kernels share work among threads: a thread a thing on a GPU, one thread for all in a row on the CPU, and its compiler flags."""
 
+import os
 from functools import cache
 
 import warp as wp
+
+# Fusion of multiplications and additions on the CPU. "off" makes results independent of how the compiler arranges a kernel, so that two
+# versions of one algorithm can be compared bit for bit; see `tools/golden.py`.
+CONTRACTION = os.environ.get("DDG_WARP_FP_CONTRACT", "fast")
 
 # Of all kernels. Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of
 # it each); pairs instead of eights save the shuffles of small matrices, a tenth of it. Warp 1.19's own flags stop LLVM's SLP vectorizer
 # at a depth of 4, where it miscompiles large reverse-mode kernels for AVX-512: they read registers that nothing has written. 12 is
 # LLVM's own depth, said here because such options stay set in a process.
 CPU_OPTIONS = {
-    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mprefer-vector-width=128 -mllvm=-slp-recursion-max-depth=12"
-    " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
+    "cpu_compiler_flags": f"-march=native -ffp-contract={CONTRACTION} -mprefer-vector-width=128"
+    " -mllvm=-slp-recursion-max-depth=12 -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
 }
 
 

@@ -71,6 +71,17 @@ def test_readings_see_earlier_launches(device):
     np.testing.assert_array_equal(reading(), 0)
     for number in (3, 4):
         values.fill_(number)
-        result = reading()
-        np.testing.assert_array_equal(result, number)
-        assert result is reading()
+        found = reading()
+        np.testing.assert_array_equal(found, number)
+        assert found is reading()
+
+
+def test_columns_are_views_in_the_order_of_memory(device):
+    values = np.arange(2.0 * 3 * 5 * 4).reshape(6, 5, 4)  # rows, nodes, rods
+    array = arrays.upload(values, wp.float64, device)
+    order = (0, 2, 1) if arrays.serial(device) else (0, 1, 2)  # rod by rod on the CPU, node by node on a GPU
+    expected = values.transpose(order).reshape(6, -1)
+    np.testing.assert_array_equal(arrays.columns(array).numpy(), expected)
+    np.testing.assert_array_equal(arrays.columns(array, 2, 3).numpy(), expected.reshape(2, 3, -1))
+    arrays.columns(array).fill_(7.0)
+    np.testing.assert_array_equal(arrays.download(array), 7.0)

@@ -7,7 +7,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.compile.storage import FREE
-from ddg_warp.kernels.adjoint import chain, step
+from ddg_warp.kernels.adjoint import chain, elements, step
+from ddg_warp.kernels.chain import rod_storage
 from ddg_warp.learn.drag import ChainDragAdjoint
 from ddg_warp.learn.followers import Followers
 from ddg_warp.learn.predictor import ChainPredictor
@@ -91,8 +92,9 @@ class ChainAdjoint:
         self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
         self.predictor = ChainPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
-        self._pull = [chain.pull_kernel(kind, i, real) for i in terms]
-        self._strain = [chain.strain_kernel(kind, i, real) for i in terms] if kind.viscous else []
+        storage, viscous = rod_storage(kind, real), kind.viscous
+        self._pull = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
+        self._strain = [elements.strain_kernel(storage, i, real, False) for i in terms] if viscous else []
         self._frame = chain.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
         self._ends, self._nodes, self._edges = chain.gather_kernels(kind, real)
         self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})
@@ -102,7 +104,7 @@ class ChainAdjoint:
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.gravity = wp.array(np.tile(group.gravity_host, (group.worlds, 1)), dtype=self.vector, device=device)
-        twisted, viscous = kind.twist, kind.viscous
+        twisted = kind.twist
         self._window, self._lag = self._rows(kind.window), self._rows(13)
         self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
         self._by_frame = self._rows(7, twisted and viscous)
@@ -188,9 +190,9 @@ class ChainAdjoint:
             tangents = predictor.x if self._midpoint else tangents
         if kind.viscous:
             # strains of the end, which the next step is damped from
+            read = [group.element_inputs(after, after.last), arrays.columns(given.last)]
             for kernel in self._strain:
-                read = [after.x, after.theta, after.frame, after.last, group.still]
-                self._launch(kernel, [*read, *self._parameters, given.last], [window, lag, inputs.parameters])
+                self._launch(kernel, read, [*map(arrays.columns, (window, lag, inputs.parameters))])
             if kind.twist:
                 by_frame = self._by_frame
                 arrays.copy(by_frame, given.frame)
@@ -203,8 +205,8 @@ class ChainAdjoint:
         read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
         self._launch(self._solution, read, [self._dof, self._right])
         resisted = self.drag and (self.drag, before, tangents)
-        read = [kept.x, kept.theta, kept.frame, before.last, self._rate, *self._parameters, inputs.load]
-        written = [window, lag, inputs.parameters, start.last, inputs.rate]
+        read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
+        written = [*map(arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
         self.solve(kept, before.last, s, self._right, inputs.load, resisted)
         for kernel in self._pull:
             self._launch(kernel, read, written)
@@ -252,10 +254,6 @@ class ChainAdjoint:
         own += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]
-
-    @property
-    def _parameters(self) -> list:
-        return [*self.group.parameters.arrays, self.group.count]
 
     def _rows(self, rows: int, needed: bool = True) -> wp.array:
         shape = (rows, self.group.nodes, self.group.columns) if needed else (1, 1, 1)

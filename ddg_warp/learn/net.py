@@ -6,9 +6,10 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
+from ddg_warp.kernels.adjoint import elements
 from ddg_warp.kernels.adjoint import net as reverse
 from ddg_warp.kernels.drag import block_inertia
-from ddg_warp.kernels.net.elements import FRAME
+from ddg_warp.kernels.net.elements import FRAME, coupled_storage
 from ddg_warp.learn.drag import NetDragAdjoint
 from ddg_warp.learn.followers import Followers
 from ddg_warp.learn.net_contact import ContactAdjoint
@@ -98,8 +99,12 @@ class NetAdjoint:
         self.solve = NetSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
         self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
-        self._pull = [reverse.pull_kernel(part.term, real) for part in net.sets]
-        self._strains = [reverse.strain_kernel(p.term, real) if p.term.density.lagged else None for p in net.sets]
+        storages = [coupled_storage(part.term, real) for part in net.sets]
+        self._pull = [elements.pull_kernel(storage, 0, real, True, True) for storage in storages]
+        self._strains = [
+            elements.strain_kernel(storage, 0, real, True) if part.term.density.lagged else None
+            for storage, part in zip(storages, net.sets, strict=True)
+        ]
         self._solution, self._inert, self._start, self._ended = reverse.step_kernels(real, midpoint, drag)
         self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
         self._rates, self._rubbing = (wp.zeros(net.worlds, dtype=real, device=self.device) for _ in range(2))
@@ -290,7 +295,7 @@ class NetAdjoint:
         self._shares.clear()
 
     def _over(self, index: int, kernel, inputs: list, outputs: list) -> None:
-        self._launch(kernel, self.net.sets[index].elements * self.net.worlds, inputs, outputs)
+        self._launch(kernel, (self.net.worlds, self.net.sets[index].elements), inputs, outputs)
 
-    def _launch(self, kernel, count: int, inputs: list, outputs: list) -> None:
+    def _launch(self, kernel, count: int | tuple[int, int], inputs: list, outputs: list) -> None:
         wp.launch(kernel, count, inputs, outputs, device=self.device)

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.net.glue import TERM
-from ddg_warp.kernels.net.elements import term_kernels
+from ddg_warp.kernels.net.elements import linear_stress_kernel
 
 
 def follow(net, state, angles: bool, rates: bool) -> None:
@@ -23,7 +23,8 @@ def follow(net, state, angles: bool, rates: bool) -> None:
         if rates:
             net.strains(state, index, strain, stress)
             inputs = [net.elements(state, index), state.v]
-            wp.launch(term_kernels(TERM, net.real)[4], edges.size, inputs, [next_stress], device=net.device)
+            grid = net.worlds, part.elements
+            wp.launch(linear_stress_kernel(TERM, net.real), grid, inputs, [next_stress], device=net.device)
             slip = (next_stress.numpy() - stress.numpy()).reshape(shape) / np.where(stiffness > 0.0, stiffness, 1.0)
             _turn(state.v, edges, np.where(free, -slip, 0.0))
 

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile import precision
 from ddg_warp.compile.chains import ChainGroup
+from ddg_warp.kernels import chain
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene import drag
 
@@ -56,6 +57,20 @@ class Group:
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
         self._stiffnesses = None, ()  # key and values
+
+    def element_inputs(self, state, last: wp.array, rate: wp.array | None = None, table: ParameterTable | None = None):
+        """Return what kernels of elements read at a state, or at an iterate with its x, theta and frame.
+
+        Args:
+            last: strains of the last step (strains, n, R).
+            rate: inverse length of the solve of every rod [1/s], zero by default.
+            table: parameters, those of the group by default.
+        """
+        inputs = chain.rod_elements_type(self.dim, self.parameters.arrays[0].dtype)()
+        inputs.x, inputs.theta, inputs.frame = state.x, state.theta, state.frame
+        inputs.last, inputs.rate = arrays.columns(last), self.still if rate is None else rate
+        (inputs.buffer, inputs.table), inputs.count = (table or self.parameters).arrays, self.count
+        return inputs
 
     def set_parameter(self, name: str, values: np.ndarray) -> bool:
         """Replace "term.parameter"; return True if its memory was reallocated.

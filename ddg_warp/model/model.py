@@ -14,7 +14,8 @@ from ddg_warp.errors import SceneError
 from ddg_warp.io.contacts import Touching
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
-from ddg_warp.kernels import element, step
+from ddg_warp.kernels import element_path, step
+from ddg_warp.kernels.chain import rod_storage
 from ddg_warp.model import glue
 from ddg_warp.model.group import Group
 from ddg_warp.model.order import Order
@@ -444,11 +445,10 @@ class Model:
     def strains(self, group: Group, data: GroupState, out: wp.array, stress: wp.array | None = None) -> None:
         """Launch the strain kernel of a group; write elastic stresses to `stress` if given. Can be captured."""
         wp.launch(
-            element.strain_kernel(group.kind, self.types.real),
+            element_path.strain_kernel(rod_storage(group.kind, self.types.real), self.types.real),
             (group.elements, group.columns),
-            [data.x, data.theta, data.frame, data.last, group.still, *group.parameters.arrays, group.count]
-            + [int(stress is not None)],
-            [out, out if stress is None else stress],
+            [group.element_inputs(data, data.last), int(stress is not None)],
+            [arrays.columns(out), arrays.columns(out if stress is None else stress)],
             device=self.wp_device,
         )
 

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.net.net import Net, inert_mass
 from ddg_warp.compile.precision import float32_error, stiffnesses
+from ddg_warp.kernels import element_path
 from ddg_warp.kernels.net import elements, frames
 from ddg_warp.kernels.search import RELAG
 from ddg_warp.model.parameters import ParameterTable
@@ -276,8 +277,8 @@ class DeviceNet:
         """Compute strains of an element set (strains, W E), and stresses if `stress` is given."""
         part = self.sets[index]
         wp.launch(
-            elements.term_kernels(part.term, self.real)[3],
-            self.worlds * part.elements,
+            element_path.strain_kernel(elements.coupled_storage(part.term, self.real), self.real),
+            (self.worlds, part.elements),
             [self.elements(state, index), int(stress is not None)],
             [strain, strain if stress is None else stress],
             device=self.device,

@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import element, evaluate
-from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels import element_path
+from ddg_warp.kernels.chain import ChainKind, rod_elements_type, rod_storage
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.terms import REGISTRY, Term
@@ -32,10 +32,15 @@ class Chain(Sample):
     """
 
     shape, LEFT_OUT = (6, 2), frozenset({"energy", "resultant"})
+    INPUTS = ("x", "theta", "frame", "last", "rate", "buffer")
 
     def __init__(self, term: Term, kind: ChainKind, *arguments):
         self.chain, self.count = "closed" if kind.closed else "open", np.array([6, 5])
-        self.index, self.column = kind.terms.index(term), np.broadcast_to(np.arange(2), self.shape)
+        self.index, self.grid, self.column = (
+            kind.terms.index(term),
+            self.shape,
+            np.broadcast_to(np.arange(2), self.shape),
+        )
         self.first, *_, row = kind.places()[self.index]
         self.rows, self.vectors = slice(row, row + len(term.measure.strains)), [np.s_[..., : kind.dim]]
         super().__init__(term, kind, *arguments)
@@ -111,14 +116,14 @@ class Chain(Sample):
         dim, window = kind.dim, kind.window
         sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
-        kernel = evaluate.evaluate_kernel(kind, real, real, 0 if exact else None)
-        inputs, islands = self._inputs(real), Islands(2, real, self.device)
-        wp.copy(islands.rate, inputs[4])
-        inputs[4:5] = islands.arrays
-        clamped = wp.full(2, 0 if exact else 1, dtype=int, device=self.device)
-        wp.launch(
-            kernel, shape, [*inputs, clamped, 0], out, device=self.device, block_dim=128
-        )  # required by its launch bounds
+        kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, 0 if exact else None)
+        islands, found = Islands(2, real, self.device), element_path.results_type(real, real)()
+        islands.clamped.fill_(0 if exact else 1)
+        rows = [array.reshape((*array.shape[:-2], -1)) for array in out]
+        found.factor, found.second, found.gradient, found.energy, found.stiffness = rows
+        found.tension = found.factor
+        inputs = [self.inputs(real), *islands.arrays]
+        wp.launch(kernel, shape, inputs, [found], device=self.device, block_dim=128)  # it is bound to that
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
         vertex = rows[:edge_row].reshape(kind.vertex_strains, window, *shape)
@@ -131,27 +136,6 @@ class Chain(Sample):
             matrix[i, j] += geometric
             matrix[j[i != j], i[i != j]] += geometric[i != j]
         return matrix, force, energy[1]
-
-    def reverse(self, order: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Return derivatives of the energy (order 0) or gradient (1) kernel of the term by input, in reverse mode."""
-        inputs = self._inputs(self.real)
-        adjoints = [wp.zeros_like(array) for array in inputs[:6]]
-        seeds = wp.array(seed, dtype=self.real, device=self.device)
-        wp.launch(
-            element.term_kernels(self.kind, self.index, self.real, reverse=True)[order],
-            self.shape,
-            inputs,
-            [wp.zeros_like(seeds, requires_grad=True)],
-            adjoint=True,
-            adj_inputs=[*adjoints, None, None],
-            adj_outputs=[seeds],
-            device=self.device,
-        )
-        x, theta, *remaining = (array.numpy().astype(float) for array in adjoints)
-        q = np.zeros((*self.shape, 4))
-        q[..., : self.kind.dim], q[..., 3] = x, theta
-        names = (name for name in self.data if name != "q")
-        return {"q": q} | {n: v.reshape(self.data[n].shape) for n, v in zip(names, remaining, strict=True)}
 
     def scatter(self, local: np.ndarray) -> np.ndarray:
         """Return derivatives by local dofs (window, n, R) by all dofs (n, R, 4)."""
@@ -210,11 +194,30 @@ class Chain(Sample):
                 last[self.rows] = np.einsum("ij,jnr->inr", spin, self.data["last"][self.rows])
             yield velocity, last
 
-    def _inputs(self, real, **changed) -> list[wp.array]:
-        """Return the inputs of the kernels of a term: x, theta, frame, last, rate, buffer, table, count."""
+    def storage(self, real):
+        """Return the element storage of the chain."""
+        return rod_storage(self.kind, real)
+
+    def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
+        """Return derivatives by the window as (window, ..., n, R)."""
+        return values.reshape(*values.shape[:-1], *self.shape)
+
+    def as_written(self, seed: np.ndarray, which: int) -> np.ndarray:
+        """Return weights of energies or gradients as kernels write these."""
+        return seed.reshape(*seed.shape[:-2], -1)
+
+    def by_data(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return derivatives by what kernels read as those by `data`."""
+        q = np.zeros((*self.shape, 4))
+        q[..., : self.kind.dim], q[..., 3] = values["x"], values["theta"]
+        return {"q": q} | {name: values[name].reshape(own.shape) for name, own in self.data.items() if name != "q"}
+
+    def inputs(self, real, **changed):
+        """Return what the kernels of a term read; see `kernels.chain.rod_elements_type`."""
         data, dim = {**self.data, **changed}, self.kind.dim
         q = data["q"]
-        values = [q[..., :dim], q[..., 3], data["frame"], data["last"], data["rate"], data["buffer"].ravel()]
+        last = data["last"].reshape(len(data["last"]), -1)
+        values = [q[..., :dim], q[..., 3], data["frame"], last, data["rate"], data["buffer"].ravel()]
         types = [wp.types.vector(dim, real), *[real] * 5]
         out = [
             wp.array(np.ascontiguousarray(v), dtype=t, device=self.device, requires_grad=True)
@@ -222,18 +225,8 @@ class Chain(Sample):
         ]
         n, rods = self.shape
         table = np.array([(row * n * rods, rods, 1) for row in range(len(data["buffer"]))], np.int32)
-        return [*out, *(wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32)))]
-
-    def _launch(self, order: int, real, **changed):
-        """Return results of the energy (0), gradient (1), Hessian (2) or strain (3) kernel."""
-        kind, w = self.kind, self.kind.window
-        size = [(), (w,), (w * w,), (kind.strain_rows,)][order]
-        kernels = element.term_kernels(kind, self.index, real, reverse=True)
-        kernel = element.strain_kernel(kind, real) if order == 3 else kernels[order]
-        out = [wp.zeros((*size, *self.shape), dtype=real, device=self.device) for _ in range(2 if order == 3 else 1)]
-        inputs = [*self._inputs(real, **changed), *[1] * (order == 3)]
-        wp.launch(kernel, (*self.shape, w) if order == 2 else self.shape, inputs, out, device=self.device)
-        results = [array.numpy().astype(float) for array in out]
-        if order == 3:
-            return tuple(values[self.rows] for values in results)
-        return results[0].reshape(w, w, *self.shape) if order == 2 else results[0]
+        out += [wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32))]
+        given = rod_elements_type(dim, real)()
+        for name, values in zip((*self.INPUTS, "table", "count"), out, strict=True):
+            setattr(given, name, values)
+        return given

@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from ddg_warp.kernels import element_path
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.net import elements as net_elements
@@ -27,6 +28,7 @@ class Elements(Sample):
     def __init__(self, term: Term, *arguments):
         measure = term.measure
         self.shape, self.first, self.rows, self.parts = (self.COUNT,), 0, slice(0, len(measure.strains)), [self]
+        self.grid, self.index = (1, self.COUNT), 0
         self.slots = np.arange(measure.slots * self.COUNT).reshape(-1, self.COUNT)
         self.angle_start = measure.nodes * self.COUNT
         self.angle_end = self.angle_start + measure.angles * self.COUNT
@@ -83,8 +85,10 @@ class Elements(Sample):
         out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
         search = Islands(1, real, self.device)
         search.clamped.fill_(0 if exact else 1)
-        kernel = net_elements.evaluate_kernel(self.term, real, real, 0 if exact and packed else None)
-        wp.launch(kernel, count, [self._elements(real), *search.arrays], out, device=self.device)
+        kernel = element_path.evaluate_kernel(self.storage(real), real, real, 0 if exact and packed else None)
+        found = element_path.results_type(real, real, True)()
+        found.factor, found.tension, found.second, found.gradient, found.energy, found.stiffness = out
+        wp.launch(kernel, (1, count), [self.inputs(real), *search.arrays], [found], device=self.device)
         factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)
@@ -97,25 +101,6 @@ class Elements(Sample):
             local[:, i, j] = local[:, j, i] = second.T
             matrix += np.einsum("ia,eij,jb->abe", self.incidence, local, self.incidence)
         return matrix, _flat(gradient), energy[1]
-
-    def reverse(self, order: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Return derivatives of the energy (order 0) or gradient (1) kernel by input, in reverse mode."""
-        elements, dtype = self._elements(self.real), wp.types.vector(3, self.real) if order else self.real
-        if order:
-            seed = seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1)
-        seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
-        wp.launch(
-            net_elements.term_kernels(self.term, self.real, reverse=True)[order],
-            self.COUNT,
-            [elements],
-            [wp.zeros_like(seeds, requires_grad=True)],
-            adjoint=True,
-            adj_inputs=[net_elements.elements_type(self.real)()],
-            adj_outputs=[seeds],
-            device=self.device,
-        )
-        values = {name: getattr(elements, name).grad.numpy().astype(float) for name in self.INPUTS}
-        return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
 
     def on_edges(self, blocks: np.ndarray) -> np.ndarray:
         """Return blocks (E, n, n) times I between the first n edge vectors, in local dofs (local, local, E)."""
@@ -133,8 +118,26 @@ class Elements(Sample):
             [*edges, np.kron(angles, axes[:1]), np.kron(spins, axes), np.kron(slot[: measure.points], axes)]
         )
 
-    def _elements(self, real, **changed):
-        """Return the elements as kernel inputs; see `kernels.net.elements.elements_type`."""
+    def storage(self, real):
+        """Return the element storage of the term."""
+        return net_elements.coupled_storage(self.term, real)
+
+    def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
+        """Return gradients (slots, E, 3) and Hessians by the dofs of the measure as those by three reals a slot."""
+        if which == 2:
+            return np.einsum("ia,ije,jb->abe", self.incidence, values, self.incidence)
+        return _flat(values) if which == 1 else values
+
+    def as_written(self, seed: np.ndarray, which: int) -> np.ndarray:
+        """Return weights of energies or gradients as kernels write these."""
+        return seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1) if which else seed
+
+    def by_data(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return derivatives by what kernels read as those by `data`."""
+        return {name: own.reshape(self.data[name].shape) for name, own in values.items()}
+
+    def inputs(self, real, **changed):
+        """Return what kernels read; see `kernels.net.elements.elements_type`."""
         data, elements = {**self.data, **changed}, net_elements.elements_type(real)()
 
         def put(values, dtype):
@@ -151,22 +154,6 @@ class Elements(Sample):
         elements.angle_start, elements.edges = self.angle_start, self.angle_end - self.angle_start
         elements.elements = self.COUNT
         return elements
-
-    def _launch(self, order: int, real, **changed):
-        """Return results of the energy (0), gradient (1), Hessian (2) or strain (3) kernel."""
-        measure, count, device = self.measure, self.COUNT, self.device
-        n, size = len(measure.strains), measure.size
-        shape = [(count,), (measure.slots, count), (count, size, size), (n, count)][order]
-        dtype = wp.types.vector(3, real) if order == 1 else real
-        out = [wp.zeros(shape, dtype=dtype, device=device) for _ in range(2 if order == 3 else 1)]
-        extra = [[], [], [wp.zeros((n, count), dtype=real, device=device)], [1]][order]
-        kernel = net_elements.term_kernels(self.term, real, reverse=True)[order]
-        grid = (count, size) if order == 2 else count
-        wp.launch(kernel, grid, [self._elements(real, **changed), *extra], out, device=device)
-        results = [array.numpy().astype(float) for array in out]
-        if order == 2:
-            return np.einsum("ia,eij,jb->abe", self.incidence, results[0], self.incidence)
-        return _flat(results[0]) if order == 1 else tuple(results) if order == 3 else results[0]
 
 
 def _flat(values: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.precision import PRECISIONS
+from ddg_warp.kernels import element_path
 from ddg_warp.kernels.terms import Term
 
 
@@ -25,6 +26,7 @@ class Sample:
         first: row of the first parameter of the term in the buffer.
         rows: rows of the term's strains among the strains of the last step.
         parts: samples of all terms in the fused kernel, this one included.
+        grid: dimensions of a launch over the elements; index: index of the term in its storage.
     """
 
     chain = "net"
@@ -68,6 +70,42 @@ class Sample:
     def strains(self, **changed) -> tuple[np.ndarray, np.ndarray]:
         """Return strains and stresses (strains, *shape)."""
         return self._launch(3, wp.float64, **changed)
+
+    def _launch(self, which: int, real, **changed):
+        """Return what the energy (0), gradient (1), Hessian (2) or strain (3) kernel writes, by local dofs."""
+        storage, device = self.storage(real), self.device
+        size, strains = storage.Window._length_, sum(len(own.term.measure.strains) for own in storage.terms)
+        rows, dtype = [(), (storage.num_slots or size,), (size, size), (strains,)][which], real
+        if which == 1 and storage.slots:
+            dtype = wp.types.vector(3, real)
+        count = int(np.prod(self.grid))
+        out = [wp.zeros((*rows, count), dtype=dtype, device=device) for _ in range(2 if which == 3 else 1)]
+        kernels = element_path.term_kernels(storage, self.index, real, reverse=True)
+        kernel = element_path.strain_kernel(storage, real) if which == 3 else kernels[which]
+        more = [[], [], [wp.zeros((0, 0), dtype=real, device=device)], [1]][which]
+        grid = (*self.grid, size) if which == 2 else self.grid
+        wp.launch(kernel, grid, [self.inputs(real, **changed), *more], out, device=device)
+        found = [array.numpy().astype(float) for array in out]
+        if which == 3:
+            return tuple(values.reshape(-1, *self.shape)[self.rows] for values in found)
+        return self.of_local(found[0], which)
+
+    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Reverse mode of the energy (which = 0) or gradient (1) kernel of the term, by input."""
+        storage, inputs = self.storage(self.real), self.inputs(self.real)
+        dtype = wp.types.vector(3, self.real) if which and storage.slots else self.real
+        seeds = wp.array(np.ascontiguousarray(self.as_written(seed, which)), dtype=dtype, device=self.device)
+        wp.launch(
+            element_path.term_kernels(storage, self.index, self.real, reverse=True)[which],
+            self.grid,
+            [inputs],
+            [wp.zeros_like(seeds, requires_grad=True)],
+            adjoint=True,
+            adj_inputs=[storage.Inputs()],
+            adj_outputs=[seeds],
+            device=self.device,
+        )
+        return self.by_data({name: getattr(inputs, name).grad.numpy().astype(float) for name in self.INPUTS})
 
     @cached_property
     def seed(self) -> np.ndarray:

@@ -111,8 +111,8 @@ class ChainEnergy(_Energy):
         wp.launch(
             self._measure,
             (self.ranges, group.columns),
-            [before.x, before.v, before.theta, before.omega, before.frame, newton.x, newton.theta, newton.frame]
-            + [before.last, *step.islands.arrays, *group.parameters.arrays, group.count, newton.mass, group.rotary]
+            [group.element_inputs(state, before.last, step.islands.rate) for state in (before, newton)]
+            + [before.v, before.omega, *step.islands.arrays, newton.mass, group.rotary]
             + [
                 *self._loads,
                 newton.load,
@@ -156,7 +156,7 @@ class NetEnergy(_Energy):
         for i, (part, data, kernel) in enumerate(zip(net.sets, solver.parts, self._elements, strict=True)):
             wp.launch(
                 kernel,
-                step.model.worlds * part.elements,
+                (step.model.worlds, part.elements),
                 [
                     net.elements(middle, i, q=solver.q, rate=step.islands.rate),
                     before.q,

@@ -8,91 +8,9 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import block_inertia
-from ddg_warp.kernels.net import elements
-from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
+from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function, spread_function
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.variation import variation_functions
-
-
-@cache
-def pull_kernel(term: Term, real):
-    """pull(...): what elements bring, -w . dE/dq, by their slots, lagged and constant data, rest measure, parameters, strains of the
-    last step and rate. Adds.
-    """
-    Elements, measure, density = elements_type(real), term.measure, term.density
-    V = wp.types.vector(3, real)
-    Q, S, E, _ = measure.types(real)
-    n, size = len(measure.strains), density.parameter_size(len(measure.strains))
-    gather, spread = elements.functions(term, real)
-    along, _ = variation_functions(term, real)
-    slots, rows, data = measure.slots, len(term.parameter_names) - 1, measure.lag_size + measure.data_size
-    lagged = density.lagged
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
-        given: Elements,
-        w: wp.array(dtype=V),
-        slot_out: wp.array2d(dtype=V),
-        lag_out: wp.array2d(dtype=real),
-        parameter_out: wp.array2d(dtype=real),
-        last_out: wp.array2d(dtype=real),
-        rate_out: wp.array(dtype=real),
-    ):
-        tid = wp.tid()
-        world = tid / given.elements
-        e = tid - world * given.elements
-        q, s, measured, p = gather(given, given.q, world, e)
-        v, _s, _w, _p = gather(given, w, world, e)
-        dq, ds, dmeasure, dp, _dv, _de = wp.grad(along)(q, s, measured, p, -v, E())
-        for i in range(wp.static(slots)):
-            slot_out[i, tid] = slot_out[i, tid] + spread(dq, i)
-        for i in range(wp.static(data)):
-            lag_out[i, tid] = lag_out[i, tid] + ds[i]
-        parameter_out[0, tid] = parameter_out[0, tid] + dmeasure
-        for i in range(wp.static(rows)):
-            parameter_out[1 + i, tid] = parameter_out[1 + i, tid] + dp[i]
-        if wp.static(lagged):
-            for i in range(wp.static(n)):
-                last_out[i, tid] = last_out[i, tid] + dp[wp.static(rows) + i]
-            rate_out[tid] = rate_out[tid] + dp[wp.static(size - 1)]
-
-    return pull
-
-
-@cache
-def strain_kernel(term: Term, real):
-    """pull(...): from the derivative by strains at a state to those by slots, lagged data and rest measure. Adds."""
-    Elements, measure = elements_type(real), term.measure
-    V = wp.types.vector(3, real)
-    _, _, E, _ = measure.types(real)
-    n = len(measure.strains)
-    gather, spread = elements.functions(term, real)
-    _, strained = variation_functions(term, real)
-    slots, data = measure.slots, measure.lag_size + measure.data_size
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
-        given: Elements,
-        by: wp.array2d(dtype=real),
-        slot_out: wp.array2d(dtype=V),
-        lag_out: wp.array2d(dtype=real),
-        parameter_out: wp.array2d(dtype=real),
-    ):
-        tid = wp.tid()
-        world = tid / given.elements
-        q, s, measured, _p = gather(given, given.q, world, tid - world * given.elements)
-        f = E()
-        for i in range(wp.static(n)):
-            f[i] = by[i, tid]
-        dq, ds, dmeasure, _df = wp.grad(strained)(q, s, measured, f)
-        for i in range(wp.static(slots)):
-            slot_out[i, tid] = slot_out[i, tid] + spread(dq, i)
-        for i in range(wp.static(data)):
-            lag_out[i, tid] = lag_out[i, tid] + ds[i]
-        parameter_out[0, tid] = parameter_out[0, tid] + dmeasure
-
-    return pull
 
 
 @cache
@@ -104,7 +22,7 @@ def lag_kernel(term: Term, real):
     own = measure.lag_size - FRAME * measure.frames
     L = wp.types.vector(own, real)
     place, advance = place_function(measure, real), measure.advance(real)
-    _, spread = elements.functions(term, real)
+    spread = spread_function(measure, real)
     slots, data = measure.slots, measure.lag_size + measure.data_size
 
     @wp.func

@@ -9,8 +9,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.adjoint.chain import displaced_function, gathered_function
-from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels.adjoint.chain import gathered_function
+from ddg_warp.kernels.chain import ChainKind, displaced_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 

@@ -82,12 +82,7 @@ def band_kernels(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        set0: Along,
-        set1: Along,
-        set2: Along,
-        set3: Along,
-        set4: Along,
-        set5: Along,
+        sets: wp.array(dtype=Along),
         blocks_out: wp.array3d(dtype=linear),
     ):
         start, r = wp.tid()
@@ -97,7 +92,7 @@ def band_kernels(
         if flags[WANTED, w] == 0 or layout.idle[r] != 0 or start >= n:
             return
         for k in range(start, until(start, n)):
-            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, set0, set1, set2, set3, set4, set5, k, c, w)
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, sets, k, c, w)
             store(blocks_out, 0, k, r, D)
             store(blocks_out, wp.static(nb**2), k, r, E)
             if wp.static(span == 2):
@@ -270,12 +265,7 @@ def lengthen_kernel(terms: tuple[Term, ...], real, linear):
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        set0: Along,
-        set1: Along,
-        set2: Along,
-        set3: Along,
-        set4: Along,
-        set5: Along,
+        sets: wp.array(dtype=Along),
         values: wp.array3d(dtype=linear),
         longer_out: wp.array3d(dtype=linear),
     ):
@@ -284,7 +274,7 @@ def lengthen_kernel(terms: tuple[Term, ...], real, linear):
         c = r - w * layout.count.shape[0]
         if flags[WANTED, w] == 0 or k >= layout.count[c]:
             return
-        _t, slack = tension_behind(set0, set1, set2, set3, set4, set5, k, c, w)
+        _t, slack = tension_behind(sets, k, c, w)
         longer_out[0, k, r] = slack
         longer_out[1, k, r] = (
             slack * values[values.shape[0] - 1, k, r] * linear(real(1.0) / wp.sqrt(scalars[CARRIED, w]))

@@ -13,14 +13,14 @@ from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION
 from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, place_functions
 from ddg_warp.kernels.matrix.sliced import second_function
 from ddg_warp.kernels.net.elements import part_function
-from ddg_warp.kernels.net.places import along_type, one_function
+from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import first_of
 
 
 @cache
 def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...], split: bool = False):
-    """Return the device function `add(set0, ..., set5, k, c, w, with_second) -> (D, E, F)` at a path node.
+    """Return the device function `add(sets, k, c, w, with_second) -> (D, E, F)` at a path node.
 
     It adds the contributions of the last of the terms, and calls itself for the terms before.
     """
@@ -36,7 +36,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     )
     second_of = second_function(measure, linear) if curved else None
     before = sum_function(terms[:-1], twist, real, linear, exact[:-1], split) if len(terms) > 1 else None
-    first, one = len(terms) == 1, one_function(len(terms) - 1, real, linear)
+    first, which = len(terms) == 1, len(terms) - 1
     part = part_function(measure, linear)
 
     @wp.func
@@ -113,22 +113,11 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
         return D, E, F
 
     @wp.func
-    def add(
-        set0: Along,
-        set1: Along,
-        set2: Along,
-        set3: Along,
-        set4: Along,
-        set5: Along,
-        k: int,
-        c: int,
-        w: int,
-        with_second: bool,
-    ):
-        element_set = one(set0, set1, set2, set3, set4, set5)
+    def add(sets: wp.array(dtype=Along), k: int, c: int, w: int, with_second: bool):
+        element_set = sets[wp.static(which)]
         D, E, F = own_sum(element_set, k, c, w, with_second)
         if wp.static(not first):
-            D1, E1, F1 = before(set0, set1, set2, set3, set4, set5, k, c, w, with_second)
+            D1, E1, F1 = before(sets, k, c, w, with_second)
             D += D1
             E += E1
             F += F1
@@ -191,12 +180,7 @@ def blocks_function(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        set0: Along,
-        set1: Along,
-        set2: Along,
-        set3: Along,
-        set4: Along,
-        set5: Along,
+        sets: wp.array(dtype=Along),
         k: int,
         c: int,
         w: int,
@@ -212,7 +196,7 @@ def blocks_function(
         if wp.static(add is not None):
             # the iteration has been counted since its evaluation
             with_second = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-            D, E, F = add(set0, set1, set2, set3, set4, set5, k, c, w, with_second)
+            D, E, F = add(sets, k, c, w, with_second)
             for part in range(wp.static(parts)):
                 block = layout.places[part, k, c]
                 if block >= 0:
@@ -238,7 +222,7 @@ def blocks_function(
         if listed:
             D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
         if wp.static(split):
-            t, slack = tension_behind(set0, set1, set2, set3, set4, set5, k, c, w)
+            t, slack = tension_behind(sets, k, c, w)
             D[wp.static(nb - 1), wp.static(nb - 1)] = linear(-1.0)
             if slack > linear(0.0):
                 D[wp.static(nb - 1), wp.static(nb - 1)] = -slack
@@ -252,7 +236,7 @@ def blocks_function(
             if listed:
                 E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
             if wp.static(split):
-                t, slack = tension_behind(set0, set1, set2, set3, set4, set5, k + 1, c, w)
+                t, slack = tension_behind(sets, k + 1, c, w)
                 if slack > linear(0.0):
                     for d in range(3):
                         E[d, wp.static(nb - 1)] = -t[d]

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.net.places import along_type, one_function
+from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import first_of
 
@@ -151,21 +151,21 @@ def splits(term: Term) -> bool:
 
 @cache
 def behind_function(terms: tuple[Term, ...], real, linear):
-    """Return the device function `behind(set0, ..., set5, k, c, w) -> (row, slack)` of the edge that ends at a path node.
+    """Return the device function `behind(sets, k, c, w) -> (row, slack)` of the edge that ends at a path node.
 
     The slack is zero for an edge without tension.
     """
     H, Along = wp.types.vector(3, linear), along_type(real, linear)
-    first, one, own_splits = len(terms) == 1, one_function(len(terms) - 1, real, linear), splits(terms[-1])
+    first, which, own_splits = len(terms) == 1, len(terms) - 1, splits(terms[-1])
     before = None if first else behind_function(terms[:-1], real, linear)
 
     @wp.func
-    def behind(set0: Along, set1: Along, set2: Along, set3: Along, set4: Along, set5: Along, k: int, c: int, w: int):
-        element_set = one(set0, set1, set2, set3, set4, set5)
+    def behind(sets: wp.array(dtype=Along), k: int, c: int, w: int):
+        element_set = sets[wp.static(which)]
         t = H()
         slack = linear(0.0)
         if wp.static(not first):
-            t, slack = before(set0, set1, set2, set3, set4, set5, k, c, w)
+            t, slack = before(sets, k, c, w)
         if wp.static(own_splits):
             e = element_set.at[1, k, c]
             if e >= 0:

@@ -160,7 +160,9 @@ def inertia_function(real, linear, drag: bool):
     return inertia_of
 
 
-SETS = 6  # element sets summed in one launch
+# Element sets summed in one launch, each an argument. Measured: as one array of structs, read from memory instead of launch
+# constants, the kernel takes 64 registers for sm_90 instead of 48, and 3 % more time on the CPU.
+SETS = 6
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The element path of nets: gather by index -> strains and Jacobian -> energy | gradient | factor | Hessian, per element.
+"""Elements of the coupled system: their dofs, found by index, and their storage.
 
 All dofs lie in blocks of three reals: positions of nodes, then an angle each (in component 0), then rotation vectors of rigid
 joints. An element has *slots*: its nodes, its angles, its rotation vectors, each with the index of a block. Derivatives are
@@ -13,12 +13,10 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.evaluate import carried_function, left_out_function
-from ddg_warp.kernels.islands import CARRIED, CLAMPED, ITERATION, SLOT, STALE, STATUS
+from ddg_warp.kernels.element_path import ElementStorage, TermAccess, parameter_function, write_rows_function
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
-from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
-from ddg_warp.kernels.variation import variation_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 FRAME = 6  # reals of the reference frame of an edge: first director and tangent
 
@@ -105,33 +103,12 @@ def place_function(measure: Measure, real):
 
 
 @cache
-def functions(term: Term, real):
-    """gather(given, q, world, e) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
-    Elements = elements_type(real)
-    measure, density = term.measure, term.density
+def spread_function(measure: Measure, real):
+    """Build `spread(f, slot)`: return the part of a derivative by the local dofs that belongs to the dof block of a slot."""
     V = wp.types.vector(3, real)
     Q, _, _, _ = measure.types(real)
-    n = len(measure.strains)
-    P = wp.types.vector(density.parameter_size(n), real)
-    static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
     nodes, angles, spins, edge_count = measure.nodes, measure.angles, measure.spins, len(measure.edges)
     points, (angle_row, spin_row, point_row), (first, second) = measure.points, measure.starts, edge_ends(measure)
-    lagged = density.lagged
-    place = place_function(measure, real)
-
-    @wp.func
-    def gather(given: Elements, q: wp.array(dtype=V), world: int, e: int):
-        local, s = place(given, q, world, e)
-        tid = e + world * given.elements
-        p = P()
-        for i in range(wp.static(static_size)):
-            row = i + 1
-            p[i] = given.buffer[given.table[row, 0] + e * given.table[row, 1] + world * given.table[row, 2]]
-        if wp.static(lagged):
-            for i in range(wp.static(n)):
-                p[wp.static(static_size) + i] = given.last[i, tid]
-            p[wp.static(size - 1)] = given.rate[world]
-        return local, s, given.buffer[given.table[0, 0] + e * given.table[0, 1] + world * given.table[0, 2]], p
 
     @wp.func
     def spread(f: Q, slot: int):
@@ -158,111 +135,7 @@ def functions(term: Term, real):
                 )
         return v
 
-    return gather, spread
-
-
-@cache
-def term_kernels(term: Term, real, reverse: bool = False):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses.
-
-    With `reverse` the first two have an adjoint, which doubles the time that they take to compile.
-    """
-    Elements = elements_type(real)
-    measure, density = term.measure, term.density
-    V = wp.types.vector(3, real)
-    Q, S, E, _ = measure.types(real)
-    n = len(measure.strains)
-    P = wp.types.vector(density.parameter_size(n), real)
-    strains_of, jacobian_of, *_ = measure.functions(real)
-    energy_of, slope_of, _ = density.functions(real, n)
-    gather, spread = functions(term, real)
-    along, _ = variation_functions(term, real)
-    slots_count, size = measure.slots, measure.size
-
-    @wp.func
-    def gradient_at(q: Q, s: S, w: real, p: P):
-        e, jacobian = jacobian_of(q, s, w)
-        return (slope_of(e, p) * w) * jacobian
-
-    @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
-    def energy(
-        given: Elements,
-        energy_out: wp.array(dtype=real),
-    ):
-        e = wp.tid()
-        world = e / given.elements
-        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
-        energy_out[e] = w * energy_of(strains_of(x, s, w), p)
-
-    @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
-    def gradient(
-        given: Elements,
-        gradient_out: wp.array2d(dtype=V),
-    ):
-        e = wp.tid()
-        world = e / given.elements
-        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
-        f = gradient_at(x, s, w, p)
-        for i in range(wp.static(slots_count)):
-            gradient_out[i, e] = spread(f, i)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def hessian(
-        given: Elements,
-        extra: wp.array2d(dtype=real),
-        hessian_out: wp.array3d(dtype=real),
-    ):
-        """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors.
-
-        `extra` (strains, elements) is added to the stresses that the second derivatives of the strains are weighted with.
-        """
-        e, column = wp.tid()
-        world = e / given.elements
-        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
-        v = Q()
-        v[column] = real(1.0)
-        more = E()
-        for i in range(wp.static(n)):
-            more[i] = extra[i, e]
-        dq, _ds, _dw, _dp, _dv, _de = wp.grad(along)(x, s, w, p, v, more)
-        for i in range(wp.static(size)):
-            hessian_out[e, i, column] = dq[i]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def strains(
-        given: Elements,
-        stressed: int,
-        strain_out: wp.array2d(dtype=real),
-        stress_out: wp.array2d(dtype=real),
-    ):
-        e = wp.tid()
-        world = e / given.elements
-        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
-        strain = strains_of(x, s, w)
-        for i in range(wp.static(n)):
-            strain_out[i, e] = strain[i]
-        if stressed != 0:
-            stress = slope_of(strain, p)
-            for i in range(wp.static(n)):
-                stress_out[i, e] = stress[i]
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
-    def linear_stress(
-        given: Elements,
-        step: wp.array(dtype=V),
-        stress_out: wp.array2d(dtype=real),
-    ):
-        """Stresses of the strains that a step gives to first order, e + J step."""
-        tid = wp.tid()
-        world = tid / given.elements
-        x, s, w, p = gather(given, given.q, world, tid - world * given.elements)
-        d, _s, _w, _p = gather(given, step, world, tid - world * given.elements)
-        e, jacobian = jacobian_of(x, s, w)
-        stress = slope_of(e + jacobian * d, p)
-        for i in range(wp.static(n)):
-            stress_out[i, tid] = stress[i]
-
-    return energy, gradient, hessian, strains, linear_stress
+    return spread
 
 
 def factor_type(linear, local: bool):
@@ -300,145 +173,89 @@ def part_function(measure: Measure, real):
 
 
 @cache
-def evaluate_kernel(
-    term: Term,
-    real,
-    linear,
-    exact_from: int | None = None,
-    local: bool = False,
-    serial: bool = False,
-    split: bool = False,
-):
-    """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
+def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) -> ElementStorage:
+    """Return the storage of an element set: an island is a world, and dof blocks are found by index.
 
-    Factor rows are vectors [strain * slots + slot][element], or if `local` reals [strain * size + dof][element], as the gradient, which
-    then is of the local dofs, too; `tension_out` holds the scalars of the geometric stiffness; in
-    worlds that are `clamped` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of
-    its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
-    hold. `stiffness_out` is the largest that a strain has against moving the element.
-
-    `stale` is raised in worlds where frames have to be renewed before the next step.
-
-    Of terms whose measure has second derivatives `second_out` holds, from iteration `exact_from` on, what F and the geometric
-    stiffness leave out of the exact Hessian, packed over the local dofs; before, and in `clamped` worlds, it is not written.
-
-    With `split`, factors of edges have what the matrix carries of their stiffness, and `tension_out` their slack behind the tension:
-    see `kernels.solve.tension`.
+    Args:
+        slots: whether derivatives are vectors [slot][element], instead of reals of the local dofs.
+        serial: whether a thread takes all elements of a world.
     """
-    Elements, share, until = elements_type(real), share_function(serial), until_function(serial)
-    share_of_edge = carried_function(real) if split else None
-    measure, density = term.measure, term.density
-    V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
-    Q, S, E, _ = measure.types(real)
-    n, tensions = len(measure.strains), measure.tensions
-    _, jacobian_of, tension_of, curvature_of = measure.functions(real)
-    energy_of, slope_of, root_of = density.functions(real, n)
-    gather, spread = functions(term, real)
-    slots_count, coupled = measure.slots, density.coupled
-    C = wp.types.vector(3, real)
-    begin, packed = exact_from or 0, measure.packed if exact_from is not None else 0
-    left_out = left_out_function(term, real) if packed else None
-    stale = measure.stale(real) if measure.stale else None
-    options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
-    Factor, Gradient = factor_type(linear, local), wp.array2d(dtype=real if local else V)
-    size = measure.size
+    measure, Inputs, V = term.measure, elements_type(real), wp.types.vector(3, real)
+    Q, S, _, _ = measure.types(real)
+    place, spread = place_function(measure, real), spread_function(measure, real)
 
     @wp.func
-    def put(factor: Factor, m: int, row: Q, e: int):
-        """Row m of the factor."""
-        if wp.static(local):
-            for i in range(wp.static(size)):
-                factor[m * wp.static(size) + i, e] = linear(row[i])
-        else:
-            for i in range(wp.static(slots_count)):
-                v = spread(row, i)
-                factor[m * wp.static(slots_count) + i, e] = F(linear(v[0]), linear(v[1]), linear(v[2]))
+    def same(q: Q):
+        return q
 
     @wp.func
-    def definite(c: C):
-        """The nearest positive semi-definite (c11, c12, c22)."""
-        mean = real(0.5) * (c[0] + c[2])
-        half = real(0.5) * (c[0] - c[2])
-        radius = wp.sqrt(half * half + c[1] * c[1])
-        low = mean - radius
-        high = mean + radius
-        if low >= real(0.0):
-            return c
-        if high <= real(0.0):
-            return C()
-        # high * v v^T with v the eigenvector of the larger eigenvalue: (c - low I) high / (high - low)
-        scale = high / (high - low)
-        return C((c[0] - low) * scale, c[1] * scale, (c[2] - low) * scale)
+    def same_lagged(s: S):
+        return s
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=options)
-    def evaluate(
-        given: Elements,
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        factor_out: Factor,
-        tension_out: wp.array2d(dtype=linear),
-        second_out: wp.array2d(dtype=linear),
-        gradient_out: Gradient,
-        energy_out: wp.array2d(dtype=real),
-        stiffness_out: wp.array(dtype=linear),
-    ):
-        world, start = share(wp.tid(), given.elements)
-        if flags[STATUS, world] != 0:
-            return
-        for element in range(start, until(start, given.elements)):
-            tid = element + world * given.elements
-            x, s, w, p = gather(given, given.q, world, element)
-            if wp.static(stale is not None):
-                if stale(x, s):
-                    flags[STALE, world] = 1
-            e, jacobian = jacobian_of(x, s, w)
-            slope = slope_of(e, p)
-            energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)
-            f = (slope * w) * jacobian
-            if wp.static(local):
-                for i in range(wp.static(size)):
-                    gradient_out[i, tid] = f[i]
-            else:
-                for i in range(wp.static(slots_count)):
-                    gradient_out[i, tid] = spread(f, i)
-            shift = E()
-            if wp.static(tensions == 1):
-                c, shift = tension_of(x, w, slope)
-                if c < real(0.0) and flags[CLAMPED, world] != 0:
-                    c = real(0.0)
-                    shift = E()
-                tension_out[0, tid] = linear(c)
-            if wp.static(tensions == 3):
-                c3, _shift = tension_of(x, w, slope)
-                if flags[CLAMPED, world] != 0:
-                    c3 = definite(c3)
-                for i in range(3):
-                    tension_out[i, tid] = linear(c3[i])
-            root = root_of(e, p, shift)
-            weight = wp.sqrt(w)
-            stiffest = real(0.0)
-            if wp.static(coupled):
-                rows = root * jacobian
-                for m in range(wp.static(n)):
-                    stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
-                    put(factor_out, m, rows[m] * weight, tid)
-            else:
-                for m in range(wp.static(n)):
-                    stiffness = w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m])
-                    stiffest = wp.max(stiffest, stiffness)
-                    scale = root[m] * weight
-                    if wp.static(split):
-                        part, slack = share_of_edge(stiffness, scalars[CARRIED, world])
-                        tension_out[wp.static(tensions), tid] = linear(slack)
-                        scale *= part
-                    put(factor_out, m, jacobian[m] * scale, tid)
-            stiffness_out[tid] = linear(stiffest)
-            if wp.static(packed > 0):
-                if flags[ITERATION, world] >= wp.static(begin) and flags[CLAMPED, world] == 0:
-                    second = curvature_of(x, s, w, slope)
-                    if wp.static(left_out is not None):
-                        second = second + left_out(root * weight, e, p, w, jacobian)
-                    for i in range(wp.static(packed)):
-                        second_out[i, tid] = linear(second[i])
+    @wp.func
+    def items(world: int, first: int):
+        return world, first
 
-    return evaluate
+    @wp.func
+    def count(inputs: Inputs, world: int):
+        return inputs.elements
+
+    @wp.func
+    def column(inputs: Inputs, world: int, e: int):
+        return wp.max(e + world * inputs.elements, 0)
+
+    @wp.func
+    def whole(inputs: Inputs, world: int, e: int):
+        return True
+
+    @wp.func
+    def read(inputs: Inputs, world: int, e: int, all: bool):
+        return place(inputs, inputs.q, world, e)
+
+    @wp.func
+    def displacement(inputs: Inputs, w: wp.array(dtype=V), world: int, e: int, all: bool):
+        q, _s = place(inputs, w, world, e)
+        return q
+
+    return ElementStorage(
+        terms=(TermAccess(term, same, same_lagged, same, slack=measure.tensions),),
+        Inputs=Inputs,
+        Window=Q,
+        Lagged=S,
+        items=items,
+        last_item=until_function(serial),
+        count=count,
+        column=column,
+        whole=whole,
+        read=read,
+        displacement=displacement,
+        Displacements=wp.array(dtype=V),
+        slots=spread if slots else None,
+        num_slots=measure.slots if slots else 0,
+    )
+
+
+@cache
+def linear_stress_kernel(term: Term, real):
+    """Build the kernel of stresses at the strains that a step gives to first order, e + J step."""
+    storage, V, n = coupled_storage(term, real), wp.types.vector(3, real), len(term.measure.strains)
+    Inputs, items, read = storage.Inputs, storage.items, storage.read
+    displacement, column_of = storage.displacement, storage.column
+    _, jacobian_of, *_ = term.measure.functions(real)
+    _, slope_of, _ = term.density.functions(real, n)
+    parameters, write = (
+        parameter_function(storage, 0, real),
+        write_rows_function(term.measure.types(real)[2], real, real),
+    )
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def linear_stress(inputs: Inputs, step: wp.array(dtype=V), stress_out: wp.array2d(dtype=real)):
+        i, j = wp.tid()
+        world, element = items(i, j)
+        at = column_of(inputs, world, element)
+        w, p = parameters(inputs, world, element, at)
+        q, s = read(inputs, world, element, True)
+        e, jacobian = jacobian_of(q, s, w)
+        write(stress_out, 0, slope_of(e + jacobian * displacement(inputs, step, world, element, True), p), at)
+
+    return linear_stress

@@ -4,28 +4,25 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
+from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, rows_function
 from ddg_warp.kernels.islands import PROGRESS, RATE
 from ddg_warp.kernels.matrix.sliced import mass_type
-from ddg_warp.kernels.net.elements import elements_type, functions
+from ddg_warp.kernels.net.elements import coupled_storage
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
 def element_kernel(term: Term, real, linear):
-    """Build the kernel of an element set.
-
-    `measure`: write the rows of the energy balance of each element; row i of world w is i * worlds + w.
-    """
-    Elements = elements_type(real)
-    V = wp.types.vector(3, real)
-    gather, _ = functions(term, real)
-    balance = balance_function(term, real)
+    """Build the kernel of the rows of the elements of a set; row i of world w is i * worlds + w."""
+    storage, V = coupled_storage(term, real), wp.types.vector(3, real)
+    Inputs, items, read = storage.Inputs, storage.items, storage.read
+    window_of, column_of = storage.displacement, storage.column
+    rows_of = rows_function(storage, 0, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        elements: Elements,
+        inputs: Inputs,
         q0: wp.array(dtype=V),
         stiffness: wp.array(dtype=linear),
         floor: real,
@@ -33,19 +30,18 @@ def element_kernel(term: Term, real, linear):
         scalars: wp.array2d(dtype=real),
         rows_out: wp.array2d(dtype=real),
     ):
-        tid = wp.tid()
-        w = tid / elements.elements
+        i, j = wp.tid()
+        w, e = items(i, j)
         if scalars[PROGRESS, w] >= real(1.0):
             return
-        e = tid - w * elements.elements
-        b, s, weight, p = gather(elements, elements.q, w, e)
-        a, _s, _w, _p = gather(elements, q0, w, e)
-        reach = wp.max(wp.abs(elements.q[elements.slots[0, e] + w * elements.blocks]))
-        rows = balance(a, s, b, s, weight, p, reach, floor)
+        at = column_of(inputs, w, e)
+        q, s = read(inputs, w, e, True)
+        reach = wp.max(wp.abs(inputs.q[inputs.slots[0, e] + w * inputs.blocks]))
+        rows = rows_of(inputs, window_of(inputs, q0, w, e, True), s, q, s, True, reach, floor, w, e, at)
         least = floor * reach
         worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, e] = rows[wp.static(DRIFT)]
-        rows_out[wp.static(ROUNDING) * worlds + w, e] = rows[wp.static(ROUNDING)] + real(stiffness[tid]) * least * least
+        rows_out[wp.static(ROUNDING) * worlds + w, e] = rows[wp.static(ROUNDING)] + real(stiffness[at]) * least * least
         rows_out[wp.static(HELD) * worlds + w, e] = rows[wp.static(HELD)]
         rows_out[wp.static(DISSIPATED) * worlds + w, e] = rows[wp.static(DISSIPATED)]
 

@@ -36,35 +36,13 @@ def along_type(real, linear):
 
 
 @cache
-def one_function(which: int, real, linear):
-    """one(...): of up to six sets, that of number `which`."""
-    Along = along_type(real, linear)
-
-    @wp.func
-    def one(own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along):
-        if wp.static(which == 1):
-            return own1
-        if wp.static(which == 2):
-            return own2
-        if wp.static(which == 3):
-            return own3
-        if wp.static(which == 4):
-            return own4
-        if wp.static(which == 5):
-            return own5
-        return own0
-
-    return one
-
-
-@cache
 def force_function(terms: tuple[Term, ...], real, linear):
-    """collect(along..., k, c, w, accepted) of the last of the terms, and by calling itself of those before: what meets at a place.
+    """collect(sets, k, c, w, accepted) of the last of the terms, and by calling itself of those before: what meets at a place.
 
     Returns forces on its node, their sizes and stiffnesses, the same of the angle ahead, the change of the energy of the elements that
     begin there, and the size of that.
     """
-    measure, first, one = terms[-1].measure, len(terms) == 1, one_function(len(terms) - 1, real, linear)
+    measure, first, which = terms[-1].measure, len(terms) == 1, len(terms) - 1
     V, Along = wp.types.vector(3, real), along_type(real, linear)
     nodes, angles = measure.nodes, measure.angles
     part, largest = part_function(measure, real), largest_function(real)
@@ -72,18 +50,13 @@ def force_function(terms: tuple[Term, ...], real, linear):
 
     @wp.func
     def collect(
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        sets: wp.array(dtype=Along),
         k: int,
         c: int,
         w: int,
         accepted: int,
     ):
-        own = one(own0, own1, own2, own3, own4, own5)
+        own = sets[wp.static(which)]
         force = V()
         size = real(0.0)
         stiff = real(0.0)
@@ -93,9 +66,7 @@ def force_function(terms: tuple[Term, ...], real, linear):
         change = real(0.0)
         noise = real(0.0)
         if wp.static(not first):
-            force, size, stiff, moment, size_too, stiff_too, change, noise = before(
-                own0, own1, own2, own3, own4, own5, k, c, w, accepted
-            )
+            force, size, stiff, moment, size_too, stiff_too, change, noise = before(sets, k, c, w, accepted)
         for i in range(wp.static(nodes)):
             e = own.at[i, k, c]
             if e >= 0:
@@ -137,12 +108,7 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
         elsewhere: wp.array(dtype=wp.uint8),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
+        sets: wp.array(dtype=Along),
         found: Found,
     ):
         start, r = wp.tid()
@@ -155,9 +121,7 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
         accepted = flags[SLOT, w]
         shift = first_of(w, given.blocks)
         for k in range(start, until(start, count[c])):
-            f, size, stiff, moment, size_too, stiff_too, change, noise = collect(
-                own0, own1, own2, own3, own4, own5, k, c, w, accepted
-            )
+            f, size, stiff, moment, size_too, stiff_too, change, noise = collect(sets, k, c, w, accepted)
             node = places[0, k, c]
             if node >= 0:
                 if elsewhere[node] == wp.uint8(0):

@@ -51,12 +51,7 @@ def walk_kernel(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         layout: Layout,
-        set0: Along,
-        set1: Along,
-        set2: Along,
-        set3: Along,
-        set4: Along,
-        set5: Along,
+        sets: wp.array(dtype=Along),
         right: wp.array(dtype=H),
         blocks: int,
         factors: wp.array3d(dtype=linear),
@@ -80,7 +75,7 @@ def walk_kernel(
         before = B()
         before2 = B()
         for k in range(n):
-            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, set0, set1, set2, set3, set4, set5, k, c, w)
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, sets, k, c, w)
             L, inverse, lost_here = factor(D - minus)
             lost_pivots += lost_here
             Zb = lower(L, E - minus_couple)

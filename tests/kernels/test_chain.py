@@ -7,7 +7,8 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import element, outcome
+from ddg_warp.kernels import element_path, outcome
+from ddg_warp.kernels.chain import rod_storage
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 
 KINDS = {
@@ -152,18 +153,10 @@ class Problem:
         for i in range(len(kind.terms)):
             out = arrays.allocate((group.nodes, group.columns), real, self.device)
             wp.launch(
-                element.term_kernels(kind, i, real)[0],
+                element_path.term_kernels(rod_storage(kind, real), i, real)[0],
                 (group.elements, group.columns),
-                [
-                    newton.x,
-                    newton.theta,
-                    newton.frame,
-                    self.last,
-                    newton.islands.rate,
-                    *group.parameters.arrays,
-                    group.count,
-                ],
-                [out],
+                [group.element_inputs(newton, self.last, newton.islands.rate)],
+                [arrays.columns(out)],
                 device=self.device,
             )
             total += arrays.download(out).sum(0)

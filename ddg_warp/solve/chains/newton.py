@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp import arguments, arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import balance, chain, evaluate, foresight, search, step
+from ddg_warp.kernels import balance, chain, element_path, foresight, search, step
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.solve import sweep, tension
@@ -119,7 +119,6 @@ class ChainNewton:
         )
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
         self.islands = Islands(columns, self.real, device)
-        self.without_compression = self.islands.clamped  # rods whose matrix leaves out what compression takes away
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
         rows = kind.geometric_rows if self.exact else 1
@@ -127,10 +126,21 @@ class ChainNewton:
         self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
         self._project = None
         if self.psd == "project" and self.exact:
-            self.without_compression = wp.full(columns, 1, dtype=int, device=device)
             self._project = geometric.project_kernel(kind, self.real, self.linear)
         self.device = device
-        self._evaluate = evaluate.evaluate_kernel(kind, self.real, self.linear, self.exact_from, split)
+        self._evaluate = element_path.evaluate_kernel(
+            chain.rod_storage(kind, self.real, self.linear),
+            self.real,
+            self.linear,
+            self.exact_from,
+            split,
+            self.definite,
+            self.reuse,
+        )
+        self._results = element_path.results_type(self.real, self.linear)()
+        self._results.factor = self._results.tension = arrays.columns(self.factor)
+        self._results.second, self._results.gradient = arrays.columns(self.geometric), arrays.columns(self.gradient)
+        self._results.energy, self._results.stiffness = arrays.columns(self.energy), arrays.columns(self.stiffness)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._further = None if midpoint else foresight.further_kernel(kind, self.real, self.linear)
@@ -149,6 +159,11 @@ class ChainNewton:
     def outdated(self) -> bool:
         """Whether parameters have changed so that another mode suits the rods than the one that was chosen."""
         return self.options.psd == "auto" and self.psd != self.automatic_psd()
+
+    @property
+    def definite(self) -> bool:
+        """True if matrices always drop compression."""
+        return self.psd == "project" and self.exact
 
     @property
     def kernels(self) -> list:
@@ -207,9 +222,8 @@ class ChainNewton:
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [self.x, self.theta, self.frame, last, *self.islands.arrays, *group.parameters.arrays, group.count]
-            + [self.without_compression, int(self.reuse)],
-            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness],
+            [group.element_inputs(self, last, self.islands.rate), *self.islands.arrays],
+            [self._results],
             device=self.device,
             block_dim=128,
         )

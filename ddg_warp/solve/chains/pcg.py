@@ -34,8 +34,6 @@ class PcgNewton(AssembledNewton):
         self.factors = self.vectors(3 * kind.block**2 + kind.block) if by_chain else self.blocks
         self.rest, self.z, self.p, self.q = (self.vectors() for _ in range(4))
         self._repeats = self.psd in ("progressive", "none")
-        if not self._repeats:
-            self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
         self.rho, self.rho_first = (wp.zeros(columns, dtype=self.linear, device=device) for _ in range(2))
         self.iterations, self.negative = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
         self.busy = wp.zeros(1, dtype=int, device=device)
@@ -46,6 +44,11 @@ class PcgNewton(AssembledNewton):
         self._repeat = pcg.repeat_kernel(self.real, self.psd == "none") if self._repeats else None
         self._take = pcg.take_kernel(kind, self.real, self.linear)
         self._limit = 10 * kind.block * group.nodes
+
+    @property
+    def definite(self) -> bool:
+        """True if matrices always drop compression: PCG needs definite ones where it cannot tell."""
+        return self.psd not in ("progressive", "none")
 
     def automatic_psd(self) -> str:
         """Gauss-Newton where an indefinite matrix would not be noticed."""

@@ -7,7 +7,8 @@ import numpy as np
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import element, foresight, step
+from ddg_warp.kernels import element_path, foresight, step
+from ddg_warp.kernels.chain import rod_storage
 from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
@@ -127,7 +128,8 @@ class ChainStep(PartStep):
         kernels = [self._begin, self._nodes, *([self._frames] if self._frames else [])]
         kernels += [] if self.midpoint else [self._foresee]
         if self.group.kind.viscous:
-            kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
+            real = self.model.types.real
+            kernels.append(element_path.strain_kernel(rod_storage(self.group.kind, real), real))
         return kernels
 
     @property

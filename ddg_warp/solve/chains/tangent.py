@@ -13,7 +13,8 @@ from scipy import sparse
 from ddg_warp import arrays
 from ddg_warp.compile.tolerance import support_forces
 from ddg_warp.geometry.turning import turned
-from ddg_warp.kernels import element
+from ddg_warp.kernels import element_path
+from ddg_warp.kernels.chain import rod_storage
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.part import Part
@@ -208,24 +209,18 @@ class ChainTangent(Part):
         return moved
 
     def _launch(self, state, index: int, which: int, out: wp.array, parameters: ParameterTable | None = None) -> None:
-        group, data = self.group, self.data(state)
-        kernel = element.term_kernels(group.kind, index, self.model.types.real)[which]
-        grid = (group.elements, group.columns) + ((group.kind.window,) if which == 2 else ())
-        wp.launch(
-            kernel,
-            grid,
-            [
-                data.x,
-                data.theta,
-                data.frame,
-                data.last,
-                self.rate,
-                *(parameters or group.parameters).arrays,
-                group.count,
-            ],
-            [out],
-            device=self.model.wp_device,
-        )
+        group, data, real = self.group, self.data(state), self.model.types.real
+        window, device = group.kind.window, self.model.wp_device
+        kernel = element_path.term_kernels(rod_storage(group.kind, real), index, real)[which]
+        inputs, grid = [group.element_inputs(data, data.last, self.rate, parameters)], (group.elements, group.columns)
+        rows = ()
+        if which == 2:  # by the stresses of the law alone
+            inputs, grid, rows = (
+                [*inputs, wp.zeros((0, 0), dtype=real, device=device)],
+                (*grid, window),
+                (window, window),
+            )
+        wp.launch(kernel, grid, inputs, [arrays.columns(out, *rows)], device=device)
 
 
 def _incidence(group) -> sparse.csr_matrix:

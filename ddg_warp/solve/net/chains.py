@@ -134,8 +134,9 @@ class Chains:
         for name in ("places", "chain", "count", "held", "idle"):
             setattr(self.layout, name, getattr(self, name))
         self.layout.diagonal, self.layout.positions = table.diagonal, table.positions
-        own = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
-        self._own = own + own[-1:] * (SETS - len(own))
+        # structs on the host keep arrays alive that those on the device point to
+        self._of_sets = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
+        self._own = wp.array(self._of_sets, dtype=along_type(real, linear), device=device)
         if self.banded:
             self._balance = place_kernel(terms, plan.twist, real, linear, drag, self._contact, serial)
             apart = np.zeros(net.blocks, np.uint8)
@@ -193,7 +194,7 @@ class Chains:
         self._launch(
             self._balance,
             (arrays.takers(self.longest, self.device), self.columns),
-            [given, self.places, self.count, self._apart, *islands.arrays, *self._own],
+            [given, self.places, self.count, self._apart, *islands.arrays, self._own],
             [found],
         )
 
@@ -202,7 +203,7 @@ class Chains:
         self._launch(
             self._assemble,
             (arrays.takers(self.longest, self.device), self.columns),
-            [matrix, mass, *islands.arrays, self.layout, *self._own],
+            [matrix, mass, *islands.arrays, self.layout, self._own],
             [self.bands],
         )
         if self._clears:
@@ -230,13 +231,13 @@ class Chains:
             self.prepare(matrix, fixed, anew.wanted, lost)
             self.apply(matrix, right, barred, islands.wanted, z, dots)
             if self.split:
-                inputs = [*islands.arrays, self.layout, *self._own, self.values]
+                inputs = [*islands.arrays, self.layout, self._own, self.values]
                 self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
             return
         self._launch(
             self._walk,
             self.columns,
-            [matrix, mass, *islands.arrays, self.layout, *self._own, right, self.net.blocks],
+            [matrix, mass, *islands.arrays, self.layout, self._own, right, self.net.blocks],
             [self.factors, self.values, lost, z],
         )
         if self.joints:

@@ -4,10 +4,11 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels import element_path
 from ddg_warp.kernels.adjoint.solve import block_kernels, check_kernels
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix.exact import COUNT, FIRST, SIGN, exact_kernels
-from ddg_warp.kernels.net import elements
+from ddg_warp.kernels.net.elements import coupled_storage
 from ddg_warp.model.net import NetState
 from ddg_warp.solve.choice import net_preconditioner
 from ddg_warp.solve.net.chains import Chains
@@ -71,14 +72,12 @@ class ExactSystem:
         self._begin, self._add = exact_kernels(real, self.linear, drag, arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
         self._rest, self._check = check_kernels(self.linear)
-        self._hessians = [elements.term_kernels(part.term, real)[2] for part in net.sets]
+        self._hessians = [element_path.term_kernels(coupled_storage(part.term, real), 0, real)[2] for part in net.sets]
         sizes = [part.term.measure.size for part in net.sets]
         largest = max(part.elements * size**2 for part, size in zip(net.sets, sizes, strict=True))
         hessians, count = make(worlds * largest, real), [worlds * part.elements for part in net.sets]
         self._written = [hessians[: n * size**2].reshape((n, size, size)) for n, size in zip(count, sizes, strict=True)]
-        self._no_stress = [
-            make((len(part.term.measure.strains), n), real) for part, n in zip(net.sets, count, strict=True)
-        ]
+        self._no_stress = make((0, 0), real)
         self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in net.sets]
         self.krylov = ConjugateGradients(self, preconditioner.endswith("multilevel"), indefinite=True)
 
@@ -129,7 +128,8 @@ class ExactSystem:
         self._launch(self._begin, every, read, [self.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
             given = self.net.elements(state, i, rate=rate)
-            self._launch(kernel, hessian.shape[:2], [given, self._no_stress[i]], [hessian])
+            grid = self.net.worlds, self.net.sets[i].elements, hessian.shape[1]
+            self._launch(kernel, grid, [given, self._no_stress], [hessian.transpose((1, 2, 0))])
             read = [hessian, *table.adds[i], self._ends[i], self.net.sets[i].term.measure.slots, flags, table.positions]
             self._launch(self._add, every, read, [self.matrix])
         if self.planes:

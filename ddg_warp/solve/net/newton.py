@@ -9,10 +9,12 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import element_path
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix.chain_places import splits
-from ddg_warp.kernels.net import elements, newton
+from ddg_warp.kernels.net import newton
+from ddg_warp.kernels.net.elements import coupled_storage
 from ddg_warp.kernels.solve import pcg
 from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.net.balance import Balance
@@ -132,7 +134,9 @@ class NetNewton:
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [
-            elements.evaluate_kernel(part.term, self.real, self.linear, late, local, serial, own)
+            element_path.evaluate_kernel(
+                coupled_storage(part.term, self.real, not local, serial), self.real, self.linear, late, own
+            )
             for part, late, local, own in zip(net.sets, self.exact_from, self.local, self.split, strict=True)
         ]
         if self.chains:
@@ -268,15 +272,16 @@ class NetNewton:
         arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
 
     def _evaluate_set(self, state, index: int) -> None:
-        own = self.parts[index]
-        arrays.sweep(
+        results = element_path.results_type(self.real, self.linear, not self.local[index])()
+        for name, values in self.parts[index].items():
+            setattr(results, name, values)
+        wp.launch(
             self._evaluate[index],
-            self.net.sets[index].elements,
+            (self.worlds, arrays.takers(self.net.sets[index].elements, self.device)),
             [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
-            [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
-            self.device,
-            128,
-            self.worlds,
+            [results],
+            device=self.device,
+            block_dim=128,
         )
 
     def balance(self) -> None:

@@ -8,8 +8,9 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
-from ddg_warp.kernels.net import elements, frames, newton
+from ddg_warp.kernels import element_path, outcome
+from ddg_warp.kernels.net import frames, newton
+from ddg_warp.kernels.net.elements import coupled_storage
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
@@ -307,7 +308,8 @@ class NetStep(PartStep):
         real, net = self.model.types.real, self.net
         kernels = [self._begin, self._finish, self._take, *([] if self.midpoint else self._foresight.kernels)]
         for part in net.sets:
-            kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
+            if part.term.density.lagged:
+                kernels.append(element_path.strain_kernel(coupled_storage(part.term, real), real))
         return kernels
 
     @property

@@ -8,7 +8,8 @@ from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
 from ddg_warp.geometry.turning import turned
-from ddg_warp.kernels.net import elements
+from ddg_warp.kernels import element_path
+from ddg_warp.kernels.net.elements import coupled_storage, linear_stress_kernel
 from ddg_warp.model import validate
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.contact import assembled
@@ -113,7 +114,8 @@ class NetTangent(Part):
             extra = np.zeros((len(part.term.measure.strains), count))
             if stress is not None:
                 extra = stress[i] - self._stress(state, i)
-            self._launch(state, i, 2, out, (size,), wp.array(extra, dtype=self.net.real, device=self.net.device))
+            extra = wp.array(extra, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 2, out.transpose((1, 2, 0)), (size,), extra)
             values = out.numpy().astype(np.float64)
             values = 0.5 * (values + values.transpose(0, 2, 1))
             to_local, places = scatter[i]
@@ -132,7 +134,9 @@ class NetTangent(Part):
         for i, part in enumerate(self.net.sets):
             shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
             out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
-            self._launch(state, i, 4, out, (), change)
+            given = self.net.elements(state.net, i, rate=self.rate)
+            kernel = linear_stress_kernel(part.term, self.net.real)
+            wp.launch(kernel, (self.net.worlds, part.elements), [given, change], [out], device=self.net.device)
             result.append(out.numpy().astype(np.float64))
         return result
 
@@ -310,10 +314,10 @@ class NetTangent(Part):
         return f"joint {block - self.host.nodes - self.host.angles}"
 
     def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
-        part = self.net.sets[index]
+        part, real = self.net.sets[index], self.net.real
         wp.launch(
-            elements.term_kernels(part.term, self.net.real)[which],
-            (part.elements * self.net.worlds, *columns),
+            element_path.term_kernels(coupled_storage(part.term, real), 0, real)[which],
+            (self.net.worlds, part.elements, *columns),
             [self.net.elements(state.net, index, rate=self.rate), *more],
             [out],
             device=self.net.device,

@@ -1,0 +1,261 @@
+"""Golden test: record states of small scenes on the CPU, and compare those of another version with them.
+
+    DDG_WARP_FP_CONTRACT=off python tools/golden.py write FILE [SCENE ...]
+    DDG_WARP_FP_CONTRACT=off python tools/golden.py compare FILE [SCENE ...]
+
+`write` keeps all arrays of the state after a few steps, and the counts of Newton and PCG iterations; with torch, also gradients of a
+loss by what steps read, of objects of `ddg_warp.learn.gradient_objects`. `compare` prints, by scene, the
+largest difference over the largest entry of the array that differs most, and fails where iteration counts differ or differences exceed
+1e-9. Without fused multiply-adds (DDG_WARP_FP_CONTRACT=off) versions that compute the same are equal bit for bit.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.kernels.threads import CONTRACTION
+from ddg_warp.scenes import hair
+
+STEPS = 8
+LARGEST = 1e-9  # difference over the largest entry
+DOWN = (0.0, -1.0, -9.81)  # m/s^2
+SOFT = ddg.Material(young=1e6, poisson=0.3, density=1000.0, viscosity=100.0)
+RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
+SECTION = ddg.Circle(0.01)
+
+
+def line(nodes: int, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """Nodes of a straight rod of 1 m along x (nodes, 3) [m]."""
+    points = np.zeros((nodes, 3))
+    points[:] = 0.0, y, z
+    points[:, 0] = np.linspace(0.0, 1.0, nodes)
+    return points
+
+
+def cantilevers(scene: ddg.Scene, count: int = 2, nodes: int = 14, material=RUBBER, **options) -> np.ndarray:
+    """Add clamped rods side by side."""
+    points = np.stack([line(nodes, 0.1 * k) for k in range(count)])
+    rods = scene.add_rods(points, section=SECTION, material=material, **options)
+    scene.clamp(rods, edges=[0])
+    return rods
+
+
+def twisted() -> ddg.Scene:
+    """Uncoupled rods with twist and damping."""
+    scene = ddg.Scene(gravity=DOWN)
+    rods = cantilevers(scene, material=SOFT)
+    scene.add_twisting_moment(int(rods[0]), 12, 0.002)
+    return scene
+
+
+def planar() -> ddg.Scene:
+    """Uncoupled planar rods."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), dimension=2)
+    scene.clamp(scene.add_rod(line(14), section=SECTION, material=RUBBER), edges=[0])
+    scene.clamp(scene.add_rod(line(11, z=1.0), section=SECTION, material=RUBBER), edges=[0])
+    return scene
+
+
+def curved() -> ddg.Scene:
+    """Uncoupled rods with natural curvature: second derivatives of bending and twist."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 20)
+    helix = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.05 * angle], axis=1)
+    scene = ddg.Scene(gravity=DOWN)
+    scene.clamp(scene.add_rod(helix, section=SECTION, material=RUBBER), edges=[0])
+    return scene
+
+
+def untwisted() -> ddg.Scene:
+    """Uncoupled rods without twist, open and closed."""
+    angle = 2.0 * np.pi * np.arange(16) / 16
+    ring = np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.0 * angle], axis=1)
+    scene = ddg.Scene(gravity=DOWN)
+    cantilevers(scene, twist=False)
+    scene.fix(
+        scene.add_rod(ring, section=SECTION, material=RUBBER, twist=False, closed=True, natural="straight"), [0, 1]
+    )
+    return scene
+
+
+def joined() -> ddg.Scene:
+    """Rods of a coupled system, with rigid and hinged joints and natural curvature."""
+    scene = ddg.Scene(gravity=DOWN)
+    rods = cantilevers(scene, 3, 9, SOFT)
+    across = np.zeros((9, 3))
+    across[:, 0], across[:, 1] = 1.0, np.linspace(0.0, 0.1, 9)
+    across[:, 2] = 0.02 * np.sin(np.linspace(0.0, np.pi, 9))
+    first, second = (
+        scene.add_rod(across + [0.0, shift, 0.0], section=SECTION, material=RUBBER) for shift in (0.0, 0.1)
+    )
+    scene.join([(int(rods[0]), -1), (first, 0)])
+    scene.join([(int(rods[1]), -1), (first, -1), (second, 0)])
+    scene.join([(int(rods[2]), -1), (second, -1)], rigid=False)
+    return scene
+
+
+def sheet() -> ddg.Scene:
+    """A sheet held at two corners, by St. Venant and Kirchhoff, with bending by mid-edge normals."""
+    points, triangles = meshes.rectangle(5, 5, (1.0, 1.0), "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    shell = scene.add_shell(points, triangles, thickness=1e-2, material=RUBBER)
+    held = (points[:, 0] == points[:, 0].min()) & np.isin(points[:, 1], [points[:, 1].min(), points[:, 1].max()])
+    scene.hold(shell, np.flatnonzero(held))
+    return scene
+
+
+def contact() -> ddg.Scene:
+    """A rod that falls across another one, with friction."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    low, high = line(11), line(11, z=0.024)[:, [1, 0, 2]] + [0.5, -0.5, 0.0]
+    scene.clamp(scene.add_rod(low, section=SECTION, material=RUBBER), edges=[0, 9])
+    scene.add_rod(high, section=SECTION, material=RUBBER)
+    scene.contact(stiffness=2e4, friction=0.3, range=2e-3)
+    return scene
+
+
+def magnet() -> ddg.Scene:
+    """A magnetised rod that turns into a field."""
+    scene = ddg.Scene()
+    (rod,) = cantilevers(scene, 1)
+    scene.magnetize(int(rod), 1e5)
+    scene.magnetic_field((0.0, 0.002, 0.005))
+    return scene
+
+
+def strands(scene: ddg.Scene, joined: bool = False) -> ddg.Scene:
+    """Add curly hair, whose axial forces are unknowns in mixed precision; `joined`: its roots to stubs that are held."""
+    kind = {"section": ddg.Circle(40e-6), "material": HAIR}
+    for points in hair.curls(2, 32):
+        rod = scene.add_rod(points, natural="shape", **kind)
+        if not joined:
+            scene.clamp(rod, edges=[0])
+            continue
+        stub = scene.add_rod(np.linspace(points[0] + [0.0, 0.0, 0.02], points[0], 3), **kind)
+        scene.clamp(stub, edges=[0, 1])
+        scene.join([(rod, 0), (stub, -1)], rigid=False)
+    return scene
+
+
+def tensions() -> ddg.Scene:
+    """Uncoupled rods by the mixed axial-force formulation."""
+    return strands(ddg.Scene(gravity=(3.0, 0.0, -9.81)))
+
+
+def tensions_joined() -> ddg.Scene:
+    """Rods of a coupled system by the mixed axial-force formulation."""
+    return strands(ddg.Scene(gravity=(3.0, 0.0, -9.81)), joined=True)
+
+
+# Name -> scene, precision, time step [s], options of the integrator.
+CASES: dict[str, tuple[Callable[[], ddg.Scene], str, float, dict]] = {
+    "twisted": (twisted, "float64", 0.01, {}),
+    "twisted_mixed": (twisted, "mixed", 0.01, {}),
+    "midpoint": (twisted, "float64", 0.002, {"scheme": "implicit_midpoint"}),
+    "midpoint_joined": (joined, "float64", 0.002, {"scheme": "implicit_midpoint"}),
+    "planar": (planar, "float64", 0.01, {}),
+    "curved": (curved, "float64", 0.02, {}),
+    "project": (curved, "float64", 0.02, {"psd": "project"}),
+    "projective": (twisted, "float64", 0.01, {"solver": "projective"}),
+    "untwisted": (untwisted, "float64", 0.01, {}),
+    "joined": (joined, "float64", 0.01, {}),
+    "joined_exact": (joined, "float64", 0.01, {"psd": "progressive"}),
+    "sheet": (sheet, "float64", 0.005, {}),
+    "contact": (contact, "float64", 0.005, {}),
+    "magnet": (magnet, "float64", 0.01, {}),
+    "tensions": (tensions, "mixed", 1.0 / 60.0, {}),
+    "tensions_joined": (tensions_joined, "mixed", 1.0 / 60.0, {}),
+}
+
+
+# Name -> object of `ddg_warp.learn.gradient_objects`, analysis.
+GRADIENTS = {
+    "grad_rod": ("rod", "implicit_euler"),
+    "grad_midpoint": ("rod", "implicit_midpoint"),
+    "grad_planar": ("planar rod", "implicit_euler"),
+    "grad_closed": ("closed rod", "implicit_euler"),
+    "grad_joined": ("rods joined rigidly", "implicit_midpoint"),
+    "grad_shell": ("shell, midedge", "implicit_euler"),
+    "grad_contact": ("rods in contact", "implicit_euler"),
+    "grad_static": ("rod", "statics"),
+    "grad_static_net": ("rods joined rigidly", "statics"),
+}
+
+
+def gradient(name: str) -> tuple[dict[str, np.ndarray], str]:
+    """Return the derivatives of a loss by everything that steps, or equilibria, of an object read."""
+    from ddg_warp.learn.gradient_cases import Case
+
+    found = {}
+    for own in Case(*GRADIENTS[name], "cpu").inputs():
+        with suppress(ddg.SceneError):  # where equilibria are searched from has no gradient
+            found[own.name] = np.array(own.found())
+    return found | {"counts": np.zeros(3)}, ""
+
+
+def record(name: str) -> tuple[dict[str, np.ndarray], str]:
+    """Return all arrays of the state after `STEPS` steps with the iteration counts, and which linear solvers were used."""
+    if name in GRADIENTS:
+        return gradient(name)
+    build, precision, dt, options = CASES[name]
+    model = build().build("cpu", precision, worlds=2)
+    integrator, state = ddg.Integrator(model, check_every=1, **options), model.state()
+    for _ in range(STEPS):
+        state = integrator.step(state, dt)
+    found = integrator.statistics()
+    newton, energy = found["newton_iterations"], found.get("energy", {})
+    counts = np.array([newton["mean"], newton["max"], found["pcg_iterations"]])
+    account = {f"energy {key}": np.array(value) for key, value in energy.items()}
+    return {**state.snapshot(), **account, "counts": counts}, ", ".join(found["linear"])
+
+
+def difference(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest difference over the largest entry; infinity where shapes differ."""
+    if one.shape != other.shape:
+        return np.inf
+    if one.size == 0 or np.array_equal(one, other, equal_nan=True):
+        return 0.0
+    largest = np.abs(one.astype(float)).max()
+    return float(np.abs(one.astype(float) - other).max() / (largest or 1.0))
+
+
+def main() -> int:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("write", "compare"))
+    parser.add_argument("file", type=Path, help="NumPy archive of recorded states")
+    parser.add_argument("scene", nargs="*", help=f"of {', '.join((*CASES, *GRADIENTS))} (default: all)")
+    chosen = parser.parse_args()
+    wp.config.quiet = True
+    names, failed = chosen.scene or [*CASES, *(GRADIENTS if find_spec("torch") else [])], False
+    print(f"floating-point contraction: {CONTRACTION}")
+    if chosen.action == "write":
+        found = {}
+        for name in names:
+            arrays, linear = record(name)
+            found |= {f"{name}/{key}": values for key, values in arrays.items()}
+            print(f"{name:14} Newton {arrays['counts'][0]:.3f} PCG {arrays['counts'][2]:.0f} {linear}", flush=True)
+        np.savez_compressed(chosen.file, **found)
+        return 0
+    golden = np.load(chosen.file)
+    for name in names:
+        arrays, _ = record(name)
+        off = {key: difference(golden[f"{name}/{key}"], values) for key, values in arrays.items()}
+        same = off.pop("counts") == 0.0
+        worst = max(off, key=off.get)
+        failed |= not same or not off[worst] <= LARGEST
+        counts = "equal counts" if same else f"counts {golden[f'{name}/counts']} became {arrays['counts']}"
+        print(f"{name:14} {'bitwise' if off[worst] == 0.0 else f'{off[worst]:.1e} in {worst}'}, {counts}", flush=True)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
