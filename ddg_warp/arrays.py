@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.threads import THREADS
+from ddg_warp.kernels.core.launch import THREADS
 
 # Threads of a grid-stride loop, as many as a large GPU runs at once.
 #
@@ -89,7 +89,7 @@ def load_kernels(kernels, device) -> None:
 
 
 def serial(device) -> bool:
-    """Return True if one thread loops over all items, instead of one thread each; see `kernels.threads.until_function`."""
+    """Return True if one thread loops over all items, instead of one thread each; see `kernels.core.launch.until_function`."""
     return wp.get_device(device).is_cpu
 
 
@@ -108,7 +108,7 @@ def take_turns(kernel, count: int, inputs: list, outputs: list, device) -> None:
 
 
 def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS, worlds: int = 1) -> None:
-    """Launch a kernel over `count` items, or as many in every world; see `kernels.threads.share_function`."""
+    """Launch a kernel over `count` items, or as many in every world; see `kernels.core.launch.share_function`."""
     wp.launch(kernel, worlds * takers(count, device), inputs, outputs, device=device, block_dim=threads)
 
 

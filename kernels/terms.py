@@ -6,20 +6,20 @@ from functools import cached_property
 
 import numpy as np
 
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE, Kind
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE, Kind
 from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
-from ddg_warp.kernels.densities.damping import damped
 from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
 from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
+from ddg_warp.kernels.densities.kelvin_voigt import damped
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
 from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
+from ddg_warp.kernels.measures.boundary_hinge_angle import edge_tilt
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
-from ddg_warp.kernels.measures.edge_tilt import edge_tilt
 from ddg_warp.kernels.measures.hinge_angle import hinge_angle
 from ddg_warp.kernels.measures.isometric_bending import isometric_bending
 from ddg_warp.kernels.measures.joint_curvature_twist import joint_curvature_twist
@@ -33,7 +33,7 @@ from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, mided
 from ddg_warp.kernels.measures.midedge_metric import midedge_metric
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
-from ddg_warp.kernels.measures.rod_surface_angle import rod_surface_angle
+from ddg_warp.kernels.measures.rod_shell_angle import rod_surface_angle
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
 from ddg_warp.kernels.measures.turning_angle import (
     curvature_binormal_angle,

@@ -17,9 +17,9 @@ from test_predictors import (
 
 import ddg_warp as ddg
 from ddg_warp import arrays
-from ddg_warp.kernels.islands import LOAD_SCALE, SCALARS
-from ddg_warp.kernels.net import foresight
-from ddg_warp.kernels.turns import LEAP, edge_functions
+from ddg_warp.kernels.core.islands import LOAD_SCALE, SCALARS
+from ddg_warp.kernels.newton.edge_rotation import LEAP, edge_functions
+from ddg_warp.kernels.stepping import coupled_warm_start
 
 T240 = 1.0 / 240.0
 STEPS = np.array([T240, T240, T240, 0.5 * T240, 0.01, 0.01])
@@ -168,7 +168,7 @@ def test_warm_start_weight_follows_the_persistence_of_corrections(device):
     """The weight is the cosine with the last correction, limited to a fourfold growth; shocks get 1/20, corrections
     below tolerance 0.
     """
-    real, (*_, trust) = wp.float64, foresight.foresight_kernels(wp.float64, wp.float64, arrays.serial(device))
+    real, (*_, trust) = wp.float64, coupled_warm_start.foresight_kernels(wp.float64, wp.float64, arrays.serial(device))
     rtol = 0.1
     # m a.b, m a.a, m b.b, m |a|, and the weight
     cases = [

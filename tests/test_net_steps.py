@@ -7,7 +7,7 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.compile.net.outwards import outwards
 from ddg_warp.geometry import meshes
-from ddg_warp.kernels.search import RELAG
+from ddg_warp.kernels.newton.rod_iterate import RELAG
 from ddg_warp.solve.net.newton import NetNewton, NewtonOptions
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)

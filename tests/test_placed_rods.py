@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.kernels.search import PLACE
+from ddg_warp.kernels.newton.rod_iterate import PLACE
 from ddg_warp.solve.net.newton import NetNewton, NewtonOptions
 
 SIZES = (2, 3, 33, 64, 65, 200, 1300)  # around one and two runs of edges; the last size has longer runs

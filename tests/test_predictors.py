@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.kernels.turns import LEAP, edge_functions
+from ddg_warp.kernels.newton.edge_rotation import LEAP, edge_functions
 
 slow = pytest.mark.slow
 DONE = {"converged", "converged_to_rounding"}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from ddg_warp.kernels.reading import read_function, write_function
+from ddg_warp.kernels.core.vectorised_access import read_function, write_function
 
 TYPES = [wp.int32, wp.float32, wp.float64]
 SIZES = [1, 2, 3, 4, 6, 8]

@@ -10,12 +10,12 @@ from test_laws import cantilever as lawful
 from test_predictors import DONE, RUBBER, SCHEMES, SOLVERS, T60, hair, linear_of, slow
 
 import ddg_warp as ddg
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import DETOURS_ALLOWED, Islands
 from ddg_warp.kernels.densities import NOT_NEGATIVE, Density, Parameter
-from ddg_warp.kernels.islands import DETOURS_ALLOWED, Islands
-from ddg_warp.kernels.net.newton import STALLED, search_kernels
-from ddg_warp.kernels.step import advance_kernel
-from ddg_warp.kernels.turns import TURNED
+from ddg_warp.kernels.newton.coupled_newton import STALLED, search_kernels
+from ddg_warp.kernels.newton.edge_rotation import TURNED
+from ddg_warp.kernels.stepping.rod_step import advance_kernel
 
 # The motion.
 

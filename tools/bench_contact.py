@@ -22,9 +22,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.motion import corners_function
-from ddg_warp.kernels.contact.surfaces import EDGES, pair_functions, sides_struct
-from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function
+from ddg_warp.kernels.collision.primitives import EDGES, pair_functions, sides_struct
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes

@@ -21,7 +21,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.kernels.threads import CONTRACTION
+from ddg_warp.kernels.core.launch import CONTRACTION
 from ddg_warp.scenes import hair
 
 STEPS = 8

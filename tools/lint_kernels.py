@@ -8,7 +8,7 @@ self-overwrite    `q[0] = q[0] * a`, or `q[0] += a` on a vector: reverse mode re
                   and imports of a differentiated file.
 annotations       `from __future__ import annotations` makes strings of the types of kernel arguments.
 enable-backward   Every kernel says whether it has an adjoint, which doubles to quadruples its compile time.
-cpu-options       Every kernel names its module_options: Warp's own flags for the CPU miscompile large ones (kernels/threads.py).
+cpu-options       Every kernel names its module_options: Warp's own flags for the CPU miscompile large ones (kernels/core/launch.py).
 float-literal     A bare literal is float32: write real(0.5) or linear(0.5).
 static-variable   `wp.static(places[i])` of a loop variable: Warp resolves it by generating the code of the whole kernel for each
                   definition, and then hashes a function differently, so that it is compiled twice. Index a

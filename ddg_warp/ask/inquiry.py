@@ -95,7 +95,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
 
 @dataclass(frozen=True)
 class Drag:
-    """Drag of the fluid on rods; see `kernels.drag`.
+    """Drag of the fluid on rods; see `kernels.forces.drag`.
 
     All fields have an axis (worlds, ...) in front for several worlds.
 

@@ -5,7 +5,7 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.kernels.contact.look import closest_kernel
+from ddg_warp.kernels.collision.contact.query import closest_kernel
 from ddg_warp.model import glue
 from ddg_warp.threads import launches
 

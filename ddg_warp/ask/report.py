@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ddg_warp.kernels.solve import cyclic_reduction
+from ddg_warp.kernels.linear import cyclic_reduction
 from ddg_warp.kernels.terms import ALL, FRICTION, Potential, contact_potential
 from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE

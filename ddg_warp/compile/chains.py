@@ -10,8 +10,8 @@ from ddg_warp.compile.ghosts import Ghosts
 from ddg_warp.compile.rods import Alike, alike, compress, net_rods, piece_of
 from ddg_warp.compile.storage import Along, RodPlaces, Storage
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.chain import ChainKind
-from ddg_warp.kernels.drag import ROWS as DRAG_ROWS
+from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.forces.drag import ROWS as DRAG_ROWS
 from ddg_warp.scene import drag
 from ddg_warp.scene.scene import Scene
 
@@ -34,7 +34,7 @@ class ChainGroup(Storage):
         mass: mass of nodes (n, R) [kg]; rotary: inertia of edges about the tangent (n, R) [kg m^2].
         fixed: bits of the fixed components of a node; the bit after the components is the twist angle (n, R).
         length: rod lengths (R,) [m].
-        drag: drag coefficients of edges (rows, n, R), in the order of `kernels.drag`; None without.
+        drag: drag coefficients of edges (rows, n, R), in the order of `kernels.forces.drag`; None without.
         parameters: parameters of all terms, "term.parameter", each broadcastable to (n, R).
     """
 

@@ -8,7 +8,7 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.turns import TURNED
+from ddg_warp.kernels.newton.edge_rotation import TURNED
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def choose(name: str | None, device) -> Precision:
 
 FLOAT32_LIMIT = 0.02  # relative error of a search direction that Newton still corrects quickly; beyond it float32 states are doubtful
 STIFF = 5e4  # Stiffness ratio from which rods always use edge-rotation updates and full Hessians.
-CARRIED = 1e-3  # Error up to which a float32 matrix includes a stiffness; see `kernels.solve.tension`.
+CARRIED = 1e-3  # Error up to which a float32 matrix includes a stiffness; see `kernels.linear.mixed_axial_force`.
 FLOAT32_LOST = 0.1  # Relative error beyond which rounding decides the motion.
 
 
@@ -91,8 +91,9 @@ def largest_carried(softest: np.ndarray) -> np.ndarray:
 def straight_turns(errors: np.ndarray) -> np.ndarray:
     """Return the largest edge rotation of a straight update [rad], for rods with such errors.
 
-    0 means that every update rotates edges. A straight update that rotates an edge by a stretches it by a^2 / 2, and leaves that force
-    to the next iteration. Soft rods need no more iterations for it, and a straight update is cheaper. See `kernels.turns`.
+    0 means that every update rotates edges. A straight update that rotates an edge by a stretches it by a^2 / 2, and leaves that
+    force to the next iteration. Soft rods need no more iterations for it, and a straight update is cheaper. See
+    `kernels.newton.edge_rotation`.
     """
     return np.where(stiff(errors), 0.0, TURNED)
 

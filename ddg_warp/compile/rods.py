@@ -10,7 +10,7 @@ from ddg_warp.compile.half_cells import HalfCells
 from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels.elements.rod_layout import ChainKind
 from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import drag
 from ddg_warp.scene.contact import touching_names

@@ -7,8 +7,9 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.compile.storage import FREE
-from ddg_warp.kernels.adjoint import chain, elements, step
-from ddg_warp.kernels.chain import rod_storage
+from ddg_warp.kernels.adjoint import elements, rod_elements
+from ddg_warp.kernels.adjoint import rod_step as step
+from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.learn.drag import ChainDragAdjoint
 from ddg_warp.learn.followers import Followers
 from ddg_warp.learn.predictor import ChainPredictor
@@ -95,8 +96,8 @@ class ChainAdjoint:
         storage, viscous = rod_storage(kind, real), kind.viscous
         self._pull = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
         self._strain = [elements.strain_kernel(storage, i, real, False) for i in terms] if viscous else []
-        self._frame = chain.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
-        self._ends, self._nodes, self._edges = chain.gather_kernels(kind, real)
+        self._frame = rod_elements.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
+        self._ends, self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
         self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})
         self._more_to_start = bool(self.drag or self.predictor)
         self._solution, self._start = step.step_kernels(kind, real, midpoint, self._more_to_start)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp.kernels import drag
+from ddg_warp.kernels.forces import drag
 from ddg_warp.learn import contact_places
 from ddg_warp.learn.layout import view
 from ddg_warp.learn.places import ArrayPlace

@@ -7,10 +7,10 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import arrays
-from ddg_warp.kernels import chain
 from ddg_warp.kernels.adjoint.drag import chain_kernels, net_kernels
-from ddg_warp.kernels.drag import ROWS, block_inertia
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import rod_layout
+from ddg_warp.kernels.forces.drag import ROWS, block_inertia
 from ddg_warp.solve.drag import ChainDrag, NetDrag
 from ddg_warp.solve.net.system import lists
 
@@ -19,7 +19,7 @@ class ChainDragAdjoint:
     """VJP of drag on a rod group.
 
     Attributes:
-        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.drag`, n, R), written by `pull`.
+        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `pull`.
     """
 
     def __init__(self, model, group, midpoint: bool):
@@ -51,7 +51,7 @@ class ChainDragAdjoint:
             twisted = shape if kind.twist else (1, 1)
             self._islands = Islands(group.columns, real, device)
             self._islands.coefficient.fill_(1.0)
-            self._inertia = SimpleNamespace(mass=arrays.allocate(shape, chain.inertia_type(kind, real), device))
+            self._inertia = SimpleNamespace(mass=arrays.allocate(shape, rod_layout.inertia_type(kind, real), device))
             self._inertia.rotary, self._inertia.target_angle = (
                 arrays.allocate(twisted, real, device) for _ in range(2)
             )

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.adjoint.step import asked_kernel, flag_kernels, smooth_kernel
+from ddg_warp.kernels.adjoint.rod_step import asked_kernel, flag_kernels, smooth_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.controls import StepControls
@@ -43,7 +43,7 @@ class Engine:
         scheme, options: see `Integrator`.
 
     Attributes:
-        codes: outcomes of the last step per world (worlds,), see `kernels.outcome`. Zero if good.
+        codes: outcomes of the last step per world (worlds,), see `kernels.core.outcome`. Zero if good.
         layout, fields: layout of the tensors of a state.
         tables, controls: parameters and controls of steps.
         before, after: states at the ends of a step.

@@ -10,7 +10,7 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.core import outcome
 from ddg_warp.learn.layout import along
 from ddg_warp.learn.rotations import turned
 from ddg_warp.learn.simulator import Simulator, WorldState

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.adjoint.loads import POINTS, follower_kernel, gather_kernel
+from ddg_warp.kernels.adjoint.follower_loads import POINTS, follower_kernel, gather_kernel
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.system import lists
 

@@ -6,10 +6,9 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.adjoint import elements
-from ddg_warp.kernels.adjoint import net as reverse
-from ddg_warp.kernels.drag import block_inertia
-from ddg_warp.kernels.net.elements import FRAME, coupled_storage
+from ddg_warp.kernels.adjoint import coupled_step, elements
+from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
+from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.learn.drag import NetDragAdjoint
 from ddg_warp.learn.followers import Followers
 from ddg_warp.learn.net_contact import ContactAdjoint
@@ -105,7 +104,7 @@ class NetAdjoint:
             elements.strain_kernel(storage, 0, real, True) if part.term.density.lagged else None
             for storage, part in zip(storages, net.sets, strict=True)
         ]
-        self._solution, self._inert, self._start, self._ended = reverse.step_kernels(real, midpoint, drag)
+        self._solution, self._inert, self._start, self._ended = coupled_step.step_kernels(real, midpoint, drag)
         self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
         self._rates, self._rubbing = (wp.zeros(net.worlds, dtype=real, device=self.device) for _ in range(2))
 

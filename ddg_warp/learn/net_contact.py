@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.adjoint import contact_sums
+from ddg_warp.kernels.adjoint import contact_parameters
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
-from ddg_warp.kernels.contact.gather import sum_kernel
+from ddg_warp.kernels.collision.contact.assembly import sum_kernel
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.rolling import turned_by
 from ddg_warp.solve.net.exact_contact import ExactContact
@@ -57,14 +57,14 @@ class ContactAdjoint:
         self._rolls = [friction.rolls for friction in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
         self.rubbing, spins = Rubbing(net, self.system), bool(self._spins)
-        self._direct = contact_sums.direction_kernels(real) if any(leads) else ()
+        self._direct = contact_parameters.direction_kernels(real) if any(leads) else ()
         direction_nodes = search.shapes.beside
         self._leads = [
             self._led(direction_nodes(kind.first)) if has_directions else None
             for kind, has_directions in zip(kinds, leads, strict=False)
         ]
-        self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
-        self._group, self._bodies = contact_sums.group_kernels(real), contact_sums.body_kernel(real)
+        self._sides = [contact_parameters.side_kernels(kind, real) for kind in kinds]
+        self._group, self._bodies = contact_parameters.group_kernels(real), contact_parameters.body_kernel(real)
         self._items, self._add = [NodeItems(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
         rolling = zip(kinds, self._items, self._rolls, strict=True)
         self._rub_items = [NodeItems(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling]

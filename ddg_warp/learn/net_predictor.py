@@ -7,9 +7,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.adjoint import net_predictor
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.net import newton
+from ddg_warp.kernels.adjoint import coupled_predictor
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.net import NetState
 from ddg_warp.solve.net.system import lists
 from ddg_warp.solve.net.turns import Turns
@@ -35,8 +35,8 @@ class NetPredictor:
             wp.zeros(net.worlds * net.blocks, dtype=net.vector, device=device) for _ in range(5)
         )
         self.frame, self._lag = net.lagged() if self.carries else (None, None)
-        self._begin, _ = newton.step_kernels(real, midpoint, arrays.serial(device))
-        self._unplace, self._pass_on, self._turn, self._pull = net_predictor.net_kernels(real, midpoint)
+        self._begin, _ = coupled_newton.step_kernels(real, midpoint, arrays.serial(device))
+        self._unplace, self._pass_on, self._turn, self._pull = coupled_predictor.net_kernels(real, midpoint)
         plan, loops = host.outwards, np.array([rod.piece.kind.closed for rod in host.rods], int)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
         nodes, next_nodes = plan.nodes, plan.nodes[plan.ahead(loops)]

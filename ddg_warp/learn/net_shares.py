@@ -1,11 +1,10 @@
-"""What elements of a net bring in the reverse of a step, and what it belongs to; see `ddg_warp.kernels.adjoint.net_shares`."""
+"""What elements of a net bring in the reverse of a step, and what it belongs to; see `ddg_warp.kernels.adjoint.coupled_assembly`."""
 
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.adjoint import net as reverse
-from ddg_warp.kernels.adjoint import net_shares
-from ddg_warp.kernels.net.elements import FRAME
+from ddg_warp.kernels.adjoint import coupled_assembly, coupled_step
+from ddg_warp.kernels.elements.coupled_element import FRAME
 from ddg_warp.model.net import NetState
 from ddg_warp.solve.net.system import lists
 
@@ -21,9 +20,9 @@ class Shares:
     def __init__(self, model):
         net, real = model.net, model.types.real
         self.net, self.real, self.device = net, real, net.device
-        self.gather, self._frames, self._rows = net_shares.gather_kernels(real)
-        self._frame = net_shares.frame_kernel(real) if net.edges else None
-        self._lags = [reverse.lag_kernel(p.term, real) if p.term.measure.advance else None for p in net.sets]
+        self.gather, self._frames, self._rows = coupled_assembly.gather_kernels(real)
+        self._frame = coupled_assembly.frame_kernel(real) if net.edges else None
+        self._lags = [coupled_step.lag_kernel(p.term, real) if p.term.measure.advance else None for p in net.sets]
         self._meets = [self._list(part.host.slots, net.blocks) for part in net.sets]
         self._edges = self._list(np.reshape(net.host.ends, (-1, 2)).T, net.blocks) if net.edges else None
         self._framed, self.slots, self.lags = [], [], []  # the first: of the frames that elements read

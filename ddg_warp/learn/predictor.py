@@ -6,9 +6,9 @@ Follower loads are evaluated on the predicted configuration; in the midpoint rul
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import step
-from ddg_warp.kernels.adjoint import chain, chain_predictor
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.adjoint import rod_elements, rod_predictor
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.stepping import rod_step
 
 
 class ChainPredictor:
@@ -42,9 +42,9 @@ class ChainPredictor:
         self._islands.portion.fill_(1.0)
         self._dt = wp.zeros(model.worlds, dtype=real, device=device)
         self._none = wp.zeros(group.columns, dtype=real, device=device)
-        self._begin = step.begin_kernel(kind, real, midpoint)
-        self._carry = chain.frame_kernel(kind, real, unit=False) if self.carries else None
-        self._pull = chain_predictor.predict_kernel(kind, real, midpoint)
+        self._begin = rod_step.begin_kernel(kind, real, midpoint)
+        self._carry = rod_elements.frame_kernel(kind, real, unit=False) if self.carries else None
+        self._pull = rod_predictor.predict_kernel(kind, real, midpoint)
 
     @classmethod
     def of(cls, model, group, motion, scheme: str | None) -> "ChainPredictor | None":
@@ -69,7 +69,7 @@ class ChainPredictor:
             return False
         kind, real = self.group.kind, self.model.types.real
         self._direction = arrays.allocate((kind.block, *self.x.shape), linear, self.model.wp_device)
-        self._predict = step.predict_kernel(kind, real, linear, self._midpoint)
+        self._predict = rod_step.predict_kernel(kind, real, linear, self._midpoint)
         return True
 
     def find(self, before) -> None:

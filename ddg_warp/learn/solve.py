@@ -9,8 +9,8 @@ from scipy.sparse.linalg import splu
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.adjoint import precision, refine
-from ddg_warp.kernels.adjoint.solve import check_kernels
+from ddg_warp.kernels.adjoint import float32_error, iterative_refinement
+from ddg_warp.kernels.adjoint.coupled_linear_solve import check_kernels
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.pcg import PcgNewton
@@ -218,8 +218,8 @@ class DirectSolve:
             self.solver = Elimination(kind, *size, precision_of_factors, device)
         self.failed = self.system.islands.bad
         if linear is not None:
-            self._product = refine.product_kernel(kind, real)
-            self._guess, self._rest, self._add = refine.refine_kernels(kind, real, linear)
+            self._product = iterative_refinement.product_kernel(kind, real)
+            self._guess, self._rest, self._add = iterative_refinement.refine_kernels(kind, real, linear)
             self._elements = arrays.allocate((kind.window, *size), real, device)
             self._right, self._found = self.system.vectors(), self.system.vectors()
 
@@ -321,11 +321,11 @@ class ChainSolve:
         group, real, device = self.group, self.model.types.real, self.model.wp_device
         self.exact = DirectSolve(self.model, group)
         self.failed = wp.zeros_like(self.system.failed)
-        self._measure, self._judge = precision.stiffness_kernels(group.kind, real)
+        self._measure, self._judge = float32_error.stiffness_kernels(group.kind, real)
         self._poor = wp.zeros(1, dtype=int, device=device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
-        parts = -(-group.nodes // precision.PART)
-        self._found = wp.zeros((precision.ROWS, parts, group.columns), dtype=real, device=device)
+        parts = -(-group.nodes // float32_error.PART)
+        self._found = wp.zeros((float32_error.ROWS, parts, group.columns), dtype=real, device=device)
 
     @property
     def kernels(self) -> list:

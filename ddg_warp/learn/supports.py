@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.adjoint.step import angle_kernel
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.adjoint.rod_step import angle_kernel
+from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.net.prescribed import NetMotion
 

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.core import outcome
 from ddg_warp.learn import constants
 from ddg_warp.learn.places import ArrayPlace, TermPlace
 from ddg_warp.model.parameters import valid_numbers

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.core import outcome
 from ddg_warp.learn.engine import Engine
 from ddg_warp.learn.layout import Layout
 
@@ -19,7 +19,7 @@ class WorldState:
         values: arrays of a `State`, ordered as `Layout.fields`; NaN in failed worlds.
         time: [s], of all worlds.
         engine: engine with the layout; None for a copied or loaded state, see `Simulator.world_state`.
-        codes: outcomes of the step to this state (B,), see `kernels.outcome`; 0 if good, or without a step.
+        codes: outcomes of the step to this state (B,), see `kernels.core.outcome`; 0 if good, or without a step.
         differentiable: bools (B,), True if a gradient goes through all steps to this state, as far as made for gradients. Gradients
             of other worlds are NaN, unless their cotangent is zero: mask them in a loss, and apply `torch.nan_to_num` to
             values computed from failed worlds.

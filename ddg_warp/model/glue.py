@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.net.glue import TERM
-from ddg_warp.kernels.net.elements import linear_stress_kernel
+from ddg_warp.kernels.elements.coupled_element import linear_stress_kernel
 
 
 def follow(net, state, angles: bool, rates: bool) -> None:

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile import precision
 from ddg_warp.compile.chains import ChainGroup
-from ddg_warp.kernels import chain
+from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene import drag
 
@@ -66,7 +66,7 @@ class Group:
             rate: inverse length of the solve of every rod [1/s], zero by default.
             table: parameters, those of the group by default.
         """
-        inputs = chain.rod_elements_type(self.dim, self.parameters.arrays[0].dtype)()
+        inputs = rod_layout.rod_elements_type(self.dim, self.parameters.arrays[0].dtype)()
         inputs.x, inputs.theta, inputs.frame = state.x, state.theta, state.frame
         inputs.last, inputs.rate = arrays.columns(last), self.still if rate is None else rate
         (inputs.buffer, inputs.table), inputs.count = (table or self.parameters).arrays, self.count

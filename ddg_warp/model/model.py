@@ -14,8 +14,9 @@ from ddg_warp.errors import SceneError
 from ddg_warp.io.contacts import Touching
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
-from ddg_warp.kernels import element_path, step
-from ddg_warp.kernels.chain import rod_storage
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.rod_layout import rod_storage
+from ddg_warp.kernels.stepping import rod_step
 from ddg_warp.model import glue
 from ddg_warp.model.group import Group
 from ddg_warp.model.order import Order
@@ -424,7 +425,7 @@ class Model:
                 new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
                 every = wp.full(group.columns, 1, dtype=int, device=self.wp_device)
                 wp.launch(
-                    step.finish_frames_kernel(group.kind, self.types.real),
+                    rod_step.finish_frames_kernel(group.kind, self.types.real),
                     group.element_threads,
                     [data.x, data.frame, data.frame, group.count, every],
                     [new],

@@ -8,9 +8,10 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.net.net import Net, inert_mass
 from ddg_warp.compile.precision import float32_error, stiffnesses
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.net import elements, frames
-from ddg_warp.kernels.search import RELAG
+from ddg_warp.kernels.elements import coupled_element as elements
+from ddg_warp.kernels.elements import coupled_frames as frames
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.newton.rod_iterate import RELAG
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.model.rod_elements import RodElements
 
@@ -21,7 +22,7 @@ class NetState:
 
     Attributes:
         q, v: blocks (W N,) of positions [m], twist angles and rotation vectors since the last step [rad], and their rates.
-        a: accelerations of blocks (W N,) for the warm start; see `GroupState` and `kernels.net.foresight`.
+        a: accelerations of blocks (W N,) for the warm start; see `GroupState` and `kernels.stepping.coupled_warm_start`.
         frame: director and tangent of rod edges (6, W edges).
         lag: time-lagged rows of each element set (rows, W E).
         last: strains of each damped set at this state.
@@ -120,7 +121,7 @@ class DeviceNet:
         mass: of dof blocks (worlds, N) [kg, kg m^2].
         weighed: whether `mass` may differ from `host`.
         moves: masses of dof blocks (N,), positive where inertia or drag determine a rate.
-        drag: drag coefficients of edges, world by world (rows, W E), see `kernels.drag`; None without.
+        drag: drag coefficients of edges, world by world (rows, W E), see `kernels.forces.drag`; None without.
         touching: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).
     """
 
@@ -306,7 +307,7 @@ class DeviceNet:
         self._carry(state, state, q, state, todo, RELAG, 1)
 
     def _carry(self, before, after, q: wp.array, kept, moved: wp.array, wanted: int, within: int) -> None:
-        """Launch the frame and lag kernels of `kernels.net.frames`."""
+        """Launch the frame and lag kernels of `kernels.elements.coupled_frames`."""
         real, serial = self.real, arrays.serial(self.device)
 
         def launch(kernel, count, inputs, outputs):

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile import shells
 from ddg_warp.geometry import shell_forms
 from ddg_warp.geometry.surface import DEGENERATE, Surface
 from ddg_warp.model.model import check_model
@@ -132,7 +132,7 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
     plate = replace(net_shell.plate, **changes)
     sets = {part.term.law: part for part in model.net.sets}
-    elements_of = shell_terms.shell_elements(surface, plate, net_shell.kinds, bending, membrane)
+    elements_of = shells.shell_elements(surface, plate, net_shell.kinds, bending, membrane)
     places = [(sets[e.term.law], net_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
     net_shell.plate = plate  # nothing can fail after this
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))

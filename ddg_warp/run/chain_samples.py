@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.chain import ChainKind, rod_elements_type, rod_storage
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.rod_layout import ChainKind, rod_elements_type, rod_storage
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.terms import REGISTRY, Term
 from ddg_warp.run.samples import Sample, random_parameters, random_strains
@@ -213,7 +213,7 @@ class Chain(Sample):
         return {"q": q} | {name: values[name].reshape(own.shape) for name, own in self.data.items() if name != "q"}
 
     def inputs(self, real, **changed):
-        """Return what the kernels of a term read; see `kernels.chain.rod_elements_type`."""
+        """Return what the kernels of a term read; see `kernels.elements.rod_layout.rod_elements_type`."""
         data, dim = {**self.data, **changed}, self.kind.dim
         q = data["q"]
         last = data["last"].reshape(len(data["last"]), -1)

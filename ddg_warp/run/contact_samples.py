@@ -7,13 +7,23 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.adjoint.contact import FRICTION, NUMBERS, RATE, pull_kernel, rub_kernel
-from ddg_warp.kernels.contact.collisions import distance_function, end_function, mollifier_function, node_function
-from ddg_warp.kernels.contact.gather import ROW, SLOTS, WEIGHT, factor_struct
-from ddg_warp.kernels.contact.pair_bend import KINDS, bend_function
-from ddg_warp.kernels.contact.pair_energy import ENDS, rows_of
-from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_kernel, lagged_struct
-from ddg_warp.kernels.contact.pair_terms import columns_kernel, evaluate_kernels, law_struct, read_functions
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, sides_struct
+from ddg_warp.kernels.collision.contact.assembly import ROW, SLOTS, WEIGHT, factor_struct
+from ddg_warp.kernels.collision.contact.closest_points import (
+    distance_function,
+    end_function,
+    mollifier_function,
+    node_function,
+)
+from ddg_warp.kernels.collision.contact.geometric_stiffness import KINDS, bend_function
+from ddg_warp.kernels.collision.contact.pair_evaluation import (
+    columns_kernel,
+    evaluate_kernels,
+    law_struct,
+    read_functions,
+)
+from ddg_warp.kernels.collision.contact.potential import ENDS, rows_of
+from ddg_warp.kernels.collision.friction.potential import ROWS, friction_kernel, lag_kernel, lagged_struct
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, sides_struct
 from ddg_warp.kernels.terms import LAWS, Potential
 from ddg_warp.run.samples import Sample, random_parameters
 

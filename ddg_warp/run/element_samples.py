@@ -5,10 +5,9 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import coupled_element, element_path
 from ddg_warp.kernels.measures import lagged_frames
-from ddg_warp.kernels.net import elements as net_elements
 from ddg_warp.kernels.terms import Term
 from ddg_warp.run.samples import Sample, random_parameters, random_strains
 
@@ -120,7 +119,7 @@ class Elements(Sample):
 
     def storage(self, real):
         """Return the element storage of the term."""
-        return net_elements.coupled_storage(self.term, real)
+        return coupled_element.coupled_storage(self.term, real)
 
     def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
         """Return gradients (slots, E, 3) and Hessians by the dofs of the measure as those by three reals a slot."""
@@ -137,8 +136,8 @@ class Elements(Sample):
         return {name: own.reshape(self.data[name].shape) for name, own in values.items()}
 
     def inputs(self, real, **changed):
-        """Return what kernels read; see `kernels.net.elements.elements_type`."""
-        data, elements = {**self.data, **changed}, net_elements.elements_type(real)()
+        """Return what kernels read; see `kernels.elements.coupled_element.elements_type`."""
+        data, elements = {**self.data, **changed}, coupled_element.elements_type(real)()
 
         def put(values, dtype):
             return wp.array(

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.precision import PRECISIONS
-from ddg_warp.kernels import element_path
+from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.terms import Term
 
 

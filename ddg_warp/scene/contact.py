@@ -158,7 +158,7 @@ class Contacts:
             one, other: names as given to `add_rods`, `add_shell` and `add_obstacle`.
             ignore: whether the objects pass through each other; excludes all other arguments.
             friction: as of `contact`. For rods on an obstacle also three coefficients of anisotropic friction: sliding forwards
-                (towards the last node), backwards, and across (snakes, worms, bristles). `kernels.contact.pair_friction`
+                (towards the last node), backwards, and across (snakes, worms, bristles). `kernels.collision.friction.potential`
                 interpolates between these directions.
             stiffness, range: as of `contact`.
 

@@ -1,4 +1,4 @@
-"""Drag laws of rods and coefficients per length: see `kernels.drag` for the theory. NumPy only."""
+"""Drag laws of rods and coefficients per length: see `kernels.forces.drag` for the theory. NumPy only."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ class Resistance:
         return replace(self, **{name: along(name, getattr(self, name)) for name in names})
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
-        """Return rows of `kernels.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
+        """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [self.tangential, self.normal, self.rotational, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
@@ -85,7 +85,7 @@ class Viscous:
         return self if self.radius is None else replace(self, radius=along("radius", self.radius))
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
-        """Return rows of `kernels.drag` for edges of radii (R, edges) of rods of lengths (R, 1).
+        """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1).
 
         Raises:
             SceneError: the rod is too thick for the theory.
@@ -113,7 +113,7 @@ class Viscous:
 @arguments.called
 @dataclass(frozen=True)
 class Granular:
-    """Drag of a granular medium, a function of the direction of velocity only: see `kernels.drag` (Maladen et al. 2009).
+    """Drag of a granular medium, a function of the direction of velocity only: see `kernels.forces.drag` (Maladen et al. 2009).
 
     With the angle psi between velocity and rod, forces per length are C_S sin(beta) across and C_F cos(psi) + C_L (1 - sin(beta))
     along it, tan(beta) = sin(psi) / tan(gamma). The velocity is time-lagged, with a first-order error: drag is too large in the
@@ -144,7 +144,7 @@ class Granular:
         arguments.positive("Granular: speed", self.speed, "m/s")
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
-        """Return rows of `kernels.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
+        """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [0.0, 0.0, 0.0, self.lateral, self.friction, self.leading, np.tan(self.angle), self.speed]
 
 
@@ -281,8 +281,8 @@ class Laws:
             self._row[drag.rods] = np.arange(len(drag.rods))
 
     def coefficients(self, rods: np.ndarray, batch, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Return rows of `kernels.drag` (R, edges, rows) of rods (R,) of a batch with drag; zero on ghost edges (length 0)."""
-        from ddg_warp.kernels.drag import FIRST, LAST, ROWS
+        """Return rows of `kernels.forces.drag` (R, edges, rows) of rods (R,) of a batch with drag; zero on ghost edges (length 0)."""
+        from ddg_warp.kernels.forces.drag import FIRST, LAST, ROWS
 
         result, laws = np.zeros((*lengths.shape, ROWS)), self.of_rods[rods]
         real = lengths[0] > 0.0

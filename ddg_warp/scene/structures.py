@@ -13,15 +13,7 @@ from ddg_warp.geometry.shell_forms import MEMBRANES, MODELS, TURNING
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene import validate
 from ddg_warp.scene.contact import Contacts
-from ddg_warp.scene.descriptions import (
-    Attachment,
-    EdgeCouple,
-    Joint,
-    Pressure,
-    Shell,
-    ShellLoad,
-    ShellSupport,
-)
+from ddg_warp.scene.descriptions import Attachment, EdgeCouple, Joint, Pressure, Shell, ShellLoad, ShellSupport
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.magnets import Magnets

@@ -1,10 +1,10 @@
-"""Velocity changes of steps, summed on the device for the local error estimate; see `kernels.step_error`."""
+"""Velocity changes of steps, summed on the device for the local error estimate; see `kernels.stepping.local_error`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.step_error import differ_kernel
+from ddg_warp.kernels.stepping.local_error import differ_kernel
 from ddg_warp.model.state import State
 from ddg_warp.solve.net.system import Sums
 

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile import tolerance
-from ddg_warp.kernels import controls as kernels
+from ddg_warp.kernels.forces import control_loads as kernels
 from ddg_warp.model import group
 from ddg_warp.solve.loads import Loads
 

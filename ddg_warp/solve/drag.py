@@ -1,4 +1,4 @@
-"""Drag on uncoupled and coupled rods in a flowing fluid; see `kernels.drag`."""
+"""Drag on uncoupled and coupled rods in a flowing fluid; see `kernels.forces.drag`."""
 
 from types import SimpleNamespace
 
@@ -6,8 +6,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import chain, drag
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import rod_layout
+from ddg_warp.kernels.forces import drag
 from ddg_warp.scene.drag import flow_at
 from ddg_warp.solve.net.system import lists
 
@@ -66,7 +67,7 @@ class ChainDrag(Drag):
         """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
         group, real, device = self.part, self.model.types.real, self.model.wp_device
         solve = SimpleNamespace(x=data.x)
-        solve.mass = arrays.allocate((group.nodes, group.columns), chain.inertia_type(group.kind, real), device)
+        solve.mass = arrays.allocate((group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device)
         solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
         self.upload(t, t)
         self.resist(data, solve, self._over_a_second())

@@ -7,7 +7,7 @@ from ddg_warp import arguments, arrays
 from ddg_warp.compile import memory
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.core import outcome
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.model import check_model
@@ -68,14 +68,14 @@ class Integrator:
             supports and the rounding floor do not count. A step beyond the bound is retried at half length, and then fails with the
             outcome `energy_drift`. The count starts at a state from outside (a resumed run counts from zero). Resolved motion
             conserves the energy to about 1e-3, while an unstable run multiplies it within some steps: the default of a tenth lies
-            between. Implicit Euler dissipates and is not watched. See `kernels.energy`.
+            between. Implicit Euler dissipates and is not watched. See `kernels.stepping.rod_energy_drift`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
         failures: "raise" raises an error for a failed step. With "flag" nothing is read or raised, and `outcomes` lists the outcomes.
             A world with a failed step keeps the state before the step until `reset`, or until the integrator gets a state from
             outside, while other worlds continue.
         gyroscopic: True if the spin of a rod about its tangent resists rotation of the tangent. By default True from states with given
             spins (`Model.state`) on. Set it if motors or moments spin up a rod that then tumbles. If a rod spins no faster than it
-            rotates, the effect is of the order of the neglected rotary inertia, (radius / length)^2. See `kernels.gyroscopic`.
+            rotates, the effect is of the order of the neglected rotary inertia, (radius / length)^2. See `kernels.forces.gyroscopic`.
 
     Attributes:
         whole: True if rods out of contact are solved in the coupled system regardless; see `step_whole`.
@@ -367,7 +367,7 @@ class Integrator:
         return self._chains if self._net is None else [*self._chains, self._net]
 
     def _solved(self, dt: float) -> float:
-        """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.step`."""
+        """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.rod_step`."""
         return 0.5 * dt if self.scheme == "implicit_midpoint" else dt
 
     def _weigh(self, dt: float, state: State) -> None:

@@ -7,8 +7,7 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import energy
-from ddg_warp.kernels.net import energy as net_energy
+from ddg_warp.kernels.stepping import coupled_energy_drift, rod_energy_drift
 from ddg_warp.solve.net.system import Sums
 
 BOUND = 0.1  # see `Integrator`
@@ -40,7 +39,7 @@ def summary(parts: list["_Energy"]) -> dict[str, float]:
 
 
 class _Energy:
-    """Discrete energy balance of the steps of a stepper; see `kernels.energy`.
+    """Discrete energy balance of the steps of a stepper; see `kernels.stepping.rod_energy_drift`.
 
     Args:
         step: `ChainStep` or `NetStep`.
@@ -58,12 +57,12 @@ class _Energy:
         def make(*shape):
             return wp.zeros(shape, dtype=real, device=self.device)
 
-        self.account = kept.account if kept else make(energy.ROWS, count)
+        self.account = kept.account if kept else make(rod_energy_drift.ROWS, count)
         self.failed = kept.failed if kept else make(2, count)
-        self.sums = make(rows, energy.ROWS, count)
+        self.sums = make(rows, rod_energy_drift.ROWS, count)
         self.rows = self.sums.transpose((1, 0, 2))
         self.floor = step.newton.options.floor_factor * self.model.types.eps
-        self._judge = energy.judge_kernel(real)
+        self._judge = rod_energy_drift.judge_kernel(real)
 
     def _enter(self) -> None:
         """Update the energy balance, or mark steps as failed."""
@@ -96,7 +95,7 @@ class ChainEnergy(_Energy):
         self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
-        self._measure = energy.chain_kernel(group.kind, self.model.types.real, step.newton.linear)
+        self._measure = rod_energy_drift.chain_kernel(group.kind, self.model.types.real, step.newton.linear)
 
     @property
     def kernels(self) -> list:
@@ -137,12 +136,12 @@ class NetEnergy(_Energy):
         super().__init__(step, worlds, len(net.sets) + 1, kept)
         real = self.model.types.real
         counts = [*(part.elements for part in net.sets), net.blocks]
-        self._values = [wp.zeros((energy.ROWS * worlds, n), dtype=real, device=self.device) for n in counts]
-        self._add = [Sums(energy.ROWS * worlds, n, real, self.device) for n in counts]
+        self._values = [wp.zeros((rod_energy_drift.ROWS * worlds, n), dtype=real, device=self.device) for n in counts]
+        self._add = [Sums(rod_energy_drift.ROWS * worlds, n, real, self.device) for n in counts]
         self._out = [self.sums[i].flatten() for i in range(len(counts))]
-        self._elements = [net_energy.element_kernel(part.term, real, step.newton.linear) for part in net.sets]
+        self._elements = [coupled_energy_drift.element_kernel(part.term, real, step.newton.linear) for part in net.sets]
         self._load = wp.clone(step.newton.load) if net.host.followers else step.newton.load
-        self._blocks = net_energy.block_kernel(real, step.drag is not None)
+        self._blocks = coupled_energy_drift.block_kernel(real, step.drag is not None)
 
     @property
     def kernels(self) -> list:

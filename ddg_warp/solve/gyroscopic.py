@@ -1,4 +1,4 @@
-"""Gyroscopic couples of spinning rods, before and after every step; see `kernels.gyroscopic`."""
+"""Gyroscopic couples of spinning rods, before and after every step; see `kernels.forces.gyroscopic`."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.gyroscopic import kick_kernel
+from ddg_warp.kernels.forces.gyroscopic import kick_kernel
 from ddg_warp.model.state import State
 
 

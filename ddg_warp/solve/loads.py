@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp.kernels.loads import follower_kernel, spread_kernel
+from ddg_warp.kernels.forces.follower_loads import follower_kernel, spread_kernel
 
 
 class Loads:

@@ -9,9 +9,10 @@ import warp as wp
 from ddg_warp import arguments
 from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels import motion, outcome
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.motion import COUNTED, HALF
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.forces import prescribed_motion as motion
+from ddg_warp.kernels.forces.prescribed_motion import COUNTED, HALF
 from ddg_warp.model.state import State
 
 
@@ -105,7 +106,7 @@ class Motion:
         part: `Group` or `DeviceNet`.
 
     Attributes:
-        pose: see `kernels.motion`; with grips per world, `stride` rows apart.
+        pose: see `kernels.forces.prescribed_motion`; with grips per world, `stride` rows apart.
         rows: number of poses of an interval.
         levels: log2 of the number of intervals of every world (worlds,).
     """

@@ -3,8 +3,7 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.matrix import block_band
-from ddg_warp.kernels.solve import cyclic_reduction, paired, reduction_again
+from ddg_warp.kernels.linear import cyclic_reduction, cyclic_reduction_solve, mixed_pairs, rod_matrix
 from ddg_warp.solve.choice import LONGEST_REPEATED
 
 REDUCING = 128  # Threads of a block in a reduction level.
@@ -14,12 +13,13 @@ TOGETHER = 4  # Neighbouring rods in a block, for reads of 16 bytes.
 
 
 class CyclicReduction:
-    """Block cyclic reduction of open rods of at most `nodes` nodes of `nb` dofs; see `kernels.solve.cyclic_reduction`.
+    """Block cyclic reduction of open rods of at most `nodes` nodes of `nb` dofs; see `kernels.linear.cyclic_reduction`.
 
     Args:
-        tensions: number of tension dofs of a node; if positive, the system comes in the form of a level. See `kernels.solve.paired`.
+        tensions: number of tension dofs of a node; if positive, the system comes in the form of a level. See
+            `kernels.linear.mixed_pairs`.
         repeated: True for many right-hand sides of one matrix: factors of rods up to a length are kept; see
-            `kernels.solve.reduction_again`.
+            `kernels.linear.cyclic_reduction_solve`.
 
     Attributes:
         repeats: True if factors are kept.
@@ -54,8 +54,8 @@ class CyclicReduction:
             wp.zeros((columns, self.blocks[0], self.dofs), dtype=linear, device=device) for _ in range(2)
         )
         self._none = wp.zeros((0, 0, 0), dtype=linear, device=device)
-        self._pack = reduction_again.pack_kernel(nb, linear, not tensions and levels == 0, tensions)
-        self._again = reduction_again.again_kernel(nb, linear)
+        self._pack = cyclic_reduction_solve.pack_kernel(nb, linear, not tensions and levels == 0, tensions)
+        self._again = cyclic_reduction_solve.again_kernel(nb, linear)
         self._threads = 1
         if wp.get_device(device).is_cuda:
             self._threads = min(MOST, -(-(self.blocks[0] + 1) // 2 * self.dofs // 32) * 32)
@@ -125,12 +125,12 @@ class CyclicReduction:
 
     def again_kernel_at_places(self, twist: bool):
         """Return the kernel of `again_at_places` and the block size."""
-        return reduction_again.again_at_places_kernel(twist, self._linear), self._threads
+        return cyclic_reduction_solve.again_at_places_kernel(twist, self._linear), self._threads
 
     def again_at_places(
         self, twist: bool, residual, places, fixed, count, inactive, wanted, blocks: int, z, dots
     ) -> None:
-        """Solve rod paths of the coupled system with kept factors, see `reduction_again.again_at_places_kernel`."""
+        """Solve rod paths of the coupled system with kept factors, see `cyclic_reduction_solve.again_at_places_kernel`."""
         kernel, threads = self.again_kernel_at_places(twist)
         wp.launch(
             kernel,
@@ -164,7 +164,7 @@ class Elimination:
         self.columns, self.device = columns, device
         self._factors = arrays.allocate((3 * kind.block**2 + kind.block, nodes, columns), linear, device)
         self._first = wp.zeros(columns, dtype=int, device=device)  # first iteration of every column
-        self._factor, self._direct = block_band.factor_kernel(kind, linear), block_band.direct_kernel(kind, linear)
+        self._factor, self._direct = rod_matrix.factor_kernel(kind, linear), rod_matrix.direct_kernel(kind, linear)
 
     @property
     def kernels(self) -> list:
@@ -182,21 +182,21 @@ class Elimination:
 
 
 class TensionReduction:
-    """Block cyclic reduction of a rod group in the mixed axial-force formulation; see `kernels.solve.paired`."""
+    """Block cyclic reduction of a rod group in the mixed axial-force formulation; see `kernels.linear.mixed_pairs`."""
 
     def __init__(self, group, real, linear, device):
         kind, columns = group.kind, group.columns
-        size = kind.block + paired.TENSIONS
+        size = kind.block + mixed_pairs.TENSIONS
         self.group, self.device = group, device
-        self.levels = CyclicReduction(size, group.nodes, columns, linear, device, paired.TENSIONS)
+        self.levels = CyclicReduction(size, group.nodes, columns, linear, device, mixed_pairs.TENSIONS)
         matrix_rows, right_rows, _ = cyclic_reduction.level_rows(size)
         pairs = self.levels.blocks[0]
         self.matrix, self.right = (
             arrays.allocate((rows, pairs, columns), linear, device) for rows in (matrix_rows, right_rows)
         )
         self.solution = arrays.allocate((size, group.nodes, columns), linear, device)
-        self._pair = paired.pair_kernel(kind, linear)
-        self._unpair = paired.unpair_kernel(kind, real, linear)
+        self._pair = mixed_pairs.pair_kernel(kind, linear)
+        self._unpair = mixed_pairs.unpair_kernel(kind, real, linear)
 
     @property
     def kernels(self) -> list:

@@ -10,9 +10,10 @@ from ddg_warp import arrays
 from ddg_warp.compile.precision import FLOAT32_LIMIT, stiff, straight_turns
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import outcome, step
-from ddg_warp.kernels.islands import DETOURS_ALLOWED, LEAST
-from ddg_warp.kernels.judge import ROUNDED
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import DETOURS_ALLOWED, LEAST
+from ddg_warp.kernels.newton.line_search import ROUNDED
+from ddg_warp.kernels.stepping import rod_step as step
 from ddg_warp.solve.motion import jump_between
 
 KEPT = 16  # number of step lengths with cached limits
@@ -25,7 +26,7 @@ class Means(NamedTuple):
     Attributes:
         linear: scalar type of the linear algebra; None for the type of the model.
         stiff: True if a rod is stiff over the step; see `compile.precision.stiff`.
-        split: True for the mixed axial-force formulation; see `kernels.solve.tension`.
+        split: True for the mixed axial-force formulation; see `kernels.linear.mixed_axial_force`.
     """
 
     linear: type | None = None
@@ -49,7 +50,7 @@ def suited(precision: str, before: Means, errors: float, split_errors: float) ->
 
 
 class PartStep:
-    """Stepper of all islands of a solver, with retries per island; see `kernels.step`.
+    """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.rod_step`.
 
     Subclasses define the attempt (`attempt`) and its kernels (`own_kernels`). For a failed island they return its name (`who`), its
     rods (`rods_of`) and the location of the failure (`where`). `float32_errors` returns the float32 errors of the islands of a world
@@ -64,7 +65,7 @@ class PartStep:
     Attributes:
         energy, motion, loads, field, drag: energy watch, motion of supports, loads in time, magnetic field, drag; None without.
         rounded: outcome of solves that end by rounding.
-        tally, work: counts of outcomes and of work; see `kernels.step.advance_kernel`.
+        tally, work: counts of outcomes and of work; see `kernels.stepping.rod_step.advance_kernel`.
     """
 
     energy = motion = loads = field = drag = None
@@ -91,7 +92,7 @@ class PartStep:
 
     @property
     def islands(self):
-        """See `kernels.islands`."""
+        """See `kernels.core.islands`."""
         return self.newton.islands
 
     @property

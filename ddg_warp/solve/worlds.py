@@ -5,8 +5,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
-from ddg_warp.kernels.worlds import blank_kernels, forget_kernel, island_kernels, select_kernel
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.stepping.world_reset import blank_kernels, forget_kernel, island_kernels, select_kernel
 from ddg_warp.model.state import State
 from ddg_warp.threads import capturing
 
@@ -28,7 +28,7 @@ class Worlds:
     instead.
 
     Attributes:
-        resting: outcome code of each inactive world, 0 for active ones (worlds,); see `kernels.outcome`.
+        resting: outcome code of each inactive world, 0 for active ones (worlds,); see `kernels.core.outcome`.
         invalid: outcome code of each watched world with refused parameters, else 0 (worlds,).
         start: state for watched worlds excluded from a step.
     """

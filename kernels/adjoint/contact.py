@@ -1,4 +1,4 @@
-"""Reverse mode of contact and friction in a step of the coupled system, pair by pair; see `kernels.variation`.
+"""Reverse mode of contact and friction in a step of the coupled system, pair by pair; see `kernels.elements.variation`.
 
 For a loss with the solution w of H^T w = g, contact contributes the derivative of -w . dE/dx by x, stiffness, range and thickness. E is
 the energy of pairs (`contact.pair_energy`) at the solution x. Friction also depends on lagged data (`contact.pair_friction`). The
@@ -19,14 +19,19 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.collisions import node_types, tangents_function
-from ddg_warp.kernels.contact.gather import ANGLES, SLOTS
-from ddg_warp.kernels.contact.pair_energy import pair_energy_functions
-from ddg_warp.kernels.contact.pair_friction import directed_basis, rolling_functions, spun_function
-from ddg_warp.kernels.contact.pair_terms import by_rate_function, groups_function, law_struct, read_functions
-from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
+from ddg_warp.kernels.collision.contact.assembly import ANGLES, SLOTS
+from ddg_warp.kernels.collision.contact.closest_points import node_types, tangents_function
+from ddg_warp.kernels.collision.contact.pair_evaluation import (
+    by_rate_function,
+    groups_function,
+    law_struct,
+    read_functions,
+)
+from ddg_warp.kernels.collision.contact.potential import pair_energy_functions
+from ddg_warp.kernels.collision.friction.potential import directed_basis, rolling_functions, spun_function
+from ddg_warp.kernels.collision.primitives import Kind, sides_struct
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.densities import Density
-from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
 NUMBERS = 5  # parameters of a pair

@@ -1,18 +1,18 @@
 """Vector-Jacobian product of drag, with resistance lagged at the start of a step or at the predicted midpoint.
 
 Gradients are of w . f, with the force f = -D (r (x - x_n) - u) on a node of resistance D, in a solve of length 1 / r; see
-`kernels.drag`.
+`kernels.forces.drag`.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.balance import node_functions
-from ddg_warp.kernels.chain import ChainKind, gather_functions
-from ddg_warp.kernels.drag import FIRST, LAST, ROTATIONAL, ROWS, block_inertia, edge_function
-from ddg_warp.kernels.gather import row_functions
-from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.core.dof_map import row_functions
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, block_inertia, edge_function
+from ddg_warp.kernels.residual.rod_residual import node_functions
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Adjoint of elements, written once for all storages; see `kernels.variation` and `kernels.element_path`.
+"""Adjoint of elements, written once for all storages; see `kernels.elements.variation` and `kernels.elements.element_path`.
 
 Every element writes its own share of each derivative, a column an element. Dofs and edges then sum these in one order, without
 atomics.
@@ -8,9 +8,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element_path import ElementStorage, parameter_function, write_function
-from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.variation import variation_functions
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_function, write_function
+from ddg_warp.kernels.elements.variation import variation_functions
 
 
 @cache

@@ -76,7 +76,7 @@ class Density:
         `root(e, p, shift)` is the square root of psi'' + diag(shift), made positive semidefinite: a vector, or for a coupled law the
         matrix R (n x n) with R^T R = psi''. A closed form may ignore `shift`.
         """
-        from ddg_warp.kernels.densities.definite import root_function
+        from ddg_warp.kernels.densities.psd_square_root import root_function
 
         energy, slope, _ = self.laws(real, strains)
         root = self.own_root(real, strains) if self.own_root else root_function(self, real, strains)

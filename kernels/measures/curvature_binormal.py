@@ -9,14 +9,14 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.measures import Measure, turning
+from ddg_warp.kernels.measures import Measure, bending_second_variation
 
 
 @cache
 def _functions(real):
     Q, S, E, M = curvature_binormal.types(real)
     V, H, M3 = wp.types.vector(3, real), wp.types.vector(21, real), wp.types.matrix((3, 3), real)
-    turning_of, across, lengthening = turning.functions(real)
+    turning_of, across, lengthening = bending_second_variation.functions(real)
 
     @wp.func
     def strains(q: Q, s: S, w: real):

@@ -22,7 +22,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.division import nonzero_function
+from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.measures import Measure
 
 

@@ -27,7 +27,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels import frames
+from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.measures import Measure, lagged_frames
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 
@@ -203,7 +203,7 @@ def functions(real, between: bool = False):
 def _advance(real):
     Q, S, _, _ = joint_curvature_twist.types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(7, real)
-    _, reference_twist, _ = frames.functions(real)
+    _, reference_twist, _ = parallel_transport.functions(real)
     turned, *_ = rotations(real)
 
     @wp.func
@@ -223,7 +223,7 @@ def _advance(real):
 def _stale(real):
     Q, S, _, _ = joint_curvature_twist.types(real)
     V = wp.types.vector(3, real)
-    stale_of = frames.stale_function(real)
+    stale_of = parallel_transport.stale_function(real)
     turned, *_ = rotations(real)
 
     @wp.func

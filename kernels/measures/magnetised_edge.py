@@ -25,7 +25,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames
+from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.measures import Measure
 
 FIELD = 12  # data of the field: B and the rows of its gradient
@@ -39,7 +39,7 @@ def direction_functions(real, framed: bool):
     `turned(n, v, t, z, inverse)`: derivatives of v . n with respect to e and theta.
     """
     V = wp.types.vector(3, real)
-    transport, _, rotate = frames.functions(real)
+    transport, _, rotate = parallel_transport.functions(real)
 
     @wp.func
     def along(e: V, theta: real, u0: V, t0: V, a: V):

@@ -37,7 +37,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.measures import Measure
-from ddg_warp.kernels.measures.edge_tilt import mirror, tilt
+from ddg_warp.kernels.measures.boundary_hinge_angle import mirror, tilt
 from ddg_warp.kernels.measures.hinge_angle import dihedral
 
 

@@ -11,15 +11,15 @@ z = (t0 x te) / (1 + t0 . te), which subtracts (d/dtheta_e) z / |e| from the der
 Singular where the rod folds back by 180 degrees, or an edge rotates by 180 degrees from its lagged tangent.
 
 Second derivatives, contracted with moments M: the spin s_e = dtheta_e - z . de / |e| of a frame changes m1 by s_e m2, m2 by -s_e
-m1, and te changes by v (see `turning`). Let h = M1 m1 + M2 m2 and g = M1 m2 - M2 m1 of each edge, b half of the curvature binormal,
-i and tt as in `turning`. The derivative of w M . strains along a line is
+    m1, and te changes by v (see `bending_second_variation`). Let h = M1 m1 + M2 m2 and g = M1 m2 - M2 m1 of each edge, b half of
+    the curvature binormal, i and tt as in `bending_second_variation`. The derivative of w M . strains along a line is
 
     A . v + B . u - (b . h_e + M3) s_e - (b . h_f - M3) s_f,   A, B of g = g_e + g_f, plus M3 b,
 
-and its derivative adds to that of `turning`: 2 (tt . (v + u)) (b . h_e s_e + b . h_f s_f) + (g_e . v) (b . v) + (g_f . u) (b . u)
-- 2 i s_e (v . tf x h_e - u . te x h_e) - 2 i s_f (v . tf x h_f - u . te x h_f) - b . g_e s_e^2 - b . g_f s_f^2
-+ M3 (tt . (u x v) - (tt . (v + u)) (b . (v + u))), and with the spin's own ds_e = (z . v) (t0 . v) / (1 + t0 . te) + 2 (te . de)
-(z . v) / |e| the factors of s_e and s_f times it. (Bergou et al. 2010 give these for frames that do not spin.)
+and its derivative adds to that of `bending_second_variation`: 2 (tt . (v + u)) (b . h_e s_e + b . h_f s_f) + (g_e . v) (b . v) +
+    (g_f . u) (b . u) - 2 i s_e (v . tf x h_e - u . te x h_e) - 2 i s_f (v . tf x h_f - u . te x h_f) - b . g_e s_e^2 - b . g_f
+    s_f^2 + M3 (tt . (u x v) - (tt . (v + u)) (b . (v + u))), and with the spin's own ds_e = (z . v) (t0 . v) / (1 + t0 . te) + 2
+    (te . de) (z . v) / |e| the factors of s_e and s_f times it. (Bergou et al. 2010 give these for frames that do not spin.)
 
 Lagged data: u_e (3), t_e (3), u_f (3), t_f (3), m_ref (1).
 """
@@ -28,8 +28,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames
-from ddg_warp.kernels.measures import Measure, turning
+from ddg_warp.kernels.elements import parallel_transport
+from ddg_warp.kernels.measures import Measure, bending_second_variation
 
 
 @cache
@@ -38,8 +38,8 @@ def functions(real, between: bool = False):
     Q, S, E, M = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
     H, M3 = wp.types.vector(36, real), wp.types.matrix((3, 3), real)
-    transport, reference_twist, rotate = frames.functions(real)
-    turning_of, across, lengthening = turning.functions(real)
+    transport, reference_twist, rotate = parallel_transport.functions(real)
+    turning_of, across, lengthening = bending_second_variation.functions(real)
 
     @wp.func
     def material_frames(q: Q, s: S):
@@ -183,7 +183,7 @@ def functions(real, between: bool = False):
 def _advance(real):
     Q, S, _, _ = rod_curvature_twist.types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(1, real)
-    _, reference_twist, _ = frames.functions(real)
+    _, reference_twist, _ = parallel_transport.functions(real)
 
     @wp.func
     def advance(q: Q, s: S):
@@ -199,7 +199,7 @@ def _advance(real):
 def _stale(real):
     Q, S, _, _ = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
-    stale_of = frames.stale_function(real)
+    stale_of = parallel_transport.stale_function(real)
 
     @wp.func
     def stale(q: Q, s: S):

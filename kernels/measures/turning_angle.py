@@ -24,9 +24,7 @@ from functools import cache, partial
 
 import warp as wp
 
-from ddg_warp.kernels.measures import Measure
-from ddg_warp.kernels.measures import joint_curvature_twist as joint
-from ddg_warp.kernels.measures import rod_curvature_twist as rod
+from ddg_warp.kernels.measures import Measure, joint_curvature_twist, rod_curvature_twist
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 
@@ -120,7 +118,11 @@ def _by_angle(tangent: Measure, functions) -> Measure:
     )
 
 
-rod_curvature_twist_angle = _by_angle(rod.rod_curvature_twist, partial(rod.functions, between=True))
-joint_curvature_twist_angle = _by_angle(joint.joint_curvature_twist, partial(joint.functions, between=True))
+rod_curvature_twist_angle = _by_angle(
+    rod_curvature_twist.rod_curvature_twist, partial(rod_curvature_twist.functions, between=True)
+)
+joint_curvature_twist_angle = _by_angle(
+    joint_curvature_twist.joint_curvature_twist, partial(joint_curvature_twist.functions, between=True)
+)
 curvature_binormal_angle = _by_angle(curvature_binormal, curvature_binormal.functions)
 planar_curvature_angle = _by_angle(planar_curvature, planar_curvature.functions)

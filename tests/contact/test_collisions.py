@@ -5,7 +5,12 @@ import pytest
 import warp as wp
 from brute_force import edge_edge, point_edge, point_triangle
 
-from ddg_warp.kernels.contact.collisions import distance_function, mollifier_function, node_types, tangents_function
+from ddg_warp.kernels.collision.contact.closest_points import (
+    distance_function,
+    mollifier_function,
+    node_types,
+    tangents_function,
+)
 from ddg_warp.kernels.terms import CONTACT
 from ddg_warp.run.contact_samples import ContactSample
 

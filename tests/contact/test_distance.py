@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from ddg_warp.kernels.contact.motion import corners_function
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_TRIANGLE, pair_functions
-from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_TRIANGLE, pair_functions
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 KINDS = {
     "edges": (EDGES, brute_force.edge_edge),

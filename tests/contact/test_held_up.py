@@ -6,7 +6,7 @@ from eager_steps import step_without_capture
 
 import ddg_warp as ddg
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.net.newton import ON_THE_WAY
+from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY
 from ddg_warp.scenes import overhand_knot
 from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.tangent import Tangent

@@ -9,8 +9,8 @@ from test_impact import gaps, random_pairs
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.contact.impact import NEAR, REST
-from ddg_warp.kernels.contact.shares import ROUNDS
+from ddg_warp.kernels.collision.ccd.additive_ccd import NEAR, REST
+from ddg_warp.kernels.collision.ccd.step_fractions import ROUNDS
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
 

@@ -6,9 +6,9 @@ import warp as wp
 from pair_cases import hessian_product, move, state, terms
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact import gather
-from ddg_warp.kernels.contact.node_items import list_kernels
-from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE, Kind
+from ddg_warp.kernels.collision.contact import assembly
+from ddg_warp.kernels.collision.contact.incidence import list_kernels
+from ddg_warp.kernels.collision.primitives import EDGES, POINT_TRIANGLE, Kind
 from ddg_warp.solve.contact.shapes import Shapes
 
 MU, RATE, SIDE = 0.4, 100.0, 50
@@ -44,7 +44,7 @@ def test_thread_mappings_agree_for_a_node_in_thousands_of_pairs(device, monkeypa
             for node in (0, 1, 2, 3):
                 start, number = (array.numpy()[node] for array in (pair_list.places, pair_list.numbers))
                 items = pair_list.items.numpy()[start : start + number]
-                targets = pair_list.factor.nodes.numpy()[items // gather.ITEMS, items % gather.ITEMS]
+                targets = pair_list.factor.nodes.numpy()[items // assembly.ITEMS, items % assembly.ITEMS]
                 assert (np.diff(items) > 0).all() and (targets == node).all()
         return [
             *state(result),
@@ -68,7 +68,7 @@ def test_incidence_items_are_sorted(device, kind):
     nodes = np.column_stack([np.zeros(count, int), rng.integers(1, 4000, (count, size - 1))])
     nodes = rng.permuted(nodes, axis=1)  # some pairs have a node twice, which does not matter here
     nodes = np.column_stack([nodes, np.repeat(nodes[:, :1], 4 - size, 1)])
-    items = (gather.ITEMS * np.arange(count)[:, None] + np.arange(size)).ravel()
+    items = (assembly.ITEMS * np.arange(count)[:, None] + np.arange(size)).ravel()
     targets = nodes[:, :size].ravel()
     numbers = np.bincount(targets, minlength=4000)
     starts = np.cumsum(numbers) - numbers

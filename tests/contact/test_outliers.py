@@ -8,8 +8,8 @@ import warp as wp
 from eager_steps import step_without_capture
 
 import ddg_warp as ddg
-from ddg_warp.kernels.islands import DROWNED, STATUS, UNBALANCED
-from ddg_warp.kernels.net.outliers import FARTHEST
+from ddg_warp.kernels.core.islands import DROWNED, STATUS, UNBALANCED
+from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.run.simulate import simulate
 from ddg_warp.solve.net.krylov import SPARE
 from ddg_warp.solve.net.newton import LOOSEST, NetNewton

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from brute_force import curves, near_pairs, upload
 
-from ddg_warp.kernels.contact.runs import AHEAD, STEPS
+from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, STEPS
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.runs import Runs
 from ddg_warp.solve.contact.shapes import Shapes

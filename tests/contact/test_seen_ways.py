@@ -6,7 +6,7 @@ import warp as wp
 from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 from motion_cases import MARGIN, REACH, Motion, tangle
 
-from ddg_warp.kernels.contact.motion import AHEAD
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import AHEAD
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
 

@@ -23,7 +23,7 @@ from turn_cases import (
 )
 
 import ddg_warp as ddg
-from ddg_warp.kernels.motion import MOST_PARTS
+from ddg_warp.kernels.forces.prescribed_motion import MOST_PARTS
 from ddg_warp.solve.net.arcs import PART
 
 WIDE = "mesh", "box", "hold", "half-space"  # these move a whole rod, which cannot rotate aside

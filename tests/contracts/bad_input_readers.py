@@ -12,7 +12,7 @@ from bad_inputs import INF, NAN, each, refuse
 from ddg_warp.geometry import meshes
 from ddg_warp.io import Curves, read
 from ddg_warp.io.curves import checked_curves
-from ddg_warp.io.dismech import read_rods as read_text
+from ddg_warp.io.dismech import read_rods
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.paths import existing
 from ddg_warp.io.revolve import Revolution
@@ -36,7 +36,7 @@ for kind_of_file, reader in {
     "curves": read,
     "curves of USD": read_curves,
     "a mesh": read_mesh,
-    "DisMech": read_text,
+    "DisMech": read_rods,
     "USD": validate,
 }.items():
     each("paths", kind_of_file, NO_PATHS, reader, "the file to read", "pathlib.Path")

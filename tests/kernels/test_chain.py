@@ -7,8 +7,9 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import element_path, outcome
-from ddg_warp.kernels.chain import rod_storage
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 
 KINDS = {

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
-from ddg_warp.kernels.threads import CPU_OPTIONS
 
 COUNT = 1000
 PENALTY = {"stiffness": 3.0, "range": 0.1, "thickness": 0.02}

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from ddg_warp.geometry.polyline import unit
-from ddg_warp.kernels import frames
+from ddg_warp.kernels.elements import parallel_transport
 
 REALS = pytest.mark.parametrize("real", [wp.float64, wp.float32], ids=["float64", "float32"])
 
@@ -16,7 +16,7 @@ REALS = pytest.mark.parametrize("real", [wp.float64, wp.float32], ids=["float64"
 def kernels(real):
     """Build kernels that apply the device functions to arrays."""
     V = wp.types.vector(3, real)
-    transport, reference_twist, rotate = frames.functions(real)
+    transport, reference_twist, rotate = parallel_transport.functions(real)
 
     @wp.kernel(module="unique", enable_backward=False)
     def carry(d: wp.array(dtype=V), t0: wp.array(dtype=V), t1: wp.array(dtype=V), out: wp.array(dtype=V)):

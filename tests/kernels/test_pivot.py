@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.linear import block_ldlt
 
 SIZES = pytest.mark.parametrize("size", [2, 3, 4])
 REALS = pytest.mark.parametrize("real", [wp.float64, wp.float32], ids=["float64", "float32"])
@@ -17,7 +17,7 @@ COUNT = 100
 def kernels(size, real):
     """Build kernels that apply the device functions to arrays."""
     H, M = wp.types.vector(size, real), wp.types.matrix((size, size), real)
-    factor, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(size, real)
+    factor, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(size, real)
 
     @wp.kernel(module="unique", enable_backward=False)
     def factorise(

@@ -8,7 +8,7 @@ import warp as wp
 from chain_system import system
 
 from ddg_warp import arrays
-from ddg_warp.kernels.matrix.chain_places import place_dofs
+from ddg_warp.kernels.linear.rod_dof_map import place_dofs
 from ddg_warp.solve.net.both_ends import BothEnds
 
 COUNTS = (1, 2, 3, 4, 5, 6, 17, 32, 33)

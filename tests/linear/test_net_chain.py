@@ -11,7 +11,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve import reduction
 from ddg_warp.solve.choice import net_preconditioner
-from ddg_warp.solve.net import chains as net_chains
+from ddg_warp.solve.net import chains
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
@@ -43,7 +43,7 @@ def pcg_iterations(problem: Problem, forcing: float) -> np.ndarray:
 
 
 def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
-    """Condense rod interiors, then single joints, by the formulas of `kernels.solve.elimination` with dense matrices."""
+    """Condense rod interiors, then single joints, by the formulas of `kernels.linear.rod_substructuring` with dense matrices."""
     host, free = problem.net.host, problem.free()
     H = np.where(np.outer(free, free), problem.matrix(world), np.diag(~free))
     pairs = problem.newton.chains.plan.pairs
@@ -78,7 +78,7 @@ def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
 def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduces):
     """Equal to dense condensation by the serial sweep and by cyclic reduction, with factors stored or recomputed."""
-    monkeypatch.setattr(net_chains, "long_and_few", lambda *_: bool(reduces))
+    monkeypatch.setattr(chains, "long_and_few", lambda *_: bool(reduces))
     monkeypatch.setattr(reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
     problem.newton.islands.clamped.fill_(1)

@@ -4,14 +4,14 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.kernels.solve import krylov
+from ddg_warp.kernels.linear import coupled_pcg
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve import step
 
 
 def test_solves_without_direction_are_flagged(device):
     """Flag r . z <= 0 or not finite at the start of a solve, and later beyond the tolerance."""
-    _, _, begin, *_, test = krylov.solver_kernels(wp.float32)
+    _, _, begin, *_, test = coupled_pcg.solver_kernels(wp.float32)
     first = [1.0, 0.0, -1.0, np.nan, np.inf, 1.0]
 
     def upload(values, dtype=wp.float32):

@@ -8,7 +8,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import arrays
-from ddg_warp.kernels import search
+from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.solve import choice
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
@@ -145,7 +145,7 @@ def adjust_serially(newton, todo: int):
     copies = [wp.clone(array) for array in (newton.x, newton.theta, newton.frame, newton.base)]
     newton.islands.todo.fill_(todo)
     wp.launch(
-        search.adjust_kernel(group.kind, newton.real, newton.linear),
+        rod_iterate.adjust_kernel(group.kind, newton.real, newton.linear),
         group.columns,
         [group.count, group.fixed, group.anchor, newton.direction, *newton.islands.arrays, *copies],
         device=newton.device,
@@ -167,7 +167,7 @@ def test_edge_rotations_match_serial_kernel(device, name, supported):
         arrays.assign(newton.direction, step)
         newton.islands.step_length.fill_(0.7)
         newton.islands.angle_change.fill_(-0.3)
-        expected = adjust_serially(newton, search.PLACE)
+        expected = adjust_serially(newton, rod_iterate.PLACE)
         straight = arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
         newton.move()
         inside = np.arange(group.nodes)[:, None] < np.tile(group.host.count, 2)
@@ -182,7 +182,7 @@ def test_frame_updates_match_serial_kernel(device):
     for newton, state in solvers("twist", device, clamped=True, noise=0.3):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
-            before, (x, _, expected) = arrays.download(newton.frame), adjust_serially(newton, search.RELAG)
+            before, (x, _, expected) = arrays.download(newton.frame), adjust_serially(newton, rod_iterate.RELAG)
             newton.move()
             frames = arrays.download(newton.frame)
             np.testing.assert_allclose(frames, expected, rtol=0, atol=1e-13)

@@ -6,8 +6,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import arrays
-from ddg_warp.kernels.matrix import block_band
-from ddg_warp.kernels.solve import pcg
+from ddg_warp.kernels.linear import rod_matrix, rod_pcg
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.pcg import PcgNewton
 
@@ -171,7 +170,7 @@ def test_product_matches_dense(device, name, closed):
     arrays.assign(newton.p, v)
     arrays.assign(newton.q, np.full_like(v, 7.0))
     newton.islands.wanted.assign(np.array([1, 1, 0, 1], np.int32))
-    _, product, _ = pcg.solver_kernels(problem.kind, newton.linear, "chain")
+    _, product, _ = rod_pcg.solver_kernels(problem.kind, newton.linear, "chain")
     problem.launch(
         product,
         (nodes, columns),
@@ -194,7 +193,7 @@ def test_factors_solve_without_seam(device, name, closed):
     """Factors solve with the open rod: couplings across the seam are omitted."""
     problem = Problem(name, closed, device)
     newton, kind = problem.newton, problem.kind
-    substitute = block_band.substitute_function(kind.block, kind.span, newton.linear, dotted=True)
+    substitute = rod_matrix.substitute_function(kind.block, kind.span, newton.linear, dotted=True)
 
     @wp.kernel(module="unique", enable_backward=False)
     def solve(
@@ -221,7 +220,7 @@ def test_factors_solve_without_seam(device, name, closed):
 
 
 @EVERY_CHAIN
-@pytest.mark.parametrize("preconditioner", pcg.PRECONDITIONERS)
+@pytest.mark.parametrize("preconditioner", rod_pcg.PRECONDITIONERS)
 def test_direction_matches_dense_solve(device, name, closed, preconditioner):
     """PCG matches; with the exact preconditioner an open rod takes one iteration."""
     problem = Problem(name, closed, device, preconditioner)
@@ -256,7 +255,7 @@ def falling(name, closed, device, precision="float64", **options):
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
 )
-@pytest.mark.parametrize("preconditioner", pcg.PRECONDITIONERS)
+@pytest.mark.parametrize("preconditioner", rod_pcg.PRECONDITIONERS)
 def test_open_rods_match_sweep(device, name, preconditioner):
     """Solvers stop at slightly different iterates; at a tolerance of all digits they agree to rounding."""
     exact, swept, start = falling(name, False, device, linear="sweep", rtol=1e-14)
@@ -276,7 +275,7 @@ def test_preconditioners_agree_on_closed_ring(device, precision):
     angle = 2.0 * np.pi * np.arange(40) / 40
     points = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
     ends, iterations = [], []
-    for preconditioner in ("auto", *pcg.PRECONDITIONERS):
+    for preconditioner in ("auto", *rod_pcg.PRECONDITIONERS):
         scene = ddg.Scene()
         ring = scene.add_rod(points, section=ddg.Circle(0.02), material=ddg.Material(1e7, 0.5, 1000.0), closed=True)
         scene.clamp(ring, [0])

@@ -7,7 +7,7 @@ from test_pcg import EVERY_CHAIN, Problem
 
 import ddg_warp as ddg
 from ddg_warp import arrays
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.core import outcome
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.pcg import PcgNewton
 from ddg_warp.solve.tangent import Tangent

@@ -10,8 +10,7 @@ import numpy as np
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.ghosts import Ghosts
-from ddg_warp.compile.net import conditions
-from ddg_warp.compile.net import elements as net_elements
+from ddg_warp.compile.net import conditions, elements
 from ddg_warp.compile.net.net import Net, NetRod, NetShell
 from ddg_warp.compile.net.touching import touching
 from ddg_warp.compile.rods import Piece, alike, net_rods, piece_of
@@ -189,7 +188,7 @@ class _Builder:
             markers=[merged[numbers] for numbers in self.markers],
         )
         net.fixed[nodes : nodes + angles, 1:] = True
-        net.sets = net_elements.element_sets(scene, net, self.along)
+        net.sets = elements.element_sets(scene, net, self.along)
         conditions.add_masses(scene, net)
         conditions.hold(scene, net)
         conditions.load(scene, net)

@@ -6,8 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from ddg_warp.compile import axisymmetric
-from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile import axisymmetric, shells
 from ddg_warp.compile.elements import ElementSet
 from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.compile.net.glue import glue_sets
@@ -172,7 +171,7 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
         models = description.bending, description.membrane
         try:
-            shell_sets = shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models)
+            shell_sets = shells.shell_elements(shell.surface, shell.plate, shell.kinds, *models)
         except SceneError as error:
             raise SceneError(f"shell '{description.name}': {error}") from None
         for elements in shell_sets:
@@ -182,7 +181,7 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
             shell.first[elements.term.name] = count[elements.term.law]
             count[elements.term.law] += len(elements)
         if description.bending in shell_forms.TURNING:
-            net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
+            net.fixed[shell.edges[~shells.turning(shell.kinds, description.bending)], 0] = True
     return sets
 
 

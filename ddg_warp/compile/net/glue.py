@@ -12,7 +12,7 @@ m. The series keeps the coupling no stiffer than needed if one side is much soft
 
 import numpy as np
 
-from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile import shells
 from ddg_warp.compile.net.net import Net, NetRod, NetSet, NetShell
 from ddg_warp.geometry import polyline
 from ddg_warp.geometry.shell_forms import SYMMETRY
@@ -67,7 +67,7 @@ def _elements(net: Net, rod: NetRod, edges, shell: NetShell, mesh_edges, bending
     sides = net.rest[opposite] - vertices[0]
     length = np.linalg.norm(e, axis=1)
     heights = np.linalg.norm(np.cross(e, sides), axis=2) / length
-    turns = shell_terms.turning(shell.kinds, bending)[mesh_edges]
+    turns = shells.turning(shell.kinds, bending)[mesh_edges]
     fraction = np.where(lone, 0.0, np.where(turns, 0.5, heights[0] / heights.sum(0)))
     along = np.where(shell.nodes[surface.edges[mesh_edges, 0]] == ends[0], 1.0, -1.0)
     k = edges + rod.first

@@ -3,12 +3,12 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.matrix import block_band
+from ddg_warp.kernels.linear import rod_matrix
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 
 
 class AssembledNewton(ChainNewton):
-    """As `ChainNewton`, with the matrix of every node in memory; see `kernels.matrix.block_band`.
+    """As `ChainNewton`, with the matrix of every node in memory; see `kernels.linear.rod_matrix`.
 
     Args:
         stored: scalar type of the blocks, where it is another one than that of the elements.
@@ -31,7 +31,7 @@ class AssembledNewton(ChainNewton):
         kind, self.stored = group.kind, stored or self.linear
         self.blocks = self.vectors(3 * kind.block**2)
         self.islands.placed.fill_(1)  # `base` holds where every step comes from
-        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
+        self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
 
     def vectors(self, rows: int | None = None) -> wp.array:
         """Zeros of the linear algebra for every node, as many as a node has dofs unless told otherwise."""
@@ -43,7 +43,7 @@ class AssembledNewton(ChainNewton):
         group = self.group
         wp.launch(
             self._assemble,
-            (-(-group.columns // block_band.TILE), group.nodes, min(block_band.TILE, group.columns)),
+            (-(-group.columns // rod_matrix.TILE), group.nodes, min(rod_matrix.TILE, group.columns)),
             [self.factor, self.geometric, group.count, self.mass, self.rotary, group.fixed, *self.islands.arrays]
             + [int(self.reuse)],
             [self.blocks],

@@ -6,10 +6,13 @@ import warp as wp
 
 from ddg_warp import arguments, arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import balance, chain, element_path, foresight, search, step
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.matrix import geometric
-from ddg_warp.kernels.solve import sweep, tension
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import element_path, rod_layout
+from ddg_warp.kernels.linear import geometric_stiffness, mixed_axial_force
+from ddg_warp.kernels.newton import rod_iterate
+from ddg_warp.kernels.newton import rod_sweep as sweep
+from ddg_warp.kernels.residual import rod_residual
+from ddg_warp.kernels.stepping import rod_step, rod_warm_start
 
 EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
@@ -33,18 +36,17 @@ class NewtonOptions:
         rotation_cap: largest turn of an edge, a joint or the angle of a rod in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
         psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
-            compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian,
-            and in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or
-            compressed rods and long steps, where Gauss-Newton takes many iterations. Where many iterations are such, a time step is
-            tried again with a shorter one (outcome `indefinite`; see `kernels.islands.patience_function`). "project": the exact one
-            with every element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
-            exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
-            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, or stiff over a time step
-            (`compile.precision.stiff`), on their own or in nets, else "gauss_newton". Nets take all but
-            "project". Their exact Hessian is that of rods and rigid joints; second derivatives of
-            shells' bending, of glue and of magnets are left out, which "none" refuses. It is indefinite where a pivot is lost, or
-            conjugate gradients meet negative curvature; by "gauss_newton" nets go on with the direction found so far, and leave
-            compression out of the next matrix.
+            compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian, and
+            in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or compressed rods
+            and long steps, where Gauss-Newton takes many iterations. Where many iterations are such, a time step is tried again
+            with a shorter one (outcome `indefinite`; see `kernels.core.islands.patience_function`). "project": the exact one with
+            every element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
+            exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again with a
+            shorter one. "auto": "progressive" for rods that are curved or twisted at rest, or stiff over a time step
+            (`compile.precision.stiff`), on their own or in nets, else "gauss_newton". Nets take all but "project". Their exact
+            Hessian is that of rods and rigid joints; second derivatives of shells' bending, of glue and of magnets are left out,
+            which "none" refuses. It is indefinite where a pivot is lost, or conjugate gradients meet negative curvature; by
+            "gauss_newton" nets go on with the direction found so far, and leave compression out of the next matrix.
         outliers: in contact, part of the bodies of a world (rods, shells, and what is joined of them) that may be out of balance
             at the end of a step, each by no more than ten times the tolerance: in crowds some slip off others at any time, and
             hold up all the rest. What is left of its residual acts on such a body like a force, in that step. Where contact cuts
@@ -76,14 +78,15 @@ class ChainNewton:
         model, group, options: what to solve, and how.
         linear: scalar type of the linear algebra; that of the model by default.
         midpoint: whether predicted iterates are midpoints, to which the lagged frames are carried.
-        split: whether edges may be stiffer than the matrix carries, by tensions that are unknowns; see `kernels.solve.tension`.
+        split: whether edges may be stiffer than the matrix carries, by tensions that are unknowns; see
+            `kernels.linear.mixed_axial_force`.
 
     Attributes:
         x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
         target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
-        mass, rotary: m; with drag, of which `kernels.drag` makes them at the start of a solve, its own.
+        mass, rotary: m; with drag, of which `kernels.forces.drag` makes them at the start of a solve, its own.
         load, load_angle: forces on nodes and moments about edges, where there are any (`loaded`).
-        islands: state of every rod's search; see `kernels.islands`.
+        islands: state of every rod's search; see `kernels.core.islands`.
     """
 
     reuse = False  # whether the matrix of a step's first iterate serves the whole step
@@ -106,13 +109,13 @@ class ChainNewton:
         self.load, self.load_angle, self.loaded = group.load, group.load_angle, group.host.loaded
         self.mass, self.rotary = group.mass, group.rotary
         if kind.drag:
-            self.mass = make(*nodes, dtype=chain.inertia_type(kind, self.real))
+            self.mass = make(*nodes, dtype=rod_layout.inertia_type(kind, self.real))
             self.rotary = make(*twisted)
         self.factor = make(kind.factor_rows + split, *nodes, dtype=self.linear)
         self.gradient = make(kind.window, *nodes)
         self.energy = make(2, *nodes)
         self.stiffness = make(*nodes, dtype=self.linear)
-        kept = 2 * kind.block**2 + kind.block + (tension.kept_rows(kind.block) if split else 0)
+        kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if split else 0)
         self.elimination = make(kept, *nodes, dtype=self.linear) if not kind.closed else None
         self.right, self.direction = (
             make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + split)
@@ -126,10 +129,10 @@ class ChainNewton:
         self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
         self._project = None
         if self.psd == "project" and self.exact:
-            self._project = geometric.project_kernel(kind, self.real, self.linear)
+            self._project = geometric_stiffness.project_kernel(kind, self.real, self.linear)
         self.device = device
         self._evaluate = element_path.evaluate_kernel(
-            chain.rod_storage(kind, self.real, self.linear),
+            rod_layout.rod_storage(kind, self.real, self.linear),
             self.real,
             self.linear,
             self.exact_from,
@@ -141,13 +144,13 @@ class ChainNewton:
         self._results.factor = self._results.tension = arrays.columns(self.factor)
         self._results.second, self._results.gradient = arrays.columns(self.geometric), arrays.columns(self.gradient)
         self._results.energy, self._results.stiffness = arrays.columns(self.energy), arrays.columns(self.stiffness)
-        self._check = balance.check_kernel(kind, self.real, self.linear)
-        self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
-        self._further = None if midpoint else foresight.further_kernel(kind, self.real, self.linear)
+        self._check = rod_residual.check_kernel(kind, self.real, self.linear)
+        self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
+        self._further = None if midpoint else rod_warm_start.further_kernel(kind, self.real, self.linear)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
             self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
-        self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear, split)
+        self._adjust = None if kind.closed else rod_iterate.adjust_kernel(kind, self.real, self.linear, split)
 
     def automatic_psd(self) -> str:
         """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""

@@ -7,8 +7,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import parallel_moves, parallel_search
-from ddg_warp.kernels.turns import FURTHER, ON
+from ddg_warp.kernels.newton import line_search_parallel, rod_iterate_parallel
+from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.reduction import CyclicReduction, TensionReduction
@@ -40,11 +40,11 @@ class PartitionedNewton(AssembledNewton):
         else:
             self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
         self.split = split
-        self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
-        self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear, self.exact)
-        self._moves = parallel_moves.move_kernels(kind, real, self.linear, split)
-        self._turn_ahead, *_ = parallel_moves.move_kernels(kind, real, self.linear)
-        self._aim, self._renew, self._again = parallel_moves.predict_kernels(kind, real, self.linear)
+        self._weigh, self._gauge = line_search_parallel.sum_kernels(kind, real, self.linear)
+        self._judge, self._take = line_search_parallel.decide_kernels(kind, real, self.linear, self.exact)
+        self._moves = rod_iterate_parallel.move_kernels(kind, real, self.linear, split)
+        self._turn_ahead, *_ = rod_iterate_parallel.move_kernels(kind, real, self.linear)
+        self._aim, self._renew, self._again = rod_iterate_parallel.predict_kernels(kind, real, self.linear)
 
     @property
     def kernels(self) -> list:
@@ -128,7 +128,8 @@ class PartitionedNewton(AssembledNewton):
         """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate.
 
         Args:
-            onward: of a predictor's step, which has no tensions, how it goes on, see `kernels.turns`; None of one of the solve.
+            onward: of a predictor's step, which has no tensions, how it goes on, see `kernels.newton.edge_rotation`; None of one of
+                the solve.
             base: where it starts, `base` by default; now: see `search.move_functions`.
         """
         base = self.base if base is None else base

@@ -4,9 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import judge
-from ddg_warp.kernels.matrix import block_band
-from ddg_warp.kernels.solve import pcg
+from ddg_warp.kernels.linear import rod_matrix, rod_pcg
+from ddg_warp.kernels.newton import line_search
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import FROZEN, FROZEN_ONLY, NewtonOptions
 
@@ -22,8 +21,8 @@ class PcgNewton(AssembledNewton):
     def __init__(
         self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None, midpoint: bool = False
     ):
-        if preconditioner not in pcg.PRECONDITIONERS:
-            raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(pcg.PRECONDITIONERS)}")
+        if preconditioner not in rod_pcg.PRECONDITIONERS:
+            raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(rod_pcg.PRECONDITIONERS)}")
         if preconditioner != "chain" and options.psd in ("progressive", "none"):
             raise SceneError(
                 f"psd {options.psd!r}: preconditioner {preconditioner!r} cannot tell an indefinite matrix; use 'chain'"
@@ -38,11 +37,11 @@ class PcgNewton(AssembledNewton):
         self.iterations, self.negative = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
         self.busy = wp.zeros(1, dtype=int, device=device)
         self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
-        self._judge = judge.judge_kernel(kind, self.real, self.linear)
-        self._factor = block_band.factor_kernel(kind, self.linear) if by_chain else None
-        self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
-        self._repeat = pcg.repeat_kernel(self.real, self.psd == "none") if self._repeats else None
-        self._take = pcg.take_kernel(kind, self.real, self.linear)
+        self._judge = line_search.judge_kernel(kind, self.real, self.linear)
+        self._factor = rod_matrix.factor_kernel(kind, self.linear) if by_chain else None
+        self._start, self._product, self._advance = rod_pcg.solver_kernels(kind, self.linear, preconditioner)
+        self._repeat = rod_pcg.repeat_kernel(self.real, self.psd == "none") if self._repeats else None
+        self._take = rod_pcg.take_kernel(kind, self.real, self.linear)
         self._limit = 10 * kind.block * group.nodes
 
     @property
@@ -169,7 +168,7 @@ class ProjectiveNewton(PcgNewton):
         if options.psd not in FROZEN:
             raise SceneError(FROZEN_ONLY.format(options.psd))
         super().__init__(model, group, options, "chain", linear, midpoint)
-        self._direct = block_band.direct_kernel(group.kind, self.linear)
+        self._direct = rod_matrix.direct_kernel(group.kind, self.linear)
 
     @property
     def kernels(self) -> list:

@@ -1,4 +1,7 @@
-"""A time step of a group of rods on their own: predictor, prescribed motion and loads, Newton, end update. See `kernels.step`."""
+"""A time step of a group of rods on their own:
+
+predictor, prescribed motion and loads, Newton, end update. See `kernels.stepping.rod_step`.
+"""
 
 from dataclasses import replace
 
@@ -7,8 +10,9 @@ import numpy as np
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import element_path, foresight, step
-from ddg_warp.kernels.chain import rod_storage
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.rod_layout import rod_storage
+from ddg_warp.kernels.stepping import rod_step, rod_warm_start
 from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
@@ -36,12 +40,12 @@ class ChainStep(PartStep):
         super().__init__(integrator, model, _newton(model, group, integrator, means), means, counts_of)
         self.group = group
         kind, real = group.kind, model.types.real
-        self._begin = step.begin_kernel(kind, real, self.midpoint)
-        self._foresee = foresight.foresee_kernel(kind, real, self.newton.linear)
+        self._begin = rod_step.begin_kernel(kind, real, self.midpoint)
+        self._foresee = rod_warm_start.foresee_kernel(kind, real, self.newton.linear)
         predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
         self._predicted, self._predicted_angle = (arrays.allocate(*given) for given in predicted)
-        self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
-        self._frames = step.finish_frames_kernel(kind, real) if kind.twist else None
+        self._nodes = rod_step.finish_nodes_kernel(kind, real, self.midpoint)
+        self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
         self.outer = group.outer
         if (given := integrator.given) is not None:
             self.newton.take_loads()

@@ -13,8 +13,8 @@ from scipy import sparse
 from ddg_warp import arrays
 from ddg_warp.compile.tolerance import support_forces
 from ddg_warp.geometry.turning import turned
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.chain import rod_storage
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.part import Part

@@ -1,1 +1,1 @@
-"""Contact search, CCD and contact forces: memory and launches of `kernels.contact`."""
+"""Contact search, CCD and contact forces: memory and launches of `kernels.collision`."""

@@ -5,8 +5,8 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.gather import SLOTS
-from ddg_warp.kernels.contact.pair_terms import columns_kernel
+from ddg_warp.kernels.collision.contact.assembly import SLOTS
+from ddg_warp.kernels.collision.contact.pair_evaluation import columns_kernel
 
 COLUMNS = 3 * SLOTS
 

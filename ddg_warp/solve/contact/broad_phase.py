@@ -1,4 +1,4 @@
-"""Broad phase of contact on a device: candidates, candidate validity and motion limits; see `kernels.contact`."""
+"""Broad phase of contact on a device: candidates, candidate validity and motion limits; see `kernels.collision`."""
 
 import math
 from collections.abc import Callable
@@ -9,9 +9,9 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.kernels.contact.impact import impact_kernel
-from ddg_warp.kernels.contact.motion import motion_kernels
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
+from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
 from ddg_warp.solve.contact.motion_filter import MotionFilter
 from ddg_warp.solve.contact.pairs import PairList
 from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
@@ -153,8 +153,8 @@ class BroadPhase:
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
         """Search again along the motion from `base` to q if candidates are outdated at either end.
 
-        Without q nothing moves. Otherwise the path extends beyond q, see `kernels.contact.motion`, but in worlds with a single step
-        fraction; there the candidates of an unfiltered motion hold from q on.
+        Without q nothing moves. Otherwise the path extends beyond q, see `kernels.collision.broad_phase.candidate_validity`, but in
+        worlds with a single step fraction; there the candidates of an unfiltered motion hold from q on.
         """
         together = self._never if together is None else together
         _, lengthen, *_ = self._motion

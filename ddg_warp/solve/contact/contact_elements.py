@@ -1,13 +1,16 @@
-"""Contact potential on the pairs of one list: memory and launches of `kernels.contact.pair_terms`, and incidence lists."""
+"""Contact potential on the pairs of one list:
+
+memory and launches of `kernels.collision.contact.pair_evaluation`, and incidence lists.
+"""
 
 from functools import partial
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.pair_energy import rows_of
-from ddg_warp.kernels.contact.pair_terms import evaluate_kernels, exact_product_kernel
-from ddg_warp.kernels.contact.surfaces import EDGES
+from ddg_warp.kernels.collision.contact.pair_evaluation import evaluate_kernels, exact_product_kernel
+from ddg_warp.kernels.collision.contact.potential import rows_of
+from ddg_warp.kernels.collision.primitives import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.mollified import Mollified, Unkept
 from ddg_warp.solve.contact.pair_elements import PairElements

@@ -1,11 +1,11 @@
-"""Friction on lagged contact pairs: memory and launches of `kernels.contact.pair_friction`."""
+"""Friction on lagged contact pairs: memory and launches of `kernels.collision.friction.potential`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.gather import ANGLES
-from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_kernel, lagged_struct
+from ddg_warp.kernels.collision.contact.assembly import ANGLES
+from ddg_warp.kernels.collision.friction.potential import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.pair_elements import PairElements

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.contact.pair_terms import law_struct
+from ddg_warp.kernels.collision.contact.pair_evaluation import law_struct
 from ddg_warp.solve.contact.shapes import Shapes
 
 ROUNDING = 1e-6  # relative excess of an activation distance over the search distance; below the margin of searches

@@ -1,12 +1,12 @@
-"""Near-parallel edges: exact Hessians for `PairProduct`; see `kernels.contact.pair_terms`."""
+"""Near-parallel edges: exact Hessians for `PairProduct`; see `kernels.collision.contact.pair_evaluation`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.gather import SLOTS
-from ddg_warp.kernels.contact.pair_terms import columns_kernel, exact_product_kernel, mark_kernel
-from ddg_warp.kernels.contact.sums import choose
-from ddg_warp.kernels.contact.surfaces import EDGES
+from ddg_warp.kernels.collision.contact.assembly import SLOTS
+from ddg_warp.kernels.collision.contact.pair_evaluation import columns_kernel, exact_product_kernel, mark_kernel
+from ddg_warp.kernels.collision.primitives import EDGES
+from ddg_warp.kernels.core.prefix_sum import choose
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.pairs import RunningSums
 
@@ -22,7 +22,7 @@ class Mollified:
 
     Attributes:
         keeps: True: `PairProduct` multiplies the Hessians with all others.
-        marks, starts, columns: see `kernels.contact.gather.set_struct`.
+        marks, starts, columns: see `kernels.collision.contact.assembly.set_struct`.
     """
 
     keeps = True

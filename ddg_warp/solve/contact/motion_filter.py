@@ -1,4 +1,4 @@
-"""CCD step fractions of a proposed motion on a device; see `kernels.contact.shares`."""
+"""CCD step fractions of a proposed motion on a device; see `kernels.collision.ccd.step_fractions`."""
 
 from functools import partial
 
@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.contact.shares import limit_kernels, share_kernels
+from ddg_warp.kernels.collision.ccd.step_fractions import limit_kernels, share_kernels
 
 
 class MotionFilter:

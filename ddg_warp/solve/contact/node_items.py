@@ -1,11 +1,11 @@
-"""Incidence lists of nodes and pairs; see `kernels.contact.node_items`."""
+"""Incidence lists of nodes and pairs; see `kernels.collision.contact.incidence`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.gather import ANGLES
-from ddg_warp.kernels.contact.node_items import list_kernels
-from ddg_warp.kernels.contact.surfaces import Kind
+from ddg_warp.kernels.collision.contact.assembly import ANGLES
+from ddg_warp.kernels.collision.contact.incidence import list_kernels
+from ddg_warp.kernels.collision.primitives import Kind
 from ddg_warp.solve.contact.pairs import RunningSums
 
 

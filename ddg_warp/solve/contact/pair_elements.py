@@ -1,15 +1,15 @@
-"""Elements on collision pairs: memory of factors, and assembly to nodes and worlds; see `kernels.contact.gather`."""
+"""Elements on collision pairs: memory of factors, and assembly to nodes and worlds; see `kernels.collision.contact.assembly`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pairs import PairList
 
-MOST = 2**31 // gather.ITEMS  # largest number of pairs with countable items
+MOST = 2**31 // assembly.ITEMS  # largest number of pairs with countable items
 
 
 class PairElements:
@@ -21,9 +21,9 @@ class PairElements:
         linear: type of factors; rolls: True if pairs rotate rods.
 
     Attributes:
-        `factor`: see `gather.factor_struct`.
+        `factor`: see `assembly.factor_struct`.
         `energy`, `gradient`: of each pair (capacity,) [J]; by local node or angle (`SLOTS` or `ITEMS`, capacity) [N, N m].
-        `placed`, `idle`: see `gather.set_struct`.
+        `placed`, `idle`: see `assembly.set_struct`.
         `pairs`, `count`, `starts`, `partners`: as of `PairList`.
         `mollified`: near-parallel edges (`Mollified`) with exact Hessians; None without.
         `numbers`, `places`, `items`, `ranks`, `angle_ranks`: as of `NodeItems`, whose lists the subclass builds.
@@ -37,7 +37,7 @@ class PairElements:
         self.found, self.device, self.rows, self.real, self.linear = candidates, candidates.device, rows, real, linear
         self.rolls, self._items = rolls, NodeItems(candidates.kind, nodes, silent, rolls)
         self.numbers, self.places = self._items.numbers, self._items.places
-        self.factor = gather.factor_struct(linear)()
+        self.factor = assembly.factor_struct(linear)()
         self.count = wp.zeros(1, dtype=int, device=self.device)
         self.starts, self.partners = (wp.zeros(candidates.first.all, dtype=int, device=self.device) for _ in range(2))
         self.kernels = [*self._items.kernels]
@@ -58,18 +58,18 @@ class PairElements:
         self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
-        self.factor.row = arrays.allocate((self.rows, capacity), wp.types.vector(gather.ROW, linear), self.device)
+        self.factor.row = arrays.allocate((self.rows, capacity), wp.types.vector(assembly.ROW, linear), self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
-        items, angle_capacity = (gather.ITEMS, capacity) if self.rolls else (gather.SLOTS, 0)
+        items, angle_capacity = (assembly.ITEMS, capacity) if self.rolls else (assembly.SLOTS, 0)
         self.gradient = arrays.allocate((items, capacity), wp.types.vector(3, self.real), self.device)
         self.factor.angles = wp.zeros(angle_capacity, dtype=wp.vec2i, device=self.device)
         self.factor.lever = arrays.allocate(
-            (self.rows, angle_capacity), wp.types.vector(gather.ANGLES, linear), self.device
+            (self.rows, angle_capacity), wp.types.vector(assembly.ANGLES, linear), self.device
         )
         self._items.reserve(capacity)
         self.items, self.ranks, self.angle_ranks = self._items.items, self._items.ranks, self._items.angle_ranks
         self.idle = wp.zeros(capacity, dtype=wp.uint8, device=self.device)
-        self.placed = wp.zeros(len(self.items), dtype=wp.types.vector(gather.PLACED, linear), device=self.device)
+        self.placed = wp.zeros(len(self.items), dtype=wp.types.vector(assembly.PLACED, linear), device=self.device)
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the active pairs (n,), and forces on first primitives (n, 3) [N]. Reads from the device."""

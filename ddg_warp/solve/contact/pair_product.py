@@ -1,12 +1,12 @@
-"""Products of the contact and friction matrix with vectors; see `kernels.contact.pair_product`."""
+"""Products of the contact and friction matrix with vectors; see `kernels.collision.contact.hessian_product`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.gather import set_struct
-from ddg_warp.kernels.contact.pair_bend import KINDS
-from ddg_warp.kernels.contact.pair_product import product_kernels
-from ddg_warp.kernels.contact.surfaces import EDGES
+from ddg_warp.kernels.collision.contact.assembly import set_struct
+from ddg_warp.kernels.collision.contact.geometric_stiffness import KINDS
+from ddg_warp.kernels.collision.contact.hessian_product import product_kernels
+from ddg_warp.kernels.collision.primitives import EDGES
 from ddg_warp.solve.contact.contact_elements import ContactElements
 
 
@@ -14,7 +14,7 @@ class PairProduct:
     """Product of the matrix of some sets of pair elements with a vector; call `fit` after the sets have grown.
 
     Attributes:
-        sets: the sets, see `kernels.contact.gather.set_struct`; most: largest capacity of a set.
+        sets: the sets, see `kernels.collision.contact.assembly.set_struct`; most: largest capacity of a set.
     """
 
     def __init__(self, pair_sets: list, law, real, linear):

@@ -1,6 +1,6 @@
 """Contact and friction on the candidates of a search: energies, forces, and products with the Hessian.
 
-See `kernels.contact.pair_energy` and `kernels.contact.pair_friction`.
+See `kernels.collision.contact.potential` and `kernels.collision.friction.potential`.
 """
 
 from functools import partial
@@ -10,7 +10,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.contact.broad_phase import BroadPhase
@@ -124,7 +124,7 @@ class PairTerms:
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
-        made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
+        made = assembly.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
         self._collect, self._join, self._roll = made
         edges = len(self.between) if self.rolls else 0
         types = (*(wp.types.vector(3, self.linear),) * 2, self.linear)
@@ -219,7 +219,7 @@ class PairTerms:
             rate: 1/h of each world (worlds,) [1/s]; no friction where it is 0.
             start: positions at the start of slip, by default the positions of `lag`.
             iterates: index of the accepted one of two iterates, 0 or 1, and number of iterates, by world. Then the friction matrix
-                has the direction as an extra unknown, see `kernels.contact.pair_friction`.
+                has the direction as an extra unknown, see `kernels.collision.friction.potential`.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`, or friction was not lagged since then, or rates do not fit.
@@ -255,7 +255,7 @@ class PairTerms:
 
         H is the Gauss-Newton matrix, positive semi-definite by construction; with the positions x of that `evaluate`, the exact
         Hessian. For friction both are equal. With `wanted` (worlds,), H includes the geometric stiffness at x
-        (`kernels.contact.pair_bend`) in worlds where that is nonzero, after `prepare`.
+        (`kernels.collision.contact.geometric_stiffness`) in worlds where that is nonzero, after `prepare`.
         """
         if x is None or wanted is not None:
             self.products(v, out, x, wanted)

@@ -1,16 +1,16 @@
-"""Candidate lists on a device, with fixed capacity; see `kernels.contact.candidates`."""
+"""Candidate lists on a device, with fixed capacity; see `kernels.collision.broad_phase.candidates`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.contact import sums
-from ddg_warp.kernels.contact.boxes import Trees
-from ddg_warp.kernels.contact.candidates import MOST, candidate_kernels, meet_kernel
-from ddg_warp.kernels.contact.impact import passing_kernel
-from ddg_warp.kernels.contact.motion import gap_kernel
-from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
+from ddg_warp.kernels.collision.broad_phase.aabb import Trees
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import gap_kernel
+from ddg_warp.kernels.collision.broad_phase.candidates import MOST, candidate_kernels, meet_kernel
+from ddg_warp.kernels.collision.ccd.additive_ccd import passing_kernel
+from ddg_warp.kernels.collision.primitives import Kind, sides_struct
+from ddg_warp.kernels.core import prefix_sum
 from ddg_warp.solve.contact.shapes import Shapes
 from ddg_warp.solve.contact.tree import Things
 
@@ -27,11 +27,11 @@ class RunningSums:
 
     def __init__(self, values: wp.array):
         self._levels = [values]
-        self.kernels = [sums.run]
+        self.kernels = [prefix_sum.run]
         if values.device.is_cuda:
-            self.kernels = [(sums.add_tiles, sums.THREADS), (sums.run_tiles, sums.THREADS)]
-            while len(self._levels[-1]) > sums.TILE:
-                tiles = -(-len(self._levels[-1]) // sums.TILE)
+            self.kernels = [(prefix_sum.add_tiles, prefix_sum.THREADS), (prefix_sum.run_tiles, prefix_sum.THREADS)]
+            while len(self._levels[-1]) > prefix_sum.TILE:
+                tiles = -(-len(self._levels[-1]) // prefix_sum.TILE)
                 self._levels.append(wp.zeros(tiles, dtype=int, device=values.device))
         self._starts = [wp.zeros_like(level) for level in self._levels]
         self._first = wp.zeros(1, dtype=int, device=values.device)
@@ -39,18 +39,18 @@ class RunningSums:
 
     def __call__(self) -> None:
         if not self.starts.device.is_cuda:
-            wp.launch(sums.run, 1, [self._levels[0]], [self.starts], device=self.starts.device)
+            wp.launch(prefix_sum.run, 1, [self._levels[0]], [self.starts], device=self.starts.device)
             return
         for values, tiles in zip(self._levels, self._levels[1:], strict=False):
-            self._launch(sums.add_tiles, len(tiles), [values], [tiles])
+            self._launch(prefix_sum.add_tiles, len(tiles), [values], [tiles])
         before = self._first
         for values, starts in zip(reversed(self._levels), reversed(self._starts), strict=True):
-            self._launch(sums.run_tiles, len(before), [values, before], [starts])
+            self._launch(prefix_sum.run_tiles, len(before), [values, before], [starts])
             before = starts
 
     def _launch(self, kernel, tiles: int, inputs: list, outputs: list) -> None:
         device = self.starts.device
-        wp.launch_tiled(kernel, dim=tiles, inputs=inputs, outputs=outputs, block_dim=sums.THREADS, device=device)
+        wp.launch_tiled(kernel, dim=tiles, inputs=inputs, outputs=outputs, block_dim=prefix_sum.THREADS, device=device)
 
 
 class PairList:
@@ -61,7 +61,7 @@ class PairList:
         `starts`, `partners`: offset and number of the pairs of each first primitive (first.all,), without overflow.
         `count`, `picked`: number of pairs, zero after an overflow; room for indices of some.
         `single`: True if every leaf has one primitive.
-        `sides`, `trees`: see `kernels.contact.surfaces` and `boxes`.
+        `sides`, `trees`: see `kernels.collision.primitives` and `boxes`.
         `overflow`: shared with other lists; nonzero after an overflow.
     """
 
@@ -147,7 +147,7 @@ class PairList:
         self._needed.zero_()
 
     def meet(self) -> None:
-        """Find leaves with overlapping AABBs; see `kernels.contact.candidates`."""
+        """Find leaves with overlapping AABBs; see `kernels.collision.broad_phase.candidates`."""
         self._counters.zero_()
         outputs = [self._found, self._met]
         wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
@@ -163,7 +163,7 @@ class PairList:
         wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
 
     def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
-        """Launch a kernel of `kernels.contact.impact` on the pairs with overlapping swept AABBs."""
+        """Launch a kernel of `kernels.collision.ccd.additive_ccd` on the pairs with overlapping swept AABBs."""
         inputs = [self.sides, self.trees, self._found, self._met, x, move, keep, room]
         outputs = [*outputs, self.overflow, self._needed]
         arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)

@@ -1,11 +1,11 @@
-"""Culling of rods: proof that no edges are in range, without a search for pairs; see `kernels.contact.runs`."""
+"""Culling of rods: proof that no edges are in range, without a search for pairs; see `kernels.collision.broad_phase.rod_culling`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.motion import motion_kernels
-from ddg_warp.kernels.contact.runs import AHEAD, DOUBT, KNOWN, run_kernels
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
+from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, DOUBT, KNOWN, run_kernels
 from ddg_warp.solve.contact.tree import Boxes
 
 EDGES = 64  # largest number of edges of a run
@@ -22,7 +22,8 @@ class Runs:
 
     Attributes:
         `looks`: (1,) number of times that bounds were made.
-        known (rows, worlds): see `kernels.contact.runs`; doubt: its row that is nonzero where pairs may be in range (worlds,).
+        known (rows, worlds): see `kernels.collision.broad_phase.rod_culling`; doubt: its row that is nonzero where pairs may be in
+            range (worlds,).
     """
 
     def __init__(self, search):

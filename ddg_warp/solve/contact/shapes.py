@@ -3,7 +3,7 @@
 import numpy as np
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.contact.spins import MARKERS
+from ddg_warp.kernels.collision.friction.surface_rotation import MARKERS
 
 BALLS, PLANES = 0, -1  # sizes of primitives that are balls and half-spaces, which else are numbers of nodes
 FLAT = 1e-12  # area over squared longest edge below which a triangle is degenerate
@@ -132,7 +132,8 @@ class Shapes:
         return self._add(name, 0.0, {PLANES: nodes[None]}, np.zeros((0, 4)), still=True)
 
     def spin(self, number: int, nodes) -> None:
-        """Let the surface of an obstacle rotate with nodes: a first one and markers (3,) about it; see `kernels.contact.spins`.
+        """Let the surface of an obstacle rotate with nodes: a first one and markers (3,) about it; see
+        `kernels.collision.friction.surface_rotation`.
 
         Raises:
             SceneError: it is no obstacle, or markers are not at right angles about the first node and equally far from it.

@@ -1,9 +1,9 @@
-"""Rotating surfaces: rotation of obstacles whose nodes stay, for friction; see `kernels.contact.spins`."""
+"""Rotating surfaces: rotation of obstacles whose nodes stay, for friction; see `kernels.collision.friction.surface_rotation`."""
 
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.contact.spins import MARKERS, spin_kernels
+from ddg_warp.kernels.collision.friction.surface_rotation import MARKERS, spin_kernels
 
 
 class Spins:
@@ -12,7 +12,8 @@ class Spins:
     Attributes:
         any: True if there are some.
         `places`: first node and markers of each object (objects,), negative for objects at rest; empty without rotating surfaces.
-        `turned`: rotation vectors of all objects (worlds, objects) [rad], zero at rest; see `kernels.contact.spins`.
+        `turned`: rotation vectors of all objects (worlds, objects) [rad], zero at rest; see
+            `kernels.collision.friction.surface_rotation`.
     """
 
     def __init__(self, search):

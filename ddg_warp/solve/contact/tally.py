@@ -1,8 +1,8 @@
-"""Contact statistics over the steps of an integrator; see `kernels.contact.tally`."""
+"""Contact statistics over the steps of an integrator; see `kernels.collision.contact.statistics`."""
 
 import warp as wp
 
-from ddg_warp.kernels.contact.tally import LAST, PARTS, SUM, take_kernel
+from ddg_warp.kernels.collision.contact.statistics import LAST, PARTS, SUM, take_kernel
 from ddg_warp.solve.contact.pair_terms import PairTerms
 
 
@@ -10,7 +10,7 @@ class Tally:
     """Counts of active pairs, and friction work, over all steps. Reads nothing back and can be captured.
 
     Attributes:
-        counts: of each world (3, worlds), see `kernels.contact.tally`; work: friction work (worlds,) [J].
+        counts: of each world (3, worlds), see `kernels.collision.contact.statistics`; work: friction work (worlds,) [J].
     """
 
     def __init__(self, terms: PairTerms):

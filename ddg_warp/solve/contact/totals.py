@@ -1,9 +1,9 @@
-"""Sums over pairs in each world; see `kernels.contact.totals`."""
+"""Sums over pairs in each world; see `kernels.collision.contact.world_sums`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.totals import ROWS, total_kernels, written_struct
+from ddg_warp.kernels.collision.contact.world_sums import ROWS, total_kernels, written_struct
 from ddg_warp.solve.net.system import Sums
 
 

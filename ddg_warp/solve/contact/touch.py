@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.contact.look import look_kernel
+from ddg_warp.kernels.collision.contact.query import look_kernel
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.pair_terms import PairTerms

@@ -5,8 +5,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.contact.boxes import box_kernel, bundle, encode
-from ddg_warp.kernels.contact.surfaces import surface_struct
+from ddg_warp.kernels.collision.broad_phase.aabb import box_kernel, bundle, encode
+from ddg_warp.kernels.collision.primitives import surface_struct
 from ddg_warp.solve.contact.shapes import PLANES
 
 # Successive edges of a rod in one BVH leaf, on a GPU and on the CPU. Measured: CPU search among 49 noodles 32 ms with leaves of one
@@ -51,7 +51,7 @@ class Boxes:
 
 
 class WalkOrder:
-    """Order of BVH queries along a Morton curve; see `kernels.contact.candidates`.
+    """Order of BVH queries along a Morton curve; see `kernels.collision.broad_phase.candidates`.
 
     Attributes:
         numbers: box indices (2 all,), of which the first half is valid.

@@ -15,8 +15,8 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.chains import ChainGroup, compile_chains
 from ddg_warp.compile.rods import net_rods
-from ddg_warp.kernels.contact.runs import KNOWN
-from ddg_warp.kernels.net import alone as kernels
+from ddg_warp.kernels.collision.broad_phase.rod_culling import KNOWN
+from ddg_warp.kernels.stepping import decoupled_rods as kernels
 from ddg_warp.model.group import Group
 from ddg_warp.model.rod_elements import RodElements
 from ddg_warp.solve.chains.step import ChainStep
@@ -211,7 +211,8 @@ class Places:
     """Dof map of a rod group within the coupled system.
 
     Attributes:
-        rows (8, R): see `kernels.net.alone`; sizes: numbers of blocks, rod edges, and elements of both element sets in a world.
+        rows (8, R): see `kernels.stepping.decoupled_rods`; sizes: numbers of blocks, rod edges, and elements of both element sets
+            in a world.
         whole: True if the coupled system lags the same strains of these rods as the group.
     """
 

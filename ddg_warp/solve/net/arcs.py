@@ -6,8 +6,8 @@ surfaces that a motion moves are off their chords by less than `PART` of the act
 pairs.
 
 Motions given as functions of time are sampled at uneven times until they are resolved. Grips rotate at a constant rate; their
-substeps are found on the device, world by world (`kernels.motion.grip_kernel`). Distances from an axis are measured at rest. A
-surface that only rotates about its axis of symmetry (ball, capsule, drum) needs no substeps.
+substeps are found on the device, world by world (`kernels.forces.prescribed_motion.grip_kernel`). Distances from an axis are
+measured at rest. A surface that only rotates about its axis of symmetry (ball, capsule, drum) needs no substeps.
 """
 
 import math
@@ -18,8 +18,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels import outcome
-from ddg_warp.kernels.motion import MOST_PARTS, SLACK
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.forces.prescribed_motion import MOST_PARTS, SLACK
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.motion import turns_between
 from ddg_warp.solve.net.swept import Swept, swept_surfaces

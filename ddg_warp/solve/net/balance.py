@@ -1,11 +1,11 @@
-"""Residuals of the coupled system on a device; see `kernels.net.balance` and `places`."""
+"""Residuals of the coupled system on a device; see `kernels.residual.coupled_residual` and `places`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.judge import SETTLED
-from ddg_warp.kernels.net import balance
+from ddg_warp.kernels.newton.line_search import SETTLED
+from ddg_warp.kernels.residual import coupled_residual
 
 
 class Balance:
@@ -18,7 +18,7 @@ class Balance:
     def __init__(self, newton, drag: bool):
         self.newton, net, real, linear = newton, newton.net, newton.real, newton.linear
         self.chains = newton.chains if newton.chains and newton.chains.banded else None
-        inputs, outputs = balance.given_type(real, drag)(), balance.found_type(real, linear)()
+        inputs, outputs = coupled_residual.given_type(real, drag)(), coupled_residual.found_type(real, linear)()
         inputs.q = newton.here
         for name in ("base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
             setattr(inputs, name, getattr(newton, name))
@@ -32,7 +32,7 @@ class Balance:
         outputs.least, outputs.ratio = newton.allowed.least, newton.allowed.ratio
         self.given, self.found = inputs, outputs
         self._meetings = list(self._meeting_of_sets())  # an array of structures keeps no member alive
-        self.sets = wp.array(self._meetings, dtype=balance.meeting_type(real, linear), device=net.device)
+        self.sets = wp.array(self._meetings, dtype=coupled_residual.meeting_type(real, linear), device=net.device)
         off_path_blocks = self.chains.elsewhere if self.chains else np.arange(0)
         self.some = wp.array(off_path_blocks.astype(np.int32), dtype=int, device=net.device)
         self.count = len(off_path_blocks) if self.chains else net.blocks
@@ -42,7 +42,7 @@ class Balance:
             types = int, wp.types.matrix((3, 3), real)
             self._frames = [wp.zeros(0, dtype=dtype, device=net.device) for dtype in types]
         self.kernels = [
-            balance.balance_kernel(real, linear, drag, newton.contact is not None, arrays.serial(net.device))
+            coupled_residual.balance_kernel(real, linear, drag, newton.contact is not None, arrays.serial(net.device))
         ]
 
     def _meeting_of_sets(self):
@@ -52,7 +52,7 @@ class Balance:
         for element_set, buffers, local, meets in zip(
             net.sets, newton.parts, newton.local, newton.system.meets, strict=True
         ):
-            meeting, measure = balance.meeting_type(newton.real, newton.linear)(), element_set.term.measure
+            meeting, measure = coupled_residual.meeting_type(newton.real, newton.linear)(), element_set.term.measure
             meeting.gradient, meeting.along = (
                 (nothing[0], buffers["gradient"]) if local else (buffers["gradient"], nothing[1])
             )

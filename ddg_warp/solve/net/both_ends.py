@@ -1,9 +1,9 @@
-"""Twisted factorisation of rod paths on a device: solves from both ends; see `kernels.solve.both_ends`."""
+"""Twisted factorisation of rod paths on a device: solves from both ends; see `kernels.linear.twisted_factorisation`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.solve import both_ends
+from ddg_warp.kernels.linear import twisted_factorisation
 
 
 class BothEnds:
@@ -15,8 +15,8 @@ class BothEnds:
 
     def __init__(self, plan, columns: int, linear, device, threads: int):
         self._columns, self._threads, self._device = columns, threads, device
-        self._sides, self._middle = both_ends.factor_kernels(plan.twist, plan.span, linear)
-        self._inward, self._outward = both_ends.solve_kernels(plan.twist, plan.span, linear)
+        self._sides, self._middle = twisted_factorisation.factor_kernels(plan.twist, plan.span, linear)
+        self._inward, self._outward = twisted_factorisation.solve_kernels(plan.twist, plan.span, linear)
         self._taken = arrays.allocate((3 * plan.block**2, 2, columns), linear, device)
 
     @property

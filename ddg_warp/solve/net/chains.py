@@ -1,4 +1,4 @@
-"""The chain preconditioner of a net on a device; see `kernels.solve.elimination` and `joints`."""
+"""The chain preconditioner of a net on a device; see `kernels.linear.rod_substructuring` and `joint_schur`."""
 
 from functools import cached_property
 
@@ -7,13 +7,12 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix import bands
-from ddg_warp.kernels.matrix.block_band import TILE
-from ddg_warp.kernels.matrix.chain_blocks import layout_type
-from ddg_warp.kernels.matrix.sliced import SETS
-from ddg_warp.kernels.net.places import along_type, place_kernel
-from ddg_warp.kernels.solve import elimination, joints
-from ddg_warp.kernels.solve.walk import walk_kernel
+from ddg_warp.kernels.linear import joint_schur, rod_bands, rod_substructuring
+from ddg_warp.kernels.linear.rod_band_assembly import layout_type
+from ddg_warp.kernels.linear.rod_matrix import TILE
+from ddg_warp.kernels.linear.rod_substructuring_serial import walk_kernel
+from ddg_warp.kernels.linear.sliced_ell import SETS
+from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type, place_kernel
 from ddg_warp.solve.choice import long_and_few
 from ddg_warp.solve.net.both_ends import BothEnds
 from ddg_warp.solve.net.plan import ChainPlan
@@ -28,7 +27,7 @@ class Chains:
     Args:
         net: its `DeviceNet`.
         banded: whether blocks of H between their places are kept here, in bands, and not among the positions of a `NetSystem`.
-        split: whether tensions of edges are unknowns, see `kernels.solve.tension`; where `splits` says that they can be.
+        split: whether tensions of edges are unknowns, see `kernels.linear.mixed_axial_force`; where `splits` says that they can be.
 
     Attributes:
         idle: chains of all worlds (columns,) that take no part in a direction are not zero, see `Resting`; zero without it.
@@ -125,11 +124,11 @@ class Chains:
         sets = self.along if self.banded else []
         terms = tuple(net.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
-        self._assemble, self._clear, self._product = bands.band_kernels(
+        self._assemble, self._clear, self._product = rod_bands.band_kernels(
             terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
         )
         if serial:
-            self._product = bands.product_walk_kernel(plan.twist, plan.span, linear, self.split)
+            self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, self.split)
         self.layout = layout_type()()
         for name in ("places", "chain", "count", "held", "idle"):
             setattr(self.layout, name, getattr(self, name))
@@ -142,17 +141,17 @@ class Chains:
             apart = np.zeros(net.blocks, np.uint8)
             apart[self.elsewhere] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
-        made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
+        made = rod_substructuring.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
-        self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
+        self._measure, self._meet = joint_schur.joint_kernels(linear) if self.joints else (None, None)
         self._walk = self._walk_places = self._both = None
         if serial and not (self.joints or self.reduction):
-            self._walk_places = elimination.walk_places_kernel(plan.twist, plan.span, linear, self.split)
+            self._walk_places = rod_substructuring.walk_places_kernel(plan.twist, plan.span, linear, self.split)
         if not (serial or self.joints or self.reduction or self.split):
             self._both = BothEnds(plan, self.columns, linear, device, SERIAL)
         if self.split:
             self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
-            self._lengthen = bands.lengthen_kernel(terms, real, linear)
+            self._lengthen = rod_bands.lengthen_kernel(terms, real, linear)
         if self.exact and serial and not (self.reduction or reuse or self.split):
             self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
 

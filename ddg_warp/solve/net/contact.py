@@ -1,4 +1,4 @@
-"""Contact in Newton's method on the coupled system; see `kernels.net.touch` and, for search and pairs, `solve.contact`.
+"""Contact in Newton's method on the coupled system; see `kernels.newton.contact_newton` and, for search and pairs, `solve.contact`.
 
 CCD limits every proposed motion, a predictor or a step, rod by rod. Motion of supports and obstacles is included. A world whose
 predictor or support motion was limited has motion pending. Its target `bound` then lies ahead of its positions: all terms but contact
@@ -12,8 +12,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
-from ddg_warp.kernels.net import touch as kernels
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.newton import contact_newton as kernels
 from ddg_warp.scene.obstacles import Obstacle
 from ddg_warp.solve.chains.newton import EARLY
 from ddg_warp.solve.contact.tally import Tally
@@ -41,7 +41,7 @@ class NetContact:
         diagonal: (W N,) diagonal blocks of the contact matrix.
         bound: (W N,) target positions of worlds with pending motion; positions of all others.
         bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
-        `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.contact.pair_bend`.
+        `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.collision.contact.geometric_stiffness`.
         `rubs`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
         solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `lags` - 1 of (W N,).
         farthest: [m] largest motion of nodes in worlds with a single step fraction, while candidates do not fit; see `outgrown`.

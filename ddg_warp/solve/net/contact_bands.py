@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net.contact_bands import stiffen_kernel
+from ddg_warp.kernels.linear.contact_bands import stiffen_kernel
 
 
 class ContactBands:

@@ -4,11 +4,11 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.adjoint.solve import block_kernels, check_kernels
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.matrix.exact import COUNT, FIRST, SIGN, exact_kernels
-from ddg_warp.kernels.net.elements import coupled_storage
+from ddg_warp.kernels.adjoint.coupled_linear_solve import block_kernels, check_kernels
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.linear.exact_hessian import COUNT, FIRST, SIGN, exact_kernels
 from ddg_warp.model.net import NetState
 from ddg_warp.solve.choice import net_preconditioner
 from ddg_warp.solve.net.chains import Chains
@@ -161,7 +161,7 @@ class ExactSystem:
 
 
 def _ends(measure) -> np.ndarray:
-    """What every slot of an element sees of its local dofs; see `kernels.matrix.exact`."""
+    """What every slot of an element sees of its local dofs; see `kernels.linear.exact_hessian`."""
     angles, spins, points = measure.starts
     seen = [[] for _ in range(measure.slots)]
     for i, edge in enumerate(measure.edges):

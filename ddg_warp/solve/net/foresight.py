@@ -1,9 +1,9 @@
-"""Warm start of the coupled system: extrapolate the last correction of the predictor; see `kernels.net.foresight`."""
+"""Warm start of the coupled system: extrapolate the last correction of the predictor; see `kernels.stepping.coupled_warm_start`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net import foresight
+from ddg_warp.kernels.stepping import coupled_warm_start
 from ddg_warp.solve.net.system import Sums
 
 
@@ -17,12 +17,14 @@ class Foresight:
     def __init__(self, newton):
         net, device, serial = newton.net, newton.net.device, arrays.serial(newton.net.device)
         self.newton = newton
-        self._foresee, self._weigh, self._trust = foresight.foresight_kernels(newton.real, newton.linear, serial)
+        self._foresee, self._weigh, self._trust = coupled_warm_start.foresight_kernels(
+            newton.real, newton.linear, serial
+        )
         self.predicted = wp.zeros_like(newton.q)
         self.trust = wp.ones(net.worlds, dtype=newton.real, device=device)
         self._sum = None
         if newton.contact:
-            takers, rows = arrays.takers(net.host.nodes, device), foresight.SUMS
+            takers, rows = arrays.takers(net.host.nodes, device), coupled_warm_start.SUMS
             self._weights = wp.zeros((rows, net.worlds, takers), dtype=newton.real, device=device)
             self._sums = wp.zeros((rows, net.worlds), dtype=newton.real, device=device)
             self._sum = Sums(rows * net.worlds, takers, newton.real, device)
@@ -66,6 +68,6 @@ class Foresight:
             net.blocks,
         ]
         arrays.sweep(self._weigh, nodes, inputs, [self._weights], net.device, worlds=net.worlds)
-        self._sum(self._weights.reshape((foresight.SUMS * net.worlds, -1)), self._sums.flatten())
+        self._sum(self._weights.reshape((coupled_warm_start.SUMS * net.worlds, -1)), self._sums.flatten())
         inputs = [self._sums, newton.options.rtol, newton.allowed.total, islands.arrays[1]]
         wp.launch(self._trust, net.worlds, inputs, [self.trust], device=net.device)

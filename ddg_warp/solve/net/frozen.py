@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ddg_warp.kernels.islands import WANTED, Islands
-from ddg_warp.kernels.net.newton import freeze_kernel
+from ddg_warp.kernels.core.islands import WANTED, Islands
+from ddg_warp.kernels.newton.coupled_newton import freeze_kernel
 
 
 class Frozen:

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on all worlds of the coupled system, on a device; see `kernels.solve.krylov`."""
+"""Preconditioned conjugate gradients on all worlds of the coupled system, on a device; see `kernels.linear.coupled_pcg`."""
 
 import math
 from functools import partial
@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net.outliers import FARTHEST
-from ddg_warp.kernels.solve import krylov
+from ddg_warp.kernels.linear import coupled_pcg
+from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.system import Sums
 
@@ -35,7 +35,7 @@ class ConjugateGradients:
 
     Args:
         newton: a `NetNewton`, or an object with the same names, whose matrix, residual, direction and substructuring are used.
-        multilevel: True to add BPX multilevel corrections, or to use these alone; see `kernels.solve.levels`.
+        multilevel: True to add BPX multilevel corrections, or to use these alone; see `kernels.linear.multilevel`.
         scale: power of two by which residuals and directions are scaled, against underflow and overflow of products; see
             `natural_scale`.
         indefinite: True if H may be indefinite.
@@ -60,7 +60,7 @@ class ConjugateGradients:
         self.busy = wp.zeros(1, dtype=int, device=device)
         self._unread = [wp.zeros(newton.worlds, dtype=int, device=device) for _ in range(2)]
         self.sum = Sums(newton.worlds, net.blocks, linear, device)
-        self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(linear, indefinite)
+        self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(linear, indefinite)
         self._more = newton.contact.diagonal if newton.contact else wp.zeros(0, dtype=M, device=device)
         self.levels = Multilevel(net, newton.system, linear) if multilevel else None
         self._limit = max(200, 100 * math.isqrt(net.blocks))
@@ -177,7 +177,7 @@ class Directions(ConjugateGradients):
         super().__init__(newton, multilevel, scale=self.scale)
         real = newton.real
         self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], real, newton.device, largest=True)
-        self._compare, self._confirm = krylov.confirm_kernels(real, newton.linear)
+        self._compare, self._confirm = coupled_pcg.confirm_kernels(real, newton.linear)
 
     @property
     def kernels(self) -> list:

@@ -1,10 +1,10 @@
-"""Multilevel preconditioner of the coupled system on a device; see `kernels.solve.levels`."""
+"""Multilevel preconditioner of the coupled system on a device; see `kernels.linear.multilevel`."""
 
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.solve import levels
-from ddg_warp.kernels.solve.levels import GROUP, PIECE
+from ddg_warp.kernels.linear import multilevel
+from ddg_warp.kernels.linear.multilevel import GROUP, PIECE
 
 
 class Multilevel:
@@ -46,7 +46,7 @@ class Multilevel:
 
         self.blocks, self.inverses, self.sums, self.corrections = make(M), make(M), make(H), make(H)
         self._no_members = wp.zeros(1, dtype=M, device=self.device)
-        self._collect, self._gather, self._restrict, self._correct, self._finish = levels.level_kernels(linear)
+        self._collect, self._gather, self._restrict, self._correct, self._finish = multilevel.level_kernels(linear)
 
     def _pieces(self, items: np.ndarray, target: np.ndarray, groups: int, M) -> tuple:
         """Return items of all groups in order, offsets of their pieces, first piece of each group, and buffers of piece sums."""

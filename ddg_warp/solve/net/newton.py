@@ -9,13 +9,13 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.drag import block_inertia
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.matrix.chain_places import splits
-from ddg_warp.kernels.net import newton
-from ddg_warp.kernels.net.elements import coupled_storage
-from ddg_warp.kernels.solve import pcg
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.forces.drag import block_inertia
+from ddg_warp.kernels.linear import rod_pcg
+from ddg_warp.kernels.linear.rod_dof_map import splits
+from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
@@ -40,9 +40,9 @@ class NetNewton:
 
     Args:
         preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
-            `kernels.solve.elimination`), "multilevel" (see `kernels.solve.levels`), or "chain_multilevel", both.
+            `kernels.linear.rod_substructuring`), "multilevel" (see `kernels.linear.multilevel`), or "chain_multilevel", both.
         linear: scalar type of the linear algebra; that of the model by default.
-        drag: whether a block has more than a mass; see `kernels.drag`.
+        drag: whether a block has more than a mass; see `kernels.forces.drag`.
         reuse: whether the matrix of a step's first iterate serves the whole step.
         split: whether edges may be stiffer than the matrix carries, where that can be; see `Chains.splits`.
 
@@ -147,14 +147,14 @@ class NetNewton:
         fails = self.psd == "none"
         curved = any(exact) or (self.contact is not None and self.contact.bends)
         repeats = not reuse and (fails or curved or self._direct)
-        self._repeat = pcg.repeat_kernel(self.real, fails, curved) if repeats else None
+        self._repeat = rod_pcg.repeat_kernel(self.real, fails, curved) if repeats else None
         self.negative = make(worlds, int)
         self._assembly = Assembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
         self.turns = Turns(self) if host.rods else None
         most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
-        self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
+        self._judge, self._measure, self._rotate, self._take, self._move = coupled_newton.search_kernels(
             self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None, most > 0
         )
         self.allowed = Allowed(net, self.real, self.linear)

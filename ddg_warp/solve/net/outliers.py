@@ -10,7 +10,7 @@ Measured: such slips take Newton's method as many iterations as all other rods t
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net.outliers import outlier_kernels
+from ddg_warp.kernels.newton.relaxed_convergence import outlier_kernels
 
 
 class Outliers:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix.chain_places import place_dofs
+from ddg_warp.kernels.linear.rod_dof_map import place_dofs
 from ddg_warp.solve.net.system import lists
 
 

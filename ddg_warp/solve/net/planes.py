@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.matrix import planes
+from ddg_warp.kernels.linear import skew_supports
 
 
 class HostPlanes:
@@ -51,8 +51,8 @@ class DevicePlanes:
         self.where, self.entries = put(index.astype(np.int32), int), put(entries.astype(np.int32), int)
         self.of_blocks = put(frame[:-1].astype(np.int32), int)
         self.frames = {kind: put(frames, wp.types.matrix((3, 3), kind)) for kind in {real, linear}}
-        self._matrix = planes.matrix_kernel(linear)
-        self._into, self._back = (planes.turn_kernel(linear, back) for back in (False, True))
+        self._matrix = skew_supports.matrix_kernel(linear)
+        self._into, self._back = (skew_supports.turn_kernel(linear, back) for back in (False, True))
         self.real, self.linear = real, linear
 
     @property

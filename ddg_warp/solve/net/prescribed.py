@@ -3,8 +3,8 @@
 import warp as wp
 
 from ddg_warp.compile.conditions import pose_starts
+from ddg_warp.kernels.forces.prescribed_element_data import field_kernel, normal_kernels
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
-from ddg_warp.kernels.net.motion import field_kernel, normal_kernels
 from ddg_warp.model.net import NetState
 from ddg_warp.solve.motion import Motion
 

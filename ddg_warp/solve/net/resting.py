@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net.resting import resting_kernels
+from ddg_warp.kernels.newton.sleeping_islands import resting_kernels
 
 REST = 0.1
 

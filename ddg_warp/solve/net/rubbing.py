@@ -6,7 +6,7 @@ from scipy import sparse
 
 from ddg_warp import arrays
 from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, rub_kernel
-from ddg_warp.kernels.contact.gather import ITEMS, SLOTS
+from ddg_warp.kernels.collision.contact.assembly import ITEMS, SLOTS
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.contact.rolling import turned_by
 

@@ -24,8 +24,8 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import outcome
-from ddg_warp.kernels.net import newton
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.state import Sliding, State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import large_static, net_preconditioner
@@ -62,7 +62,7 @@ class StaticNewton(NetNewton):
         self.loads = StaticLoads(model, self.net, midpoint=False) if self.net.host.followers else None
         self._there, self._before = wp.zeros_like(self.load), wp.zeros_like(self.q)
         self.islands.moved.fill_(1)
-        self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
+        self._follow, self._less, self._far = coupled_newton.static_kernels(self.real, self.linear)
         self.rubs = self.contact is not None and self.contact.rubs
         if self.rubs:  # not the rate of strain-rate damping, which acts at rest
             self.contact.rate = wp.zeros_like(self.islands.rate)

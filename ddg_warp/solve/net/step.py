@@ -1,4 +1,4 @@
-"""A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.step`."""
+"""A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.stepping.rod_step`."""
 
 from dataclasses import replace
 
@@ -8,9 +8,10 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import element_path, outcome
-from ddg_warp.kernels.net import frames, newton
-from ddg_warp.kernels.net.elements import coupled_storage
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.elements import coupled_frames, element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
@@ -72,7 +73,7 @@ class NetStep(PartStep):
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._foresight = Foresight(solver)
-        self._begin, self._finish = newton.step_kernels(
+        self._begin, self._finish = coupled_newton.step_kernels(
             real, self.midpoint, arrays.serial(model.wp_device), solver.contact is not None
         )
         if solver.contact and self.midpoint:
@@ -80,7 +81,7 @@ class NetStep(PartStep):
                 "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
             )
         self._lagged = model.net.lagged() if model.net.edges else None
-        self._take = frames.take_kernel(real)
+        self._take = coupled_frames.take_kernel(real)
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = NetMotion(model, self.midpoint) if host.moves else None

@@ -1,14 +1,13 @@
-"""Sparse system of the coupled dofs on a device: incidence lists, and H in sliced ELLPACK; see `kernels.matrix.sliced`."""
+"""Sparse system of the coupled dofs on a device: incidence lists, and H in sliced ELLPACK; see `kernels.linear.sliced_ell`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix import sliced
-from ddg_warp.kernels.matrix.sliced import SLICE
-from ddg_warp.kernels.net.balance import ITEM
-from ddg_warp.kernels.solve import krylov
+from ddg_warp.kernels.linear import coupled_pcg, sliced_ell
+from ddg_warp.kernels.linear.sliced_ell import SLICE
+from ddg_warp.kernels.residual.coupled_residual import ITEM
 
 
 class NetSystem:
@@ -16,7 +15,7 @@ class NetSystem:
 
     Args:
         `net`: `DeviceNet`.
-        kept: blocks (N,) bool whose couplings along rods are stored in bands, see `kernels.matrix.bands`. Entries of fixed blocks
+        kept: blocks (N,) bool whose couplings along rods are stored in bands, see `kernels.linear.rod_bands`. Entries of fixed blocks
             then are left out. None stores all entries here.
 
     Attributes:
@@ -109,13 +108,13 @@ class Sums:
     """
 
     def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
-        tiles = -(-n // krylov.TILE)
-        if tiles > krylov.TILES:
-            raise SceneError(f"the net has {n} blocks or edges; there may be {krylov.TILE * krylov.TILES}")
+        tiles = -(-n // coupled_pcg.TILE)
+        if tiles > coupled_pcg.TILES:
+            raise SceneError(f"the net has {n} blocks or edges; there may be {coupled_pcg.TILE * coupled_pcg.TILES}")
         self.worlds, self.tiles, self.device = worlds, tiles, wp.get_device(device)
         cuda = self.device.is_cuda
-        self._own = krylov.sum_kernels(real, largest) if cuda else (krylov.serial_sum_kernel(real, largest),)
-        self.kernels = [(kernel, krylov.THREADS) for kernel in self._own]
+        self._own = coupled_pcg.sum_kernels(real, largest) if cuda else (coupled_pcg.serial_sum_kernel(real, largest),)
+        self.kernels = [(kernel, coupled_pcg.THREADS) for kernel in self._own]
         self._partial = wp.zeros((worlds, tiles), dtype=real, device=device)
 
     def __call__(self, values: wp.array, out: wp.array) -> None:
@@ -127,11 +126,11 @@ class Sums:
             (self._own[0], (self.worlds, self.tiles), [values, self._partial]),
             (self._own[1], (self.worlds,), [self._partial, out]),
         ):
-            wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=krylov.THREADS, device=self.device)
+            wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=coupled_pcg.THREADS, device=self.device)
 
 
 class Assembly:
-    """Assembly of H from element contributions, `sliced.SETS` element sets a launch.
+    """Assembly of H from element contributions, `sliced_ell.SETS` element sets a launch.
 
     Args:
         written: the arrays "factor", "tension" and "second" of each set.
@@ -153,22 +152,22 @@ class Assembly:
     ):
         serial = arrays.serial(net.device)
         self.net, self.table, self.kernels, self._own = net, table, [], []
-        for first in range(0, len(net.sets), sliced.SETS):
+        for first in range(0, len(net.sets), sliced_ell.SETS):
             sets, from_iteration, local_dofs = (
-                each[first : first + sliced.SETS] for each in (net.sets, exact_from, local)
+                each[first : first + sliced_ell.SETS] for each in (net.sets, exact_from, local)
             )
             terms = tuple(part.term for part in sets)
             self.kernels.append(
-                sliced.assemble_kernel(terms, real, linear, first == 0, from_iteration, local_dofs, drag, serial)
+                sliced_ell.assemble_kernel(terms, real, linear, first == 0, from_iteration, local_dofs, drag, serial)
             )
             set_data = []
             for i in range(first, first + len(sets)):
-                data = sliced.contributions(linear, local[i])()
+                data = sliced_ell.contributions(linear, local[i])()
                 data.factor, data.tension, data.second = (written[i][name] for name in ("factor", "tension", "second"))
                 data.starts, data.items = table.adds[i]
                 data.elements = net.sets[i].elements
                 set_data.append(data)
-            self._own.append(set_data + [set_data[-1]] * (sliced.SETS - len(set_data)))
+            self._own.append(set_data + [set_data[-1]] * (sliced_ell.SETS - len(set_data)))
 
     def __call__(self, mass: wp.array, islands, matrix: wp.array) -> None:
         """Write H (9, positions of all worlds) in worlds that need a direction."""

@@ -8,8 +8,8 @@ from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
 from ddg_warp.geometry.turning import turned
-from ddg_warp.kernels import element_path
-from ddg_warp.kernels.net.elements import coupled_storage, linear_stress_kernel
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage, linear_stress_kernel
 from ddg_warp.model import validate
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.contact import assembled

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net import parts
+from ddg_warp.kernels.residual import residual_sums
 
 
 class Allowed:
@@ -30,7 +30,7 @@ class Allowed:
 
         self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
         self.ratio = make((worlds, net.blocks + sum(len(level.weight) for level in self.bodies.levels)))
-        self.kernels = [parts.part_kernel(real, linear, leaf, arrays.serial(device)) for leaf in (True, False)]
+        self.kernels = [residual_sums.part_kernel(real, linear, leaf, arrays.serial(device)) for leaf in (True, False)]
         self._levels = []
         for level in self.bodies.levels:
             n = len(level.weight)

@@ -1,11 +1,11 @@
-"""Edge rotations of the coupled system: retraction of Newton steps, and frame updates; see `kernels.turns`."""
+"""Edge rotations of the coupled system: retraction of Newton steps, and frame updates; see `kernels.newton.edge_rotation`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.net.turns import turn_kernels
-from ddg_warp.kernels.turns import FURTHER, ON
+from ddg_warp.kernels.newton.coupled_edge_rotation import turn_kernels
+from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
 
 BLOCK = 32  # threads a block for pieces of rods: few, since their reads are far apart
 
@@ -53,7 +53,7 @@ class Turns:
     def predict(self, v: wp.array, extrapolate: bool) -> None:
         """Rotate the edges of predictors by velocities v, where a straight predictor would stretch them.
 
-        `extrapolate`: True if the velocities are of the last step; see `kernels.turns`.
+        `extrapolate`: True if the velocities are of the last step; see `kernels.newton.edge_rotation`.
         """
         newton, net = self.newton, self.net
         islands = newton.islands
@@ -86,8 +86,8 @@ class Turns:
     def place(self, mode: int | None = None, base: wp.array | None = None, positions: wp.array | None = None) -> None:
         """Position rod nodes by edge rotation, after the straight update.
 
-        `mode`: how a predictor continues, see `kernels.turns`; None for a Newton step. `base`, `positions`: as `base`, `now` of
-        `PartitionedNewton.move`.
+        `mode`: how a predictor continues, see `kernels.newton.edge_rotation`; None for a Newton step. `base`, `positions`: as
+            `base`, `now` of `PartitionedNewton.move`.
         """
         newton, net = self.newton, self.net
         device, worlds, todo = net.device, net.worlds, newton.islands.todo

@@ -1,0 +1,134 @@
+"""The reverse's linear system H w = g of open rods in the precision of the state, by solutions in another one.
+
+w is of the size of s times the derivatives by velocities, while what it says of positions is their difference, so that rounding of w
+weighs 1 / s times as much. It begins as what inertia alone makes of g; solutions for what remains, g - H w, are added to it (iterative
+refinement; Wilkinson, Rounding Errors in Algebraic Processes, 1963): each leaves what the solver errs by, relatively.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.adjoint.rod_elements import gathered_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.elements.rod_layout import ChainKind, displaced_function
+
+
+@cache
+def product_kernel(kind: ChainKind, real):
+    """product(...): H v of every element, as its window, from the factors and geometric stiffnesses that `evaluate_kernel` wrote."""
+    W = wp.types.vector(kind.window, real)
+    displaced = displaced_function(kind, real)
+    dim, window, span = kind.dim, kind.window, kind.span
+    vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
+    edge_row = vertex_rows * window
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        module_options=CPU_OPTIONS | {"max_unroll": kind.window},
+    )
+    def product(
+        factor: wp.array3d(dtype=real),
+        geometric: wp.array3d(dtype=real),
+        v: wp.array3d(dtype=real),
+        count: wp.array(dtype=int),
+        window_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n - 1:
+            return
+        whole = wp.static(span == 2) and k < n - 2
+        u = displaced(v, k, n, whole, r)
+        y = W()
+        if whole:
+            for m in range(wp.static(vertex_rows)):
+                along = real(0.0)
+                for i in range(wp.static(window)):
+                    along += factor[m * wp.static(window) + i, k, r] * u[i]
+                for i in range(wp.static(window)):
+                    y[i] += factor[m * wp.static(window) + i, k, r] * along
+            at = int(0)  # of an upper triangle, row by row
+            for i in range(wp.static(window)):
+                for j in range(i, wp.static(window)):
+                    g = geometric[at, k, r]
+                    y[i] += g * u[j]
+                    if j > i:
+                        y[j] += g * u[i]
+                    at += 1
+        for m in range(wp.static(edge_rows)):
+            along = real(0.0)
+            for d in range(wp.static(dim)):
+                along += factor[wp.static(edge_row) + m * wp.static(dim) + d, k, r] * u[d]
+            for d in range(wp.static(dim)):
+                y[d] += factor[wp.static(edge_row) + m * wp.static(dim) + d, k, r] * along
+        for m in range(wp.static(tensions)):
+            c = factor[wp.static(edge_row + edge_rows * dim) + m, k, r]
+            for d in range(wp.static(dim)):
+                y[d] += c * u[d]
+        for i in range(wp.static(window)):
+            window_out[i, k, r] = y[i]
+
+    return product
+
+
+@cache
+def refine_kernels(kind: ChainKind, real, linear):
+    """guess(...): w of inertia alone; rest(...): the right-hand side that w leaves, from the products of elements; add(...): a solution
+    to w.
+    """
+    dim, block, gathered = kind.dim, kind.block, gathered_function(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def guess(
+        right: wp.array3d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        w_out: wp.array3d(dtype=real),
+    ):
+        """`coefficient` is that of inertia [1/s^2]."""
+        k, r = wp.tid()
+        c = coefficient[r] * mass[k, r]
+        for d in range(wp.static(block)):
+            own = real(0.0)
+            if d < wp.static(dim) and c > real(0.0):
+                own = right[d, k, r] / c
+            w_out[d, k, r] = own
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def rest(
+        right: wp.array3d(dtype=real),
+        w: wp.array3d(dtype=real),
+        elements: wp.array3d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        fixed: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        out: wp.array3d(dtype=linear),
+    ):
+        """Zero at held dofs."""
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n:
+            return
+        mask = int(fixed[k, r])
+        c = coefficient[r]
+        q = gathered(elements, k, n, r)
+        for d in range(wp.static(block)):
+            inertia = c
+            if d < wp.static(dim):
+                inertia *= mass[k, r]
+            else:
+                inertia *= rotary[k, r]
+            own = right[d, k, r] - inertia * w[d, k, r] - q[d]
+            out[d, k, r] = wp.where(((mask >> d) & 1) == 0, linear(own), linear(0.0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def add(values: wp.array3d(dtype=linear), w: wp.array3d(dtype=real)):
+        d, k, r = wp.tid()
+        w[d, k, r] = w[d, k, r] + real(values[d, k, r])
+
+    return guess, rest, add

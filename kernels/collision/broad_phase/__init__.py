@@ -1,0 +1,1 @@
+"""Candidates of collision: AABBs, BVH queries, candidate validity, rod culling."""

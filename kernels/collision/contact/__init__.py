@@ -1,0 +1,1 @@
+"""Contact potentials of collision pairs, their derivatives and sums."""

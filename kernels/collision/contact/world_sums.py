@@ -1,0 +1,77 @@
+"""Sum contact energy, number of active pairs and friction work per world, in a fixed order."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+
+ENERGY, TOUCHING, WORK = range(3)
+ROWS = 3
+
+
+@cache
+def written_struct(real):
+    """List of pairs with energies, by first primitives, `things` in a world; see `PairList`.
+
+    `used`: not zero for active pairs; `work`: work of friction, empty for contact.
+    """
+
+    @wp.struct
+    class Written:
+        count: wp.array(dtype=int)
+        starts: wp.array(dtype=int)
+        partners: wp.array(dtype=int)
+        energy: wp.array(dtype=real)
+        used: wp.array(dtype=int)
+        work: wp.array(dtype=real)
+        things: int
+
+    return Written
+
+
+@cache
+def total_kernels(real, serial: bool):
+    """Build the kernels of sums per world.
+
+    `add`: sum over the pairs of each first primitive.
+    `tell`: write the results of each world.
+    """
+    Written, share, until = written_struct(real), share_function(serial), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def add(lists: wp.array(dtype=Written), worlds: int, sums: wp.array2d(dtype=real)):
+        """Write sums (ROWS worlds, primitives); column k adds the k-th first primitives of all lists."""
+        w, start = share(wp.tid(), sums.shape[1])
+        for k in range(start, until(start, sums.shape[1])):
+            energy, work, touching = real(0.0), real(0.0), int(0)
+            for s in range(lists.shape[0]):
+                if k < lists[s].things and lists[s].count[0] > 0:
+                    pair_list = lists[s]
+                    first = pair_list.starts[k + w * pair_list.things]
+                    for p in range(first, first + pair_list.partners[k + w * pair_list.things]):
+                        if pair_list.used[p] != 0:
+                            energy += pair_list.energy[p]
+                            if pair_list.work.shape[0] > 0:
+                                work += pair_list.work[p]
+                            else:
+                                touching += 1
+            sums[wp.static(ENERGY) * worlds + w, k] = energy
+            sums[wp.static(TOUCHING) * worlds + w, k] = real(touching)
+            sums[wp.static(WORK) * worlds + w, k] = work
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def tell(
+        sums: wp.array2d(dtype=real),
+        overflow: wp.array(dtype=int),
+        energy: wp.array(dtype=real),
+        touching: wp.array(dtype=int),
+        dissipated: wp.array(dtype=real),
+    ):
+        """Write the results of each world; energies are infinite if pairs overflowed."""
+        w = wp.tid()
+        energy[w] = wp.where(overflow[0] == 0, sums[wp.static(ENERGY), w], real(wp.inf))
+        touching[w] = int(sums[wp.static(TOUCHING), w])
+        dissipated[w] = sums[wp.static(WORK), w]
+
+    return add, tell

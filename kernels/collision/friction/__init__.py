@@ -1,0 +1,1 @@
+"""Friction potentials and rotating surfaces."""

@@ -1,0 +1,1 @@
+"""Launch configuration, dof maps, island state, outcomes, prefix sums and vectorised access."""

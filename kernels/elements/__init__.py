@@ -1,0 +1,1 @@
+"""Element path: energies, gradients and factors of elements, frames and parallel transport."""

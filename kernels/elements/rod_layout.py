@@ -1,0 +1,335 @@
+"""Uncoupled rods of one kind, side by side: their layout, local dofs and element storage.
+
+Arrays run [component][node][rod]. Element k of a rod starts at its node k; edge k runs from node k to node k + 1, modulo the nodes
+of a closed rod. The *window* of an element holds its local dofs, q = [edge k, edge k + 1, theta k, theta k + 1], cut to what the rods
+have. Element forces and factors are derivatives with respect to the window; forces on nodes are differences of them.
+
+Parameters of all terms lie in one buffer. Row i of `table` is (offset, stride along the rod, stride across rods), so that one
+number, one a rod, one an element or one each are read by the same code.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.launch import until_function
+from ddg_warp.kernels.elements.element_path import ElementStorage, TermAccess
+from ddg_warp.kernels.measures.bending_second_variation import packed_index
+from ddg_warp.kernels.terms import Term
+
+
+@dataclass(frozen=True)
+class ChainKind:
+    """What a group of rods has: decides every array and kernel of the group."""
+
+    dim: int
+    twist: bool
+    closed: bool
+    terms: tuple[Term, ...]
+    serial: bool = False  # whether a thread takes all nodes of its rod; see `until_function`
+    drag: bool = False  # whether a fluid resists its motion; see `kernels.forces.drag`
+
+    @property
+    def key(self) -> tuple:
+        """By what kinds are put in order."""
+        return self.dim, self.twist, self.closed, self.drag, [term.key for term in self.terms]
+
+    @property
+    def span(self) -> int:
+        """Edges of the window."""
+        return max(term.measure.span for term in self.terms)
+
+    @property
+    def window(self) -> int:
+        """Dofs of the window."""
+        return self.dim * self.span + (2 if self.twist else 0)
+
+    @property
+    def block(self) -> int:
+        """Dofs of a node: its position and the angle of the edge that starts there."""
+        return self.dim + (1 if self.twist else 0)
+
+    @property
+    def vertex_strains(self) -> int:
+        """Factor rows that span two edges."""
+        return sum(len(term.measure.strains) for term in self.terms if term.measure.span == 2)
+
+    @property
+    def edge_strains(self) -> int:
+        """Factor rows that span one edge."""
+        return sum(len(term.measure.strains) for term in self.terms if term.measure.span == 1)
+
+    @property
+    def tensions(self) -> int:
+        """Scalars c of the geometric stiffness c I of an edge."""
+        return sum(term.measure.tensions for term in self.terms)
+
+    @property
+    def factor_rows(self) -> int:
+        """Reals of the factor of one element: vertex rows, edge rows, tensions, in this order."""
+        return self.vertex_strains * self.window + self.edge_strains * self.dim + self.tensions
+
+    @property
+    def geometric_rows(self) -> int:
+        """Reals of the geometric stiffness of a window: the upper triangle of its matrix, row by row."""
+        return self.window * (self.window + 1) // 2
+
+    @property
+    def strain_rows(self) -> int:
+        """Strains of one element, of all terms."""
+        return sum(len(term.measure.strains) for term in self.terms)
+
+    @property
+    def lagged_rows(self) -> int:
+        """Reals of the reference frame of an edge and the reference twist of its vertex."""
+        return 7 if self.twist else 0
+
+    @property
+    def viscous(self) -> bool:
+        """Whether a term reads the strains of the last step."""
+        return any(term.density.lagged for term in self.terms)
+
+    def places(self) -> list[tuple[int, int, int, int]]:
+        """Of each term: first row in the parameter table, in the factor, of its tension, and in the strains."""
+        parameter, strain = 0, 0
+        vertex, edge, tension = 0, self.vertex_strains * self.window, self.factor_rows - self.tensions
+        result = []
+        for term in self.terms:
+            rows = len(term.measure.strains)
+            if term.measure.span == 2:
+                result.append((parameter, vertex, tension, strain))
+                vertex += rows * self.window
+            else:
+                result.append((parameter, edge, tension, strain))
+                edge += rows * self.dim
+            tension += term.measure.tensions
+            parameter += len(term.parameter_names)
+            strain += rows
+        return result
+
+
+def inertia_type(kind: ChainKind, real):
+    """What a node has of inertia: its mass [kg]; with drag, a `drag_structure`."""
+    return drag_structure(kind.dim, real) if kind.drag else real
+
+
+@cache
+def drag_structure(dim: int, real):
+    """Mass of a node, and its drag over a solve of length s; one for all kinds, whose kernels Warp shares where they are alike.
+
+    That is its resistance D / s [N/m], where the fluid alone would carry it, and the resistance to the spin of the edge that starts
+    there, over s [N m].
+    """
+    V, M = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real)
+
+    @wp.struct
+    class NodeInertia:
+        mass: real
+        resistance: M
+        carried: V
+        spin: real
+
+    return NodeInertia
+
+
+@cache
+def gather_functions(kind: ChainKind, real):
+    """Device functions that read the window, its lagged data and one parameter."""
+    V = wp.types.vector(kind.dim, real)
+    W = wp.types.vector(kind.window, real)
+    S = wp.types.vector(13, real)
+    dim, span, twist, closed = kind.dim, kind.span, kind.twist, kind.closed
+
+    @wp.func
+    def along(k: int, n: int):
+        """Node k of a rod of n nodes; only a closed rod has nodes past its last."""
+        if wp.static(closed):
+            if k >= n:
+                k -= n
+        return k
+
+    @wp.func
+    def window(x: wp.array2d(dtype=V), theta: wp.array2d(dtype=real), k: int, n: int, whole: bool, r: int):
+        """Window of element k; `whole` is False at the last edge of an open rod, which has no edge ahead."""
+        q = W()
+        a = x[k, r]
+        b = x[along(k + 1, n), r]
+        for d in range(wp.static(dim)):
+            q[d] = b[d] - a[d]
+        if wp.static(twist):
+            q[wp.static(dim * span)] = theta[k, r]
+        if wp.static(span == 2):
+            if whole:
+                c = x[along(k + 2, n), r]
+                for d in range(wp.static(dim)):
+                    q[wp.static(dim) + d] = c[d] - b[d]
+                if wp.static(twist):
+                    q[wp.static(dim * span + 1)] = theta[along(k + 1, n), r]
+        return q
+
+    @wp.func
+    def lagged(frame: wp.array3d(dtype=real), k: int, n: int, whole: bool, r: int):
+        """(u, t) of both edges and the reference twist of the vertex between them."""
+        s = S()
+        if wp.static(twist):
+            if whole:
+                ahead = along(k + 1, n)
+                for c in range(6):
+                    s[c] = frame[c, k, r]
+                    s[6 + c] = frame[c, ahead, r]
+                s[12] = frame[6, k, r]
+        return s
+
+    @wp.func
+    def parameter(buffer: wp.array(dtype=real), table: wp.array2d(dtype=int), row: int, k: int, r: int):
+        return buffer[table[row, 0] + k * table[row, 1] + r * table[row, 2]]
+
+    return along, window, lagged, parameter
+
+
+@cache
+def displaced_function(kind: ChainKind, real):
+    """Build `displaced(v, k, count, whole, r)`: return the window of a displacement [component of a node][node][rod]."""
+    W = wp.types.vector(kind.window, real)
+    along_node, *_ = gather_functions(kind, real)
+    dim, span, twist = kind.dim, kind.span, kind.twist
+
+    @wp.func
+    def displaced(v: wp.array3d(dtype=real), k: int, count: int, whole: bool, r: int):
+        q = W()
+        b = along_node(k + 1, count)
+        for d in range(wp.static(dim)):
+            q[d] = v[d, b, r] - v[d, k, r]
+        if wp.static(twist):
+            q[wp.static(dim * span)] = v[wp.static(dim), k, r]
+        if wp.static(span == 2):
+            if whole:
+                c = along_node(k + 2, count)
+                for d in range(wp.static(dim)):
+                    q[wp.static(dim) + d] = v[d, c, r] - v[d, b, r]
+                if wp.static(twist):
+                    q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
+        return q
+
+    return displaced
+
+
+@cache
+def rod_elements_type(dim: int, real):
+    """Return the struct that kernels of elements read: dofs, lagged data, parameters and number of nodes of every rod."""
+    V = wp.types.vector(dim, real)
+
+    @wp.struct
+    class RodElements:
+        x: wp.array2d(dtype=V)
+        theta: wp.array2d(dtype=real)
+        frame: wp.array3d(dtype=real)
+        last: wp.array2d(dtype=real)  # strains of the last step, a column an element
+        rate: wp.array(dtype=real)
+        buffer: wp.array(dtype=real)
+        table: wp.array2d(dtype=int)
+        count: wp.array(dtype=int)
+
+    return RodElements
+
+
+@cache
+def _term_access(kind: ChainKind, index: int, real) -> TermAccess:
+    """Return the access of term `index` to the window, and to its rows among those of all terms."""
+    term, measure = kind.terms[index], kind.terms[index].measure
+    Q, S, _, _ = measure.types(real)
+    W, L, lag_size = wp.types.vector(kind.window, real), wp.types.vector(13, real), measure.lag_size
+    dofs = [*range(kind.dim * measure.span), *(kind.dim * kind.span + i for i in range(measure.angles))]
+    size, where = measure.size, wp.types.vector(measure.size, int)(*dofs)
+    second = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
+    parameter, factor, tension, strain = kind.places()[index]
+
+    @wp.func
+    def local(w: W):
+        q = Q()
+        for i in range(wp.static(size)):
+            q[i] = w[where[i]]
+        return q
+
+    @wp.func
+    def short(s: L):
+        if wp.static(lag_size > 0):
+            return s
+        else:
+            return S()
+
+    @wp.func
+    def spread(f: Q):
+        w = W()
+        for i in range(wp.static(size)):
+            w[where[i]] = f[i]
+        return w
+
+    return TermAccess(term, local, short, spread, parameter, strain, factor, tension, kind.factor_rows, second)
+
+
+@cache
+def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
+    """Return the storage of uncoupled rods: an island is a rod, and all terms share one window."""
+    Inputs, missing, closed, serial = (
+        rod_elements_type(kind.dim, real),
+        0 if kind.closed else 1,
+        kind.closed,
+        kind.serial,
+    )
+    (_, window, lagged, _), displaced = gather_functions(kind, real), displaced_function(kind, real)
+
+    @wp.func
+    def items(first: int, r: int):
+        return r, first
+
+    @wp.func
+    def count(inputs: Inputs, r: int):
+        return inputs.count[r] - wp.static(missing)
+
+    @wp.func
+    def column(inputs: Inputs, r: int, k: int):
+        """Return the column of `arrays.columns`: elements of a rod in a row on the CPU, of all rods on a GPU.
+
+        It is not below 0, as in `first_of`.
+        """
+        if wp.static(serial):
+            return wp.max(r * inputs.x.shape[0] + k, 0)
+        return wp.max(k * inputs.x.shape[1] + r, 0)
+
+    @wp.func
+    def whole(inputs: Inputs, r: int, k: int):
+        return wp.static(closed) or k < inputs.count[r] - 2
+
+    @wp.func
+    def read(inputs: Inputs, r: int, k: int, all: bool):
+        n = inputs.count[r]
+        return window(inputs.x, inputs.theta, k, n, all, r), lagged(inputs.frame, k, n, all, r)
+
+    @wp.func
+    def displacement(inputs: Inputs, w: wp.array3d(dtype=real), r: int, k: int, all: bool):
+        return displaced(w, k, inputs.count[r], all, r)
+
+    def launch_bounds(curved: bool):
+        # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200; second derivatives in
+        # float64 need more, and take a quarter less time with two
+        return 128, 2 if curved and linear == wp.float64 else 3
+
+    return ElementStorage(
+        terms=tuple(_term_access(kind, index, real) for index in range(len(kind.terms))),
+        Inputs=Inputs,
+        Window=wp.types.vector(kind.window, real),
+        Lagged=wp.types.vector(13, real),
+        items=items,
+        last_item=until_function(kind.serial),
+        count=count,
+        column=column,
+        whole=whole,
+        read=read,
+        displacement=displacement,
+        Displacements=wp.array3d(dtype=real),
+        stiffness_dofs=kind.dim,
+        clears_active=True,
+        launch_bounds=launch_bounds,
+    )

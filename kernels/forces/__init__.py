@@ -1,0 +1,1 @@
+"""Forces beside elements: drag, follower loads, control loads, prescribed motion, gyroscopic couples."""

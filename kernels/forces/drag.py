@@ -1,0 +1,320 @@
+"""Drag by resistive force theory, per length of a rod, from the local velocity v relative to the fluid,
+
+    f = -(zeta_t t t^T + zeta_n (I - t t^T)) v ,
+
+and a moment -zeta_r times the spin about the tangent t. Coefficients are constant (Gray and Hancock, J. Exp. Biol. 32, 1955), or
+depend on v as in granular media, where forces depend on the direction of v alone. With the angle psi between v and t,
+
+    f_n = C_S sin(beta) ,  f_t = C_F cos(psi) + C_L (1 - sin(beta)) ,  tan(beta) = sin(psi) / tan(gamma)
+
+(Maladen, Ding, Li and Goldman, Science 325, 2009, 314; J. R. Soc. Interface 8, 2011, 1332), where |v| is regularised as sqrt(v^2 +
+v0^2).
+
+Within a time step tangents and coefficients are constant, so that drag has a potential. A node has the resistance D, half the sum of
+its edges. The fluid alone would carry it to a = x_n + s u in a solve of length s, and the energy is (x - a) . D (x - a) / 2 s. A body
+at a node, such as a ball, adds c I to D. The potential is assembled with inertia. Angles have the same mass-like quadratic: drag and
+rotary inertia make one, about a mean target.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
+from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.residual.rod_residual import node_functions
+
+# Rows of coefficients of an edge. SLOPE is tan(gamma); SPEED is zero except in granular media. FIRST and LAST are force over velocity
+# of bodies at the first and last node [N s/m].
+TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED, FIRST, LAST = range(10)
+ROWS = 10
+
+
+@cache
+def edge_function(dim: int, real):
+    """Return the device function `half(e, v, p)`: resistance [N s/m] of half an edge, at relative velocity v."""
+    V, P = wp.types.vector(dim, real), wp.types.vector(ROWS, real)
+
+    @wp.func
+    def half(e: V, v: V, p: P):
+        length = wp.length(e)
+        t = wp.normalize(e)
+        tangential = p[wp.static(TANGENTIAL)]
+        normal = p[wp.static(NORMAL)]
+        least = p[wp.static(SPEED)]
+        if least > real(0.0):  # granular
+            along = wp.dot(v, t)
+            speed = wp.sqrt(wp.length_sq(v) + least * least)
+            slope = p[wp.static(SLOPE)]
+            sine = wp.length(v - t * along) / speed
+            root = wp.sqrt(slope * slope + sine * sine)
+            leading = (real(1.0) - sine / root) / wp.sqrt(along * along + least * least)
+            normal += p[wp.static(LATERAL)] / (root * speed)
+            tangential += wp.max(real(0.0), p[wp.static(FRICTION)] / speed + p[wp.static(LEADING)] * leading)
+        one = wp.identity(n=wp.static(dim), dtype=real)
+        return (one * normal + wp.outer(t, t) * (tangential - normal)) * (real(0.5) * length)
+
+    return half
+
+
+@cache
+def chain_kernels(kind: ChainKind, real):
+    """Build the kernels of drag on uncoupled rods.
+
+    `resist`: write inertia and drag of every node at the start of a solve.
+    `settle`: write rates of massless dofs after a solve.
+    """
+    dim, twist, closed = kind.dim, kind.twist, kind.closed
+    V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
+    Inertia = inertia_type(kind, real)
+    half = edge_function(dim, real)
+    _, previous, *_ = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+    until = until_function(kind.serial)
+
+    @wp.func
+    def of_edge(
+        x: wp.array2d(dtype=V),
+        v: wp.array2d(dtype=V),
+        coefficients: wp.array3d(dtype=real),
+        flow: V,
+        k: int,
+        n: int,
+        r: int,
+    ):
+        p = P()
+        for i in range(wp.static(ROWS)):
+            p[i] = coefficients[i, k, r]
+        end = along(k + 1, n)
+        return half(x[end, r] - x[k, r], (v[k, r] + v[end, r]) * real(0.5) - flow, p)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def resist(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        tangents: wp.array2d(dtype=V),
+        x: wp.array2d(dtype=V),
+        coefficients: wp.array3d(dtype=real),
+        flow: wp.array(dtype=V),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        inertia_out: wp.array2d(dtype=Inertia),
+        rotary_out: wp.array2d(dtype=real),
+        target_angle: wp.array2d(dtype=real),
+    ):
+        """Write inertia and drag; edges of `tangents` give the direction of the rod.
+
+        The load scale is raised to the drag on the rod if all of it moved as its fastest node.
+        """
+        start, r = wp.tid()
+        n = count[r]
+        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
+            return
+        rate = scalars[RATE, r]
+        s = real(1.0) / rate
+        u = flow[0]
+        one = wp.identity(n=wp.static(dim), dtype=real)
+        for k in range(start, until(start, n)):
+            D = M()
+            b = previous(k, n)
+            if wp.static(closed) or k < n - 1:
+                D += of_edge(tangents, v0, coefficients, u, k, n, r) + one * coefficients[wp.static(FIRST), k, r]
+            if b >= 0:
+                D += of_edge(tangents, v0, coefficients, u, b, n, r) + one * coefficients[wp.static(LAST), b, r]
+            node = Inertia()
+            node.mass = mass[k, r]
+            node.resistance = D * rate
+            node.carried = x0[k, r] + u * s
+            moved = wp.length(x[k, r] - x0[k, r]) + wp.length(u) * s
+            wp.atomic_max(scalars, LOAD_SCALE, r, real(n) * moved * wp.max(wp.get_diag(node.resistance)))
+            if wp.static(twist):
+                spin = real(0.0)
+                if wp.static(closed) or k < n - 1:
+                    end = along(k + 1, n)
+                    length = wp.length(tangents[end, r] - tangents[k, r])
+                    spin = coefficients[wp.static(ROTATIONAL), k, r] * length * rate
+                node.spin = spin
+                drag_mass = spin / scalars[COEFFICIENT, r]
+                total = rotary[k, r] + drag_mass
+                rotary_out[k, r] = total
+                if drag_mass > real(0.0):
+                    target = target_angle[k, r]
+                    target_angle[k, r] = target + (theta0[k, r] - target) * (drag_mass / total)
+            inertia_out[k, r] = node
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        x_end: wp.array2d(dtype=V),
+        theta_end: wp.array2d(dtype=real),
+        v0: wp.array2d(dtype=V),
+        omega0: wp.array2d(dtype=real),
+        v_out: wp.array2d(dtype=V),
+        omega_out: wp.array2d(dtype=real),
+        a_out: wp.array2d(dtype=V),
+        alpha_out: wp.array2d(dtype=real),
+    ):
+        """Write mean rates over the step of massless dofs, which the midpoint rule would keep oscillating.
+
+        Accelerations are changes of means over the step, zero without motion before. The midpoint rule has written v = 2 mean - v0.
+        """
+        start, r = wp.tid()
+        n = count[r]
+        if (
+            start >= n
+            or scalars[PROGRESS, r] >= real(1.0)
+            or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING)
+        ):
+            return
+        for k in range(start, until(start, n)):
+            if mass[k, r] <= real(0.0):
+                mean = (x_end[k, r] - x[k, r]) * scalars[RATE, r]
+                a = V()
+                if wp.length_sq(v0[k, r]) > real(0.0):
+                    a = (v_out[k, r] - mean) * (real(0.5) * scalars[RATE, r])
+                a_out[k, r] = a
+                v_out[k, r] = mean
+            if wp.static(twist):
+                if rotary[k, r] <= real(0.0):
+                    spin = (theta_end[k, r] - theta[k, r]) * scalars[RATE, r]
+                    alpha = real(0.0)
+                    if omega0[k, r] != real(0.0):
+                        alpha = (omega_out[k, r] - spin) * real(0.5) * scalars[RATE, r]
+                    alpha_out[k, r] = alpha
+                    omega_out[k, r] = spin
+
+    return resist, settle
+
+
+@cache
+def block_inertia(real):
+    """Return the struct of inertia and drag of a dof block: `ddg_warp.kernels.elements.rod_layout.inertia_type` with a mass per dof."""
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+
+    @wp.struct
+    class BlockInertia:
+        mass: V
+        resistance: M
+        carried: V
+
+    return BlockInertia
+
+
+@cache
+def mass_type(real, drag: bool):
+    """Return the array type of masses of dof blocks (worlds, blocks); with drag, of inertia and drag."""
+    return wp.array2d(dtype=block_inertia(real) if drag else wp.types.vector(3, real))
+
+
+@cache
+def net_kernels(real):
+    """Build the kernels of drag on the coupled system.
+
+    `resist`: write inertia and drag of every dof block at the start of a solve.
+    `settle`: write rates of massless dofs after a solve.
+    """
+    V, M, P = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(ROWS, real)
+    Inertia = block_inertia(real)
+    half = edge_function(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def resist(
+        q0: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
+        tangents: wp.array(dtype=V),
+        q: wp.array(dtype=V),
+        mass: wp.array2d(dtype=V),
+        ends: wp.array2d(dtype=int),
+        coefficients: wp.array2d(dtype=real),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        flow: wp.array(dtype=V),
+        load: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        nodes: int,
+        inertia_out: wp.array2d(dtype=Inertia),
+    ):
+        """Write inertia and drag; items of a block are the edges of its node, or the edge of its angle.
+
+        Where loads give no scale, drag does. Coefficients (rows, worlds edges) are world by world.
+        """
+        i = wp.tid()
+        w = i / blocks
+        if scalars[PROGRESS, w] >= real(1.0):
+            return
+        k = i - w * blocks
+        D = M()
+        u = V()
+        if k < nodes:
+            u = flow[0]
+        for index in range(starts[k], starts[k + 1]):
+            edge = items[index]
+            a = ends[edge, 0] + w * blocks
+            b = ends[edge, 1] + w * blocks
+            e = tangents[b] - tangents[a]
+            if k < nodes:
+                p = P()
+                for c in range(wp.static(ROWS)):
+                    p[c] = coefficients[c, edge + w * ends.shape[0]]
+                body = p[wp.static(FIRST)]
+                if b == i:
+                    body = p[wp.static(LAST)]
+                D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p) + wp.identity(n=3, dtype=real) * body
+            else:
+                D[0, 0] = coefficients[wp.static(ROTATIONAL), edge + w * ends.shape[0]] * wp.length(e)
+        rate = scalars[RATE, w]
+        block = Inertia()
+        block.mass = mass[w, k]
+        block.resistance = D * rate
+        block.carried = q0[i] + u / rate
+        inertia_out[w, k] = block
+        if k < nodes and load[w] == real(0.0):
+            moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
+            wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        q: wp.array(dtype=V),
+        inertia: wp.array2d(dtype=Inertia),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        q_end: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
+        v_out: wp.array(dtype=V),
+        a_out: wp.array(dtype=V),
+    ):
+        """Write rates of massless dofs with drag; see `chain_kernels`."""
+        i = wp.tid()
+        w = i / blocks
+        if scalars[PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+            return
+        block = inertia[w, i - w * blocks]
+        v = v_out[i]
+        mean = (q_end[i] - q[i]) * scalars[RATE, w]
+        change = (v - mean) * (real(0.5) * scalars[RATE, w])
+        moved = wp.length_sq(v0[i]) > real(0.0)
+        a = V()
+        for d in range(3):
+            if block.mass[d] <= real(0.0) and block.resistance[d, d] > real(0.0):
+                v[d] = mean[d]
+                if moved:
+                    a[d] = change[d]
+        v_out[i] = v
+        a_out[i] = a
+
+    return resist, settle

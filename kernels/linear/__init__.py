@@ -1,0 +1,1 @@
+"""Matrices, eliminations, preconditioners and conjugate gradients."""

@@ -1,0 +1,387 @@
+"""Preconditioned conjugate gradients on the coupled system, each world by itself: block Jacobi, scalars on the device.
+
+Substructuring (`elimination`) or `levels` update z after the kernels that start and advance a solve, before r . z is summed. `wanted`
+is 1 while a world iterates, 2 once it has converged, 3 if it cannot go on. Sums over blocks have a fixed order (tiles, then a tile of
+tiles).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.division import nonzero_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.linear.sliced_ell import BARRED, product_functions, settle_function
+
+TILE = 4096  # entries that one block of threads sums
+TILES = 1024  # largest number of such blocks in a world
+THREADS = 256
+
+
+@cache
+def sum_kernels(real, largest: bool = False):
+    """Build the kernels that sum rows, or find their `largest` entries.
+
+    `partial`: reduce tiles of values (worlds, n) to (worlds, tiles).
+    `total`: reduce tiles to (worlds,).
+    """
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def partial(values: wp.array2d(dtype=real), tiles_out: wp.array2d(dtype=real)):
+        w, b = wp.tid()
+        tile = wp.tile_load(values, shape=(1, wp.static(TILE)), offset=(w, b * wp.static(TILE)))
+        if wp.static(largest):
+            wp.tile_store(tiles_out[w], wp.tile_max(tile), offset=b)
+        else:
+            wp.tile_store(tiles_out[w], wp.tile_sum(tile), offset=b)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def total(tiles: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
+        w = wp.tid()
+        tile = wp.tile_load(tiles, shape=(1, wp.static(TILES)), offset=(w, 0))
+        if wp.static(largest):
+            wp.tile_store(sum_out, wp.tile_max(tile), offset=w)
+        else:
+            wp.tile_store(sum_out, wp.tile_sum(tile), offset=w)
+
+    return partial, total
+
+
+@cache
+def serial_sum_kernel(real, largest: bool = False):
+    """Build the kernel that sums rows, or finds their `largest` entries, on the CPU.
+
+    `total`: reduce values (worlds, n) to (worlds,), one thread a row.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
+        w = wp.tid()
+        s = real(0.0)
+        for i in range(values.shape[1]):
+            if wp.static(largest):
+                s = wp.max(s, values[w, i])
+            else:
+                s += values[w, i]
+        sum_out[w] = s
+
+    return total
+
+
+@cache
+def inverse_function(linear):
+    """Return the device function `inverse_of(masked, f) -> (inverse, definite)`.
+
+    The inverse is on the free dofs f of a matrix masked by f, and zero if that is not definite.
+    """
+    H, M, nonzero = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), nonzero_function(linear)
+
+    @wp.func
+    def inverse_of(masked: M, f: H):
+        m = masked + wp.diag(H(linear(1.0)) - f)
+        # scaled to a unit diagonal: a block at the end of a rod mixes stretching and bending stiffness
+        s = H()
+        for d in range(3):
+            s[d] = linear(1.0) / wp.sqrt(nonzero(wp.abs(m[d, d])))
+        scale = wp.outer(s, s)
+        m = wp.cw_mul(m, scale)
+        inverse = wp.cw_mul(wp.cw_mul(wp.inverse(m), scale), wp.outer(f, f))
+        minor = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        definite = m[0, 0] > linear(0.0) and m[1, 1] > linear(0.0) and m[2, 2] > linear(0.0)
+        definite = definite and minor > linear(0.0) and wp.determinant(m) > linear(0.0)
+        if not (definite and wp.isfinite(wp.trace(inverse))):
+            return M(), False
+        return inverse, True
+
+    return inverse_of
+
+
+@cache
+def solver_kernels(linear, indefinite: bool = False):
+    """Build the kernels of a solve, in the order of use.
+
+    `invert`: invert diagonal blocks.
+    `start`: set up residual, solution and search direction.
+    `begin`: store the first r . z of each world.
+    `product`: compute H p and p . H p.
+    `advance`: step along p and precondition the new residual.
+    `turn`: update the search direction.
+    `test`: test convergence of each world.
+
+    If `indefinite`, H may be indefinite, with a definite preconditioner. Iterates are then the conjugate-gradient points of Paige and
+    Saunders (SIAM J. Numer. Anal. 12, 1975, 617), which exist unless a curvature is zero.
+    """
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    _, free = product_functions(linear)
+    settle = settle_function(linear)
+    inverse_of, nonzero = inverse_function(linear), nonzero_function(linear)
+    eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
+
+    @wp.func
+    def ends(curvature: linear, rho: linear):
+        """Return True if the curvature is negative or lost in rounding.
+
+        The solve then ends with the solution so far, or with a step of steepest descent.
+        """
+        if wp.static(indefinite):
+            return not wp.abs(curvature) > eps * rho * linear(1.0e-6)
+        else:
+            return not curvature > eps * rho * linear(1.0e-6)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def invert(
+        matrix: wp.array2d(dtype=linear),
+        diagonal: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        more: wp.array(dtype=M),
+        inverse_out: wp.array(dtype=M),
+    ):
+        """Write inverses of the diagonal blocks of H on free dofs, at positions `diagonal`; `more` is added to blocks if not empty."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 0:
+            return
+        k = i - w * blocks
+        if diagonal[k] < 0:  # eliminated with a rod path; stays zero
+            return
+        if barred[i] == BARRED:
+            inverse_out[i] = M()
+            return
+        p = diagonal[k] + w * positions
+        f = free(barred[i])
+        m = M()
+        for r in range(3):
+            for c in range(3):
+                m[r, c] = matrix[3 * r + c, p]
+        if more.shape[0] > 0:
+            m += more[i]
+        inverse, definite = inverse_of(wp.cw_mul(m, wp.outer(f, f)), f)
+        if not definite:
+            for d in range(3):
+                inverse[d, d] = f[d] / nonzero(wp.abs(m[d, d]))
+        inverse_out[i] = inverse
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def start(
+        right: wp.array(dtype=H),
+        inverse: wp.array(dtype=M),
+        diagonal: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        scale: linear,
+        residual_out: wp.array(dtype=H),
+        solution_out: wp.array(dtype=H),
+        p_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 0:
+            return
+        k = i - w * blocks
+        r, z = H(), H()
+        if barred[i] != BARRED:
+            r = scale * right[i]
+            if diagonal[k] >= 0:
+                z = inverse[i] * r
+        residual_out[i] = r
+        solution_out[i] = H()
+        p_out[i] = z
+        dots_out[w, k] = wp.dot(r, z)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def begin(
+        total: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        rho_out: wp.array(dtype=linear),
+        first_out: wp.array(dtype=linear),
+        iterations_out: wp.array(dtype=int),
+        negative_out: wp.array(dtype=int),
+        busy_out: wp.array(dtype=int),
+    ):
+        w = wp.tid()
+        if wanted[w] == 0:
+            return
+        negative_out[w] = 0
+        rho_out[w] = total[w]
+        first_out[w] = total[w]
+        iterations_out[w] = 0
+        if total[w] > linear(0.0) and wp.isfinite(total[w]):
+            busy_out[0] = 1
+        else:  # the preconditioner is not definite in this precision: no direction
+            wanted[w] = 3
+            negative_out[w] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def product(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        product_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """Write H p on active dofs, and p . H p by block."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] != 1:
+            return
+        settle(matrix, columns, slices, barred, p, blocks, positions, i - w * blocks, w, H(), product_out, dots_out)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def advance(
+        p: wp.array(dtype=H),
+        product: wp.array(dtype=H),
+        inverse: wp.array(dtype=M),
+        diagonal: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
+        rho: wp.array(dtype=linear),
+        curvature: wp.array(dtype=linear),
+        iterations: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        unit: linear,
+        solution: wp.array(dtype=H),
+        residual: wp.array(dtype=H),
+        z_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+        busy_out: wp.array(dtype=int),
+    ):
+        """Step along p; write the new residual, z and r . z by block. `test` raises `busy_out` afterwards."""
+        i = wp.tid()
+        w = i / blocks
+        if i == 0:
+            busy_out[0] = 0
+        if wanted[w] != 1 or barred[i] == BARRED:
+            return
+        k = i - w * blocks
+        if ends(curvature[w], rho[w]):
+            if iterations[w] == 0:
+                solution[i] = unit * p[i]
+            return
+        alpha = rho[w] / curvature[w]
+        solution[i] = solution[i] + (unit * alpha) * p[i]
+        r = residual[i] - alpha * product[i]
+        residual[i] = r
+        if diagonal[k] >= 0:  # rod paths write the others
+            z = inverse[i] * r
+            z_out[i] = z
+            dots_out[w, k] = wp.dot(r, z)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def turn(
+        z: wp.array(dtype=H),
+        total: wp.array(dtype=linear),
+        rho: wp.array(dtype=linear),
+        barred: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        p: wp.array(dtype=H),
+    ):
+        """Write the next search direction."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 1 and barred[i] != BARRED:
+            p[i] = z[i] + (total[w] / rho[w]) * p[i]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def test(
+        total: wp.array(dtype=linear),
+        curvature: wp.array(dtype=linear),
+        first: wp.array(dtype=linear),
+        forcing: wp.array(dtype=linear),
+        limit: int,
+        rho: wp.array(dtype=linear),
+        iterations: wp.array(dtype=int),
+        negative: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        busy_out: wp.array(dtype=int),
+    ):
+        """Test convergence of a world by the residual in the norm of the preconditioner.
+
+        `negative` marks negative curvature, and an indefinite preconditioner, for which that norm is negative or not finite.
+        """
+        w = wp.tid()
+        if wanted[w] != 1:
+            return
+        iterations[w] = iterations[w] + 1
+        enough = forcing[w] * forcing[w] * first[w]
+        definite = total[w] >= -enough  # up to rounding
+        if not (curvature[w] > linear(0.0) and definite):
+            negative[w] = 1
+        lost = ends(curvature[w], rho[w]) or not definite
+        rho[w] = total[w]
+        if lost or iterations[w] >= limit:
+            wanted[w] = 3
+        elif total[w] > enough:
+            busy_out[0] = 1
+        else:
+            wanted[w] = 2
+
+    return invert, start, begin, product, advance, turn, test
+
+
+@cache
+def confirm_kernels(real, linear):
+    """Build the kernels that check a solution by dof block.
+
+    `compare`: write the ratio of residual to allowed residual.
+    `confirm`: continue worlds with too large a ratio.
+    """
+    H = wp.types.vector(3, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def compare(
+        residual: wp.array(dtype=H),
+        allowed: wp.array(dtype=real),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        unit: linear,
+        residual_out: wp.array(dtype=H),
+        ratio_out: wp.array2d(dtype=real),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 2:
+            r = unit * residual[i]
+            residual_out[i] = r
+            ratio_out[w, i - w * blocks] = real(wp.max(wp.abs(r))) / allowed[i]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def confirm(
+        worst: wp.array(dtype=real),
+        goal: wp.array(dtype=real),
+        number: wp.array(dtype=int),
+        most: int,
+        farthest: real,
+        limit: wp.array(dtype=real),
+        forcing: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        busy_out: wp.array(dtype=int),
+    ):
+        """Continue worlds with a largest ratio above `goal`, with a forcing term smaller by the same factor.
+
+        Relaxed convergence: `most` bodies may exceed the goal by a factor of `farthest`; `number` counts ratios above the goal.
+        """
+        w = wp.tid()
+        if wanted[w] != 2 or worst[w] <= goal[w] or real(forcing[w]) <= limit[w]:
+            return
+        least = real(0.1)
+        if most > 0:
+            if number[w] <= most and worst[w] <= farthest * goal[w]:
+                return
+            least = real(0.5)
+        factor = wp.clamp(goal[w] / worst[w], least, real(0.8))
+        forcing[w] = linear(wp.max(factor * real(forcing[w]), limit[w]))
+        wanted[w] = 1
+        busy_out[0] = 1
+
+    return compare, confirm

@@ -1,1 +1,0 @@
-"""Hessians as blocks: bands of rods, slices of the coupled system."""

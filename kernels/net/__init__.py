@@ -1,1 +1,0 @@
-"""Kernels of the coupled system: elements on shared dof blocks, gathered by index, and its matrix."""

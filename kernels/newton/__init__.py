@@ -1,0 +1,1 @@
+"""Newton iterations: line search, edge rotations, sleeping islands, relaxed convergence."""

@@ -1,0 +1,442 @@
+"""Contact in Newton's method of the coupled system: energy in the line search, step fractions, and obstructed supports."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import (
+    ACTIVE,
+    CLAMPED,
+    CUT,
+    DECREMENT,
+    DETOURS,
+    DRIVEN,
+    HALVINGS,
+    ITERATION,
+    MOVED,
+    PORTION,
+    PROGRESS,
+    RETRIES,
+    SLOT,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+    WANTED,
+)
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.linear.sliced_ell import product_functions
+from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY, THERE
+from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, STRAIGHT
+
+WHOLE, UNITS, NONE = 1, 0, -1  # modes of a world's motion: one fraction, one per CCD body, no motion
+UNBRACED = 2  # retries, until the step is halved, after which inertia stiffens contact at its minimum gap
+UNTRIED = 2  # iterates without the exact matrix after one in which it was indefinite
+
+
+@cache
+def world_kernels(real):
+    """Build the kernels with one thread per world.
+
+    `account`: add the contact energy to the change since the accepted iterate.
+    `modes`, `predicted`: choose the motion mode of an update or a predictor.
+    `depart`: advance the state of moving supports.
+    `expect`: correct the predicted decrease of a limited update.
+    `refuse`: reject substeps with crossings.
+    `curve`: choose the exact or the projected matrix.
+    `again`: continue converged worlds with updated friction.
+    `short`: mark worlds with a limited predictor.
+    `less`: correct the fraction of a motion that was shortened before CCD.
+    `brace`: set the rate of inertia in contact stiffness.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def account(
+        energy: wp.array(dtype=real),
+        gap: wp.array(dtype=real),
+        least: real,
+        overflow: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        kept: wp.array2d(dtype=real),
+        change: wp.array(dtype=real),
+        noise: wp.array(dtype=real),
+    ):
+        """Add contact energy to the change since the accepted iterate, and to the rounding.
+
+        A world with a gap below `least` [m] stops, and shorter steps are tried. All stop if pairs overflowed, as the step is repeated.
+        """
+        w = wp.tid()
+        if flags[STATUS, w] == 0 and (gap[w] < least or overflow[0] != 0):
+            flags[STATUS, w] = wp.static(outcome.NO_ROOM)
+        if flags[STATUS, w] == 0:
+            accepted = flags[SLOT, w]
+            kept[1 - accepted, w] = energy[w]
+            change[w] = change[w] + energy[w] - kept[accepted, w]
+            noise[w] = noise[w] + wp.abs(energy[w])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
+        """Choose modes: one fraction for updates that the line search has shortened, so that short ones descend. Reset `longest`."""
+        w = wp.tid()
+        longest_out[w] = real(0.0)
+        modes_out[w] = wp.static(NONE)
+        if flags[TODO, w] == wp.static(PLACE) or flags[TODO, w] == wp.static(STRAIGHT):
+            modes_out[w] = wp.where(flags[HALVINGS, w] > 0, int(wp.static(WHOLE)), int(wp.static(UNITS)))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
+        """Choose modes of predictors, in worlds that take the step."""
+        w = wp.tid()
+        longest_out[w] = real(0.0)
+        modes_out[w] = wp.where(flags[MOVED, w] != 0, int(wp.static(UNITS)), int(wp.static(NONE)))
+        flags[DRIVEN, w] = 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def depart(modes: wp.array(dtype=int), flags: wp.array2d(dtype=int)):
+        w = wp.tid()
+        if modes[w] != wp.static(NONE):
+            flags[DRIVEN, w] = wp.where(flags[DRIVEN, w] == wp.static(ON_THE_WAY), int(wp.static(THERE)), int(0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def expect(
+        modes: wp.array(dtype=int),
+        time: wp.array(dtype=real),
+        decrease: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        stalled: wp.array(dtype=int),
+        projected: wp.array(dtype=int),
+    ):
+        """Set the predicted decrease of a limited update, over its length, and keep the world from counting as stalled.
+
+        If the matrix was indefinite and the step is shortened, the exact matrix is of no use yet. The next iterate is projected at
+        once, and does not count as a projected iteration (`kernels.core.islands.patience_function`). Nor is the exact matrix tried in
+        the next few iterates: some of many bodies are always where it is indefinite, and each trial is a full solve.
+        """
+        w = wp.tid()
+        length = scalars[STEP_LENGTH, w]
+        moves = modes[w] != wp.static(NONE)
+        cut = moves and time[w] < real(1.0)
+        if moves:
+            flags[CUT, w] = int(cut)
+        short = cut or (moves and flags[HALVINGS, w] > 0)
+        if projected[w] > 0 and flags[CLAMPED, w] == 0 and (short or (moves and projected[w] <= wp.static(UNTRIED))):
+            flags[CLAMPED, w] = 1
+            if short:
+                flags[DETOURS, w] = flags[DETOURS, w] - 1
+        cut = cut and length > real(0.0)
+        if cut:
+            scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
+        if cut or flags[DRIVEN, w] != 0:
+            stalled[w] = 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def refuse(
+        crossed: wp.array(dtype=int),
+        gap: wp.array(dtype=real),
+        overflow: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        total: wp.array(dtype=wp.int64),
+        least: wp.array(dtype=real),
+    ):
+        """Reject substeps with crossing pairs; note the smallest gap of others.
+
+        If pairs overflowed, the step ends, as it will be repeated from its start.
+        """
+        w = wp.tid()
+        if overflow[0] != 0:
+            scalars[PROGRESS, w] = real(1.0)
+            return
+        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            if crossed[w] > 0:
+                flags[STATUS, w] = wp.static(outcome.CROSSED)
+                wp.atomic_add(total, 0, wp.int64(crossed[w]))
+            else:
+                wp.atomic_min(least, 0, gap[w])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def curve(
+        flags: wp.array2d(dtype=int), first_exact: int, curved: wp.array(dtype=int), projected: wp.array(dtype=int)
+    ):
+        """Mark worlds with geometric stiffness of pairs in the matrix; count consecutive projected iterates."""
+        w = wp.tid()
+        if flags[WANTED, w] != 0:
+            projected[w] = wp.where(flags[CLAMPED, w] != 0, projected[w] + 1, int(0))
+        curved[w] = wp.where(
+            flags[WANTED, w] != 0 and flags[ITERATION, w] > first_exact and flags[CLAMPED, w] == 0, 1, 0
+        )
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def again(flags: wp.array2d(dtype=int)):
+        """Continue worlds that have converged, with updated friction; the next iterate is accepted."""
+        w = wp.tid()
+        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            flags[STATUS, w] = 0
+            flags[HALVINGS, w] = 0
+            flags[DRIVEN, w] = wp.static(THERE)
+            flags[ACTIVE, 0] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
+        """Mark worlds with a predictor limited by CCD as moving."""
+        w = wp.tid()
+        if modes[w] != wp.static(NONE):
+            flags[CUT, w] = int(time[w] < real(1.0))
+            if flags[CUT, w] != 0:
+                flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def less(modes: wp.array(dtype=int), longest: wp.array(dtype=real), most: real, time: wp.array(dtype=real)):
+        """Correct the fraction of a motion that was shortened to `most` [m] before CCD."""
+        w = wp.tid()
+        if modes[w] == wp.static(WHOLE) and longest[w] > most:
+            time[w] = time[w] * (most / longest[w])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def brace(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        dt: wp.array(dtype=real),
+        braced: wp.array(dtype=int),
+        rate: wp.array(dtype=real),
+    ):
+        """Write the rate of inertia in contact stiffness of the next substep, 0 until the minimum gap was reached."""
+        w = wp.tid()
+        if scalars[PROGRESS, w] >= real(1.0):
+            return
+        if scalars[PROGRESS, w] == real(0.0) and flags[RETRIES, w] == 0:
+            braced[w] = 0
+        elif flags[RETRIES, w] >= wp.static(UNBRACED) and flags[STATUS, w] == wp.static(outcome.NO_ROOM):
+            braced[w] = 1
+        rate[w] = wp.where(braced[w] != 0, real(1.0) / (dt[w] * scalars[PORTION, w]), real(0.0))
+
+    return account, modes, predicted, depart, expect, refuse, curve, again, short, less, brace
+
+
+@cache
+def block_kernels(real, linear, serial: bool):
+    """Build the kernels over dof blocks.
+
+    `gain`: write the predicted decrease of a motion.
+    `lessen`: subtract a product from the residual.
+    `aim`: store the prescribed positions of supports.
+    `push`: write the remaining motion of supports into the direction.
+    `land`: put supports at the end of a full step.
+    `arrive`: put supports at prescribed positions, or mark the world as moving.
+    `stay`: write starts and proposed ends of motions; choose one fraction for long ones.
+    `near`: shorten long motions.
+    `part`: discard proposed motions that have ended.
+    `way`: write the remainder of a proposed motion.
+    `add`: add that remainder to the direction.
+    `keep`: store the solution.
+    """
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    _, free = product_functions(linear)
+    first_item, until = share_function(serial), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gain(
+        right: wp.array(dtype=H),
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        modes: wp.array(dtype=int),
+        blocks: int,
+        dots_out: wp.array2d(dtype=real),
+    ):
+        """Write r . (q - base), summed over the blocks of a thread."""
+        w, start = first_item(wp.tid(), blocks)
+        if modes[w] == wp.static(NONE):
+            return
+        total = real(0.0)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            r = right[i]
+            total += wp.dot(V(real(r[0]), real(r[1]), real(r[2])), q[i] - base[i])
+        dots_out[w, start] = total
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def lessen(
+        product: wp.array(dtype=H),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        right: wp.array(dtype=H),
+    ):
+        """Subtract a product from the residual on free dofs of worlds that need a direction."""
+        w, start = first_item(wp.tid(), blocks)
+        if wanted[w] != 0:
+            for k in range(start, until(start, blocks)):
+                i = k + w * blocks
+                right[i] = right[i] - wp.cw_mul(product[i], free(fixed[k]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
+        i, w = wp.tid()
+        aims_out[i, w] = q[nodes[i] + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def push(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        q: wp.array(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        direction: wp.array(dtype=H),
+    ):
+        """Write the remaining motion of supports, to prescribed positions, into the direction."""
+        i, w = wp.tid()
+        if wanted[w] == 0:
+            return
+        k = nodes[i]
+        d = aims[i, w] - q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                direction[k + w * blocks][c] = linear(d[c])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def land(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        modes: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """Set supports to prescribed positions after a full step, without the rounding of directions."""
+        i, w = wp.tid()
+        if modes[w] == wp.static(NONE) or flags[DRIVEN, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
+            return
+        k = nodes[i]
+        x = q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                x[c] = aims[i, w][c]
+        q[k + w * blocks] = x
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def arrive(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        modes: wp.array(dtype=int),
+        eps: real,
+        blocks: int,
+        q: wp.array(dtype=V),
+        flags: wp.array2d(dtype=int),
+    ):
+        """Set supports to prescribed positions if only rounding is missing; else mark the world as moving."""
+        i, w = wp.tid()
+        if modes[w] == wp.static(NONE):
+            return
+        k = nodes[i]
+        x = q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                goal = aims[i, w][c]
+                if wp.abs(goal - x[c]) <= eps * (wp.abs(goal) + wp.abs(x[c])):
+                    x[c] = goal
+                else:
+                    flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+        q[k + w * blocks] = x
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def stay(
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        unit: wp.array(dtype=int),
+        nodes: int,
+        far: real,
+        blocks: int,
+        start_out: wp.array(dtype=V),
+        modes: wp.array(dtype=int),
+        proposed: wp.array(dtype=V),
+        longest: wp.array(dtype=real),
+    ):
+        """Write the start of motions and proposed ends; motionless worlds start from `q`.
+
+        Worlds in which a node moves by more than `far` [m] take one fraction; `longest` [m] is the longest displacement of a node.
+        """
+        w, start = first_item(wp.tid(), blocks)
+        still = modes[w] == wp.static(NONE)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            start_out[i] = base[i]
+            if still:
+                start_out[i] = q[i]
+            else:
+                proposed[i] = q[i]
+                if k < nodes and unit[k] >= 0:
+                    square = wp.length_sq(q[i] - base[i])
+                    if square > far * far:
+                        modes[w] = wp.static(WHOLE)
+                        wp.atomic_max(longest, w, wp.sqrt(square))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def near(
+        base: wp.array(dtype=V),
+        unit: wp.array(dtype=int),
+        modes: wp.array(dtype=int),
+        longest: wp.array(dtype=real),
+        most: real,
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """Shorten motions by one fraction so that no node moves by more than `most` [m]."""
+        w, start = first_item(wp.tid(), blocks)
+        if modes[w] == wp.static(WHOLE) and longest[w] > most:
+            for k in range(start, until(start, blocks)):
+                if unit[k] >= 0:
+                    i = k + w * blocks
+                    q[i] = base[i] + (most / longest[w]) * (q[i] - base[i])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def part(
+        q: wp.array(dtype=V),
+        flags: wp.array2d(dtype=int),
+        blocks: int,
+        proposed: wp.array(dtype=V),
+        going: wp.array(dtype=int),
+    ):
+        """Discard proposed motions of worlds with arrived supports or updated frames."""
+        w, start = first_item(wp.tid(), blocks)
+        along = flags[DRIVEN, w] == wp.static(ON_THE_WAY)
+        if along and flags[STATUS, w] == 0:
+            going[0] = 1
+        if not along or flags[TODO, w] == wp.static(RELAG):
+            for k in range(start, until(start, blocks)):
+                proposed[k + w * blocks] = q[k + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def way(
+        q: wp.array(dtype=V),
+        proposed: wp.array(dtype=V),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        remainder_out: wp.array(dtype=H),
+    ):
+        w, start = first_item(wp.tid(), blocks)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            d = proposed[i] - q[i]
+            remainder_out[i] = wp.where(wanted[w] != 0, H(linear(d[0]), linear(d[1]), linear(d[2])), H())
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def add(remainder: wp.array(dtype=H), wanted: wp.array(dtype=int), blocks: int, direction: wp.array(dtype=H)):
+        w, start = first_item(wp.tid(), blocks)
+        if wanted[w] != 0:
+            for k in range(start, until(start, blocks)):
+                direction[k + w * blocks] += remainder[k + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def keep(q: wp.array(dtype=V), moved: wp.array(dtype=int), blocks: int, out: wp.array(dtype=V)):
+        """Store positions of worlds that are solved; other entries keep their last solution."""
+        w, start = first_item(wp.tid(), blocks)
+        if moved[w] != 0:
+            for k in range(start, until(start, blocks)):
+                out[k + w * blocks] = q[k + w * blocks]
+
+    return gain, lessen, aim, push, land, arrive, stay, near, part, way, add, keep

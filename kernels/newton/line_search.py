@@ -1,0 +1,230 @@
+"""Armijo line search and convergence test of a rod, from sums over its nodes.
+
+A rod stops where it has converged. Otherwise its iterate is accepted, or the step is shortened, by Armijo's rule (c = 1e-4) on the
+energy. If the predicted decrease is below the rounding floor, a residual that has not grown much is accepted.
+
+In float32 the rounding floor of a residual may be much of the load itself, and far above actual rounding errors. A residual above
+`ROUNDED` of the load scale but within the floor ends a solve if the last Newton step was small. It has moved the node by less than
+`SETTLED` of the length of the rod, or rotated the edge by less than `SETTLED`. Otherwise `POLISHES` more iterations follow, and
+such solves are reported, see `Integrator`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import (
+    ACTIVE,
+    DECREMENT,
+    DOUBTED,
+    DOUBTFUL,
+    DRIVEN,
+    DROWNED,
+    HALVINGS,
+    ITERATION,
+    LOAD_SCALE,
+    MERIT,
+    POLISHED,
+    RESIDUAL,
+    SLOT,
+    STALE,
+    STATUS,
+    STEP_LENGTH,
+    UNBALANCED,
+    WANTED,
+)
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, search_functions, shorter_function
+
+STOP, DIRECT = 0, 3  # actions in addition to `PLACE` and `RELAG`: none, and compute a direction
+ROUNDED, SETTLED, POLISHES = 1e-4, 1e-5, 10
+
+
+@cache
+def rests_function(real):
+    """Return the device function `rests(flags, i)`: True if island i has converged, by the flags of its iterate."""
+
+    @wp.func
+    def rests(flags: wp.array2d(dtype=int), i: int):
+        if flags[UNBALANCED, i] != 0:
+            return False
+        if flags[DROWNED, i] == 0:
+            return True
+        # The rounding floor counts only after an iteration: in a coarse precision the predictor's residual may be all of the load.
+        if flags[ITERATION, i] == 0:
+            return False
+        if wp.static(real is wp.float32):
+            return flags[DOUBTFUL, i] == 0 or (
+                flags[POLISHED, i] != 0 and flags[ITERATION, i] >= flags[POLISHED, i] + wp.static(POLISHES)
+            )
+        else:
+            return True
+
+    return rests
+
+
+@cache
+def judge_functions(twist: bool, real, driven: bool = False):
+    """Return the device functions `balanced` and `decide` of a rod.
+
+    `balanced(...)`: True if the rod has stopped.
+    `decide(...)`: next action of an active rod (`STOP`, `PLACE`, `RELAG` or `DIRECT`).
+
+    `driven`: supports may have moved in the last step, which does work unknown to the line search.
+    """
+    shorter, rests = shorter_function(real), rests_function(real)
+
+    @wp.func
+    def balanced(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), r: int):
+        """Return True if the rod has stopped, now or before; otherwise reset its flags."""
+        if flags[STATUS, r] != 0:
+            return True
+        if rests(flags, r):
+            flags[STATUS, r] = wp.where(
+                flags[DROWNED, r] == 0,
+                int(wp.static(outcome.CONVERGED)),
+                int(wp.static(outcome.CONVERGED_TO_ROUNDING)),
+            )
+            if wp.static(real is wp.float32):
+                if flags[DROWNED, r] != 0 and flags[DOUBTFUL, r] != 0 and flags[POLISHED, r] > 0:
+                    flags[DOUBTED, r] = 1
+            return True
+        if wp.static(real is wp.float32):
+            if flags[UNBALANCED, r] == 0 and flags[POLISHED, r] == 0:
+                flags[POLISHED, r] = flags[ITERATION, r]
+                if flags[ITERATION, r] == 0 and scalars[LOAD_SCALE, r] == real(0.0):  # only rounding moves it
+                    flags[POLISHED, r] = -wp.static(POLISHES)
+            flags[DOUBTFUL, r] = 0
+        flags[UNBALANCED, r] = 0
+        flags[DROWNED, r] = 0
+        return False
+
+    @wp.func
+    def decide(
+        change: real,
+        rounding: real,
+        square: real,
+        worst: real,
+        max_iterations: int,
+        max_halvings: int,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        r: int,
+    ):
+        """Return the action, from change and rounding of the energy, square and largest component of the residual.
+
+        `PLACE` leaves the shorter step in `step_length`. `RELAG` requests a frame update and a step of zero length.
+        """
+        first = flags[ITERATION, r] == 0
+        scalars[RESIDUAL, r] = worst
+        total = change
+        if first:
+            total = real(0.0)
+            if scalars[LOAD_SCALE, r] == real(0.0):
+                scalars[LOAD_SCALE, r] = worst
+        finite = wp.isfinite(square) and wp.isfinite(total)
+        if first and not finite:
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
+            return wp.static(STOP)
+        taken = scalars[STEP_LENGTH, r]
+        expected = taken * scalars[DECREMENT, r]
+        accept = first
+        if not first and finite:
+            if expected > real(10.0) * rounding:
+                accept = total <= real(-1.0e-4) * expected + rounding
+            else:
+                accept = square <= real(4.0) * scalars[MERIT, r] or taken == real(0.0)
+            if wp.static(driven):
+                accept = accept or flags[DRIVEN, r] != 0
+        if not accept:
+            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
+            if flags[HALVINGS, r] > max_halvings:
+                flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
+                return wp.static(STOP)
+            scalars[STEP_LENGTH, r] = shorter(taken, expected, total, finite)
+            return wp.static(PLACE)
+        flags[ITERATION, r] = flags[ITERATION, r] + 1
+        if flags[ITERATION, r] > max_iterations:
+            flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
+            return wp.static(STOP)
+        scalars[MERIT, r] = square
+        flags[SLOT, r] = 1 - flags[SLOT, r]
+        flags[HALVINGS, r] = 0
+        if wp.static(twist):
+            if flags[STALE, r] != 0:
+                # Twist angles change meaning: take no step, and compute a direction in the updated frames.
+                flags[STALE, r] = 0
+                scalars[DECREMENT, r] = real(1.0e30)
+                scalars[STEP_LENGTH, r] = real(0.0)
+                return wp.static(RELAG)
+        return wp.static(DIRECT)
+
+    return balanced, decide
+
+
+@cache
+def judge_kernel(kind: ChainKind, real, linear):
+    """Build the kernel of the line search.
+
+    `judge`: sum over a rod's nodes, decide, and write a shortened step or updated frames, one thread a rod.
+    """
+    V = wp.types.vector(kind.dim, real)
+    place, turn_angles, relag, _ = search_functions(kind, real, linear)
+    balanced, decide = judge_functions(kind.twist, real)
+    twist, nb = kind.twist, kind.block
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def judge(
+        residual: wp.array3d(dtype=linear),
+        change: wp.array2d(dtype=real),
+        noise: wp.array2d(dtype=linear),
+        count: wp.array(dtype=int),
+        floor: real,
+        max_iterations: int,
+        max_halvings: int,
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
+        base: wp.array2d(dtype=V),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+    ):
+        r = wp.tid()
+        flags[WANTED, r] = 0
+        if balanced(flags, scalars, r):
+            return
+        n = count[r]
+        total = real(0.0)
+        rounding = real(0.0)
+        square = real(0.0)
+        worst = real(0.0)
+        for k in range(n):
+            total += change[k, r]
+            rounding += real(noise[k, r])
+            for d in range(wp.static(nb)):
+                size = wp.abs(real(residual[d, k, r]))
+                worst = wp.max(worst, size)
+                square += size * size
+        taken = scalars[STEP_LENGTH, r]
+        action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
+        if action == wp.static(STOP):
+            return
+        flags[ACTIVE, 0] = 1
+        if action == wp.static(PLACE):
+            shortened = scalars[STEP_LENGTH, r]
+            place(x, base, base, direction, fixed, anchor, shortened, 0, n, r)
+            turn_angles(theta, direction, shortened - taken, n, r)
+        if wp.static(twist):
+            if action == wp.static(RELAG):
+                relag(x, frame, n, r)
+                for k in range(n):
+                    base[k, r] = x[k, r]
+        if action == wp.static(DIRECT):
+            flags[WANTED, r] = 1
+
+    return judge

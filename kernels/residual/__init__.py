@@ -1,0 +1,1 @@
+"""Residuals at dofs, load scales and subset sums."""

@@ -1,0 +1,165 @@
+"""Elements along the rods of a net at the places of its chains: their forces on nodes and angles, and whether these balance.
+
+A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.islands import COEFFICIENT, LOAD_SCALE, SLOT, STATUS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, until_function
+from ddg_warp.kernels.elements.coupled_element import part_function
+from ddg_warp.kernels.residual.coupled_residual import found_type, given_type, largest_function, residual_functions
+from ddg_warp.kernels.terms import Term
+
+
+@cache
+def along_type(real, linear):
+    """What a set along rods writes, of the local dofs; and its elements at each place.
+
+    Entry (i, k, c) of `at` is the element whose node i is at that place, -1 for none.
+    """
+
+    @wp.struct
+    class Along:
+        gradient: wp.array2d(dtype=real)
+        energy: wp.array2d(dtype=real)
+        stiffness: wp.array(dtype=linear)
+        factor: wp.array2d(dtype=linear)
+        tension: wp.array2d(dtype=linear)
+        second: wp.array2d(dtype=linear)
+        at: wp.array3d(dtype=int)
+        elements: int
+
+    return Along
+
+
+@cache
+def force_function(terms: tuple[Term, ...], real, linear):
+    """collect(sets, k, c, w, accepted) of the last of the terms, and by calling itself of those before: what meets at a place.
+
+    Returns forces on its node, their sizes and stiffnesses, the same of the angle ahead, the change of the energy of the elements that
+    begin there, and the size of that.
+    """
+    measure, first, which = terms[-1].measure, len(terms) == 1, len(terms) - 1
+    V, Along = wp.types.vector(3, real), along_type(real, linear)
+    nodes, angles = measure.nodes, measure.angles
+    part, largest = part_function(measure, real), largest_function(real)
+    before = None if first else force_function(terms[:-1], real, linear)
+
+    @wp.func
+    def collect(
+        sets: wp.array(dtype=Along),
+        k: int,
+        c: int,
+        w: int,
+        accepted: int,
+    ):
+        own = sets[wp.static(which)]
+        force = V()
+        size = real(0.0)
+        stiff = real(0.0)
+        moment = real(0.0)
+        size_too = real(0.0)
+        stiff_too = real(0.0)
+        change = real(0.0)
+        noise = real(0.0)
+        if wp.static(not first):
+            force, size, stiff, moment, size_too, stiff_too, change, noise = before(sets, k, c, w, accepted)
+        for i in range(wp.static(nodes)):
+            e = own.at[i, k, c]
+            if e >= 0:
+                e += first_of(w, own.elements)
+                f = part(own.gradient, 0, i, e)
+                stiffness = real(own.stiffness[e])
+                force += f
+                size += largest(f)
+                stiff += stiffness
+                if i == 0:
+                    new = own.energy[1 - accepted, e]
+                    change += new - own.energy[accepted, e]
+                    noise += wp.abs(new)
+                if wp.static(angles > 0):
+                    if i < wp.static(angles):
+                        m = own.gradient[wp.static(measure.size - angles) + i, e]
+                        moment += m
+                        size_too += wp.abs(m)
+                        stiff_too += stiffness
+        return force, size, stiff, moment, size_too, stiff_too, change, noise
+
+    return collect
+
+
+@cache
+def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, contact: bool, serial: bool):
+    """balance(...) of the nodes and angles of places, but for those `elsewhere`; see `kernels.linear.sliced_ell`."""
+    Along, Given, Found = along_type(real, linear), given_type(real, drag), found_type(real, linear)
+    M, until = wp.types.vector(1, real), until_function(serial)
+    outer, settle = residual_functions(real, linear, drag, contact)
+    outer_of_angle, settle_angle = residual_functions(real, linear, drag, contact, True)
+    collect = force_function(terms, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def balance(
+        given: Given,
+        places: wp.array3d(dtype=int),
+        count: wp.array(dtype=int),
+        elsewhere: wp.array(dtype=wp.uint8),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        sets: wp.array(dtype=Along),
+        found: Found,
+    ):
+        start, r = wp.tid()
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if flags[STATUS, w] != 0 or start >= count[c]:
+            return
+        load_scale = scalars[LOAD_SCALE, w]
+        coefficient = scalars[COEFFICIENT, w]
+        accepted = flags[SLOT, w]
+        shift = first_of(w, given.blocks)
+        for k in range(start, until(start, count[c])):
+            f, size, stiff, moment, size_too, stiff_too, change, noise = collect(sets, k, c, w, accepted)
+            node = places[0, k, c]
+            if node >= 0:
+                if elsewhere[node] == wp.uint8(0):
+                    i = node + shift
+                    force, large, rigid, work = outer(given, i, node, w, coefficient)
+                    settle(
+                        given,
+                        found,
+                        flags,
+                        load_scale,
+                        i,
+                        node,
+                        w,
+                        force - f,
+                        large + size,
+                        rigid + stiff,
+                        work + change,
+                        wp.abs(work) + noise,
+                    )
+            if wp.static(twist):
+                angle = places[1, k, c]
+                if angle >= 0:
+                    if elsewhere[angle] == wp.uint8(0):
+                        j = angle + shift
+                        turning, large_too, rigid_too, work_too = outer_of_angle(given, j, angle, w, coefficient)
+                        settle_angle(
+                            given,
+                            found,
+                            flags,
+                            load_scale,
+                            j,
+                            angle,
+                            w,
+                            turning - M(moment),
+                            large_too + size_too,
+                            rigid_too + stiff_too,
+                            work_too,
+                            wp.abs(work_too),
+                        )
+
+    return balance

@@ -1,1 +1,0 @@
-"""Linear solvers: direct elimination along rods, cyclic reduction, conjugate gradients and preconditioners."""

@@ -1,0 +1,1 @@
+"""Begin and end of steps: predictors, warm starts, substeps, energy drift, resets."""

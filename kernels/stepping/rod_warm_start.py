@@ -1,0 +1,132 @@
+"""Warm start: extrapolate the correction of the last step, an acceleration, from the inertial predictor; see
+`kernels.stepping.rod_step`.
+
+With implicit Euler the iteration starts at s^2 a from the predictor. The acceleration a is the last solve's correction of its
+predictor over the square of its step, so that constant accelerations are anticipated. With the midpoint rule corrections of stiff
+modes change sign every step. Solutions do not depend on the warm start: time-lagged quantities stay at the predictor.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.islands import BENT, CAUTIOUS, ITERATION, LOAD_SCALE, PROGRESS, RATE
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
+from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.newton.edge_rotation import FURTHER, loose_function
+from ddg_warp.kernels.newton.rod_iterate import search_functions
+
+FORESEEN = 6  # maximum iterations of a solve whose correction is extrapolated
+
+
+@cache
+def ahead_function(real):
+    """Return the device function `ahead(flags, scalars, i)`: squared step by which accelerations extrapolate the predictor.
+
+    Zero after a cold start, and without loads, as the tolerance then is relative to the first residual of a solve.
+    """
+
+    @wp.func
+    def ahead(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
+        s = real(1.0) / scalars[RATE, i]
+        foreseen = flags[CAUTIOUS, i] == 0 and scalars[LOAD_SCALE, i] > real(0.0)
+        return wp.where(foreseen, s * s, real(0.0))
+
+    return ahead
+
+
+@cache
+def told_function(real, midpoint: bool, crowd: bool = False):
+    """Return the device function `told(flags, scalars, i)`: squared rate that makes a correction an acceleration.
+
+    Zero where corrections are not extrapolated: with the midpoint rule, after a cold start, or after so many iterations that the
+    motion does not continue. In a `crowd` many iterations indicate contacts, and `kernels.stepping.coupled_warm_start` decides instead.
+    """
+
+    @wp.func
+    def told(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
+        valid = (
+            wp.static(not midpoint)
+            and flags[CAUTIOUS, i] == 0
+            and (wp.static(crowd) or flags[ITERATION, i] <= wp.static(FORESEEN))
+        )
+        return wp.where(valid, scalars[RATE, i] * scalars[RATE, i], real(0.0))
+
+    return told
+
+
+@cache
+def foresee_kernel(kind: ChainKind, real, linear):
+    """Build the kernel of the warm start.
+
+    `foresee`: store the predictor of every rod that still has to move, and add extrapolated accelerations.
+
+    For rods with rotated edges they are written as a `direction` for `further_kernel`.
+    """
+    dim, twist = kind.dim, kind.twist
+    V = wp.types.vector(dim, real)
+    until, squared_step, loose = until_function(kind.serial), ahead_function(real), loose_function(dim, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def foresee(
+        a0: wp.array2d(dtype=V),
+        alpha0: wp.array2d(dtype=real),
+        fixed: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        predicted: wp.array2d(dtype=V),
+        predicted_angle: wp.array2d(dtype=real),
+        direction: wp.array3d(dtype=linear),
+    ):
+        start, r = wp.tid()
+        n = count[r]
+        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
+            return
+        weight = squared_step(flags, scalars, r)
+        for k in range(start, until(start, n)):
+            mask = int(fixed[k, r])
+            position = x[k, r]
+            predicted[k, r] = position
+            correction = loose(mask, weight * a0[k, r])
+            x[k, r] = position + correction
+            if flags[BENT, r] != 0:
+                for d in range(wp.static(dim)):
+                    direction[d, k, r] = linear(correction[d])
+            if wp.static(twist):
+                angle = theta[k, r]
+                predicted_angle[k, r] = angle
+                if ((mask >> wp.static(dim)) & 1) == 0:
+                    theta[k, r] = angle + weight * alpha0[k, r]
+
+    return foresee
+
+
+@cache
+def further_kernel(kind: ChainKind, real, linear):
+    """Build the kernel of the warm start after predictors with rotated edges.
+
+    `further`: extrapolate the last edge rotations and stretches.
+    """
+    V = wp.types.vector(kind.dim, real)
+    place, *_ = search_functions(kind, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def further(
+        x0: wp.array2d(dtype=V),
+        fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
+        count: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        predicted: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        x: wp.array2d(dtype=V),
+    ):
+        r = wp.tid()
+        if scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0:
+            place(x, predicted, x0, direction, fixed, anchor, real(1.0), wp.static(FURTHER), count[r], r)
+
+    return further
