@@ -32,9 +32,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.scene.obstacles import Box, Capsule, Mesh, Plane, Sphere
     from ddg_warp.scene.path import Displacement, Stop
     from ddg_warp.scene.scene import Scene
-    from ddg_warp.solve import continuation, stability, statics
-    from ddg_warp.solve.dynamics import Integrator
-    from ddg_warp.solve.step_control import StepControl
+    from ddg_warp.solve.equilibrium import continuation, stability, statics
+    from ddg_warp.solve.stepping.adaptive_step import StepControl
+    from ddg_warp.solve.stepping.integrator import Integrator
 
 __version__ = "0.1.0"
 __all__ = [
@@ -91,7 +91,7 @@ _HOME = {
     "Ellipse": "scene.material",
     "Granular": "scene.drag",
     "Grip": "scene.grip",
-    "Integrator": "solve.dynamics",
+    "Integrator": "solve.stepping.integrator",
     "Law": "scene.law",
     "Material": "scene.material",
     "Mesh": "scene.obstacles",
@@ -108,7 +108,7 @@ _HOME = {
     "Sphere": "scene.obstacles",
     "State": "model.state",
     "Statics": "scene.descriptions",
-    "StepControl": "solve.step_control",
+    "StepControl": "solve.stepping.adaptive_step",
     "Stiffness": "scene.material",
     "Stop": "scene.path",
     "Trace": "scene.descriptions",
@@ -116,12 +116,12 @@ _HOME = {
 }
 _MODULES = {
     "bench": "run.bench",
-    "continuation": "solve.continuation",
+    "continuation": "solve.equilibrium.continuation",
     "inquiry": "ask.inquiry",
     "meshes": "geometry.meshes",
     "rest_shapes": "model.rest_shapes",
-    "stability": "solve.stability",
-    "statics": "solve.statics",
+    "stability": "solve.equilibrium.stability",
+    "statics": "solve.equilibrium.statics",
 }
 
 

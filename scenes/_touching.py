@@ -4,7 +4,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 HALVED = 0.1  # allowed fraction of failed solves, whose steps are then halved
 GREY = 0.75  # brightness of obstacles in pictures

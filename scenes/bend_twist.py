@@ -55,8 +55,8 @@ class PlanarBranch:
     """
 
     def __init__(self, curvature: float, n: int, device: str = "cpu", unit: float = 1000.0):
-        from ddg_warp.solve.statics import Equilibrium, StaticsOptions
-        from ddg_warp.solve.tangent import Tangent
+        from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+        from ddg_warp.solve.equilibrium.tangent import Tangent
 
         self.unit = unit
         self.model = build(curvature, unit, n).build(device, "float64")
@@ -75,13 +75,13 @@ class PlanarBranch:
 
     def lowest(self, weight: float) -> float:
         """Return the lowest eigenvalue of the tangent at G = weight."""
-        from ddg_warp.solve import stability
+        from ddg_warp.solve.equilibrium import stability
 
         return float(stability.spectrum(*self.at(weight), 1, "unit", self.tangent).eigenvalues[0])
 
     def flip(self, low: float, high: float) -> float:
         """Return the G between low and high of a zero lowest eigenvalue."""
-        from ddg_warp.solve import stability
+        from ddg_warp.solve.equilibrium import stability
 
         return stability.critical(self.at, low, high)
 

@@ -74,7 +74,7 @@ def build(
 
 def equilibrium(model):
     """Return the hanging cable before the motion: statics loads from 0 to 1 s, while the ends are still."""
-    from ddg_warp.solve.statics import solve
+    from ddg_warp.solve.equilibrium.statics import solve
 
     return solve(model)
 

@@ -62,8 +62,8 @@ def exact(tension: float) -> float:
 
 def critical_moment(tension: float, n: int, device: str = "cpu") -> float:
     """Return the moment over B / L of a zero lowest eigenvalue, for a rod of n edges."""
-    from ddg_warp.solve import stability
-    from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+    from ddg_warp.solve.equilibrium import stability
+    from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
     unit = exact(tension)
     model = build(tension, unit, n).build(device, "float64")

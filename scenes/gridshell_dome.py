@@ -8,7 +8,7 @@ under a force P at the crossing deflects by P L^3 / (96 EI), each beam carrying 
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.statics import solve
 
 SPAN = 10.0  # m
 RADIUS = 0.03  # m, of the solid round section

@@ -51,7 +51,7 @@ def build(n: int = 50, mode: int = 1, steps: int = 60, periods: float = 1.0, amp
 
 def hanging(model):
     """Return the equilibrium, from a stretched initial guess, as unstretched edges have no lateral stiffness."""
-    from ddg_warp.solve.statics import solve
+    from ddg_warp.solve.equilibrium.statics import solve
 
     points = model.scene.batches[0].points[0].copy()
     points[:, 2] *= 1.0 + 0.5 * MASS_PER_LENGTH * GRAVITY * LENGTH / EA
@@ -60,7 +60,7 @@ def hanging(model):
 
 def modes(model, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Return lowest frequencies omega sqrt(L / g) about the equilibrium, and lateral shapes (modes, nodes), 1 at the free end."""
-    from ddg_warp.solve.stability import spectrum
+    from ddg_warp.solve.equilibrium.stability import spectrum
 
     eigen = spectrum(model, hanging(model), count)
     shapes = eigen.modes.reshape(-1, 2, count)[:, 0]
@@ -69,7 +69,7 @@ def modes(model, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 def swinging(model, mode: int, amplitude: float):
     """Return the equilibrium displaced by a mode through edge rotations, as stretch would make so stiff edges jump."""
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     state, tangent = hanging(model), Tangent(model)
     rest = tangent.dofs(state)

@@ -88,7 +88,7 @@ def exact(stretch: float, turns: float) -> tuple[float, float]:
 
 def measure(model, state) -> tuple[float, float]:
     """Return force [N] and moment [N m] along the axis, from reactions on the last two nodes and the last twist angle."""
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     points = state.points()[-2:]
     reactions = Tangent(model).gradient(state).reshape(-1, 4)[-2:]

@@ -141,7 +141,7 @@ def check(result) -> list[ddg.Check]:
 
 def picture(result, frames) -> dict:
     """Draw the sag of the drawn natural shape, the fitted natural shape without weight, and with it."""
-    from ddg_warp.solve.statics import solve
+    from ddg_warp.solve.equilibrium.statics import solve
 
     strands, nodes = size(result)
     weightless = rods(strands, nodes, learn(strands, nodes))

@@ -76,7 +76,7 @@ def measure(model, state) -> tuple[float, float, float, float]:
     """Return the values of `exact`: p and s* by least squares over all edges, moment and tension from end reactions."""
     from scipy.optimize import curve_fit
 
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     s, phi = envelope(state)
 

@@ -51,7 +51,7 @@ def exact(ratio: float) -> float:
 
 def critical_twist(ratio: float, n: int, device: str = "cpu") -> float:
     """Return the total twist [rad] of a zero lowest eigenvalue, for a ring of n edges."""
-    from ddg_warp.solve import stability, statics
+    from ddg_warp.solve.equilibrium import stability, statics
 
     def twisted(fraction):
         model = build(fraction, ratio, n).build(device, "float64")

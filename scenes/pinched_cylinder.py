@@ -51,8 +51,8 @@ def observe(model, state) -> dict[str, float]:
 
 def compliance(model) -> float:
     """Return w E h / P of the cylinder at rest, from the tangent there."""
-    from ddg_warp.solve.direct import Factorisation
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.tangent import Tangent
+    from ddg_warp.solve.linear.sparse_direct import Factorisation
 
     tangent, state = Tangent(model), model.state()
     free = np.flatnonzero(tangent.free)

@@ -79,7 +79,7 @@ def build(
 
 def critical_load(model, state) -> float:
     """Return the critical load over the exact one, from the tangents of the free and the loaded plate."""
-    from ddg_warp.solve import stability
+    from ddg_warp.solve.equilibrium import stability
 
     return LOADED * stability.buckling(model, model.state(), state)[0]
 

@@ -59,7 +59,7 @@ def exact(shortening: float) -> tuple[float, float, float]:
 
 def measure(model, state) -> tuple[float, float, float]:
     """Return axial load [N], amplitude in the middle [m] and angle of the first edge [rad]."""
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     points = state.points()
     edge = points[1] - points[0]

@@ -97,9 +97,9 @@ def pitchfork(model, lateral: float = 0.3, step: float = 0.02) -> float:
         lateral: that displacement [m].
         step: displacement [m] between equilibria of the path.
     """
-    from ddg_warp.solve import stability
-    from ddg_warp.solve.statics import Equilibrium, StaticsOptions
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium import stability
+    from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     tangent, follow = Tangent(model), Equilibrium(model, StaticsOptions(mode="follow"))
     first = 1e-3 * step

@@ -84,8 +84,8 @@ def modes(model, state, count: int = 24) -> dict[str, tuple[np.ndarray, np.ndarr
     Rigid-body modes are left out. Of each pair of bending modes one is returned, rotated into the plane of x and z. Shapes of
     bending are deflections (modes, nodes) with a largest value of 1, without ghost nodes.
     """
-    from ddg_warp.solve.stability import spectrum
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.stability import spectrum
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     tangent = Tangent(model)
     eigen = spectrum(model, state, count, tangent=tangent)

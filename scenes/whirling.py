@@ -82,7 +82,7 @@ def straight(support: str, n: int) -> ddg.Scene:
 
 def critical_rate(support: str, n: int, **options) -> float:
     """Return the critical rate over sqrt(EI / (rho A L^4)), from eigenvalues of the straight shaft; options of `Scene.build`."""
-    from ddg_warp.solve.stability import spectrum
+    from ddg_warp.solve.equilibrium.stability import spectrum
 
     model = straight(support, n).build(**options)
     return float(spectrum(model, model.state(), 1).frequencies[0] / bending_rate())

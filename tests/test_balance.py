@@ -5,7 +5,7 @@ import pytest
 
 from ddg_warp.run.catalog import load_scene, scene_files
 from ddg_warp.scene.descriptions import Statics
-from ddg_warp.solve.statics import Equilibrium
+from ddg_warp.solve.equilibrium.statics import Equilibrium
 
 FAST = {
     "greenhill",

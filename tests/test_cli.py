@@ -113,7 +113,7 @@ def test_failed_check_fails_the_run(fall):
 
 
 def test_failed_solver_keeps_complete_frames(fall, monkeypatch, capsys):
-    from ddg_warp.solve.dynamics import Integrator
+    from ddg_warp.solve.stepping.integrator import Integrator
 
     step = Integrator.step
 
@@ -380,7 +380,7 @@ def test_a_run_that_fails_before_its_first_state_says_so(failure, tmp_path, monk
     code = SCENE.replace("    build.shift = shift", "    scene.initial = lost")
     code = code.replace("def build", "def lost(model):\n    raise ddg.SolverError('no equilibrium')\n\n\ndef build", 1)
     if failure == "first point":
-        from ddg_warp.solve import continuation
+        from ddg_warp.solve.equilibrium import continuation
 
         def lost(self, state, stop):
             raise SolverError("no equilibrium", state=state)

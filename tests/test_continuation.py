@@ -11,10 +11,10 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scene.path import Displacement, Stop
 from ddg_warp.scenes import lee_frame, post_buckling, roll_up
-from ddg_warp.solve import stability
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 sys.path.append(str(FilePath(__file__).parent / "accuracy"))
 from convergence import order

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.solve import statics
-from ddg_warp.solve.continuation import Continuation
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.equilibrium.continuation import Continuation
 
 DT = 0.01
 

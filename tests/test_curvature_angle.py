@@ -7,7 +7,7 @@ import ddg_warp as ddg
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.terms import REGISTRY
 from ddg_warp.scenes import tip_load
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 SECTION = ddg.Stiffness(EA=1e6, EI1=1.0, EI2=1.3, GJ=0.8, mass_per_length=1.0)
 ROUND = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=0.8)

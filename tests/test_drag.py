@@ -9,8 +9,8 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.run.simulate import simulate
 from ddg_warp.scenes import flagellum, helical_flagellum
-from ddg_warp.solve import statics
-from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.equilibrium.stability import spectrum
 
 sys.path.append(str(Path(__file__).parent / "contracts"))
 

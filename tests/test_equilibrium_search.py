@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import fsolve
 
 import ddg_warp as ddg
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, solve
 
 
 def searched(scene, device, steps: int = 1, **options):

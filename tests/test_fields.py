@@ -72,7 +72,7 @@ def test_rods_in_closed_form(device, name, worlds):
 
 def test_twist_in_closed_form(device):
     """A straight rod clamped at both ends, one rotated by 0.6 rad, has the twist 0.6 / L everywhere."""
-    from ddg_warp.solve import statics
+    from ddg_warp.solve.equilibrium import statics
 
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(np.linspace([0.0, 0.0, 0.0], [2.0, 0.0, 0.0], 9), section=SECTION)

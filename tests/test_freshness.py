@@ -6,7 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.learn.gradient_objects import OBJECTS, scene_of
 from ddg_warp.model.recipe import Recipe
-from ddg_warp.solve import statics
+from ddg_warp.solve.equilibrium import statics
 
 WORLDS, DT = 2, 2e-3
 FAST = (

@@ -14,7 +14,7 @@ from hard_run import attempt
 from scipy.optimize import fsolve
 
 import ddg_warp as ddg
-from ddg_warp.solve import statics
+from ddg_warp.solve.equilibrium import statics
 
 slow = pytest.mark.slow
 GRAVITY = 9.81

@@ -5,8 +5,8 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.ask.inquiry import reactions, stresses, total_twist, writhe
-from ddg_warp.solve import statics
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 SECTION = ddg.Stiffness(EA=50.0, EI1=3.0, EI2=2.0, GJ=1.5, mass_per_length=0.8, rotary_inertia=0.1)
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ddg_warp as ddg
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5)
 ROUND = ddg.Stiffness(EA=1e4, EI1=1.2, GJ=0.8, mass_per_length=0.5)

@@ -7,11 +7,11 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.simulate import simulate
 from ddg_warp.scenes import gridshell_dome
-from ddg_warp.solve import choice
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.linear import solver_selection
 
 RUBBER = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
 THICKNESS = 0.01  # m
@@ -189,10 +189,10 @@ def test_choice_by_size(device, monkeypatch):
     """Small coupled systems take factors, large ones conjugate gradients; counting instabilities always takes factors."""
     scene = hanging(6, ddg.Statics(load_steps=2))
     model = scene.build(device, "float64")
-    assert choice.static_solver(model) == "direct"
+    assert solver_selection.static_solver(model) == "direct"
     assert simulate(scene, device=device, progress=False).statistics["pcg_iterations"] == 0
-    monkeypatch.setattr(choice, "LARGE_STATIC", {False: 10, True: 10})
-    assert choice.static_solver(model) == "pcg"
+    monkeypatch.setattr(solver_selection, "LARGE_STATIC", {False: 10, True: 10})
+    assert solver_selection.static_solver(model) == "pcg"
     result = simulate(scene, device=device, precision="float64", progress=False)
     assert result.statistics["pcg_iterations"] > 0
     assert sum(result.statistics["outcomes"].values()) == 2

@@ -17,7 +17,7 @@ from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, MAGNETS, REGISTRY
 from ddg_warp.run import derivatives
 from ddg_warp.run.catalog import load_file
 from ddg_warp.run.cli import main
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.statics import solve
 
 FILE = Path(tempfile.mkdtemp()) / "my_law.py"  # the README's law, in a file, since Warp reads the source of functions
 FILE.write_text(dict(BLOCKS)["my_law.py"])

@@ -5,9 +5,9 @@ import pytest
 from scipy.optimize import brentq
 
 import ddg_warp as ddg
-from ddg_warp.solve import stability, statics
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability, statics
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 MA = 10.0  # magnetisation times section [A m]; with EI = L = 1 the load M A B L^2 / EI is MA B
 X, Y, Z = np.eye(3)

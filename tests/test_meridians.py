@@ -6,7 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.io.revolve import Revolution
 from ddg_warp.run.record import Recorder, export_usd
-from ddg_warp.solve.statics import Equilibrium, solve
+from ddg_warp.solve.equilibrium.statics import Equilibrium, solve
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 ANGLE = np.linspace(0.0, 1.0, 9)

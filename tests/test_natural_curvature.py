@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.solve import statics
+from ddg_warp.solve.equilibrium import statics
 
 SECTION = ddg.Stiffness(EA=1e6, EI1=1.0, EI2=2.0, GJ=1.5)
 X, Y, Z = np.eye(3)

@@ -9,7 +9,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.kernels.terms import CONTACT, FRICTION
 from ddg_warp.run.cli import main
 from ddg_warp.run.record import Recorder
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.statics import solve
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 THICKNESS = 0.01

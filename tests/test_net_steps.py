@@ -8,7 +8,7 @@ import ddg_warp as ddg
 from ddg_warp.compile.net.outwards import outwards
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.newton.rod_iterate import RELAG
-from ddg_warp.solve.net.newton import NetNewton, NewtonOptions
+from ddg_warp.solve.newton.coupled_newton import NetNewton, NewtonOptions
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 WIRE = ddg.Material(young=1e9, poisson=0.5, density=1000.0)

@@ -12,7 +12,7 @@ from ddg_warp.compile.net import blocks
 from ddg_warp.compile.net.blocks import compile_net
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 slow = pytest.mark.slow
 SCHEMES = ("implicit_euler", "implicit_midpoint")

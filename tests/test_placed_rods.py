@@ -5,7 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.kernels.newton.rod_iterate import PLACE
-from ddg_warp.solve.net.newton import NetNewton, NewtonOptions
+from ddg_warp.solve.newton.coupled_newton import NetNewton, NewtonOptions
 
 SIZES = (2, 3, 33, 64, 65, 200, 1300)  # around one and two runs of edges; the last size has longer runs
 EDGE = 0.05  # m

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.solve.relaxation import relax
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.dynamic_relaxation import relax
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import solve
 
 
 def cable(device, edges: int = 12):

@@ -8,8 +8,8 @@ from ddg_warp.geometry import meshes
 from ddg_warp.geometry.shell_forms import edge_kinds, metric, second_form
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.model.rest_shapes import bilayer_curvature, grown_metric, principal_form
-from ddg_warp.solve.statics import solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.statics import solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 MATERIAL = ddg.Material(1e6, 0.3, density=1000.0)
 THICKNESS = 0.02

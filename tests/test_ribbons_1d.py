@@ -11,7 +11,7 @@ from ddg_warp.kernels.densities.ribbon import LAWS
 from ddg_warp.kernels.terms import REGISTRY
 from ddg_warp.run import derivatives
 from ddg_warp.scenes import ribbon_bistable, ribbon_helix
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.statics import solve
 
 NAMES = tuple(LAWS)
 WIDTH, THICKNESS, NU = 0.1, 1e-3, 0.3

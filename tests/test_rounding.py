@@ -9,9 +9,9 @@ import ddg_warp as ddg
 from ddg_warp.compile.precision import FLOAT32_LIMIT, FLOAT32_LOST, lost_in_rounding, rounding
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
-from ddg_warp.solve import statics
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.stability import spectrum
 
 STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
 RUBBER = ddg.Material(young=1e6, poisson=0.4, density=1000.0)

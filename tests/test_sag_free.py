@@ -7,8 +7,8 @@ import ddg_warp as ddg
 from ddg_warp.ask.sag_free import least_stiffness, rest_strains
 from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import set_rest_strains
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import solve
 
 LENGTH, EDGES = 0.5, 20
 SECTION = ddg.Stiffness(EA=800.0, EI1=0.03, EI2=0.05, GJ=0.02, mass_per_length=0.04, rotary_inertia=1e-6)

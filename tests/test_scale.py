@@ -11,9 +11,9 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import solve
 
 MATERIAL = ddg.Material(1e6, 0.3, density=1000.0)
 LENGTHS = [1e-9, pytest.param(1e-3, marks=pytest.mark.slow), 1e5]

@@ -11,8 +11,8 @@ from ddg_warp.geometry import meshes
 from ddg_warp.geometry.shell_forms import second_form
 from ddg_warp.scenes import _sze
 from ddg_warp.scenes.hinged_roof import HALF_ANGLE, HALF_LENGTH, POISSON, RADIUS, YOUNG
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import Equilibrium, solve
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import Equilibrium, solve
 
 MATERIAL = ddg.Material(young=1e9, poisson=0.3)
 

@@ -5,13 +5,14 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve import lowest, stability
-from ddg_warp.solve.direct import Factorisation
-from ddg_warp.solve.lowest import Lowest
-from ddg_warp.solve.rigid import rigid_modes
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.linear import eigensolver
+from ddg_warp.solve.linear.eigensolver import Lowest
+from ddg_warp.solve.linear.sparse_direct import Factorisation
 
 SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
 STEEL = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
@@ -239,8 +240,8 @@ def test_iteration_finds_every_copy(device):
     model = scene.build(device, "float64")
     tangent = Tangent(model)
     matrix = tangent.stiffness(model.state())[tangent.free][:, tangent.free]
-    values, _ = lowest.Lowest(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))(25)
-    exact, _ = lowest.dense(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))
+    values, _ = eigensolver.Lowest(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))(25)
+    exact, _ = eigensolver.dense(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))
     np.testing.assert_allclose(values, exact[:25], rtol=1e-8)
     assert np.ptp(values[:11]) < 1e-8 * values[0]
     assert values[11] > 1.01 * values[10]

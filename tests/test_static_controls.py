@@ -7,7 +7,7 @@ from test_controls import AXIS, GRAVITY, PIVOT, everything, joined, model_of, on
 import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.errors import SceneError
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 TIGHT = {"rtol": 1e-12}
 FORCES = np.array([(0.0, 0.3, -0.2), (0.0, 0.0, 0.0), (0.1, -0.2, 0.4)])

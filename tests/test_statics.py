@@ -10,10 +10,10 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.simulate import simulate
 from ddg_warp.run.summary import summary
-from ddg_warp.solve import stability
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
 

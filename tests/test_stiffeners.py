@@ -5,9 +5,9 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 YOUNG, LENGTH, WIDTH, THICKNESS = 1e7, 1.0, 0.4, 0.01
 TALL = ddg.Stiffness(EA=1e3, EI1=0.08, EI2=0.01, GJ=0.02, mass_per_length=0.1, rotary_inertia=1e-5)

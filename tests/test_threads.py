@@ -14,7 +14,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.solve import statics
-from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.equilibrium.stability import spectrum
 
 def scene(number):
     s = ddg.Scene()

@@ -14,8 +14,8 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.compile.tolerance import FAN, outer_forces
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 import bench_rods

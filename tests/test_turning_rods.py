@@ -5,8 +5,8 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.statics import solve
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.statics import solve
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)

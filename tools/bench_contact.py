@@ -26,8 +26,8 @@ from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_fu
 from ddg_warp.kernels.collision.primitives import EDGES, pair_functions, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.run.summary import machine, table, write_table
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 EDGES_A_ROD, LENGTH, RADIUS, APART = 64, 0.01, 1e-3, 4.2e-3  # [m]
 REACH, MARGIN = 5e-4, 1e-3  # [m]

@@ -25,7 +25,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.model import rest_shapes
 from ddg_warp.run.catalog import load_scene
 from ddg_warp.run.summary import machine, table, write_table
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 GRAVITY = 9.81
 # P L^2 / EI = K(k)^2 -> lateral tip displacement over L, 2 k / K(k), of an inextensible column (Timoshenko and Gere,

@@ -19,8 +19,8 @@ import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.geometry import meshes
 from ddg_warp.run.summary import machine, table, write_table
-from ddg_warp.solve.net.newton import PRECONDITIONERS
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
 
 BANDWIDTH = 4.8e12  # of an H200 [bytes/s]
 SIZES = {"hinge": (32, 70, 223, 707), "midedge": (32, 70, 223, 707), "midedge_dof": (32, 70, 223, 707)}

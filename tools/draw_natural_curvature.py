@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.solve import statics
+from ddg_warp.solve.equilibrium import statics
 
 CASES = {
     "at rest, natural = (0, 0, 0)": (0.0, 0.0, 0.0),

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 SMALL = 1e-4  # of the given size: displacement for which the mode is taken as linear
 

@@ -11,8 +11,8 @@ from ddg_warp.compile.storage import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
-from ddg_warp.solve.drag import ChainDrag, NetDrag
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.forces.drag import ChainDrag, NetDrag
 from ddg_warp.threads import launches
 
 TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints

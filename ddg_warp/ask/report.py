@@ -9,12 +9,12 @@ from ddg_warp.kernels.terms import ALL, FRICTION, Potential, contact_potential
 from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
-from ddg_warp.solve.chains.step import DIRECT
-from ddg_warp.solve.choice import automatic, net_preconditioner
-from ddg_warp.solve.net.alone import uncoupled
-from ddg_warp.solve.net.chains import Chains
-from ddg_warp.solve.net.system import NetSystem
-from ddg_warp.solve.step import Means, suited
+from ddg_warp.solve.linear.rod_substructuring import Chains
+from ddg_warp.solve.linear.solver_selection import automatic, net_preconditioner
+from ddg_warp.solve.linear.sparse_system import NetSystem
+from ddg_warp.solve.stepping.decoupled_step import uncoupled
+from ddg_warp.solve.stepping.rod_step import DIRECT
+from ddg_warp.solve.stepping.step_driver import Means, suited
 
 SOLVERS = {
     "chain": "PCG (closed chains)",

@@ -8,9 +8,9 @@ e: strains, e0: rest strains, J: derivatives of e by the dofs, w: rest measures,
 follow from the shape alone, then e0 = e - s / K. A rod clamped by one edge is statically determinate. Otherwise the solution has
 the least elastic energy: least squares in y = (w / K)^(1/2) s.
 
-The equilibrium need not be stable: test it by `ddg_warp.solve.stability`. Sources: Derouet-Jourdan, Bertails-Descoubes, Daviet,
-Thollot, *Inverse dynamic hair modeling with frictional contact*, ACM ToG 32(6), 2013. Hsu, Wang, Pan, Gao, Yuksel, Wu, *Sag-free
-initialization for strand-based hybrid hair simulation*, ACM ToG 42(4), 2023.
+The equilibrium need not be stable: test it by `ddg_warp.solve.equilibrium.stability`. Sources: Derouet-Jourdan, Bertails-Descoubes,
+    Daviet, Thollot, *Inverse dynamic hair modeling with frictional contact*, ACM ToG 32(6), 2013. Hsu, Wang, Pan, Gao, Yuksel, Wu,
+    *Sag-free initialization for strand-based hybrid hair simulation*, ACM ToG 42(4), 2023.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
-from ddg_warp.solve.direct import Factorisation, shortest
-from ddg_warp.solve.rigid import rigid_modes
-from ddg_warp.solve.stability import lowest_factors
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
+from ddg_warp.solve.equilibrium.stability import lowest_factors
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.linear.sparse_direct import Factorisation, shortest
 from ddg_warp.threads import launches
 
 RTOL = 1e-8  # largest residual over the loads of a rod

@@ -5,8 +5,8 @@ import torch
 import warp as wp
 
 from ddg_warp.learn.layout import view
-from ddg_warp.solve.controls import LOADS
-from ddg_warp.solve.motion import counts_turns, turns_between
+from ddg_warp.solve.forces.control_loads import LOADS
+from ddg_warp.solve.forces.prescribed_motion import counts_turns, turns_between
 
 
 class StepControls:

@@ -11,8 +11,8 @@ from ddg_warp.kernels.adjoint.drag import chain_kernels, net_kernels
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.kernels.forces.drag import ROWS, block_inertia
-from ddg_warp.solve.drag import ChainDrag, NetDrag
-from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.forces.drag import ChainDrag, NetDrag
+from ddg_warp.solve.linear.sparse_system import lists
 
 
 class ChainDragAdjoint:

@@ -24,10 +24,10 @@ from ddg_warp.learn.tables import Tables
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.recipe import Recipe
 from ddg_warp.model.state import Sliding
-from ddg_warp.solve import statics
-from ddg_warp.solve.dynamics import Integrator
-from ddg_warp.solve.graphs import Graphs
-from ddg_warp.solve.worlds import cubed
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.stepping.graph_cache import Graphs
+from ddg_warp.solve.stepping.integrator import Integrator
+from ddg_warp.solve.stepping.world_reset import cubed
 from ddg_warp.threads import alone
 
 FOREVER = 2**62  # steps between host checks of outcomes, as worlds carry flags

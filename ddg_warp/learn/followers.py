@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.adjoint.follower_loads import POINTS, follower_kernel, gather_kernel
-from ddg_warp.solve.loads import Loads
-from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.forces.loads import Loads
+from ddg_warp.solve.linear.sparse_system import lists
 
 
 class Followers:

@@ -7,11 +7,11 @@ from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_parameters
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
 from ddg_warp.kernels.collision.contact.assembly import sum_kernel
-from ddg_warp.solve.contact.node_items import NodeItems
-from ddg_warp.solve.contact.rolling import turned_by
-from ddg_warp.solve.net.exact_contact import ExactContact
-from ddg_warp.solve.net.rubbing import Rubbing
-from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.collision.incidence import NodeItems
+from ddg_warp.solve.collision.rolling_rotation import turned_by
+from ddg_warp.solve.equilibrium.friction_jacobian import Rubbing
+from ddg_warp.solve.linear.exact_contact import ExactContact
+from ddg_warp.solve.linear.sparse_system import lists
 
 PIECES, LEAST = 256, 64  # largest number of summation chunks of a world, and fewest primitives of one
 

@@ -11,8 +11,8 @@ from ddg_warp.kernels.adjoint import coupled_predictor
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.net import NetState
-from ddg_warp.solve.net.system import lists
-from ddg_warp.solve.net.turns import Turns
+from ddg_warp.solve.linear.sparse_system import lists
+from ddg_warp.solve.newton.edge_rotation import Turns
 
 
 class NetPredictor:

@@ -6,7 +6,7 @@ import warp as wp
 from ddg_warp.kernels.adjoint import coupled_assembly, coupled_step
 from ddg_warp.kernels.elements.coupled_element import FRAME
 from ddg_warp.model.net import NetState
-from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.linear.sparse_system import lists
 
 
 class Shares:

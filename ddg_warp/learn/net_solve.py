@@ -10,8 +10,8 @@ from ddg_warp.compile.storage import FREE
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.coupled_linear_solve import chain_kernel
 from ddg_warp.learn.solve import HostSolve
-from ddg_warp.solve.net.exact import ExactSystem
-from ddg_warp.solve.net.tangent import NetTangent
+from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
+from ddg_warp.solve.linear.exact_system import ExactSystem
 
 
 class NetSolve:

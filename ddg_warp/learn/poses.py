@@ -11,7 +11,7 @@ from ddg_warp.learn.rotations import halfway, matrix, partway, quaternion
 def by_last_poses(first: torch.Tensor, last: torch.Tensor, fraction: float, cotangent: torch.Tensor) -> torch.Tensor:
     """Return the gradient by the `last` poses of a straight path (worlds, grips, 6), given that by poses on the path.
 
-    The path is that of `ddg_warp.solve.motion.poses_between`.
+    The path is that of `ddg_warp.solve.forces.prescribed_motion.poses_between`.
 
     Args:
         first: poses at the start of the path.

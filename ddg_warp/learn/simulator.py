@@ -19,9 +19,9 @@ from ddg_warp.learn.world_state import WorldState, outcome_names
 from ddg_warp.model.controls import Controls, require_acting, shapes
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
-from ddg_warp.solve import statics
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.dynamics import SCHEMES, Integrator
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.stepping.integrator import SCHEMES, Integrator
 from ddg_warp.threads import alone
 
 SETTLED = {"failures", "check_every", "energy_bound"}  # arguments of `Integrator` that the engine sets

@@ -11,14 +11,14 @@ from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint import float32_error, iterative_refinement
 from ddg_warp.kernels.adjoint.coupled_linear_solve import check_kernels
-from ddg_warp.solve.chains.assembled import AssembledNewton
-from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
-from ddg_warp.solve.chains.pcg import PcgNewton
-from ddg_warp.solve.chains.tangent import ChainTangent
-from ddg_warp.solve.choice import automatic
-from ddg_warp.solve.direct import SingularError, regular
-from ddg_warp.solve.reduction import CyclicReduction, Elimination
-from ddg_warp.solve.rigid import rigid_modes
+from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
+from ddg_warp.solve.equilibrium.rod_tangent import ChainTangent
+from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
+from ddg_warp.solve.linear.solver_selection import automatic
+from ddg_warp.solve.linear.sparse_direct import SingularError, regular
+from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
+from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
 
 CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
 PASSES = 2  # ... which limits refinement. Measured: with 3 passes, an error of 1e-2 each, gradients erred by 1e-3

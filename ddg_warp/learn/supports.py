@@ -6,8 +6,8 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.rod_step import angle_kernel
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.solve.motion import Motion
-from ddg_warp.solve.net.prescribed import NetMotion
+from ddg_warp.solve.forces.prescribed_element_data import NetMotion
+from ddg_warp.solve.forces.prescribed_motion import Motion
 
 
 class Supports:

@@ -134,7 +134,7 @@ class Model:
     @cached_property
     def touch(self):
         """Contact queries at given states (`Touch`); None without contact."""
-        from ddg_warp.solve.contact.touch import Touch
+        from ddg_warp.solve.collision.contact_model import Touch
 
         if self.net is None or self.net.host.touching is None:
             return None

@@ -241,7 +241,7 @@ def defaults(module, study: Study, device: str | None) -> dict:
     """Return the default values of the names of a study's grid."""
     import warp as wp
 
-    from ddg_warp.solve.statics import StaticsOptions
+    from ddg_warp.solve.equilibrium.statics import StaticsOptions
 
     build_defaults = parameters(module, {})
     analysis = module.build(**{name: value for name, value in study.fixed.items() if name in build_defaults}).analysis

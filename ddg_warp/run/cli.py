@@ -236,7 +236,7 @@ def built(module, name: str, settings: dict):
 def judged(module, result) -> list:
     """Return the checks of a scene; a solver failure in a check fails the run."""
     from ddg_warp.errors import SolverError
-    from ddg_warp.solve.direct import SingularError
+    from ddg_warp.solve.linear.sparse_direct import SingularError
 
     if not hasattr(module, "check") or result.failure:
         return []
@@ -285,7 +285,7 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         verdicts = {
             True: "stable",
             False: "UNSTABLE",
-            None: "not asked whether stable: ddg_warp.solve.stability.spectrum tells, but of friction",
+            None: "not asked whether stable: ddg_warp.solve.equilibrium.stability.spectrum tells, but of friction",
         }
         print(f"last equilibrium: {verdicts[content['stable']]}")
     if checks:

@@ -284,7 +284,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
         counts: Counters of a resumed run, see `counts_of`.
     """
     from ddg_warp.run.counts import counts_of, go_on, statistics
-    from ddg_warp.solve.dynamics import Integrator
+    from ddg_warp.solve.stepping.integrator import Integrator
 
     analysis = result.scene.analysis
     settings = {name: getattr(analysis, name) for name in ("scheme", "rtol", "outliers")}
@@ -307,7 +307,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
 
 def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
     """Solve all load steps and `keep` each equilibrium."""
-    from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+    from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
     keep(result.state)
     equilibrium = Equilibrium(result.model, StaticsOptions(**options))
@@ -333,7 +333,7 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
 
 def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
     """Follow the path of equilibria and `keep` each point, with load parameter and watched values."""
-    from ddg_warp.solve.continuation import Continuation
+    from ddg_warp.solve.equilibrium.continuation import Continuation
 
     analysis, started, continuation = result.scene.analysis, clock(), None
     settings = {name: getattr(analysis, name) for name in ("step", "max_step", "load_scale")}

@@ -199,7 +199,7 @@ class Contacts:
             shape: `Plane`, `Sphere`, `Capsule`, `Box` or `Mesh` in the initial position.
             motion: rigid motion of the obstacle; friction follows its surface, also of a spinning ball or drum. For a mesh it may
                 give a displacement for each vertex. Fixed by default. Steps along arcs are divided into substeps that resolve
-                the arcs, see `ddg_warp.solve.net.arcs`.
+                the arcs, see `ddg_warp.solve.collision.support_arcs`.
             name: of the obstacle in `contact_between` and output.
 
         Returns:

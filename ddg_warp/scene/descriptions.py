@@ -63,7 +63,7 @@ class Trace:
     Attributes:
         watch: displacements to record by name (`Displacement`).
         stop: termination criteria.
-        step, max_step, load_scale: see `ddg_warp.solve.continuation.ContinuationOptions`.
+        step, max_step, load_scale: see `ddg_warp.solve.equilibrium.continuation.ContinuationOptions`.
     """
 
     watch: dict[str, Displacement] = field(default_factory=dict)

@@ -68,7 +68,7 @@ SCALARS = (
     # The fraction of the time step that is done, and of the current substep
     "progress",
     "portion",
-    # The largest fraction tried at once, and the interval of a row of poses; see `solve.net.arcs`
+    # The largest fraction tried at once, and the interval of a row of poses; see `solve.collision.support_arcs`
     "substep",
     "interval",
 )

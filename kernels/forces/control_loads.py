@@ -1,6 +1,6 @@
 """Control loads of a step, per world, added to loads of the scene, and the load scales that follow.
 
-See `ddg_warp.solve.controls`; sums have a fixed order, without atomics.
+See `ddg_warp.solve.forces.control_loads`; sums have a fixed order, without atomics.
 """
 
 from functools import cache

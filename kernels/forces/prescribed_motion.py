@@ -1,10 +1,10 @@
 """Prescribed motion of supports over a time step on the device, as in `ddg_warp.scene.motion.Motion.pose`.
 
 A pose is a row of an array: rotation vector of the step (3), rotation at its start (9), pivot (3), translations at start and end (3
-each). The fraction of the step is s. The rotation has a constant rate, so that substeps follow arcs, not chords. For grips, which
-differ by world, rows of worlds follow each other with `stride`, which is zero otherwise. For a step in K = 2^k intervals
-(`solve.net.arcs`), K sets of `rows` follow the sets of all coarser intervals. A set is the motion of an interval, extended to the
-whole step, so that s means the same.
+    each). The fraction of the step is s. The rotation has a constant rate, so that substeps follow arcs, not chords. For grips,
+    which differ by world, rows of worlds follow each other with `stride`, which is zero otherwise. For a step in K = 2^k intervals
+    (`solve.collision.support_arcs`), K sets of `rows` follow the sets of all coarser intervals. A set is the motion of an interval,
+    extended to the whole step, so that s means the same.
 
 Supports are at the end of the current substep. With the midpoint rule positions are the mean of both ends, so that extrapolated
 positions are exact; angles and normals are at the middle.

@@ -1,4 +1,4 @@
-"""Contact stiffness in the matrix bands of rod paths; see `ddg_warp.solve.net.contact_bands`."""
+"""Contact stiffness in the matrix bands of rod paths; see `ddg_warp.solve.linear.contact_bands`."""
 
 from functools import cache
 

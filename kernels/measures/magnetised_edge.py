@@ -15,7 +15,7 @@ v and h = n x v
 A magnetisation along the tangent needs neither frames nor angles: rods without twist have it, too.
 
 In a field: strains n and B(x) = B + G x at the middle x of the edge. Nodes: the two of the edge. Data: a (3), B (3), G (9, row by
-row). For a field that changes with time, `ddg_warp.solve.net.prescribed` writes B and G.
+row). For a field that changes with time, `ddg_warp.solve.forces.prescribed_element_data` writes B and G.
 
 Pairs: with r = r u between the middles of two edges, strains are the orientation n . n' - 3 (n . u) (n' . u) of two point dipoles and
 their distance r. Nodes: two of each edge. Data: a, a' (3 each).

@@ -136,7 +136,10 @@ def turn_kernels(real, linear, serial: bool):
         columns: int,
         excess_out: wp.array2d(dtype=V),
     ):
-        """Write excesses, given slack and lengthening of edges at the next path nodes (k, column); see `solve.net.chains`."""
+        """Write excesses, given slack and lengthening of edges at the next path nodes (k, column);
+
+        see `solve.linear.rod_substructuring`.
+        """
         p, w = wp.tid()
         if todo[w] != wp.static(PLACE):
             return

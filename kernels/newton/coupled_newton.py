@@ -53,7 +53,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
 
     `turns`: True if there are rods, so that edges may rotate. `renews`: True if there are frames to update.
     `contact`: True if supports may be moving; see `kernels.newton.contact_newton`.
-    `crowd`: True for relaxed convergence; see `ddg_warp.solve.net.outliers`.
+    `crowd`: True for relaxed convergence; see `ddg_warp.solve.newton.relaxed_convergence`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(renews, real, contact)
@@ -387,7 +387,7 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
 
 @cache
 def static_kernels(real, linear):
-    """Build the kernels of an equilibrium; see `ddg_warp.solve.net.statics`.
+    """Build the kernels of an equilibrium; see `ddg_warp.solve.equilibrium.newton_pcg`.
 
     `follow`: take the work of follower loads from the mean load of the update.
     `less`: subtract a product from the residual.

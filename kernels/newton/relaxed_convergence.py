@@ -1,4 +1,4 @@
-"""Relaxed convergence: a few bodies may exceed the tolerance by a bounded factor; see `ddg_warp.solve.net.outliers`."""
+"""Relaxed convergence: a few bodies may exceed the tolerance by a bounded factor; see `ddg_warp.solve.newton.relaxed_convergence`."""
 
 from functools import cache
 

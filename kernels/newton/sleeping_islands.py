@@ -1,4 +1,4 @@
-"""Sleeping islands of the coupled system during the next direction; see `ddg_warp.solve.net.resting`."""
+"""Sleeping islands of the coupled system during the next direction; see `ddg_warp.solve.newton.sleeping_islands`."""
 
 from functools import cache
 

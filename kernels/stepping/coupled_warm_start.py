@@ -45,7 +45,7 @@ def foresight_kernels(real, linear, serial: bool):
     ):
         """Store the predictor q of worlds that still have to move, and add extrapolated accelerations.
 
-        Worlds with edge rotations take them as a `direction`; see `ddg_warp.solve.net.turns`.
+        Worlds with edge rotations take them as a `direction`; see `ddg_warp.solve.newton.edge_rotation`.
         """
         w, start = share(wp.tid(), blocks)
         if scalars[PROGRESS, w] >= real(1.0):

@@ -1,4 +1,4 @@
-"""Failed worlds stop, and masked worlds restart; see `ddg_warp.solve.worlds`.
+"""Failed worlds stop, and masked worlds restart; see `ddg_warp.solve.stepping.world_reset`.
 
 Arrays of all worlds have the worlds one after the other along their last axis, `width` entries each; islands likewise.
 """

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 
 def equilibrium(scene, device, **options):

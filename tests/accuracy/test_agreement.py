@@ -10,7 +10,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.scenes import cantilever, steel_wire
-from ddg_warp.solve.statics import solve
+from ddg_warp.solve.equilibrium.statics import solve
 
 DIGITS = 1.0e-5  # m
 

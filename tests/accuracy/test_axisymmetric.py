@@ -14,10 +14,10 @@ from convergence import equilibrium, order
 import ddg_warp as ddg
 from ddg_warp.geometry.meshes import spherical_cap
 from ddg_warp.scenes import axisymmetric_dome
-from ddg_warp.solve import stability
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 E, NU = 1.0e9, 0.3
 MATERIAL = ddg.Material(young=E, poisson=NU, density=1.0)

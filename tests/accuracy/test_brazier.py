@@ -20,8 +20,8 @@ from scipy.optimize import minimize, minimize_scalar
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.direct import Factorisation
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.linear.sparse_direct import Factorisation
 
 POISSON = 0.3
 BRAZIER = 0.987307  # pi c (1 - 3 c^2 / 2) at c^2 = 2/9

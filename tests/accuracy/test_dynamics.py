@@ -10,7 +10,7 @@ from scipy import linalg
 
 import ddg_warp as ddg
 from ddg_warp.scenes import flying_beam, hanging_chain, spinning_rod, vibration, whirling
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 slow = pytest.mark.slow
 

@@ -6,8 +6,8 @@ from convergence import equilibrium, order
 from scipy.fft import dct
 
 from ddg_warp.scenes import bilayer_strip, leaf
-from ddg_warp.solve.stability import spectrum
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.stability import spectrum
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 KAPPA = 1.5 * 4e-3 / bilayer_strip.THICKNESS  # of equal layers (Timoshenko 1925), mismatch 4e-3
 

@@ -6,8 +6,8 @@ from convergence import equilibrium, order
 
 import ddg_warp as ddg
 from ddg_warp.scenes import post_buckling, roll_up, tip_load
-from ddg_warp.solve import stability
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 
 # Tip of a circle of curvature `2 pi turns / L`: (sin a, 1 - cos a) L / a.

@@ -10,8 +10,8 @@ from convergence import equilibrium, order
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import plate_buckling, plate_square
-from ddg_warp.solve import stability
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 
 def deflection(device, *options, **more) -> float:

@@ -9,7 +9,7 @@ from convergence import order
 
 import ddg_warp as ddg
 from ddg_warp.scenes import michell_ring
-from ddg_warp.solve import stability, statics
+from ddg_warp.solve.equilibrium import stability, statics
 
 POISSON, WIDTH, LENGTH = 0.3, 0.1, 1.0
 

@@ -9,10 +9,10 @@ from convergence import equilibrium, order
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import sphere_indentation
-from ddg_warp.solve import stability
-from ddg_warp.solve.direct import Factorisation
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.linear.sparse_direct import Factorisation
 
 
 def stiffness(device, *options) -> float:

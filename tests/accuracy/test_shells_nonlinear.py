@@ -9,7 +9,7 @@ import pytest
 from convergence import equilibrium, order
 
 from ddg_warp.scenes import cantilever_plate_shear, hinged_roof, pinched_cylinder, pullout_cylinder, slit_annulus
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 
 def path(module, device, steps, **parameters):

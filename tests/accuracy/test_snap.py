@@ -6,7 +6,7 @@ from convergence import order
 
 from ddg_warp.scene.path import Stop
 from ddg_warp.scenes import deep_arch, lee_frame, right_angle_frame
-from ddg_warp.solve.continuation import Continuation
+from ddg_warp.solve.equilibrium.continuation import Continuation
 
 
 def path_of(scene, device, stop=None, **options):

@@ -5,7 +5,7 @@ import pytest
 from convergence import order
 
 from ddg_warp.scenes import bend_twist, greenhill, localized_helix, michell_ring
-from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 
 
 # Critical M [B/L] for a tension T [B/L^2], from the determinant (Greenhill 1883). EA L^2 / B = 1e9.

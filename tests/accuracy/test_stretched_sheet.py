@@ -14,8 +14,8 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve import stability
-from ddg_warp.solve.statics import Equilibrium
+from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.statics import Equilibrium
 
 LENGTH, POISSON, STRAIN = 1.0, 0.3, 1e-3
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.solve.contact.shapes import BALLS, Shapes
+from ddg_warp.solve.collision.collision_mesh import BALLS, Shapes
 
 SIDES = ((2, 2), (1, 3))  # numbers of nodes of the two primitives of a pair, without balls
 

@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 from brute_force import SIDES, near_pairs, scene, upload
 
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 REACH, MARGIN = 0.004, 0.01
 

@@ -5,9 +5,9 @@ import warp as wp
 from brute_force import admissible_pairs, edge_edge, point_edge, point_triangle, scene
 
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.pair_terms import PairTerms
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.contact_potential import PairTerms
 
 REACH, MARGIN = 0.004, 0.004
 LAWS = {

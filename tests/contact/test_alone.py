@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.solve.net.alone import Alone
+from ddg_warp.solve.stepping.decoupled_step import Alone
 
 RADIUS, DT = 2e-3, 1 / 240
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5, viscosity=1e-3)

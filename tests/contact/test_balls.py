@@ -7,9 +7,9 @@ from brute_force import SIDES, admissible_pairs, candidate_pairs, distances, nea
 from motion_cases import MARGIN, REACH, Motion
 from pair_cases import LAWS, central, psi
 
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.pair_terms import PairTerms
-from ddg_warp.solve.contact.shapes import BALLS, Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import BALLS, Shapes
+from ddg_warp.solve.collision.contact_potential import PairTerms
 
 
 def rods_shell_and_balls(seed: int) -> tuple[Shapes, np.ndarray]:

@@ -7,10 +7,10 @@ from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.solve.contact import tree
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.pairs import RunningSums
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision import bvh
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.candidate_list import RunningSums
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 REACH, MARGIN = 0.004, 0.01
 
@@ -67,8 +67,8 @@ def test_leaf_size_changes_no_pair_and_no_crossing(device, monkeypatch, leaf_siz
     shapes, points = scene(17, 0.3, rods=10, triangles=40)
     move = 0.05 * np.random.default_rng(18).normal(size=(2 * len(points), 3))
     results = []
-    for bundle in (tree.BUNDLE, (leaf_size, leaf_size)):
-        monkeypatch.setattr(tree, "BUNDLE", bundle)
+    for bundle in (bvh.BUNDLE, (leaf_size, leaf_size)):
+        monkeypatch.setattr(bvh, "BUNDLE", bundle)
         search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
         x = upload(np.tile(points, (2, 1)), device)
         lists = [pairs.tolist() for pairs in candidate_pairs(search)]
@@ -256,7 +256,7 @@ def test_boxes_contain_their_primitives(device, offset):
     for size in shapes.sizes:
         nodes, radius, *_ = shapes.things(size)
         radii = wp.array([shapes.radii], dtype=wp.float64, device=device)
-        primitives = tree.Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
+        primitives = bvh.Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
         primitives.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
         reach = (radius + 0.002)[:, None]
         below = points[nodes].min(1) - reach - primitives.lower.numpy().astype(float)

@@ -8,7 +8,7 @@ from pair_cases import CASES, assembled_hessian, assert_repeatable, hessian_prod
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 FACTORS = np.array([1.0, 1.7, 2.5])  # forwards, backwards and across, over MU
 RADIUS, RANGE = 5e-3, 1e-4

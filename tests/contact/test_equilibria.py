@@ -12,10 +12,10 @@ from ddg_warp import statics
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import crossed_beams
-from ddg_warp.solve import relaxation, stability
-from ddg_warp.solve.contact import pairs
-from ddg_warp.solve.net.statics import NetEquilibrium
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.collision import candidate_list
+from ddg_warp.solve.equilibrium import dynamic_relaxation, stability
+from ddg_warp.solve.equilibrium.newton_pcg import NetEquilibrium
+from ddg_warp.solve.equilibrium.tangent import Tangent
 from tests.contact.brute_force import edge_edge
 from tests.learn.contact_cases import SCENES, scene_of, touching
 from tests.learn.differences import built
@@ -377,7 +377,7 @@ def test_refusals(device):
     with pytest.raises(ddg.SceneError, match=r"'direct' stops all where two things come close.* take solver='auto'"):
         statics.solve(smooth, solver="direct")
     with pytest.raises(ddg.SceneError, match=r"relaxation keeps nothing apart; take statics\.solve"):
-        relaxation.relax(smooth)
+        dynamic_relaxation.relax(smooth)
     with pytest.raises(ddg.SceneError, match="some are on their own; leave objects out"):
         statics.solve(partly)
     state = smooth.state()
@@ -440,8 +440,8 @@ def test_long_motions_past_many_bodies_are_split(device, monkeypatch):
     model = separate_layers().build(device, precision="float64")
     at_once = statics.Equilibrium(model)
     rest = at_once.load(model.state(), 1)
-    monkeypatch.setattr(pairs, "CROWD", 1)
-    monkeypatch.setattr(pairs, "CROWD_LEAST", 1)
+    monkeypatch.setattr(candidate_list, "CROWD", 1)
+    monkeypatch.setattr(candidate_list, "CROWD_LEAST", 1)
     in_parts = statics.Equilibrium(model)
     state = in_parts.load(model.state(), 1)
     contact = in_parts.net.newton.contact
@@ -461,7 +461,7 @@ def test_step_fraction_of_a_long_motion(device, monkeypatch):
     meet = (1.0 - 4.0 / 23.0) / 12.0
     fraction = statics.Equilibrium(model).net.share(before.ravel(), (before + motion).ravel())
     assert 0.85 * meet < fraction < meet
-    monkeypatch.setattr(pairs, "CROWD", 1)
-    monkeypatch.setattr(pairs, "CROWD_LEAST", 1)
+    monkeypatch.setattr(candidate_list, "CROWD", 1)
+    monkeypatch.setattr(candidate_list, "CROWD_LEAST", 1)
     limited = statics.Equilibrium(model).net.share(before.ravel(), (before + motion).ravel())
     assert 0.2 * meet < limited < meet

@@ -21,8 +21,8 @@ from pair_cases import (
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.densities.contact import smooth_penalty
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.pair_terms import PairTerms
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.contact_potential import PairTerms
 
 
 @each_case

@@ -8,8 +8,8 @@ import ddg_warp as ddg
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY
 from ddg_warp.scenes import overhand_knot
-from ddg_warp.solve.net.contact import NetContact
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.newton.contact_newton import NetContact
 
 
 def test_steps_cut_by_ccd_converge(device):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from brute_force import upload
 
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 REACH, MARGIN = 0.004, 0.01
 FRAMES = 2001

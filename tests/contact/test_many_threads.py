@@ -7,8 +7,8 @@ from brute_force import candidate_pairs, scene, upload
 
 import ddg_warp as ddg
 from ddg_warp import arrays
-from ddg_warp.solve.contact import pairs, tree
-from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.collision import bvh, candidate_list
+from ddg_warp.solve.collision.broad_phase import BroadPhase
 
 REACH, MARGIN = 0.004, 0.01
 
@@ -19,7 +19,7 @@ def many(monkeypatch):
 
     def switch():
         monkeypatch.setattr(arrays, "serial", lambda device: False)
-        monkeypatch.setattr(pairs, "LEAST", 16)
+        monkeypatch.setattr(candidate_list, "LEAST", 16)
 
     return switch
 
@@ -41,8 +41,8 @@ def test_walk_order_follows_a_morton_curve(device):
     """Keys of three times ten bits increase, world by world; boxes outside the bounds are clamped to the sides."""
     rng, count = np.random.default_rng(2), 200
     for worlds in (1, 3):
-        boxes = tree.Boxes(count, worlds, wp.get_device(device))
-        order = tree.WalkOrder(boxes)
+        boxes = bvh.Boxes(count, worlds, wp.get_device(device))
+        order = bvh.WalkOrder(boxes)
         for away in (0.0, 5.0):  # the second time some boxes have left the bounds, which stay
             lower = rng.uniform(size=(worlds * count, 3))
             lower[::7] += away

@@ -11,8 +11,8 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.additive_ccd import NEAR, REST
 from ddg_warp.kernels.collision.ccd.step_fractions import ROUNDS
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 
 def allowed_closing(gap: float) -> float:

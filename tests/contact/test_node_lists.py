@@ -9,7 +9,7 @@ from ddg_warp import arrays
 from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.collision.contact.incidence import list_kernels
 from ddg_warp.kernels.collision.primitives import EDGES, POINT_TRIANGLE, Kind
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 MU, RATE, SIDE = 0.4, 100.0, 50
 

@@ -11,8 +11,8 @@ import ddg_warp as ddg
 from ddg_warp.kernels.core.islands import DROWNED, STATUS, UNBALANCED
 from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.run.simulate import simulate
-from ddg_warp.solve.net.krylov import SPARE
-from ddg_warp.solve.net.newton import LOOSEST, NetNewton
+from ddg_warp.solve.linear.pcg import SPARE
+from ddg_warp.solve.newton.coupled_newton import LOOSEST, NetNewton
 
 RADIUS, DT, RTOL = 2e-3, 1 / 240, 1e-4
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)

@@ -11,7 +11,7 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
-from ddg_warp.solve import statics
+from ddg_warp.solve.equilibrium import statics
 
 G, RANGE, STIFFNESS, HEIGHT = 9.81, 2e-3, 40.0, 0.002
 RUBBER = ddg.Material(1e6, 0.3, 1000.0)

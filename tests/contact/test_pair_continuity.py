@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pair_cases import LAWS, move, psi, terms
 
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 RADIUS, GAP = 0.003, 0.001
 each_law = pytest.mark.parametrize("law", LAWS)

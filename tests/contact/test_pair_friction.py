@@ -15,7 +15,7 @@ from friction_cases import (
 )
 from pair_cases import LAWS, assembled_hessian, bundle, central, hessian_product, psi, state, terms, used_pairs
 
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 
 def friction_ratios(pair_list) -> np.ndarray:

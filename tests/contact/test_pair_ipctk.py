@@ -8,9 +8,9 @@ from pair_cases import hessian_product, upload
 from test_distance import KINDS, closest_points, configurations
 
 from ddg_warp.kernels.densities.contact import log_barrier
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.pair_terms import PairTerms
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.contact_potential import PairTerms
 
 ipctk = pytest.importorskip("ipctk")
 COUNT, RANGE, STIFFNESS = 1000, 0.4, 50.0

@@ -12,7 +12,7 @@ import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.geometry import meshes
 from ddg_warp.scene.path import Displacement, Stop
-from ddg_warp.solve.continuation import Continuation
+from ddg_warp.solve.equilibrium.continuation import Continuation
 
 LENGTH = 1.1  # m, of the bars of the truss
 HEIGHT = np.sqrt(LENGTH**2 - 1.0)  # m, of its apex

@@ -10,7 +10,7 @@ from ddg_warp import statics
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import capstan
-from ddg_warp.solve.statics import Equilibrium
+from ddg_warp.solve.equilibrium.statics import Equilibrium
 
 RUBBER = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
 G = 9.81  # m/s^2

@@ -8,9 +8,9 @@ import warp as wp
 from brute_force import curves, near_pairs, upload
 
 from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, STEPS
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.runs import Runs
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.rod_culling import Runs
 
 REACH, MARGIN, RADIUS = 0.002, 0.004, 0.003
 

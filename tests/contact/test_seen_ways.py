@@ -7,8 +7,8 @@ from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 from motion_cases import MARGIN, REACH, Motion, tangle
 
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import AHEAD
-from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.collision_mesh import Shapes
 
 
 def random_offsets(rng, count: int, most: float) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.solve.net import chains
+from ddg_warp.solve.linear import rod_substructuring
 
 RADIUS = 2e-3
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -183,7 +183,7 @@ def test_substructuring_does_not_depend_on_the_thread_mapping(device, monkeypatc
     """Two eliminations include the contact terms of the bands: motions agree to rounding, iterations to one of hundreds."""
     results = []
     for reduces in (False, True):
-        monkeypatch.setattr(chains, "long_and_few", lambda *_, reduces=reduces: reduces)
+        monkeypatch.setattr(rod_substructuring, "long_and_few", lambda *_, reduces=reduces: reduces)
         scene = import_module(f"ddg_warp.scenes.{name}").build()
         model = scene.build(device, precision="float64")
         integrator = ddg.Integrator(model, rtol=1e-5)  # above the rounding floor, where iterations are another number

@@ -24,7 +24,7 @@ from turn_cases import (
 
 import ddg_warp as ddg
 from ddg_warp.kernels.forces.prescribed_motion import MOST_PARTS
-from ddg_warp.solve.net.arcs import PART
+from ddg_warp.solve.collision.support_arcs import PART
 
 WIDE = "mesh", "box", "hold", "half-space"  # these move a whole rod, which cannot rotate aside
 TURNS = 0.02, 0.05, 1 / 6, 0.3, 0.5, 0.75, 0.95, 1.0, 1.3, 2.5

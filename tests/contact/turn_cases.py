@@ -3,7 +3,7 @@
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.solve.net.arcs import PART
+from ddg_warp.solve.collision.support_arcs import PART
 
 FIRST, LAST, HALF = 0.05, 0.2, 1e-3  # m, of a blade along x: nearest and farthest from the axis, half its thickness
 RADIUS = 1e-3  # m, of the rod

@@ -6,7 +6,7 @@ from bad_inputs import DOME, INF, NAN, RUBBER, built, dome, each, refuse, rods
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.relaxation import relax
+from ddg_warp.solve.equilibrium.dynamic_relaxation import relax
 
 TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 FLAT = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [2.0, 0.0, -1.0]])

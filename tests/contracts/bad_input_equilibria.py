@@ -4,7 +4,7 @@
 from bad_inputs import INF, NAN, built, clamped, each, line, model, refuse, rods, sheet
 
 import ddg_warp as ddg
-from ddg_warp.solve import continuation, stability, statics
+from ddg_warp.solve.equilibrium import continuation, stability, statics
 
 # --- statics ---
 each("statics", "model", [None, 3], statics.solve, "statics", "scene.build()")

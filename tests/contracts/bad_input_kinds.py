@@ -23,8 +23,8 @@ import ddg_warp as ddg
 from ddg_warp.ask import fields, inquiry, sag_free
 from ddg_warp.geometry import meshes
 from ddg_warp.model import rest_shapes
-from ddg_warp.solve import continuation, stability, statics
-from ddg_warp.solve.step_control import StepControl
+from ddg_warp.solve.equilibrium import continuation, stability, statics
+from ddg_warp.solve.stepping.adaptive_step import StepControl
 
 NUMBERS = [b"0.3", "0.3", True, 1j, [[1.0], [2.0, 3.0]], {"a": 1.0}, 10**400]  # which are none
 GRAD = torch.ones(3, dtype=torch.float64, requires_grad=True)

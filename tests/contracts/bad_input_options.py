@@ -9,8 +9,8 @@ from bad_inputs import RUBBER, STIFFNESS, built, each, integrator, line, model, 
 
 import ddg_warp as ddg
 from ddg_warp.kernels.densities.quadratic import quadratic
-from ddg_warp.solve import continuation, statics
-from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.equilibrium import continuation, statics
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 # --- unknown options ---
 refuse("options: unknown", {

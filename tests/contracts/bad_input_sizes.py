@@ -20,8 +20,8 @@ from bad_inputs import (
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve import continuation, stability, statics
-from ddg_warp.solve.step_control import StepControl
+from ddg_warp.solve.equilibrium import continuation, stability, statics
+from ddg_warp.solve.stepping.adaptive_step import StepControl
 
 FAR, NEAR = [1e300, 1e200, -1e100], [1e-300, 1e-200, -1e-100]
 LARGE, SMALL = [1e300, 1e100, 10**400], [1e-300, 1e-100]

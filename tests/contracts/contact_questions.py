@@ -6,7 +6,7 @@ from questions import Variant, _mass, assert_close
 
 import ddg_warp as ddg
 from ddg_warp import statics
-from ddg_warp.solve.continuation import Continuation
+from ddg_warp.solve.equilibrium.continuation import Continuation
 
 STEP, COUNT = 2e-3, 8
 

@@ -7,11 +7,11 @@ from effects import ARC, CALLS, DEVICE, DT, MAGNET, RUBBER, SHEET, Call, Change,
 
 import ddg_warp as ddg
 from ddg_warp.ask import inquiry
-from ddg_warp.solve import continuation, stability, statics
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.corrector import ContinuationOptions
-from ddg_warp.solve.statics import StaticsOptions
-from ddg_warp.solve.step_control import StepControl
+from ddg_warp.solve.equilibrium import continuation, stability, statics
+from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions
+from ddg_warp.solve.equilibrium.statics import StaticsOptions
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.stepping.adaptive_step import StepControl
 
 
 @cache

@@ -10,9 +10,9 @@ from objects import UP, Object
 import ddg_warp as ddg
 from ddg_warp.ask import inquiry
 from ddg_warp.kernels.terms import ALL, AXISYMMETRIC, SHELLS
-from ddg_warp.solve import stability, statics
-from ddg_warp.solve.continuation import Continuation
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import stability, statics
+from ddg_warp.solve.equilibrium.continuation import Continuation
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 DT = 0.004
 
@@ -93,7 +93,7 @@ def energies(kind, variant):
 
 def _mass(model) -> np.ndarray:
     """Return the mass of every point (P,) [kg], divided among points with a common node."""
-    from ddg_warp.solve.tangent import Tangent
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
     tangent = Tangent(model)
     dofs = tangent.point_dofs()

@@ -15,8 +15,8 @@ import ddg_warp as ddg
 from ddg_warp.errors import SceneWarning
 from ddg_warp.geometry import meshes
 from ddg_warp.io.mesh_read import read_mesh
-from ddg_warp.solve import statics
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium import statics
+from ddg_warp.solve.equilibrium.tangent import Tangent
 
 STEEL = ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=0.01)
 RUBBER = ddg.Material(young=1e6, poisson=0.0, density=1000.0)
@@ -422,8 +422,8 @@ def test_oblique_symmetry_is_rotated_axis_aligned_symmetry(device, bending):
 @pytest.mark.slow
 def test_oblique_symmetry_agrees_across_worlds_precisions_and_paths(device):
     """Worlds agree exactly, precisions within rounding; frequencies and path ends equal the aligned ones."""
-    from ddg_warp.solve.continuation import Continuation
-    from ddg_warp.solve.stability import spectrum
+    from ddg_warp.solve.equilibrium.continuation import Continuation
+    from ddg_warp.solve.equilibrium.stability import spectrum
 
     results = []
     for turn, axes in ((0.0, True), (TURN, False)):

@@ -10,7 +10,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
-from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
 
 KINDS = {
     "full": {},

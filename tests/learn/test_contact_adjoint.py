@@ -9,7 +9,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.contact import FRICTION, RANGE, STIFFNESS
 from ddg_warp.learn.adjoint import Adjoint
 from ddg_warp.learn.net_solve import NetSolve
-from ddg_warp.solve.net.exact import ExactSystem
+from ddg_warp.solve.linear.exact_system import ExactSystem
 from tests.learn.contact_cases import DT, SCENES, scene_of, touching
 from tests.learn.differences import (
     TIGHT,

@@ -11,9 +11,9 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.learn.adjoint import Adjoint
 from ddg_warp.learn.solve import HostSolve
-from ddg_warp.solve.net.exact import ExactSystem
-from ddg_warp.solve.net.krylov import ConjugateGradients
-from ddg_warp.solve.net.tangent import NetTangent
+from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
+from ddg_warp.solve.linear.exact_system import ExactSystem
+from ddg_warp.solve.linear.pcg import ConjugateGradients
 from ddg_warp.torch import Simulator
 from tests.learn import differences
 from tests.learn.differences import TIGHT, built, cotangent, directions, entries, lively

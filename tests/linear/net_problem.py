@@ -5,9 +5,9 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.net.newton import NetNewton
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 SECTION = ddg.Stiffness(EA=300.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
 CABLE = ddg.Stiffness(EA=300.0, mass_per_length=0.7)

@@ -9,7 +9,7 @@ from chain_system import system
 
 from ddg_warp import arrays
 from ddg_warp.kernels.linear.rod_dof_map import place_dofs
-from ddg_warp.solve.net.both_ends import BothEnds
+from ddg_warp.solve.linear.twisted_factorisation import BothEnds
 
 COUNTS = (1, 2, 3, 4, 5, 6, 17, 32, 33)
 LONGEST, WIDTH = max(COUNTS), len(COUNTS)

@@ -6,8 +6,8 @@ from net_problem import Problem, frame_and_sheet, membrane_with_springs
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.net.newton import PRECONDITIONERS
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
 
 
 @pytest.mark.parametrize("stretch", [1.05, 0.97], ids=["tension", "compression"])

@@ -9,9 +9,8 @@ from net_problem import CABLE, SECTION, Problem, branches, frame_and_sheet, hing
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
-from ddg_warp.solve import reduction
-from ddg_warp.solve.choice import net_preconditioner
-from ddg_warp.solve.net import chains
+from ddg_warp.solve.linear import cyclic_reduction, rod_substructuring
+from ddg_warp.solve.linear.solver_selection import net_preconditioner
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
@@ -78,8 +77,8 @@ def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
 def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduces):
     """Equal to dense condensation by the serial sweep and by cyclic reduction, with factors stored or recomputed."""
-    monkeypatch.setattr(chains, "long_and_few", lambda *_: bool(reduces))
-    monkeypatch.setattr(reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
+    monkeypatch.setattr(rod_substructuring, "long_and_few", lambda *_: bool(reduces))
+    monkeypatch.setattr(cyclic_reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
     problem.newton.islands.clamped.fill_(1)
     problem.iterate(0.1)

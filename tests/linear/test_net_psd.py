@@ -6,8 +6,8 @@ from net_problem import Problem, branches, hinged_grid, ring_and_spokes, sheet
 from test_psd import CONVERGED, errors, helix, order, run
 
 import ddg_warp as ddg
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.net.newton import NetNewton
+from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 LATE = 5  # an iteration at which "progressive" takes the exact matrix
 

@@ -8,8 +8,8 @@ from test_tension import advance
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.scenes import hair
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.net.newton import NetNewton
+from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
 

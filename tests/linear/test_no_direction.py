@@ -6,7 +6,7 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.kernels.linear import coupled_pcg
 from ddg_warp.scenes import gridshell_dome
-from ddg_warp.solve import step
+from ddg_warp.solve.stepping import step_driver
 
 
 def test_solves_without_direction_are_flagged(device):
@@ -47,7 +47,7 @@ def test_lost_direction_drops_second_derivatives(device, monkeypatch):
 
     exact, _ = advanced("float64", rtol=1e-10)
     monkeypatch.setattr(
-        step, "suited", lambda *_: step.Means(wp.float32, True, False)
+        step_driver, "suited", lambda *_: step_driver.Means(wp.float32, True, False)
     )  # instead of the solver selection
     points, mixed = advanced("mixed")
     assert mixed["linear"] == ["float32"]

@@ -9,9 +9,9 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.kernels.newton import rod_iterate
-from ddg_warp.solve import choice
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.chains.partitioned import PartitionedNewton
+from ddg_warp.solve.linear import solver_selection
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.newton.rod_newton_parallel import PartitionedNewton
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 EVERY_KIND = pytest.mark.parametrize(
@@ -328,10 +328,15 @@ def test_auto_reduces_few_long_open_rods(device):
 
     def chosen(nodes, columns, closed=False, cuda=True):
         kind, where = SimpleNamespace(closed=closed), SimpleNamespace(is_cuda=cuda)
-        return choice.automatic(SimpleNamespace(kind=kind, device=where, nodes=nodes, columns=columns))
+        return solver_selection.automatic(SimpleNamespace(kind=kind, device=where, nodes=nodes, columns=columns))
 
-    assert chosen(10_000, 1) == chosen(choice.LONG, choice.FEW) == "partitioned"
-    assert chosen(choice.LONG - 1, 1) == chosen(10_000, choice.FEW + 1) == chosen(10_000, 1, cuda=False) == "sweep"
+    assert chosen(10_000, 1) == chosen(solver_selection.LONG, solver_selection.FEW) == "partitioned"
+    assert (
+        chosen(solver_selection.LONG - 1, 1)
+        == chosen(10_000, solver_selection.FEW + 1)
+        == chosen(10_000, 1, cuda=False)
+        == "sweep"
+    )
     assert chosen(10_000, 1, closed=True) == "chain"
     model = hanging().build(device)
     expected = "cyclic reduction" if model.wp_device.is_cuda else "chain sweep"

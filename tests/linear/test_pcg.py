@@ -7,8 +7,8 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.kernels.linear import rod_matrix, rod_pcg
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.chains.pcg import PcgNewton
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
 
 KINDS = {"twist": {}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 # Every kind of rod compiles separate kernels: daily runs take the closed one with all terms.

@@ -8,9 +8,9 @@ from test_pcg import EVERY_CHAIN, Problem
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.kernels.core import outcome
-from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
-from ddg_warp.solve.chains.pcg import PcgNewton
-from ddg_warp.solve.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
 
 CONVERGED = {"converged", "converged_to_rounding"}
 

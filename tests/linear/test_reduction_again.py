@@ -6,7 +6,7 @@ import warp as wp
 from chain_system import system
 
 from ddg_warp import arrays
-from ddg_warp.solve.reduction import CyclicReduction
+from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction
 
 COUNTS = (2, 3, 4, 5, 17, 31, 32, 33, 50, 64)
 

@@ -7,10 +7,10 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.scenes import hair as curled
-from ddg_warp.solve import choice
-from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.chains.partitioned import PartitionedNewton
-from ddg_warp.solve.chains.step import DIRECT
+from ddg_warp.solve.linear import solver_selection
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.newton.rod_newton_parallel import PartitionedNewton
+from ddg_warp.solve.stepping.rod_step import DIRECT
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}}
 EVERY_KIND = pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_report_names_linear_algebra_of_steps(device, monkeypatch):
     """The report names float32, float32 with tensions or float64 for the steps of the scene's analysis."""
     prefix = "over steps of 0.0166667 s: edges turned, second derivatives"
     for solver, reduced in (("chain sweep", False), ("cyclic reduction", True)):
-        monkeypatch.setattr(choice, "long_and_few", lambda *_arguments, reduced=reduced: reduced)
+        monkeypatch.setattr(solver_selection, "long_and_few", lambda *_arguments, reduced=reduced: reduced)
         for precision, linear in (("mixed", ", linear algebra in float32 with tensions"), ("float64", "")):
             report = hair(32).build(device, precision).report()
             assert prefix + linear + "\n" in report

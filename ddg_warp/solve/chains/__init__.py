@@ -1,1 +1,0 @@
-"""Of rods on their own, which lie in chains."""

@@ -1,0 +1,1 @@
+"""Collision: mesh, broad phase, candidate lists, CCD step fractions, contact and friction potentials."""

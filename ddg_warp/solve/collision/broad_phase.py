@@ -1,0 +1,361 @@
+"""Broad phase of contact on a device: candidates, candidate validity and motion limits; see `kernels.collision`."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
+from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
+from ddg_warp.solve.collision.bvh import Things
+from ddg_warp.solve.collision.candidate_list import PairList
+from ddg_warp.solve.collision.collision_mesh import BALLS, PLANES, Shapes
+from ddg_warp.solve.collision.step_filter import MotionFilter
+
+SLACK = 1e-3  # relative excess of the skin margin in searches, for rounding
+NONE = np.iinfo(np.int64).max
+MORE = 16  # counters of other objects that are read in the same transfer
+
+
+class BroadPhase:
+    """Candidates: pairs of `shapes` that may come within range, in each of some worlds.
+
+    All pairs within thickness + `reach` are candidates while every node is within half of `margin` of its position at the search.
+    After a search for a motion, the path replaces the position. Each node may be anywhere along its path, the nodes of a half-space
+    alike. In a world with a single step fraction, all nodes are at that fraction.
+
+    `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured; `update`, `filter` and `search`
+    also in conditional graph nodes. `rebuild` can be captured, on CUDA outside of conditional nodes only. There it should begin a
+    step, at least every few steps with searches. `fit` and `check` read from the device, between graph launches. Nodes that are not
+    finite are in no pair until these report them.
+
+    Args:
+        shapes: collision mesh of one world.
+        x: positions (worlds times nodes,), vectors of 3 [m], world by world.
+        reach: search distance: largest gap of interest [m], positive.
+        margin: skin margin added to the search distance [m], positive. Large ones give more pairs, small ones more searches.
+        radius: radius of every object in every world (worlds, objects) [m], in place of the radii of `shapes`.
+
+    Attributes:
+        lists: a `PairList` for each kind of pairs in the mesh.
+        overflow: (1,), nonzero after a capacity overflow, also in `impact` and `crossings`. Then call `fit`, and redo all that used
+            the pairs.
+        `searches`: (1,) number of searches.
+        `looks`: (1,) counter of `Runs`.
+        `sought`: both, as of the last `fit` or `check`.
+        `more`, `more_read`: (MORE,) counters of other objects, and the values of the last `fit` or `check`.
+        `gap`, `time`, `crossed`: [m], step fraction, count of each world; see `measure`, `impact` and `crossings`.
+        `shares`, `limited`: CCD step fractions (worlds times CCD bodies,), and the number below 1 of each world; see `filter`.
+        `every`: (worlds,) ones, for motions with a single step fraction in every world.
+        `version`: grows whenever arrays were reallocated, and graphs with these have to be captured again.
+
+    Raises:
+        SceneError: x, reach or margin are invalid.
+    """
+
+    def __init__(
+        self,
+        shapes: Shapes,
+        x: wp.array,
+        worlds: int = 1,
+        *,
+        reach: float,
+        margin: float,
+        radius: wp.array | None = None,
+    ):
+        for name, value in (("reach", reach), ("margin", margin)):
+            if not 0.0 < value < np.inf:
+                raise SceneError(f"{name} = {value!r} of a contact search; it is positive and finite [m]")
+        nodes = len(shapes.points)
+        if x.ndim != 1 or len(x) != worlds * nodes or getattr(x.dtype, "_shape_", ()) != (3,):
+            raise SceneError(
+                f"positions of {worlds} world(s) of {nodes} nodes are {worlds * nodes} vectors of 3, not {x.shape} of {x.dtype}"
+            )
+        self.shapes, self.worlds, self.reach, self.margin = shapes, worlds, float(reach), float(margin)
+        self.device, real = x.device, x.dtype._wp_scalar_type_
+        self.real = real
+        if radius is None:
+            radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
+        primitives = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
+        self._things = list(primitives.values())
+        self._still, self._move, self._way = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
+        self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # motion of the last search
+        used = np.zeros(nodes, np.uint8)  # nodes of no primitive may be no positions, as edge blocks
+        for size in shapes.sizes:
+            used[shapes.things(size)[0]] = 1
+        self._placed = wp.array(used, dtype=wp.uint8, device=self.device)
+        self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
+        self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
+        # one transfer after every step: each takes as long as a kernel or two
+        self._memory = wp.zeros(2 + MORE, dtype=wp.int64, device=self.device)
+        counters = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
+        self.overflow, self._lost, self.searches, self.looks = (counters[k : k + 1] for k in range(4))
+        self._reading = arrays.Reading(self._memory)
+        self.more, self.more_read = self._memory[2:], np.zeros(MORE, np.int64)
+        self.sought = (0, 0)
+        # candidates outdated, outdated for the check of a whole step, searched by the last `update`
+        self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
+        self._edges = primitives[2]
+        self._walked = [part for part in self._things if part.walked]
+        self._motion = motion_kernels(real, arrays.serial(self.device))
+        self.rebuild(x)
+        several_worlds = worlds > 1
+        sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
+        self.lists = [
+            PairList(kind, primitives[first], primitives[second], shapes, several_worlds, real, self.overflow)
+            for kind, first, second in sides
+            if second in primitives
+        ]
+        self._impacts, self._passes = (
+            [impact_kernel(pairs.kind, passing, real, pairs.single) for pairs in self.lists]
+            for passing in (False, True)
+        )
+        # unused outputs of impact kernels
+        self._unused = [wp.zeros(worlds, dtype=dtype, device=self.device) for dtype in (real, int, wp.int64)]
+        self.gap = wp.zeros(worlds, dtype=real, device=self.device)
+        self.time = wp.zeros(worlds, dtype=real, device=self.device)
+        self.crossed = wp.zeros(worlds, dtype=int, device=self.device)
+        self._firsts = [wp.zeros(1, dtype=wp.int64, device=self.device) for _ in self.lists]
+        self._filter = MotionFilter(self.lists, nodes, worlds, real, self.device)
+        self.version = 0
+        self.search(x)
+        self.fit(x)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
+        boxes = [kernel for part in self._things for kernel in part.kernels]
+        return [*lists, *boxes, *self._motion, *self._impacts, *self._passes, *self._filter.kernels]
+
+    @property
+    def shares(self) -> wp.array:
+        return self._filter.shares
+
+    @property
+    def limited(self) -> wp.array:
+        return self._filter.limited
+
+    def rebuild(self, x: wp.array) -> None:
+        """Rebuild the BVHs, not the lists. On CUDA searches refit these until the next call, on the CPU they build their own.
+
+        After large motions, a search in an old tree takes tens of times as long.
+        """
+        self._enclose(x, self._still, self._never, 1.0, self._within)
+        for primitives in self._things:
+            primitives.build()
+
+    def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
+        """Search again along the motion from `base` to q if candidates are outdated at either end.
+
+        Without q nothing moves. Otherwise the path extends beyond q, see `kernels.collision.broad_phase.candidate_validity`, but in
+        worlds with a single step fraction; there the candidates of an unfiltered motion hold from q on.
+        """
+        together = self._never if together is None else together
+        _, lengthen, *_ = self._motion
+
+        def anew() -> None:
+            if q is None:
+                self.search(base)
+                return
+            self._sweep(lengthen, base, [self._move, together], [self._way])
+            self.search(base, self._way, together)
+
+        self._done.zero_()
+        self._watch(base, base if q is None else q, self._stale)
+        wp.capture_if(self._stale, anew)
+
+    def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
+        """Find all candidates at x or, with `move`, anywhere on the straight motion from x by `move`.
+
+        Each node may take any step fraction; in worlds where `together` (worlds,) is not zero, all take the same.
+        """
+        move = self._still if move is None else move
+        together = self._never if together is None else together
+        self._enclose(x, move, together, 1.0, self._within)
+        for primitives in self._walked:
+            primitives.leaves.renew()
+
+        def find(pairs: PairList) -> None:
+            pairs.meet()
+            pairs.judge(x, move, together, self.reach, self._around)
+
+        arrays.side_by_side([partial(find, pairs) for pairs in self.lists], self.device)
+        _, _, mark, _ = self._motion
+        outputs = [self._start, self._end, self._stale, self._done, self.searches]
+        self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
+
+    def _watch(self, base: wp.array, q: wp.array, stale: wp.array) -> None:
+        """Mark candidates as `stale` (1,) for a motion, which becomes the present one; see the class."""
+        watch, *_ = self._motion
+        inputs = [base, q, self._start, self._end, self._placed, 0.5 * self.margin]
+        self._sweep(watch, base, inputs, [self._move, stale])
+
+    def filter(
+        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
+    ) -> None:
+        """Limit the motion from `base` to `q` in place so that all pairs keep the fraction `keep` of the thickness.
+
+        Each CCD body moves by its own step fraction, in `shares`; `time` has the smallest of each world. Common motion of all nodes
+        limits nothing. Candidates are updated. After a capacity overflow nothing moves.
+
+        Args:
+            unit: CCD body of each node of a world (nodes,); -1 for nodes that are never limited. If such a node belongs to a moving
+                object, others may not evade it.
+            together: (worlds,), nonzero where all CCD bodies have one step fraction.
+            units: number of CCD bodies of a world.
+
+        Raises:
+            SceneError: not 0 <= keep <= 1, or arrays are invalid.
+        """
+        _checked_keep(keep)
+        self._filter.check(unit, together, units)
+        self.update(base, q, together)
+        search = (self.overflow, self.time, self._done, self._start, self._end)
+        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
+
+    def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
+        """Grow overflowed lists and search again until all pairs fit; return True if any overflowed. Reads from the device.
+
+        Args:
+            x: positions of the search.
+            shorten: called if the pairs are too many to store, see `PairList.crowded`; True means that motions will be shorter, and
+                lists stay.
+
+        Raises:
+            SolverError: names a node whose position is not finite; or there are more pairs than can be counted.
+        """
+        grown = False
+        while self._checked():
+            self.overflow.zero_()
+            spare = shorten is not None and any(pairs.crowded for pairs in self.lists) and shorten()
+            for pairs in self.lists:
+                pairs.dismiss() if spare else pairs.fit()
+            self.version += not spare
+            grown = True
+            self.search(x)
+        return grown
+
+    def check(self) -> None:
+        """Refuse positions that were not finite when bounds were made. Reads from the device.
+
+        Raises:
+            SolverError: names the node and its world.
+        """
+        self._checked()
+
+    def _checked(self) -> bool:
+        """Refuse positions that are not finite; return True after a capacity overflow."""
+        memory = self._reading()
+        overflow, lost, *sought = memory[:2].view(np.int32).tolist()
+        self.sought, self.more_read, node = tuple(sought), memory[2:], lost - 1
+        if node >= 0:
+            self._lost.zero_()
+            world, node = divmod(node, len(self.shapes.points))
+            raise SolverError(
+                f"node {node} of world {world} has a position or displacement that is not finite; go back to the last good state",
+                outcome="not_finite",
+            )
+        return overflow != 0
+
+    def measure(self, x: wp.array, enough: float = -math.inf) -> None:
+        """Write the smallest gap of each world to `gap` [m], at most `reach`, or any below `enough`. Needs valid candidates."""
+        self.gap.fill_(self.reach)
+        for pairs in self.lists:
+            pairs.measure(x, self.gap, enough)
+
+    def impact(self, x: wp.array, move: wp.array, keep: float = 1.0) -> None:
+        """Write the first time in the motion from x by `move` when a pair is as near as `keep` of the thickness, by world to `time`.
+
+        The time is conservative, 1 without such a pair and 0 if some overlap at x. All pairs are tested, not only candidates.
+
+        Raises:
+            SceneError: not 0 <= keep <= 1.
+        """
+        _checked_keep(keep)
+        self.time.fill_(1.0)
+        self._passing(self._impacts, x, move, keep, self._unused[1], [self._unused[2]] * len(self.lists))
+
+    def crossings(self, x: wp.array, move: wp.array) -> None:
+        """Count interpenetrating pairs, without thickness, in the straight motion from x by `move`, by world in `crossed`."""
+        self.crossed.zero_()
+        for first in self._firsts:
+            first.fill_(NONE)
+        self._passing(self._passes, x, move, 0.0, self.crossed, self._firsts)
+
+    def check_crossings(self, base: wp.array, q: wp.array) -> None:
+        """Count interpenetrating pairs from `base` to q, among candidates alone if these are valid, which is faster."""
+        self._beyond.zero_()
+        self._watch(base, q, self._beyond)
+        wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
+
+    def passing(self, base: wp.array, keep: float = 0.0) -> None:
+        """Count interpenetrating candidates, which have to be valid, in the present motion from `base`.
+
+        With `keep`, count pairs that come within that fraction of their thickness, or slightly farther.
+        """
+        self.crossed.zero_()
+        for pairs in self.lists:
+            pairs.cross(base, self._move, self.crossed, keep, self.reach)
+
+    def first_crossing(self) -> str:
+        """Return the names of the first interpenetrating pair, or nothing. Reads from the device."""
+        for pairs, first in zip(self.lists, self._firsts, strict=True):
+            key = int(first.numpy()[0])
+            if key != NONE:
+                return self.describe(pairs, *divmod(key, pairs.second.all))
+        return ""
+
+    def describe(self, pairs: PairList, i: int, j: int) -> str:
+        """Return the names of a pair for messages."""
+        world, k = divmod(i, pairs.first.count)
+        first, second = (
+            self.shapes.describe(pairs.first.size, k),
+            self.shapes.describe(pairs.second.size, j % pairs.second.count),
+        )
+        return f"{first} and {second}" + (f" in world {world}" if self.worlds > 1 else "")
+
+    @property
+    def _around(self) -> float:
+        """Allowed distance of a node from the path, with a rounding margin."""
+        return 0.5 * (1.0 + SLACK) * self.margin
+
+    @property
+    def _within(self) -> float:
+        """Inflation of AABBs: half of the gap up to which boxes overlap."""
+        return 0.5 * self.reach + self._around
+
+    def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
+        self._enclose(x, move, self.every, keep, 0.0)
+        for primitives in self._walked:
+            primitives.leaves.tree.refit()
+        for kernel, pairs, first in zip(kernels, self.lists, firsts, strict=True):
+            pairs.meet()
+            pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, first])
+
+    def _room(self, keep: float) -> float:
+        """Return the search distance, within which gaps close step by step; 0 if gaps may close."""
+        return self.reach if keep > 0.0 else 0.0
+
+    def _find_common(self, move, together) -> None:
+        *_, common = self._motion
+        inputs = [self._edges.surface, self._edges.count, move, together]
+        wp.launch(common, self.worlds, inputs, [self._shift], device=self.device)
+
+    def _enclose(self, x, move, together, radius_fraction: float, margin: float) -> None:
+        self._find_common(move, together)
+        for primitives in self._things:
+            primitives.enclose(x, move, self._shift, radius_fraction, margin, self._lost)
+
+    def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, len(x), inputs, outputs, self.device)
+
+
+def _checked_keep(keep: float) -> None:
+    if not 0.0 <= keep <= 1.0:
+        raise SceneError(f"keep = {keep!r} of the thickness; it is from 0 to 1")

@@ -1,0 +1,52 @@
+"""Sums over pairs in each world; see `kernels.collision.contact.world_sums`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.collision.contact.world_sums import ROWS, total_kernels, written_struct
+from ddg_warp.solve.linear.sparse_system import Sums
+
+
+class Totals:
+    """Sums over the results of contact and friction sets; call `fit` after the sets have grown.
+
+    Attributes:
+        `energy`: (worlds,) [J], infinite after a capacity overflow.
+        `touching`: (worlds,) number of active pairs.
+        `dissipated`: (worlds,) [J] friction work from the start to the last evaluation, the sum of forces times slip.
+    """
+
+    def __init__(self, contacts: list, frictions: list, worlds: int, real, device):
+        self._contacts, self._frictions, self._device = contacts, frictions, device
+        self._real, self._worlds = real, worlds
+        self.energy, self.dissipated = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
+        self.touching = wp.zeros(worlds, dtype=int, device=device)
+        primitives = max(contact.found.first.count for contact in contacts)
+        self._of_things = wp.zeros((ROWS * worlds, primitives), dtype=real, device=device)
+        self._of_worlds = wp.zeros((ROWS, worlds), dtype=real, device=device)
+        self._sum = Sums(ROWS * worlds, primitives, real, device)
+        self._add, self._tell = total_kernels(real, arrays.serial(device))
+        self.kernels = [self._add, self._tell, *self._sum.kernels]
+        self.fit()
+
+    def fit(self) -> None:
+        """Take the present arrays of the sets."""
+        # keeps the arrays alive
+        self._lists = [self._written(pair_set) for pair_set in (*self._contacts, *self._frictions)]
+        self._written_by = wp.array(self._lists, dtype=written_struct(self._real), device=self._device)
+
+    def __call__(self, overflow: wp.array) -> None:
+        """Sum the last evaluation over each world."""
+        inputs = [self._written_by, self._worlds]
+        arrays.sweep(self._add, self._of_things.shape[1], inputs, [self._of_things], self._device, worlds=self._worlds)
+        self._sum(self._of_things, self._of_worlds.flatten())
+        outputs = [self.energy, self.touching, self.dissipated]
+        wp.launch(self._tell, self._worlds, [self._of_worlds, overflow], outputs, device=self._device)
+
+    def _written(self, pair_set):
+        struct = written_struct(self._real)()
+        struct.count, struct.starts, struct.partners = pair_set.count, pair_set.starts, pair_set.partners
+        struct.energy, struct.used, struct.things = pair_set.energy, pair_set.factor.used, pair_set.found.first.count
+        if pair_set in self._frictions:
+            struct.work = pair_set.work
+        return struct

@@ -1,1 +1,0 @@
-"""Contact search, CCD and contact forces: memory and launches of `kernels.collision`."""

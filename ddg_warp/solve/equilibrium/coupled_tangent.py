@@ -1,0 +1,348 @@
+"""What a net contributes to a model's energy and tangent on the host; dofs are its blocks, three each, world by world."""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp.compile.tolerance import largest_excess
+from ddg_warp.geometry.turning import turned
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage, linear_stress_kernel
+from ddg_warp.model import validate
+from ddg_warp.scene.grip import Grip
+from ddg_warp.solve.collision import exact_hessian
+from ddg_warp.solve.equilibrium.rigid_modes import Body
+from ddg_warp.solve.equilibrium.tangent_part import Part
+from ddg_warp.solve.forces.prescribed_element_data import NetMotion
+from ddg_warp.solve.linear.skew_supports import HostPlanes
+
+
+class NetTangent(Part):
+    """The part of the net. See `Tangent` for the methods."""
+
+    def __init__(self, model, offset: int):
+        host, worlds = model.net.host, model.worlds
+        kind = np.zeros((host.blocks, 3), bool)
+        kind[host.nodes :] = True
+        self.free, self.angle = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind))
+        super().__init__(model, model.net, offset, 3 * host.blocks * worlds)
+        self.net, self.block = model.net, 3
+        self.body_count, self.islands = host.bodies.count * worlds, worlds
+        self.rate = model.net.still  # over what strain-rate damping counts: at rest not
+        self.given_field = np.zeros((worlds, 3))  # of controls, over that of the scene [T]
+        self.planes = HostPlanes(host, worlds) if host.frames else None
+        self._anchored = host.fixed[: host.nodes].copy()
+        for shell in host.shells:
+            self._anchored[shell.nodes] = True
+
+    def accelerations(self, gravity: np.ndarray) -> np.ndarray:
+        return np.where(np.arange(self.host.blocks)[:, None] < self.host.nodes, gravity, 0.0)
+
+    @cached_property
+    def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
+        """Of each set B and where the entries of its elements go in the Hessian, column by column; rows and starts of columns."""
+        entries, local = [], []
+        for part in self.net.sets:
+            to_local, slot, component = _local(part.term.measure)
+            dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.net.worlds)[slot].T + component
+            entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())
+            local.append(to_local)
+        pattern, places = np.unique(np.concatenate(entries), return_inverse=True)
+        places = np.split(places, np.cumsum([len(e) for e in entries])[:-1])
+        columns, rows = np.divmod(pattern, self.size)
+        return list(zip(local, places, strict=True)), rows, np.searchsorted(columns, np.arange(self.size + 1))
+
+    def energies(self, state):
+        """(term's name, energies of its elements (worlds, elements))."""
+        for i, part in enumerate(self.net.sets):
+            out = wp.zeros(part.elements * self.net.worlds, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 0, out, ())
+            values = out.numpy().astype(np.float64)
+            yield part.term.name, values.reshape(self.net.worlds, -1)
+        if self.model.touch:
+            self.model.touch.at(state.net.q, state.net.rate)
+            yield "contact", self.model.touch.terms.energy.numpy().astype(np.float64)[:, None]
+
+    def gradient(self, state) -> np.ndarray:
+        elastic = self.elastic_gradient(state)
+        if not self.model.touch:
+            return elastic
+        self.model.touch.at(state.net.q, state.net.rate)
+        return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
+
+    def elastic_gradient(self, state) -> np.ndarray:
+        """The same without what touches."""
+        result = np.zeros((self.size // 3, 3))
+        for i, part in enumerate(self.net.sets):
+            slots, forces = part.host.slots, self.forces(state, i)
+            index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
+            for d in range(3):
+                result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
+        return self.into(result.ravel())
+
+    def into(self, values: np.ndarray) -> np.ndarray:
+        """In the frames of oblique planes where there are any."""
+        return self.planes.into(values) if self.planes else values
+
+    def back(self, values: np.ndarray) -> np.ndarray:
+        return self.planes.back(values) if self.planes else values
+
+    def matrix(self, values: sparse.csc_matrix) -> sparse.csc_matrix:
+        return self.planes.matrix(values) if self.planes else values
+
+    def forces(self, state, index: int) -> np.ndarray:
+        """Derivative of the energy of every element of a set with respect to the blocks of its slots (slots, elements, 3)."""
+        part = self.net.sets[index]
+        shape = (len(part.host.slots), part.elements * self.net.worlds)
+        out = wp.zeros(shape, dtype=self.net.vector, device=self.net.device)
+        self._launch(state, index, 1, out, ())
+        return out.numpy().astype(np.float64)
+
+    def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        validate.refuse_friction(self.model)
+        return self.potential_hessian(state, stress)
+
+    def potential_hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        """The same without friction, which has no potential, where there is some."""
+        scatter, rows, starts = self._pattern
+        total = np.zeros(len(rows))
+        for i, part in enumerate(self.net.sets):
+            size, count = part.term.measure.size, part.elements * self.net.worlds
+            out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
+            extra = np.zeros((len(part.term.measure.strains), count))
+            if stress is not None:
+                extra = stress[i] - self._stress(state, i)
+            extra = wp.array(extra, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 2, out.transpose((1, 2, 0)), (size,), extra)
+            values = out.numpy().astype(np.float64)
+            values = 0.5 * (values + values.transpose(0, 2, 1))
+            to_local, places = scatter[i]
+            spread = np.matmul(to_local.T, (values.reshape(-1, size) @ to_local).reshape(count, size, -1))
+            total += np.bincount(places, spread.ravel(), len(total))
+        elastic = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
+        if self.model.touch:
+            self.model.touch.at(state.net.q, state.net.rate)
+            elastic = elastic + exact_hessian.hessian(self.model.touch.terms, state.net.q)
+        return self.matrix(elastic)
+
+    def linear_stress(self, state, step: np.ndarray) -> list:
+        """Stresses (strains, elements) of every set that the strains e + J step have."""
+        result = []
+        change = wp.array(self.back(step).reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
+        for i, part in enumerate(self.net.sets):
+            shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+            out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+            given = self.net.elements(state.net, i, rate=self.rate)
+            kernel = linear_stress_kernel(part.term, self.net.real)
+            wp.launch(kernel, (self.net.worlds, part.elements), [given, change], [out], device=self.net.device)
+            result.append(out.numpy().astype(np.float64))
+        return result
+
+    def _stress(self, state, index: int) -> np.ndarray:
+        part = self.net.sets[index]
+        shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+        strain, stress = (wp.zeros(shape, dtype=self.net.real, device=self.net.device) for _ in range(2))
+        self.net.strains(state.net, index, strain, stress)
+        return stress.numpy().astype(np.float64)
+
+    def dofs(self, state) -> np.ndarray:
+        return self.into(state.net.q.numpy().astype(np.float64).ravel())
+
+    def rates(self, state) -> np.ndarray:
+        return self.into(state.net.v.numpy().astype(np.float64).ravel())
+
+    def assign(self, state, q: np.ndarray) -> None:
+        state.net.q.assign(self.back(q).reshape(-1, 3))
+
+    def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.geometry.turning`.
+
+        Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
+        """
+        q, step = self.back(q), self.back(step)
+        moved = q + step
+        x, dx, out = (v.reshape(self.net.worlds, -1, 3) for v in (q, step, moved))
+        order = [self.host.rods[i] for level in self.host.outwards.levels for i in level]
+        for world in range(self.net.worlds):
+            excess = np.zeros((self.host.nodes, 3))
+            placed = self._anchored.copy()
+            for rod in order:
+                at, closed = rod.all_nodes, rod.piece.kind.closed
+                excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
+                placed[at] = True
+            out[world][: self.host.nodes] += excess
+        return self.into(moved)
+
+    @cached_property
+    def _motion(self) -> NetMotion:
+        return NetMotion(self.model)
+
+    def move_supports(self, state, before: float, at: float) -> None:
+        """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
+        if self.host.moves:
+            self._motion.put(state, before, at, state.net.q, state.net.frame)
+        self.prescribe(state, at)
+
+    def give(self, found: dict[str, np.ndarray]) -> None:
+        super().give(found)
+        self.given_field[:] = found.get("field", 0.0)
+
+    def prescribe(self, state, at: float) -> None:
+        """Put the normals that supports turn, and the magnetic field, where they are at load parameter `at`."""
+        for index, data in state.net.data.items():
+            part = self.net.sets[index]
+            values = data.numpy().astype(np.float64)
+            columns = np.arange(self.net.worlds)[:, None] * part.elements
+            for motion in np.unique(part.turning[:, 2]):
+                chosen = part.turning[:, 2] == motion
+                element, row, _ = part.turning[chosen].T
+                moved = self.model.motions[motion]
+                if isinstance(moved, Grip):  # which every world has elsewhere
+                    where = state.poses().reshape(self.net.worlds, -1, 6)[:, self.model.grips.index(moved)]
+                else:
+                    where = at
+                turned = moved.turn(where, part.turning_rest[chosen])
+                for d in range(3):
+                    values[row + d, element + columns] = turned[..., d]
+            if part.term.measure.field:
+                first = part.term.measure.data_size - part.term.measure.field
+                values[first:] = self.model.scene.applied_field.at(at, at)[:, None]
+                values[first : first + 3] += np.repeat(at * self.given_field, part.elements, axis=0).T
+            data.assign(values)
+
+    def edges(self, q: np.ndarray) -> np.ndarray:
+        """Edge vectors (E, 3)."""
+        x = self.back(q).reshape(self.net.worlds, -1, 3)
+        first, second = self.host.edges.T
+        return (x[:, second] - x[:, first]).reshape(-1, 3)
+
+    def edge_dofs(self) -> np.ndarray:
+        """Dofs of the positions of both ends of all edges (2, E, 3)."""
+        blocks = self.host.edges.T[:, None] + self.host.blocks * np.arange(self.net.worlds)[:, None]
+        return 3 * blocks.reshape(2, -1)[..., None] + np.arange(3)
+
+    @cached_property
+    def balances(self) -> np.ndarray:
+        """Which dofs have forces that add up to nothing over a free piece (size,) bool: radial ones of revolution do not."""
+        result = np.repeat(np.arange(self.host.blocks)[:, None] < self.host.nodes, 3, axis=1)
+        for shell in self.host.meridians:
+            result[shell.nodes, :2] = False
+        return np.tile(result.ravel(), self.worlds)
+
+    @cached_property
+    def component(self) -> np.ndarray:
+        """Index of the connected component of every dof (size,); what touches may connect all of a world."""
+        bodies = self.host.bodies
+        own = np.zeros(self.host.blocks, int) if self.model.touch else bodies.components[bodies.owner]
+        worlds = np.arange(self.worlds)[:, None] * (own.max() + 1)
+        return np.repeat((worlds + own).ravel(), 3)
+
+    def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
+        bodies, shape = self.host.bodies, (self.net.worlds, self.host.blocks, 3)
+        gradient = np.array(gradient).reshape(shape)
+        gradient[:, self.host.of_obstacles] = 0.0
+        gradient, result = gradient.ravel(), []
+        for own, force in zip(
+            np.where(self.free & ~self.angle, np.abs(outer), 0.0).reshape(shape),
+            np.where(~self.free & ~self.angle, gradient, 0.0).reshape(shape),
+            strict=True,
+        ):
+            result.append(bodies.loads(own.sum(1), bodies.support(force)))
+        return np.concatenate(result)
+
+    def allowed(self, loads: np.ndarray) -> np.ndarray:
+        """Residuals at rtol = 1 (size,) [N, N m] of bodies with such loads; see `ddg_warp.compile.tolerance`."""
+        blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.net.worlds, -1)]
+        return np.repeat(np.concatenate(blocks), 3)
+
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
+        """Whether residuals add up to little, and the largest excess over rounding, world by world; see `tolerance.largest_excess`."""
+        by_world = loads.reshape(self.net.worlds, -1), residual.reshape(self.net.worlds, -1, 3)
+        floors = floor.reshape(self.net.worlds, -1, 3).max(2)
+        found = [
+            largest_excess(self.host.bodies.levels, own, rtol, r, f)
+            for own, r, f in zip(*by_world, floors, strict=True)
+        ]
+        return tuple(np.array(values) for values in zip(*found, strict=True))
+
+    def edge_length(self) -> float:
+        """Mean rest length of edges [m]."""
+        return float(self.host.edge_lengths.mean())
+
+    def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points`, and the dofs (rows, 3) of the first world."""
+        rows, blocks = self.model.order.net_rows
+        return rows, self.host.dofs(blocks)
+
+    def bodies(self) -> list[Body]:
+        """Rods with the rotations of their rigid joints, shells, and shells of revolution, of every world."""
+        host, none = self.host, np.zeros(0, int)
+        joints = [part for part in host.sets if part.term.measure.spins]
+        parts = []
+        for rod in host.rods:
+            edges = rod.all_edges
+            ends = np.stack([np.arange(len(edges)), (np.arange(len(edges)) + 1) % len(rod.all_nodes)], axis=1)
+            spins = [part.slots[-1, np.isin(part.slots[-2], edges)] for part in joints]
+            parts.append((rod.all_nodes, edges, ends, np.unique(np.concatenate([none, *spins]))))
+        parts += [(body.nodes, none, np.zeros((0, 2), int), none) for body in (*host.shells, *host.meridians)]
+        result = []
+        for world in range(self.net.worlds):
+            dofs = self.offset + 3 * world * host.blocks
+            for nodes, edges, ends, spins in parts:
+                places = (dofs + 3 * blocks[:, None] + np.arange(3) for blocks in (nodes, spins))
+                nodes, spins = places
+                result.append(Body(nodes, dofs + 3 * edges, ends, spins))
+        return result
+
+    def where(self, dof: int) -> str:
+        """Name of a dof's place."""
+        block = dof // 3 % self.host.blocks
+        for rod in self.host.rods:
+            for what, blocks in (("node", rod.nodes), ("edge", rod.edges)):
+                if block in blocks:
+                    return f"{what} {int(np.flatnonzero(blocks == block)[0])} of rod {rod.rod}"
+        for i, shell in enumerate(self.host.shells):
+            for what, blocks in (("vertex", shell.nodes), ("mesh edge", shell.edges)):
+                if block in blocks:
+                    return f"{what} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
+        for i, meridian in enumerate(self.host.meridians):
+            if block in meridian.nodes:
+                return f"node {int(np.flatnonzero(meridian.nodes == block)[0])} of axisymmetric shell {i}"
+        return f"joint {block - self.host.nodes - self.host.angles}"
+
+    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
+        part, real = self.net.sets[index], self.net.real
+        wp.launch(
+            element_path.term_kernels(coupled_storage(part.term, real), 0, real)[which],
+            (self.net.worlds, part.elements, *columns),
+            [self.net.elements(state.net, index, rate=self.rate), *more],
+            [out],
+            device=self.net.device,
+        )
+
+
+def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
+    """Slots (n, W E) of all worlds."""
+    return np.concatenate([slots + world * blocks for world in range(worlds)], axis=1)
+
+
+def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """B of an element: (local dofs, dofs of its slots that they depend on); and slot and component of these."""
+    full = np.zeros((measure.size, measure.slots, 3))
+    for i, (a, b) in enumerate(measure.edges):
+        full[3 * i : 3 * i + 3, b] += np.eye(3)
+        full[3 * i : 3 * i + 3, a] -= np.eye(3)
+    at = 3 * len(measure.edges)
+    for i in range(measure.angles):
+        full[at + i, measure.nodes + i, 0] = 1.0
+    for i in range(measure.spins):
+        rows = at + measure.angles + 3 * i
+        full[rows : rows + 3, measure.nodes + measure.angles + i] = np.eye(3)
+    at += measure.angles + 3 * measure.spins
+    for i in range(measure.points):
+        full[at + 3 * i : at + 3 * i + 3, i] = np.eye(3)
+    slot, component = np.nonzero(full.any(0))
+    return full[:, slot, component], slot, component

@@ -1,0 +1,148 @@
+"""Drag on uncoupled and coupled rods in a flowing fluid; see `kernels.forces.drag`."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import rod_layout
+from ddg_warp.kernels.forces import drag
+from ddg_warp.scene.drag import flow_at
+from ddg_warp.solve.linear.sparse_system import lists
+
+
+class Drag:
+    """Drag on a `Group` or `DeviceNet`."""
+
+    def __init__(self, model, part, kernels: tuple, midpoint: bool):
+        self.model, self.part, self.midpoint = model, part, midpoint
+        self._resist, self._settle = kernels
+        vector = wp.types.vector(part.dim, model.types.real)
+        self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._resist, *([self._settle] if self.midpoint else [])]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Upload the flow at the evaluation time of the scheme."""
+        if callable(self.model.scene.flow):
+            self.flow.assign(self._flow(0.5 * (t0 + t1) if self.midpoint else t1))
+
+    def _flow(self, t: float) -> np.ndarray:
+        return flow_at(self.model.scene, t)[None, list(self.part.host.axes)]
+
+    def _over_a_second(self) -> Islands:
+        """Return islands with the inertia and drag coefficients of a step of one second."""
+        islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
+        islands.coefficient.fill_(1.0)
+        islands.rate.fill_(1.0)
+        return islands
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+
+class ChainDrag(Drag):
+    """Drag on a rod group in a flowing fluid."""
+
+    def __init__(self, model, group, midpoint: bool = False):
+        super().__init__(model, group, drag.chain_kernels(group.kind, model.types.real), midpoint)
+
+    def resist(self, before, newton, islands) -> None:
+        """Write inertia and drag of a solve from the state `before`, after the predictor."""
+        group = self.part
+        self._launch(
+            self._resist,
+            group.node_threads,
+            [before.x, before.v, before.theta, newton.x if self.midpoint else before.x, newton.x, group.drag, self.flow]
+            + [group.mass, group.rotary, group.count, *islands.arrays],
+            [newton.mass, newton.rotary, newton.target_angle],
+        )
+
+    def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
+        group, real, device = self.part, self.model.types.real, self.model.wp_device
+        solve = SimpleNamespace(x=data.x)
+        solve.mass = arrays.allocate((group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device)
+        solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
+        self.upload(t, t)
+        self.resist(data, solve, self._over_a_second())
+        return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
+
+    def settle(self, before, after, newton, islands) -> None:
+        """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
+        group = self.part
+        if self.midpoint:
+            self._launch(
+                self._settle,
+                group.node_threads,
+                [newton.x, newton.theta, group.mass, group.rotary, group.count, *islands.arrays]
+                + [after.x, after.theta, before.v, before.omega],
+                [after.v, after.omega, after.a, after.alpha],
+            )
+
+    def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return rates of nodes and edges (node, column), of massless dofs extrapolated by `lead` [s]."""
+        v, a, omega, alpha, mass, rotary = (
+            arrays.download(array).astype(float)
+            for array in (data.v, data.a, data.omega, data.alpha, self.part.mass, self.part.rotary)
+        )
+        if lead > 0.0:
+            v = v + lead * np.where((mass[..., None] <= 0.0) & (v != 0.0), a, 0.0)
+            if self.part.kind.twist:
+                omega = omega + lead * np.where((rotary <= 0.0) & (omega != 0.0), alpha, 0.0)
+        return v, omega
+
+
+class NetDrag(Drag):
+    """Drag on the coupled rods in a flowing fluid."""
+
+    def __init__(self, model, midpoint: bool = False):
+        net, host, device = model.net, model.net.host, model.wp_device
+        super().__init__(model, net, drag.net_kernels(model.types.real), midpoint)
+        ends, angles, _ = host.drag
+        places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
+        starts, items = lists(places, host.blocks + 1)
+
+        self.ends, self.starts, self.items = (
+            wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in (ends.T, starts, items // 3)
+        )
+
+    def resist(self, before, solver, islands) -> None:
+        """Write inertia and drag of a solve from the state `before`, after the predictor."""
+        net = self.part
+        self._launch(
+            self._resist,
+            net.worlds * net.blocks,
+            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, net.mass, self.ends]
+            + [net.drag, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
+            + [net.blocks, net.host.nodes],
+            [solver.mass],
+        )
+
+    def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return inertia and drag (world, block) of a state at t over a second, and the flow (blocks, 3)."""
+        net, device = self.part, self.model.wp_device
+        mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
+        self.upload(t, t)
+        self.resist(state, SimpleNamespace(q=state.q, outer=net.still, mass=mass), self._over_a_second())
+        flow = np.zeros((net.blocks, 3))
+        flow[: net.host.nodes] = self.flow.numpy()[0]
+        return mass.numpy(), flow
+
+    def rates(self, state, lead: float) -> np.ndarray:
+        """Return rates of dof blocks (world, block), of massless dofs extrapolated by `lead` [s]."""
+        net = self.part
+        v, a = (array.numpy().astype(float).reshape(net.worlds, -1, 3) for array in (state.v, state.a))
+        return v + lead * np.where((net.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
+
+    def settle(self, before, after, solver, islands) -> None:
+        """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
+        net = self.part
+        if self.midpoint:
+            inputs = [solver.q, solver.mass, *islands.arrays, net.blocks, after.q, before.v]
+            self._launch(self._settle, net.worlds * net.blocks, inputs, [after.v, after.a])

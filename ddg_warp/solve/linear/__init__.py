@@ -1,0 +1,1 @@
+"""Linear systems: matrices, preconditioners, conjugate gradients, factorisations, eigenvalues, solver selection."""

@@ -1,0 +1,76 @@
+"""Contact and friction at the solution of a step, for linear systems with the exact Hessian; see `ExactSystem`."""
+
+import warp as wp
+
+from ddg_warp.solve.collision.contact_model import Touch
+from ddg_warp.solve.linear.contact_bands import ContactBands
+
+MARGIN = 1e-3  # of the search distance: skin margin; the query is a single position
+
+
+class ExactContact:
+    """Contact of a `DeviceNet`, with candidates found again at the friction lag and at the solution: steps keep none.
+
+    Attributes:
+        `touch`: search, pairs and their terms, friction lag.
+        diagonal: (W N,) diagonal blocks, for preconditioners.
+    """
+
+    def __init__(self, net):
+        self.net, contact = net, net.host.touching
+        obstacle_nodes = net.host.of_obstacles  # their rows of H do not count
+        self.touch = Touch(net, wp.float64, net.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True)
+        self.search, self.terms = self.touch.search, self.touch.terms
+        self.diagonal = self.terms.diagonal
+        self._q = self._bands = None
+
+    def bind(self, system) -> None:
+        """Attach to an `ExactSystem`."""
+        self._system = system
+        self._bands = ContactBands(system.chains, self.touch.shapes) if system.chains else None
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*self.search.kernels, *self.terms.kernels, *(self._bands.kernels if self._bands else [])]
+
+    def find(
+        self, lagged: wp.array, before: wp.array, q: wp.array, rate: wp.array, rates: tuple = (None, None)
+    ) -> None:
+        """Evaluate contact at a solution q with friction lagged at blocks `lagged`, in a step from `before` at rates 1/h (worlds,).
+        Launches alone.
+
+        `rates`: inverse times of inertia in the contact stiffness at q (default: none) and at the friction lag.
+        """
+        search, terms = self.search, self.terms
+        rate_at_q, rate_at_lag = rates
+        terms.brace(rate_at_q)
+        search.rebuild(lagged)
+        if terms.frictions:
+            search.search(lagged)
+            terms.lag(lagged, rate=rate_at_lag)
+        search.search(q)
+        terms.evaluate(q, rate if terms.frictions else None, before)
+        terms.meet()
+        terms.prepare(q, self.net.every)
+        self._q = q
+
+    def assemble(self) -> None:
+        """Add contact to the preconditioner."""
+        if self._bands:
+            self.terms.join()
+            self._bands(self.terms, self._system.islands.arrays[0])
+
+    def spread(self, p: wp.array) -> None:
+        """Write the contributions of pairs to H p."""
+        self.terms.place(p, self._q, self.net.every)
+
+    def settle(self, p: wp.array, product: wp.array) -> None:
+        """Add the contributions of pairs to the product, and write p . H p block by block."""
+        system = self._system
+        self.terms.settle(p, product, system.barred, system.islands.wanted, system.krylov_dots)
+
+    def outgrown(self, q: wp.array) -> bool:
+        """Return True if lists of pairs overflowed and have grown. Reads from the device."""
+        grown = self.search.fit(q)
+        return self.terms.fit() or grown

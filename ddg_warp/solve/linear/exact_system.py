@@ -1,0 +1,181 @@
+"""Linear systems with the exact Hessian of a net, on the device: those of the reverse of its steps."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.adjoint.coupled_linear_solve import block_kernels, check_kernels
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.linear.exact_hessian import COUNT, FIRST, SIGN, exact_kernels
+from ddg_warp.model.net import NetState
+from ddg_warp.solve.linear.pcg import ConjugateGradients
+from ddg_warp.solve.linear.rod_substructuring import Chains
+from ddg_warp.solve.linear.skew_supports import DevicePlanes
+from ddg_warp.solve.linear.solver_selection import net_preconditioner
+from ddg_warp.solve.linear.sparse_system import NetSystem
+
+
+class ExactSystem:
+    """(H + c M) w = g on the free dofs of every world, with the exact Hessian H at the solution of a step.
+
+    The solve is that of a direction of `NetNewton`, whose names it has for what `ConjugateGradients` reads, with all of H in one place,
+    in float64 whatever the precision of the model, and to a tolerance of its own. H is symmetric, as drag is and loads do not follow
+    within a step, but may be indefinite, at a saddle. The host reads nothing.
+
+    On a CPU the reverse of a step takes a quarter to a half of the time that it takes by sparse factors where rods branch, and up to
+    twice and three times that of large sheets and gridshells (tools/results/gradient_nets_cpu.csv).
+
+    Args:
+        inertia: inertia and drag of the blocks (worlds, N); None without drag.
+        contact: `ExactContact`, which is where the solution is; None without contact.
+
+    Attributes:
+        tolerance: what conjugate gradients leave of the residual, in the norm of their preconditioner.
+        missed: what they may have left in truth, for rounding.
+        failed: not zero of worlds where it is more, so that w means nothing (worlds,); zeroed by who asks for solves.
+    """
+
+    tolerance = 1e-12
+    missed = 1e-6
+
+    def __init__(self, model, inertia: wp.array | None = None, contact=None):
+        self.contact = contact
+        net, real = model.net, model.types.real
+        self.net, self.device, self.real, self.linear = net, net.device, real, wp.float64
+        worlds, host, device = net.worlds, net.host, net.device
+        self.worlds, self.all = worlds, worlds * net.blocks
+        H = wp.types.vector(3, self.linear)
+
+        def make(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        preconditioner = net_preconditioner(net)
+        self.chains = Chains.of(net, preconditioner, banded=False)
+        self.system = NetSystem(net)
+        self.planes = DevicePlanes(net, self.system, real, self.linear) if host.frames else None
+        self.fixed = self.bits(host.fixed)
+        self.barred = wp.array(np.tile(self.fixed.numpy(), worlds), dtype=wp.uint8, device=device)
+        self.mass = net.mass if inertia is None else inertia
+        self.right, self.direction = (make(self.all, H) for _ in range(2))
+        self.matrix = make((9, worlds * self.system.positions), self.linear)
+        self.krylov_dots = make((worlds, net.blocks), self.linear)
+        self.iterations, self.indefinite, self.failed = (make(worlds, int) for _ in range(3))
+        self.forcing = make(worlds, self.linear)
+        self.islands = self.anew = Islands(worlds, real, device)
+        drag = inertia is not None
+        if self.chains:
+            self.chains.bind(self.system, [], real, self.linear, (), drag)
+        if contact:
+            contact.bind(self)
+        self._begin, self._add = exact_kernels(real, self.linear, drag, arrays.serial(device))
+        self._into, self._back, self._keep = block_kernels(real, self.linear)
+        self._rest, self._check = check_kernels(self.linear)
+        self._hessians = [element_path.term_kernels(coupled_storage(part.term, real), 0, real)[2] for part in net.sets]
+        sizes = [part.term.measure.size for part in net.sets]
+        largest = max(part.elements * size**2 for part, size in zip(net.sets, sizes, strict=True))
+        hessians, count = make(worlds * largest, real), [worlds * part.elements for part in net.sets]
+        self._written = [hessians[: n * size**2].reshape((n, size, size)) for n, size in zip(count, sizes, strict=True)]
+        self._no_stress = make((0, 0), real)
+        self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in net.sets]
+        self.krylov = ConjugateGradients(self, preconditioner.endswith("multilevel"), indefinite=True)
+
+    def bits(self, dofs: np.ndarray) -> wp.array:
+        """Dofs (blocks, 3) bool as bits of blocks."""
+        return wp.array((dofs * [1, 2, 4]).sum(1).astype(np.uint8), dtype=wp.uint8, device=self.device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        used = [part.kernels for part in (self.krylov, self.chains, self.planes, self.contact) if part]
+        own = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
+        return [*own, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
+
+    def solve(self, state: NetState, coefficient: float, rate: wp.array, right: wp.array, w: wp.array) -> None:
+        """Write w (W N,), zero at held dofs; what g (W N,) has there is left out. Launches alone.
+
+        Args:
+            state: the solution with its lagged data and the strains of the last step.
+            coefficient: c [1/s^2].
+            rate: of every world, over which strain-rate damping counts [1/s].
+        """
+        self.islands.wanted.fill_(1)
+        self.islands.coefficient.fill_(coefficient)
+        self.assemble(state, rate)
+        self._launch(self._into, self.all, [right], [self.right])
+        if self.planes:
+            self.planes.into(self.right, self.islands.wanted)
+        self._launch(self._keep, self.all, [self.fixed, self.net.blocks], [self.right])
+        self.forcing.fill_(self.tolerance)
+        self.krylov.solve()
+        self.check()
+        self._give(self.direction, w)
+
+    def part(self, values: wp.array, left_out: wp.array, out: wp.array) -> None:
+        """Write `values` (W N,) without their components at dofs whose bits are set, in the frames of planes where there are some."""
+        self._launch(self._into, self.all, [values], [self.right])
+        if self.planes:
+            self.planes.into(self.right, self.net.every)
+        self._launch(self._keep, self.all, [left_out, self.net.blocks], [self.right])
+        self._give(self.right, out)
+
+    def assemble(self, state: NetState, rate: wp.array) -> None:
+        """H of all worlds."""
+        table, flags = self.system, self.islands.arrays[0]
+        every = arrays.takers(self.matrix.shape[1], self.device)
+        read = [self.mass, *self.islands.arrays, table.rows, table.columns, table.positions]
+        self._launch(self._begin, every, read, [self.matrix])
+        for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
+            given = self.net.elements(state, i, rate=rate)
+            grid = self.net.worlds, self.net.sets[i].elements, hessian.shape[1]
+            self._launch(kernel, grid, [given, self._no_stress], [hessian.transpose((1, 2, 0))])
+            read = [hessian, *table.adds[i], self._ends[i], self.net.sets[i].term.measure.slots, flags, table.positions]
+            self._launch(self._add, every, read, [self.matrix])
+        if self.planes:
+            self.planes.matrix(self.matrix, self.islands.wanted)
+        if self.chains:
+            self.chains.assemble(self.matrix, self.mass, self.islands)
+        if self.contact:
+            self.contact.assemble()
+
+    def check(self) -> None:
+        """`failed`, by the residual that the solution leaves."""
+        krylov, wanted = self.krylov, self.islands.wanted
+        wanted.fill_(1)
+        krylov.multiply(self.direction)
+        read = [self.right, krylov.product, krylov.inverse, self.net.blocks]
+        self._launch(self._rest, self.all, read, [krylov.rest, krylov.z, self.krylov_dots])
+        krylov.precondition(krylov.z)
+        krylov.sum(self.krylov_dots, krylov.total)
+        self._launch(self._check, self.worlds, [krylov.total, krylov.rho_first, self.missed], [self.failed])
+
+    def _give(self, values: wp.array, out: wp.array) -> None:
+        """Write blocks in the precision of the model, in space."""
+        if self.planes:
+            self.planes.back(values, self.net.every)
+        self._launch(self._back, self.all, [values], [out])
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+
+
+def _ends(measure) -> np.ndarray:
+    """What every slot of an element sees of its local dofs; see `kernels.linear.exact_hessian`."""
+    angles, spins, points = measure.starts
+    seen = [[] for _ in range(measure.slots)]
+    for i, edge in enumerate(measure.edges):
+        for node, sign in zip(edge, (-1, 1), strict=True):
+            seen[node].append((3 * i, sign, 3))
+    for i in range(measure.points):
+        seen[i].append((points + 3 * i, 1, 3))
+    for i in range(measure.angles):
+        seen[measure.nodes + i].append((angles + i, 1, 1))
+    for i in range(measure.spins):
+        seen[measure.nodes + measure.angles + i].append((spins + 3 * i, 1, 3))
+    most = max(map(len, seen))
+    result = np.zeros((measure.slots, most, 3), np.int32)
+    for slot, dofs in enumerate(seen):
+        for i, (first, sign, count) in enumerate(dofs):
+            result[slot, i, FIRST], result[slot, i, SIGN], result[slot, i, COUNT] = first, sign, count
+    return result.reshape(-1, 3)

@@ -1,0 +1,376 @@
+"""The chain preconditioner of a net on a device; see `kernels.linear.rod_substructuring` and `joint_schur`."""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.linear import joint_schur, rod_bands, rod_substructuring
+from ddg_warp.kernels.linear.rod_band_assembly import layout_type
+from ddg_warp.kernels.linear.rod_matrix import TILE
+from ddg_warp.kernels.linear.rod_substructuring_serial import walk_kernel
+from ddg_warp.kernels.linear.sliced_ell import SETS
+from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type, place_kernel
+from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction
+from ddg_warp.solve.linear.solver_selection import long_and_few
+from ddg_warp.solve.linear.substructuring_plan import ChainPlan
+from ddg_warp.solve.linear.twisted_factorisation import BothEnds
+
+SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
+
+
+class Chains:
+    """The rods of a net as chains between their joints, and the preconditioner they make.
+
+    Args:
+        net: its `DeviceNet`.
+        banded: whether blocks of H between their places are kept here, in bands, and not among the positions of a `NetSystem`.
+        split: whether tensions of edges are unknowns, see `kernels.linear.mixed_axial_force`; where `splits` says that they can be.
+
+    Attributes:
+        idle: chains of all worlds (columns,) that take no part in a direction are not zero, see `Resting`; zero without it.
+        exact: whether the preconditioner is the inverse of H, so that a direction takes no conjugate gradients; see `bind`.
+        longer (2, longest, columns): if `split`, slack and lengthening of the edges behind places by the last direction.
+
+    Raises:
+        SceneError: the net has no rods.
+    """
+
+    def __init__(self, net, banded: bool, split: bool = False):
+        if not net.host.rods:
+            raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
+        self.net, self.device, self.split = net, net.device, split
+        self.plan = ChainPlan(net.host, split)
+        self.along = [i for i, part in enumerate(net.sets) if part.host.along]
+        self.banded = banded and len(self.along) <= SETS
+        self.kept = self.plan.where >= 0 if self.banded else None
+        self._contact = net.host.touching is not None
+
+    @classmethod
+    def of(cls, net, preconditioner: str, banded: bool = True, split: bool = False) -> "Chains | None":
+        """The chains of a preconditioner, in bands where these serve it; None of one without chains."""
+        if preconditioner not in ("chain", "chain_multilevel"):
+            return None
+        return cls(net, banded and preconditioner == "chain" and not net.host.frames, split)
+
+    @property
+    def splits(self) -> bool:
+        """Whether tensions of edges may be unknowns, once the plan is bound: of chains alone, each walked along by a thread.
+
+        Between joints that move they were tried, too: as right as float64, 5 to 17 % slower than it on an H200 and 1.2 to 2 times on a
+        CPU core (gridshells of 8 edges, EA L^2 / EI = 1e8, and hair with twigs, where 1/60 s took 11 iterations instead of 7).
+        """
+        longest, width = self.plan.chain.shape
+        few = long_and_few(longest, self.net.worlds * width, wp.get_device(self.device))
+        return self.split or (self.banded and self.plan.alone and not (few or self._contact))
+
+    def bind(
+        self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
+    ) -> None:
+        """Take the `NetSystem` of the net, without what bands keep, and what the elements of all sets write; see `Assembly`.
+
+        With `reuse` one matrix serves several directions. In contact there is more to H than is here, which goes into `eliminated`
+        before `prepare`.
+        """
+        self.table, net, plan = table, self.net, self.plan
+        plan.bind(net.host, table.rows.numpy(), table.columns.numpy(), self.kept)
+        self.exact = self.banded and plan.complete and not self._contact
+        worlds, device, serial = net.worlds, net.device, arrays.serial(net.device)
+        H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        self.places = arrays.upload(plan.places.astype(np.int32), int, device)
+        self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
+        self._at_none = put(np.flatnonzero(plan.where < 0))  # blocks without a place
+        self.held = arrays.upload(plan.held(net.host), wp.uint8, device)
+        self.longest, self.width = plan.chain.shape
+        self.columns = worlds * self.width
+        self.idle = wp.zeros(self.columns, dtype=int, device=device)
+        block = plan.block
+        self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
+        self.reduction = None
+        if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device), self._contact):
+            repeated = not self.exact or len(plan.of_places[1]) > 0
+            self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device, repeated=repeated)
+            self._all = put(np.tile(plan.count, worlds))
+            self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
+            self.bands = self.factors
+        elif not self.banded or self.exact:  # nobody asks for the blocks once they are factored
+            self.bands = self.factors
+        else:
+            self.bands = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
+        self.eliminated = self.bands  # what is factored
+        if self._contact and self.banded:
+            self.eliminated = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
+        self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
+        self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
+        self.coupled = len(plan.of_places[1]) > 0
+        # whether chains and what is at their places are all that there is to further right-hand sides
+        self._at_places = self.reduction is not None and self.reduction.repeats and not len(plan.pairs)
+        self.met = None if plan.met is None else arrays.upload(plan.met.astype(np.int32), int, device)
+        self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
+        self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
+        self.colour, self.taken = put(plan.colour), put(plan.taken)
+        self._clears = self.banded and not self.exact and plan.taken.size > 0  # for products, which are of all of H
+        self.starts, self.items = map(put, plan.of_places)
+        self.joint_starts, self.joint_items = map(put, plan.of_joints)
+        self.moved = wp.zeros(max(1, worlds * self.joint_rows), dtype=H, device=device)
+        self.units = wp.array(np.repeat(plan.units, worlds, axis=1).reshape(-1, 3), dtype=H, device=device)
+        self.parts = wp.zeros((3, max(1, worlds * self.joints)), dtype=M, device=device)
+        sets = self.along if self.banded else []
+        terms = tuple(net.sets[i].term for i in sets)
+        late = tuple(exact_from[i] for i in sets)
+        self._assemble, self._clear, self._product = rod_bands.band_kernels(
+            terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
+        )
+        if serial:
+            self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, self.split)
+        self.layout = layout_type()()
+        for name in ("places", "chain", "count", "held", "idle"):
+            setattr(self.layout, name, getattr(self, name))
+        self.layout.diagonal, self.layout.positions = table.diagonal, table.positions
+        # structs on the host keep arrays alive that those on the device point to
+        self._of_sets = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
+        self._own = wp.array(self._of_sets, dtype=along_type(real, linear), device=device)
+        if self.banded:
+            self._balance = place_kernel(terms, plan.twist, real, linear, drag, self._contact, serial)
+            apart = np.zeros(net.blocks, np.uint8)
+            apart[self.elsewhere] = 1
+            self._apart = wp.array(apart, dtype=wp.uint8, device=device)
+        made = rod_substructuring.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
+        self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
+        self._measure, self._meet = joint_schur.joint_kernels(linear) if self.joints else (None, None)
+        self._walk = self._walk_places = self._both = None
+        if serial and not (self.joints or self.reduction):
+            self._walk_places = rod_substructuring.walk_places_kernel(plan.twist, plan.span, linear, self.split)
+        if not (serial or self.joints or self.reduction or self.split):
+            self._both = BothEnds(plan, self.columns, linear, device, SERIAL)
+        if self.split:
+            self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
+            self._lengthen = rod_bands.lengthen_kernel(terms, real, linear)
+        if self.exact and serial and not (self.reduction or reuse or self.split):
+            self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._walk] if self._walk else [self._assemble]
+        if self._both:
+            own += self._both.kernels
+        elif self._walk_places:
+            own += [] if self._walk else [(self._walk_places, SERIAL)]
+        else:
+            own += [self._load] if self.coupled or not self._walk else []
+            own += [self._finish] if self.joints or not self._walk else []
+        if self.reduction:
+            own += [*self._columns, *self.reduction.kernels]
+            own += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
+        elif not self._both:
+            own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
+            own += [(self._solve_all, SERIAL)] if self.coupled else []
+        own += [self._balance] if self.banded else []
+        own += [self._lengthen] if self.split else []
+        own += [self._clear] if self._clears else []
+        own += [self._product] if self.banded and not self.exact else []
+        own += [self._follow] if self.met is not None else []
+        return own + ([self._measure, self._meet] if self.joints else [])
+
+    @cached_property
+    def elsewhere(self) -> np.ndarray:
+        """Blocks that are not at a place, or at which elements meet that do not run along rods."""
+        found = self.plan.where < 0
+        for part in self.net.sets:
+            if not part.host.along:
+                found[part.host.slots.ravel()] = True
+        return np.flatnonzero(found)
+
+    def balance(self, given, islands, found) -> None:
+        """Residuals of all blocks but those `elsewhere`."""
+        self._launch(
+            self._balance,
+            (arrays.takers(self.longest, self.device), self.columns),
+            [given, self.places, self.count, self._apart, *islands.arrays, self._own],
+            [found],
+        )
+
+    def assemble(self, matrix: wp.array, mass: wp.array, islands) -> None:
+        """Blocks of the chains of the worlds that want a direction."""
+        self._launch(
+            self._assemble,
+            (arrays.takers(self.longest, self.device), self.columns),
+            [matrix, mass, *islands.arrays, self.layout, self._own],
+            [self.bands],
+        )
+        if self._clears:
+            inputs = [self.taken, islands.wanted, self.table.positions]
+            self._launch(self._clear, (self.taken.size, self.net.worlds), inputs, [matrix])
+
+    def product(self, matrix, p: wp.array, barred, wanted, product: wp.array, dots: wp.array) -> None:
+        """H p with what the bands make of p, and p . H p block by block."""
+        table, net, threads = self.table, self.net, 1
+        inputs = [matrix, table.columns, table.slices, barred, p, wanted, net.blocks, table.positions]
+        inputs += [self.bands, self.places, self.count, self.idle]
+        if not arrays.serial(self.device):
+            of_places = -(-self.columns // TILE) * TILE * self.longest
+            inputs += [of_places, self._at_none]
+            threads = of_places + net.worlds * len(self._at_none)
+        self._launch(self._product, threads, inputs, [product, dots])
+
+    def direct(self, matrix, mass, islands, anew, fixed, barred, right, lost: wp.array, z: wp.array, dots) -> None:
+        """H^-1 r of the worlds that want a direction, where this is exact; raises `lost` where H is indefinite.
+
+        H is new in the islands `anew`.
+        """
+        if not self._walk:
+            self.assemble(matrix, mass, anew)
+            self.prepare(matrix, fixed, anew.wanted, lost)
+            self.apply(matrix, right, barred, islands.wanted, z, dots)
+            if self.split:
+                inputs = [*islands.arrays, self.layout, self._own, self.values]
+                self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
+            return
+        self._launch(
+            self._walk,
+            self.columns,
+            [matrix, mass, *islands.arrays, self.layout, self._own, right, self.net.blocks],
+            [self.factors, self.values, lost, z],
+        )
+        if self.joints:
+            self._prepare_joints(matrix, fixed, islands.wanted, lost)
+            self._apply_joints(matrix, right, barred, islands.wanted, z, dots)
+
+    def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
+        """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
+        self._lost = lost
+        if self.reduction and self.reduction.repeats:
+            self._spread(wanted)
+            self.reduction.factorise(self.eliminated, self._all, self._wanted, self._bad)
+            self._note()
+        elif self._both:
+            self._both.factorise(self.eliminated, self.count, self.idle, wanted, self.factors, lost)
+        elif not self.reduction:
+            self._launch(
+                self._factorise,
+                self.columns,
+                [self.eliminated, self.count, self.idle, wanted],
+                [self.factors, lost],
+                SERIAL,
+            )
+        if self.joints:
+            self._prepare_joints(matrix, fixed, wanted, lost)
+
+    def apply(self, matrix, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
+        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block.
+
+        Blocks that are barred (W N,), with all bits set, keep theirs.
+        """
+        at = residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks
+        if self._walk_places:
+            self._launch(self._walk_places, self.columns, [self.factors, *at], [self.values, z, dots], SERIAL)
+            return
+        if self._both:
+            self._both.solve(self.factors, at, self.values, z, dots)
+            return
+        if self._at_places:
+            self.reduction.again_at_places(self.plan.twist, *at, z, dots)
+            return
+        self._eliminate(matrix, wanted, self.values, residual, None)
+        self._apply_joints(matrix, residual, barred, wanted, z, dots)
+
+    def _prepare_joints(self, matrix, fixed, wanted, lost: wp.array) -> None:
+        """Factors of joints, once those of chains are there."""
+        if self.coupled:
+            self._eliminate(matrix, wanted, self.responses, None, self.units)
+        self._launch(
+            self._measure,
+            self.net.worlds * self.joints,
+            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, self.plan.size, fixed, wanted]
+            + [self.table.positions],
+            [self.parts, lost],
+        )
+
+    def _apply_joints(self, matrix, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
+        """z from what chains make of the residual on their own."""
+        net = self.net
+        if self.joints:
+            self._launch(
+                self._meet,
+                net.worlds * self.joints,
+                [matrix, *self._joint_inputs(self.values), self.parts, residual, wanted, net.blocks]
+                + [self.table.positions],
+                [self.moved],
+            )
+        if self.met is not None:
+            self._launch(
+                self._follow,
+                (self.longest, self.columns),
+                [self.met, self.count, wanted, self.responses, self.moved, self.joint_rows],
+                [self.values],
+            )
+        elif self.coupled:
+            self._eliminate(matrix, wanted, self.values, residual, self.moved)
+        self._launch(
+            self._finish,
+            arrays.takers(net.worlds * net.blocks, self.device),
+            [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, barred, wanted]
+            + [net.blocks, net.host.nodes],
+            [z, dots],
+        )
+
+    def _joint_inputs(self, values: wp.array) -> list:
+        chains = [self.joint_starts, self.joint_items, values, self.where, self.width, self.net.host.nodes]
+        return [self.table.columns, *chains, self.pairs]
+
+    def _eliminate(self, matrix, wanted, values: wp.array, residual, moved) -> None:
+        """H_II^-1 (r_I - H_IJ z_J), of movements one by one or all at once; without `residual` or `moved` that one is zero."""
+        table, net, solves = self.table, self.net, values.shape[2] // self.columns
+        self._launch(
+            self._load,
+            (arrays.takers(self.longest, self.device), solves * self.columns),
+            [matrix, table.columns, self.places, self.count, self.idle, self.held, self.starts, self.items]
+            + [self.joint_row, self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
+            + [int(moved is not None), self.moved if residual is None else residual]
+            + [self.moved if moved is None else moved],
+            [values],
+        )
+        if self.reduction:
+            self._reduce(values, wanted)
+            return
+        kernel, sides = (self._solve, 1) if values is self.values else (self._solve_all, self.plan.size)
+        inputs = [self.factors, self.count, self.idle, wanted]
+        self._launch(kernel, solves // sides * self.columns, inputs, [values], SERIAL)
+
+    def _reduce(self, values: wp.array, wanted: wp.array) -> None:
+        """H_II^-1 of values by cyclic reduction, which eliminates long chains anew every time."""
+        for first in range(0, values.shape[2], self.columns):
+            part = values[:, :, first : first + self.columns]
+            if self.reduction.repeats:
+                self.reduction.again(part, self._all, wanted, self.width, part)
+                continue
+            self._spread(wanted)
+            self.reduction.solve(self.eliminated, part, self._all, self._wanted, part, self._bad)
+            self._note()
+
+    def _spread(self, wanted: wp.array) -> None:
+        """Which chains are wanted, of the worlds that are."""
+        self._launch(self._columns[0], self.columns, [wanted, self.idle, self.width], [self._wanted])
+
+    def _note(self) -> None:
+        """Raise what is lost of worlds by what their chains lose."""
+        self._launch(self._columns[1], self.columns, [self.width], [self._bad, self._lost])
+
+    def _elements(self, index: int, written: dict, real, linear):
+        """What the elements of a set write, and where they are."""
+        part, own = self.net.sets[index], along_type(real, linear)()
+        for name, array in written.items():
+            setattr(own, name, array)
+        own.at = arrays.upload(self.plan.elements(self.net.host, part.host).astype(np.int32), int, self.device)
+        own.elements = part.elements
+        return own
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)

@@ -1,1 +1,0 @@
-"""Solvers of the coupled system, with dofs addressed by block index."""

@@ -1,0 +1,414 @@
+"""Newton on a net by preconditioned conjugate gradients; every world has its own loop, all on the device."""
+
+import math
+from functools import cached_property, partial
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile.tolerance import outer_forces
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.forces.drag import block_inertia
+from ddg_warp.kernels.linear import rod_pcg
+from ddg_warp.kernels.linear.rod_dof_map import splits
+from ddg_warp.kernels.newton import coupled_newton
+from ddg_warp.solve.linear.pcg import SPARE, Directions, natural_scale
+from ddg_warp.solve.linear.rod_substructuring import Chains
+from ddg_warp.solve.linear.skew_supports import DevicePlanes
+from ddg_warp.solve.linear.sparse_system import Assembly, NetSystem, Sums
+from ddg_warp.solve.newton.contact_newton import NetContact
+from ddg_warp.solve.newton.edge_rotation import Turns
+from ddg_warp.solve.newton.frozen_hessian import Frozen
+from ddg_warp.solve.newton.relaxed_convergence import Outliers
+from ddg_warp.solve.newton.residual import Balance
+from ddg_warp.solve.newton.residual_tolerance import Allowed
+from ddg_warp.solve.newton.rod_newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
+from ddg_warp.solve.newton.sleeping_islands import Resting
+
+PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
+STRAIGHT = 1e-9  # turn between edges of a rod at rest that may be rounding [rad]
+RESCALED = 2.0**12  # change of the natural scale that conjugate gradients take as it is
+LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
+
+
+class NetNewton:
+    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `ChainNewton`.
+
+    Args:
+        preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
+            `kernels.linear.rod_substructuring`), "multilevel" (see `kernels.linear.multilevel`), or "chain_multilevel", both.
+        linear: scalar type of the linear algebra; that of the model by default.
+        drag: whether a block has more than a mass; see `kernels.forces.drag`.
+        reuse: whether the matrix of a step's first iterate serves the whole step.
+        split: whether edges may be stiffer than the matrix carries, where that can be; see `Chains.splits`.
+
+    Attributes:
+        barred: (W N,) bits of dofs that a direction leaves where they are: held ones and, in contact, those of what rests.
+    """
+
+    banded = True  # whether chains keep their part of H, which holds on free dofs alone
+
+    def __init__(
+        self,
+        model,
+        options: NewtonOptions,
+        preconditioner: str = "block_jacobi",
+        linear=None,
+        drag: bool = False,
+        reuse: bool = False,
+        split: bool = False,
+    ):
+        if reuse and options.psd not in FROZEN:
+            raise SceneError(FROZEN_ONLY.format(options.psd))
+        if preconditioner not in PRECONDITIONERS:
+            raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
+        net = model.net
+        self.net, self.options, self.device = net, options, net.device
+        self.real, self.linear = model.types.real, linear or model.types.linear
+        self.eps = model.types.eps
+        worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
+        serial = arrays.serial(device)
+        self.worlds, self.all = worlds, worlds * blocks
+        V, H = net.vector, wp.types.vector(3, self.linear)
+        self.chains = Chains.of(net, preconditioner, self.banded, split)
+        self.system = NetSystem(net, self.chains and self.chains.kept)
+
+        def make(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.q, self.base, self.target = (make(self.all, V) for _ in range(3))
+        self.load = wp.array(np.tile(host.constant_loads(), (worlds, 1)), dtype=V, device=device)
+        self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
+        self.change, self.noise, self.square = (self._weights[i] for i in range(3))
+        self.dots = make((worlds, arrays.takers(blocks, device)), self.real)
+        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else net.mass
+        bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
+        self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
+        self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
+        self.planes = DevicePlanes(net, self.system, self.real, self.linear) if host.frames else None
+        self.barred = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
+        if self.planes:
+            bits[list(host.frames)] = 0
+            self.held = wp.array(bits, dtype=wp.uint8, device=device)
+        gravity = np.asarray(model.scene.gravity, float)
+        self.gravity = wp.array(gravity[None], dtype=V, device=device)
+        self.right, self.direction = (make(self.all, H) for _ in range(2))
+        self.matrix = make((9, worlds * self.system.positions), self.linear)
+        self.krylov_dots = make((worlds, blocks), self.linear)
+        self.islands = Islands(worlds, self.real, device)
+        self.iterations, self.stalled = (make(worlds, int) for _ in range(2))
+        self.best, self.decrease, self.turn, self.worst, self.goal, self.limit = (
+            make(worlds, self.real) for _ in range(6)
+        )
+        self.goal.fill_(math.inf)
+        self.forcing = make(worlds, self.linear)
+        self.pcg_work = make(1, wp.int64)
+        self.frozen = Frozen(self.islands) if reuse else None
+        self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
+        if self.psd == "none":
+            self._require_exact()
+        self.contact = NetContact(self, model) if host.touching else None
+        exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in net.sets]
+        self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
+        banded = self.chains is not None and self.chains.banded
+        self.local = tuple(banded and part.host.along for part in net.sets)  # whether derivatives are of the local dofs
+        self.split = tuple(split and own and splits(part.term) for own, part in zip(self.local, net.sets, strict=True))
+        sets = zip(net.sets, exact, self.local, self.split, strict=True)
+        self.parts = [self._part(*given, make, H) for given in sets]
+        ends = host.edges
+        self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
+        # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
+        capless = np.concatenate([np.zeros(0, int), *(shell.edges for shell in host.shells)])
+        spins = np.arange(host.nodes, blocks)
+        spins = spins[~np.isin(spins, capless)]
+        self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
+        turning = arrays.takers(len(ends) + len(spins), device)
+        self.squares = make((worlds, turning), self.real)
+        self._sum = Sums(worlds, self.dots.shape[1], self.real, device)
+        self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
+        self._largest = Sums(worlds, turning, self.real, device, largest=True)
+        lengths = host.edge_lengths
+        self.arm, self.longest = float(lengths.mean()), float(lengths.max())
+        self._evaluate = [
+            element_path.evaluate_kernel(
+                coupled_storage(part.term, self.real, not local, serial), self.real, self.linear, late, own
+            )
+            for part, late, local, own in zip(net.sets, self.exact_from, self.local, self.split, strict=True)
+        ]
+        if self.chains:
+            self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
+            if self.contact:
+                self.contact.bind(self.chains)
+        self._direct = self.chains is not None and self.chains.exact
+        fails = self.psd == "none"
+        curved = any(exact) or (self.contact is not None and self.contact.bends)
+        repeats = not reuse and (fails or curved or self._direct)
+        self._repeat = rod_pcg.repeat_kernel(self.real, fails, curved) if repeats else None
+        self.negative = make(worlds, int)
+        self._assembly = Assembly(
+            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
+        )
+        self.turns = Turns(self) if host.rods else None
+        most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
+        self._judge, self._measure, self._rotate, self._take, self._move = coupled_newton.search_kernels(
+            self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None, most > 0
+        )
+        self.allowed = Allowed(net, self.real, self.linear)
+        outer = outer_forces(host, gravity)
+        self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
+        self.resting = Resting(self, *self.contact.bodies) if self.contact else None
+        self.outliers = Outliers(self, most) if most else None
+        self.here = self.contact.bound if self.contact else self.q
+        self._balance = Balance(self, drag)
+        self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
+        self._multilevel = preconditioner in ("multilevel", "chain_multilevel")
+
+    def _require_exact(self) -> None:
+        """Refuse the exact Hessian where it leaves out what a measure has no second derivatives for."""
+        for part in self.net.sets:
+            if not (part.term.measure.packed or part.term.measure.tensions):
+                raise SceneError(
+                    f"psd 'none': second derivatives of {part.term.name} are left out of the matrix of a net; "
+                    "use 'auto', 'gauss_newton' or 'progressive'"
+                )
+
+    def automatic_psd(self) -> str:
+        """The mode that suits the rods; see `ChainNewton.automatic_psd`. Curvature that is rounding counts as none.
+
+        What touches turns about what it touches, and bends: without second derivatives the last digits take tens of iterations.
+        """
+        if self.net.host.touching:
+            return "progressive"
+        bending = [part for part in self.net.sets if part.term.measure.packed and not self.frozen]
+        if any(part.parameters.foreign.intersection(part.term.rest) for part in bending):
+            return "progressive"
+        turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
+        return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
+
+    @property
+    def outdated(self) -> bool:
+        """As of `ChainNewton`; or stretching is stiffer or softer by so much that conjugate gradients need another scale."""
+        if self.options.psd == "auto" and self.psd != self.automatic_psd():
+            return True
+        return not 1.0 / RESCALED < natural_scale(self.net) / self.krylov.scale < RESCALED
+
+    def _part(self, part, exact: bool, local: bool, split: bool, make, H) -> dict:
+        """What the elements of a set write."""
+        measure, count = part.term.measure, self.worlds * part.elements
+        rows, factor, gradient = (
+            (measure.size, self.linear, self.real) if local else (measure.slots, H, self.net.vector)
+        )
+
+        def lay(rows, dtype):
+            return arrays.allocate((rows, count), dtype, self.device)
+
+        return {
+            "factor": lay(len(measure.strains) * rows, factor),
+            "tension": lay(max(1, measure.tensions) + split, self.linear),
+            "second": lay(measure.packed, self.linear) if exact else make((1, 1), self.linear),
+            "gradient": lay(rows, gradient),
+            "energy": lay(2, self.real),
+            "stiffness": make(count, self.linear),
+        }
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
+        own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
+        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
+        used += (self.outliers,)
+        parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
+        evaluate = [(kernel, 128) for kernel in self._evaluate]
+        sums = (self._sum, self._sum_weights, self._largest, self._worst)
+        sums = [kernel for part in sums for kernel in part.kernels]
+        own += self.frozen.kernels if self.frozen else []
+        return [*own, *evaluate, *self._assembly.kernels, *parts, *sums]
+
+    def pcg_iterations(self) -> int:
+        """Iterations of all solves so far."""
+        return int(self.pcg_work.numpy()[0])
+
+    def solve(self, state) -> None:
+        """Iterate until no world is active, with the lagged data of `state`; can be captured."""
+        if self.frozen:
+            self.frozen.begin()
+        if self.resting:
+            self.resting.wake()
+        wp.capture_while(self.islands.active, lambda: self.iterate(state))
+
+    def iterate(self, state) -> None:
+        """One iteration of every active world."""
+        self.islands.signals.zero_()
+        self.evaluate(state)
+        self.balance()
+        self.judge()
+        wp.capture_if(self.islands.active, lambda: self._step(state))
+
+    def _step(self, state) -> None:
+        """The next iterate of active worlds."""
+        wp.capture_if(self.islands.wanting, self._aim)
+        self.move()
+        if self.turns:
+            wp.capture_if(self.islands.turning, lambda: self.turns.turn(state))
+        if self.contact:
+            self.contact.hold()
+
+    def _aim(self) -> None:
+        """Directions, and how far along them, of worlds that do not shorten a step."""
+        if self.resting:
+            self.resting(self.contact.terms.products)
+        self.assemble()
+        self.direct()
+        self.take()
+
+    def evaluate(self, state) -> None:
+        """Energies, gradients and factors of all elements at the iterate, `here`."""
+        parts = [partial(self._evaluate_set, state, index) for index in range(len(self.net.sets))]
+        arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
+
+    def _evaluate_set(self, state, index: int) -> None:
+        results = element_path.results_type(self.real, self.linear, not self.local[index])()
+        for name, values in self.parts[index].items():
+            setattr(results, name, values)
+        wp.launch(
+            self._evaluate[index],
+            (self.worlds, arrays.takers(self.net.sets[index].elements, self.device)),
+            [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
+            [results],
+            device=self.device,
+            block_dim=128,
+        )
+
+    def balance(self) -> None:
+        """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
+        islands = self.islands
+        self._balance()
+        flags = islands.unbalanced, islands.drowned
+        self.allowed.sum_up(self.right, self.options.rtol, islands, *flags, self._direct and not self.frozen)
+
+    def judge(self) -> None:
+        """Stop worlds, reject their iterates, or ask for a direction."""
+        options = self.options
+        weights = self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten()
+        sums = [partial(self._sum_weights, *weights), partial(self._worst, self.allowed.ratio, self.worst)]
+        counts = [partial(self.outliers.count, options.rtol)] if self.outliers else []
+        arrays.side_by_side([*sums, *counts], self.device)
+        if self.outliers:
+            self.outliers.excuse()
+        if self.contact:
+            self.contact.account(self._weight[0], self._weight[1])
+        wp.launch(
+            self._judge,
+            self.worlds,
+            [*(self._weight[i] for i in range(3)), self.worst, options.rtol]
+            + [options.floor_factor * self.eps]
+            + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
+            + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal, self.limit],
+            device=self.device,
+        )
+
+    def assemble(self) -> None:
+        """H of the worlds that want a direction."""
+        if self.frozen:
+            self.frozen.update()
+        if not self.contact:
+            self._assemble_own()
+            return
+        arrays.side_by_side([self._assemble_own, self.contact.assemble], self.device)
+        self.contact.join()
+
+    def _assemble_own(self) -> None:
+        anew = self.anew
+        self._assembly(self.mass, anew, self.matrix)
+        if self.planes:
+            self.planes.matrix(self.matrix, anew.wanted)
+        if self.chains and not self._direct:
+            self.chains.assemble(self.matrix, self.mass, anew)
+
+    def direct(self) -> None:
+        """Directions: by elimination where that is exact, else by conjugate gradients."""
+        if self._direct:
+            self.negative.zero_()
+            self.forcing.zero_()  # what is left is rounding
+            self.chains.direct(
+                self.matrix,
+                self.mass,
+                self.islands,
+                self.anew,
+                self.fixed,
+                self.barred,
+                self.right,
+                self.negative,
+                self.direction,
+                self.krylov_dots,
+            )
+        elif self.contact:
+            self.contact.direct()
+        else:
+            self.krylov.solve()
+        if self._repeat:  # what was indefinite comes again, without second derivatives and compression
+            wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
+
+    @cached_property
+    def krylov(self) -> Directions:
+        """What finds directions where elimination is not exact."""
+        return Directions(self, self._multilevel)
+
+    @property
+    def anew(self) -> Islands | Frozen:
+        """Those whose matrix is new."""
+        return self.frozen or self.islands
+
+    @property
+    def indefinite(self) -> wp.array:
+        """Where conjugate gradients note what is not definite: the iterate comes again, or the next one leaves out compression."""
+        return self.negative if self._repeat else self.islands.clamped
+
+    def watch(self) -> None:
+        """What is looked at after every iteration of conjugate gradients."""
+
+    def take(self) -> None:
+        """Lengths of the steps along the directions."""
+        blocks = self.net.blocks
+        inputs = [self.right, self.direction, self.islands.wanted, blocks]
+        arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
+        self._sum(self.dots, self.decrease)
+        self.measure_turns()
+        wp.launch(
+            self._take,
+            self.worlds,
+            [self.decrease, self.turn, self.options.rotation_cap, self.iterations],
+            [*self.islands.arrays, self.stalled, self.pcg_work],
+            device=self.device,
+        )
+
+    def measure_turns(self) -> None:
+        """Largest turn that the directions make, squared; these are in space then."""
+        if self.planes:
+            self.planes.back(self.direction, self.islands.wanted)
+        arrays.sweep(
+            self._rotate,
+            len(self.ends) + len(self.spins),
+            [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
+            [self.squares],
+            self.device,
+            worlds=self.worlds,
+        )
+        self._largest(self.squares, self.turn)
+
+    def move(self) -> None:
+        """Take the step that is to be taken, or the part of it that the search has left."""
+        islands = self.islands
+        arrays.sweep(
+            self._move,
+            self.net.blocks,
+            [self.direction, islands.step_length, islands.todo, islands.halvings, self.net.blocks],
+            [self.base, self.q],
+            self.device,
+            worlds=self.worlds,
+        )

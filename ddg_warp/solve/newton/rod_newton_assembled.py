@@ -1,0 +1,51 @@
+"""Newton on chains whose system is assembled in blocks, for solvers that need the whole matrix at once."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.linear import rod_matrix
+from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+
+
+class AssembledNewton(ChainNewton):
+    """As `ChainNewton`, with the matrix of every node in memory; see `kernels.linear.rod_matrix`.
+
+    Args:
+        stored: scalar type of the blocks, where it is another one than that of the elements.
+
+    Attributes:
+        blocks: D, E and F of every node, (3 block^2, nodes, columns).
+    """
+
+    def __init__(
+        self,
+        model,
+        group,
+        options: NewtonOptions,
+        linear=None,
+        midpoint: bool = False,
+        split: bool = False,
+        stored=None,
+    ):
+        super().__init__(model, group, options, linear, midpoint, split)
+        kind, self.stored = group.kind, stored or self.linear
+        self.blocks = self.vectors(3 * kind.block**2)
+        self.islands.placed.fill_(1)  # `base` holds where every step comes from
+        self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
+
+    def vectors(self, rows: int | None = None) -> wp.array:
+        """Zeros of the linear algebra for every node, as many as a node has dofs unless told otherwise."""
+        group = self.group
+        return arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.stored, self.device)
+
+    def assemble_blocks(self) -> None:
+        """Blocks of active rods."""
+        group = self.group
+        wp.launch(
+            self._assemble,
+            (-(-group.columns // rod_matrix.TILE), group.nodes, min(rod_matrix.TILE, group.columns)),
+            [self.factor, self.geometric, group.count, self.mass, self.rotary, group.fixed, *self.islands.arrays]
+            + [int(self.reuse)],
+            [self.blocks],
+            device=self.device,
+        )

@@ -1,0 +1,171 @@
+"""Newton on few, long rods: every node a thread, the system by block cyclic reduction."""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.newton import line_search_parallel, rod_iterate_parallel
+from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
+from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, TensionReduction
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
+
+
+class PartitionedNewton(AssembledNewton):
+    """As `ChainNewton`, without a loop of one thread over the nodes of a rod, for open rods.
+
+    An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
+    """
+
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
+        if options.psd == "none":
+            raise SceneError("psd 'none': linear 'partitioned' cannot stop at an indefinite matrix; use 'sweep'")
+        super().__init__(model, group, options, linear, midpoint, split)
+        kind, device, real = group.kind, model.wp_device, self.real
+        vector, columns = wp.types.vector(kind.dim, real), group.columns
+        self.width = math.isqrt(group.nodes - 1) + 1
+        self.ranges = -(-group.nodes // self.width)
+        self.midpoint = midpoint
+        self.partial = arrays.allocate((4, self.ranges, columns), real, device)
+        self.sums = arrays.allocate((2, self.ranges, columns), vector, device)
+        self.prefix = arrays.allocate((group.nodes, columns), vector, device)
+        self.mean = wp.zeros(columns, dtype=vector, device=device)
+        self.held = arrays.upload(_held_neighbours(group), int, device)
+        self.new_frame = arrays.allocate(self.frame.shape, real, device)
+        if split:
+            self.reduction = TensionReduction(group, real, self.linear, device)
+        else:
+            self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
+        self.split = split
+        self._weigh, self._gauge = line_search_parallel.sum_kernels(kind, real, self.linear)
+        self._judge, self._take = line_search_parallel.decide_kernels(kind, real, self.linear, self.exact)
+        self._moves = rod_iterate_parallel.move_kernels(kind, real, self.linear, split)
+        self._turn_ahead, *_ = rod_iterate_parallel.move_kernels(kind, real, self.linear)
+        self._aim, self._renew, self._again = rod_iterate_parallel.predict_kernels(kind, real, self.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim]
+        own += [self._renew] if self.midpoint else [self._again]
+        own += [self._turn_ahead] * self.split  # without, it is among the moves
+        others = self._predict, self._further  # in place of which it has its own
+        around = [kernel for kernel in self.kernels_around if kernel not in others]
+        return [*around, self._assemble, *own, *self.reduction.kernels]
+
+    def predict(self, before) -> None:
+        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
+        group = self.group
+        self._launch(
+            self._aim,
+            group.nodes,
+            [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.x],
+            [self.base, self.direction],
+        )
+        self.move(0 if self.midpoint else ON)
+        if self.midpoint and group.kind.twist:
+            wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
+            self.move()
+
+    def go_further(self, before, predicted: wp.array) -> None:
+        """As of `ChainNewton`."""
+        wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
+        self.move(FURTHER, base=predicted, now=before.x)
+
+    def sweep(self) -> None:
+        """Assemble, decide, solve for a direction and take it."""
+        self.assemble_blocks()
+        self.judge()
+        self.direct()
+        self.take()
+        self.move()
+
+    def judge(self) -> None:
+        """Stop rods, reject their iterates, or ask for a direction."""
+        options = self.options
+        self._launch(
+            self._weigh,
+            self.ranges,
+            [self.right, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
+            [self.partial],
+        )
+        wp.launch(
+            self._judge,
+            self.group.columns,
+            [self.partial, self.ranges, options.floor_factor * self.eps, options.max_iterations, options.max_halvings]
+            + self.islands.arrays,
+            device=self.device,
+        )
+
+    def direct(self) -> None:
+        """Directions by cyclic reduction."""
+        islands = self.islands
+        if self.split:
+            self.reduction.solve(self.blocks, self.factor, self.right, self.x, islands, self.direction)
+        else:
+            self.reduction.solve(self.blocks, self.right, self.group.count, islands.wanted, self.direction, islands.bad)
+
+    def take(self) -> None:
+        """Lengths of the steps along the directions."""
+        group = self.group
+        self._launch(
+            self._gauge,
+            self.ranges,
+            [self.right, self.direction, self.x, group.count, self.islands.wanted, self.ranges],
+            [self.base, self.partial],
+        )
+        wp.launch(
+            self._take,
+            group.columns,
+            [self.partial, self.ranges, self.options.rotation_cap, *self.islands.arrays],
+            device=self.device,
+        )
+
+    def move(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
+        """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate.
+
+        Args:
+            onward: of a predictor's step, which has no tensions, how it goes on, see `kernels.newton.edge_rotation`; None of one of
+                the solve.
+            base: where it starts, `base` by default; now: see `search.move_functions`.
+        """
+        base = self.base if base is None else base
+        group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
+        self._launch(
+            turn if onward is None else self._turn_ahead,
+            group.nodes,
+            [group.count, islands.todo, self.direction, islands.step_length, islands.turn]
+            + [onward or 0, base, base if now is None else now, self.x, self.frame],
+            [self.prefix, self.new_frame],
+        )
+        self._launch(scan, self.ranges, [group.count, islands.todo, self.width, self.prefix], [self.sums])
+        wp.launch(
+            offset,
+            group.columns,
+            [group.count, islands.todo, self.width, self.ranges, self.sums],
+            [self.mean],
+            device=self.device,
+        )
+        self._launch(
+            move,
+            group.nodes,
+            [group.count, group.fixed, self.held, *islands.arrays, self.direction]
+            + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
+            [self.x, self.theta, self.frame, base],
+        )
+
+    def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
+        """One thread for each of `size` parts of every rod."""
+        wp.launch(kernel, (size, self.group.columns), inputs, outputs, device=self.device)
+
+
+def _held_neighbours(group) -> np.ndarray:
+    """The held nodes next to every node, itself included: (before or after, node, column), -1 where there is none."""
+    k, held = np.arange(group.nodes)[:, None], group.host.anchored
+    before = np.maximum.accumulate(np.where(held, k, -1), axis=0)
+    after = np.minimum.accumulate(np.where(held, k, group.nodes)[::-1], axis=0)[::-1]
+    neighbours = np.stack([before, np.where(after < group.nodes, after, -1)]).astype(np.int32)
+    return np.tile(neighbours, (1, 1, group.worlds))

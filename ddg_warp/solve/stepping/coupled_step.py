@@ -1,0 +1,385 @@
+"""A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.stepping.rod_step`."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile.precision import largest_carried
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.elements import coupled_frames, element_path
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.newton import coupled_newton
+from ddg_warp.model.net import NetState
+from ddg_warp.scene import drag
+from ddg_warp.solve.collision.support_arcs import Arcs
+from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.forces.control_loads import ControlledLoads, NetScale
+from ddg_warp.solve.forces.drag import NetDrag
+from ddg_warp.solve.forces.loads import Loads
+from ddg_warp.solve.forces.prescribed_element_data import NetField, NetMotion
+from ddg_warp.solve.linear.solver_selection import net_preconditioner
+from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS, NetNewton
+from ddg_warp.solve.stepping.decoupled_step import Alone, rods_of, suits, uncoupled
+from ddg_warp.solve.stepping.energy_drift import NetEnergy
+from ddg_warp.solve.stepping.step_driver import USUAL, PartStep
+from ddg_warp.solve.stepping.warm_start import Foresight
+
+RUNS, TREES = 1, 2  # what is made anew before some steps
+# Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
+# step in which they touch nothing. So many looks trees of runs serve, which are refitted by these alone.
+RENEWAL = 8
+
+
+class NetStep(PartStep):
+    """Steps a model's net in all worlds, each an island. Arguments as of `ChainStep`."""
+
+    def __init__(self, integrator, model, means=USUAL, counts_of=None):
+        self.net = model.net
+        host, real = model.net.host, model.types.real
+        options = integrator.options
+        for name, value, only in (
+            ("linear", integrator.linear, ("auto", *PRECONDITIONERS)),
+            ("psd", options.psd, ("auto", "gauss_newton", "progressive", "none")),
+        ):
+            if value not in only:
+                raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")
+        bare = ((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1)
+        if host.drag:
+            ends, _, coefficients = host.drag
+            bare[ends[drag.holds(coefficients)]] = False
+        bare = np.flatnonzero(bare)
+        if bare.size:
+            raise SceneError(
+                f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
+                "give the material a density, the section a mass_per_length, or the rod drag along and across"
+            )
+        preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
+        reuse = integrator.solver == "projective"
+        if options.psd == "auto" and means.stiff and not reuse:
+            options = replace(options, psd="progressive")
+        solver = NetNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse, means.split)
+        super().__init__(integrator, model, solver, means, counts_of)
+        if counts_of is not None:
+            self.newton.pcg_work = counts_of.newton.pcg_work
+            if solver.contact:
+                solver.contact.go_on(counts_of.newton.contact)
+        if solver.contact:
+            own = solver.contact.search.more[: len(self.tally)]
+            wp.copy(own, self.tally)
+            self.tally = own
+        self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
+        self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
+        self._foresight = Foresight(solver)
+        self._begin, self._finish = coupled_newton.step_kernels(
+            real, self.midpoint, arrays.serial(model.wp_device), solver.contact is not None
+        )
+        if solver.contact and self.midpoint:
+            raise SceneError(
+                "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
+            )
+        self._lagged = model.net.lagged() if model.net.edges else None
+        self._take = coupled_frames.take_kernel(real)
+        self.drag = NetDrag(model, self.midpoint) if host.drag else None
+        self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
+        self.motion = NetMotion(model, self.midpoint) if host.moves else None
+        if (given := integrator.given) is not None:
+            scale = NetScale(model, self.net, solver)
+            self.loads = ControlledLoads(model, self.net, self.midpoint, given, scale)
+        elif host.timed or host.followers:
+            self.loads = Loads(model, self.net, self.midpoint)
+        self.arcs = self._resolve_arcs()
+        self.field = NetField(model, self.midpoint, integrator.field)
+        self._data = (self.motion.data if self.motion else {}) | self.field.data
+        self.alone, self._groups = None, counts_of and counts_of._groups
+        # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
+        self._since_renewal, self._sought = 0, (0, 0)
+
+    def _resolve_arcs(self) -> Arcs | None:
+        """What finds the substeps in which contact sees prescribed motions; None where these move no surface."""
+        arcs = Arcs(self.model) if self.newton.contact and self.motion else None
+        if not (arcs and arcs.moved):
+            return None
+        for parts in (self.islands.substep, self.islands.interval):
+            parts.fill_(1.0)
+        self.motion.resolve_grips([*arcs.of_grips, *self.islands.arrays, self.tally])
+        return arcs
+
+    def arrive(self) -> None:
+        """The next step begins from a state that comes from elsewhere."""
+        self._since_renewal = 0
+
+    def outdated(self, anew: bool) -> int:
+        """What is made anew before a step, see `renew`: trees that were used since, every few steps or looks."""
+        if self.newton.contact is None or self.model.wp_device.is_cpu:
+            return 0  # on the CPU every search makes its own
+        due = anew or self._since_renewal % RENEWAL == 0
+        fresh = anew or self._since_renewal == 0
+        self._since_renewal += 1
+        (searches, looks), before = self.newton.contact.search.sought, self._sought
+        if due and (fresh or searches != before[0]):
+            self._sought = searches, looks
+            return TREES
+        if looks - before[1] >= RENEWAL:
+            self._sought = before[0], looks
+            return RUNS
+        return 0
+
+    def renew(self, before, what: int) -> None:
+        """Make trees of searches anew from a state, `TREES`, or those of `RUNS` alone; launches alone."""
+        if what == TREES:
+            self.newton.contact.renew(before.q)
+        if self.alone:
+            self.alone.renew()
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one state to another."""
+        if self.alone is None or self.net.worlds > 1:
+            self._keep()
+        if len(before.rate):
+            wp.copy(after.rate, before.rate)
+        if self.alone is None:
+            super().step(before, after)
+            return
+        self.alone.step(before, after)
+
+    def _keep(self) -> None:
+        """Remember what is counted before a step that may have to be done again."""
+        if not self.newton.contact:
+            return
+        for kept, array in zip(self._kept, self._counts, strict=True):
+            wp.copy(kept, array)
+        self.newton.contact.tally.begin()
+
+    def go_on(self, before, after) -> None:
+        """Step the worlds that `alone` has left to the net; those that are done rest as they are."""
+        if self.net.worlds == 1:  # of which nothing was counted yet
+            self._keep()
+        else:
+            self.integrator._worlds.take_part(self.alone.left, before, after, self.net.worlds)
+            wp.copy(self.newton.q, after.q)
+            before = after
+        self._try(before, after)
+        wp.capture_while(self.remaining, lambda: self._try(after, after))
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """As of `PartStep`."""
+        super().prescribe(t0, t1)
+        for chain in self._rods:
+            chain.prescribe(t0, t1)
+        if self.arcs:
+            self._cut(self.arcs.levels(t0, t1), t0, t1)
+
+    def _cut(self, levels: np.ndarray, t0: float, t1: float) -> None:
+        """Take the step in 2^levels substeps (worlds,); those of grips may be shorter."""
+        if not (levels.any() or self.motion.levels.any()):
+            return
+        if self.motion.divide(levels, t0, t1):
+            for chain in self._rods:
+                if chain.motion:
+                    chain.motion.go_by(self.motion)
+            self.integrator._graphs.clear()
+        self.islands.interval.assign(0.5**levels)
+        self.islands.substep.assign(0.5**levels)
+
+    def load_modules(self) -> None:
+        """As of `PartStep`."""
+        super().load_modules()
+        if self.alone is None:
+            return
+        arrays.load_kernels(self.alone.kernels, self.model.wp_device)
+        for chain in self._rods:
+            chain.load_modules()
+        if self.net.worlds > 1:
+            self.integrator._worlds.load_modules()
+
+    @property
+    def _rods(self) -> list:
+        """Steps of its rods on their own, where there are any."""
+        return self.alone.chains if self.alone else []
+
+    def adapt(self, s: float, anew: bool = False) -> bool:
+        """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before.
+
+        `anew` as of `PartStep.suited`.
+        """
+        before = self.alone
+        if not (uncoupled(self.model) and suits(self.integrator)):
+            self.alone = None
+        elif self.alone is None:
+            self._groups = self._groups or rods_of(self.model)
+            self.alone = Alone(self, self._groups)
+        return self.alone is not before or (self.alone is not None and self.alone.adapt(s, anew))
+
+    def outgrown(self, before) -> bool:
+        """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
+
+        Then there is room, and all is as it was before that step. Reads from the device where there is contact.
+        """
+        if self.newton.contact is None or not self.newton.contact.outgrown(before.q):
+            return False
+        for kept, array in zip(self._kept, self._counts, strict=True):
+            wp.copy(array, kept)
+        return True
+
+    def _counted(self) -> np.ndarray:
+        """As of `PartStep`; where there is contact as `outgrown` has read it."""
+        contact = self.newton.contact
+        return contact.search.more_read[: len(self.tally)] if contact else super()._counted()
+
+    def attempt(self, before, after) -> None:
+        """One solve of every world that has not finished the step, from state `before` to `after`."""
+        net, solver, islands = self.net, self.newton, self.islands
+        blocks = net.blocks
+        if solver.contact:
+            solver.contact.brace(self.integrator._dt)
+        self._sweep(
+            self._begin,
+            [before.q, before.v, solver.held, net.moves]
+            + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
+            [solver.q, solver.base, solver.target],
+        )
+        if self.motion:
+            self.motion.place(islands, solver.q)
+        if solver.turns:
+            solver.turns.predict(before.v, not self.midpoint)
+        start = self._start_frames(before)
+        if self.motion:
+            self.motion.direct(islands, solver.q, start.frame)
+        if self.loads:
+            self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
+        if self.drag:
+            self.drag.resist(before, solver, islands)
+        if not self.midpoint:
+            self._foresight.start(before)
+        if solver.contact:
+            solver.contact.place()
+            solver.contact.lag(before.q, rate=before.rate)
+        solver.solve(start)
+        if solver.contact:
+            for solution in solver.contact.solutions:
+                solver.contact.lag_again(solution)
+                solver.solve(start)
+            solver.contact.finish(before.q)
+        if self.energy:
+            self.energy.judge(before, start)
+        self._foresight.weigh(before)
+        rate = solver.contact.terms.law.rate if solver.contact else after.rate
+        inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
+        self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a, after.rate])
+        if self.drag:
+            self.drag.settle(before, after, solver, islands)
+        self.net.carry(start, after, kept=before, moved=islands.moved)
+        if self.motion:
+            self.motion.turn(islands, before, after)
+        self.field.finish(islands.moved, before, after)
+        self.net.update_strains(after)
+
+    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
+        """Over the blocks of every world."""
+        arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.model.wp_device, worlds=self.net.worlds)
+
+    def _start_frames(self, before):
+        """The state whose lagged data serve the solve, which may renew them: for the midpoint rule carried to the predicted midpoint.
+
+        Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
+        inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
+        found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
+        Worlds that have finished keep the frames of their solve, by which gradients tell whether these were renewed.
+        """
+        if not self.net.edges:
+            return replace(before, data=self._data)
+        frame, lag = self._lagged
+        start = NetState(self.newton.q, before.v, before.a, frame, lag, before.last, self._data)
+        if self.midpoint:
+            self.net.carry(before, start, kept=start, moved=self.islands.moved)
+            return start
+        inputs = [self.islands.moved, self.net.edges, before.frame]
+        wp.launch(self._take, frame.shape[1], inputs, [frame], device=self.model.wp_device)
+        for part, own, given in zip(self.net.sets, lag, before.lag, strict=True):
+            if part.term.measure.advance:
+                wp.copy(own, given)
+        return start
+
+    @property
+    def own_kernels(self) -> list:
+        """Kernels of an attempt, without those of the solver."""
+        real, net = self.model.types.real, self.net
+        kernels = [self._begin, self._finish, self._take, *([] if self.midpoint else self._foresight.kernels)]
+        for part in net.sets:
+            if part.term.density.lagged:
+                kernels.append(element_path.strain_kernel(coupled_storage(part.term, real), real))
+        return kernels
+
+    @property
+    def stiffness_version(self) -> int:
+        """As of `PartStep`."""
+        return self.net.version
+
+    def float32_errors(self, s: float) -> np.ndarray:
+        """The largest of a rod (1,); see `precision.float32_error`."""
+        return self.net.rod_errors(s).max(initial=0.0, keepdims=True)
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """The same with tensions as unknowns; infinite where they cannot be."""
+        chains = self.newton.chains
+        if not (chains and chains.splits) or self.newton.frozen:
+            return super().split_errors(s)
+        return self.net.split_errors(s).max(initial=0.0, keepdims=True)
+
+    def limit(self, s: float) -> None:
+        """As of `PartStep`."""
+        super().limit(s)
+        for chain in self._rods:
+            chain.limit(s)
+
+    def _find_limits(self, s: float) -> dict[str, np.ndarray]:
+        """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
+        found = super()._find_limits(s)
+        if any(self.newton.split):
+            softest = self.net.rod_stiffnesses(s)[2].min()
+            found["carried"] = np.full(len(self.islands), largest_carried(softest))
+        return found
+
+    def who(self, world: int) -> str:
+        """The net of a world."""
+        return f"the net (world {world})"
+
+    def rods_of(self, worlds: np.ndarray) -> list[int]:
+        """None: what failed is not one rod's."""
+        return []
+
+    def failure(self, state, island: int) -> tuple[str, str]:
+        """As of `PartStep`."""
+        if int(self.islands.reason.numpy()[island]) == outcome.TURNED_TOO_FAR:
+            return outcome.NAMES[outcome.TURNED_TOO_FAR], self.arcs.failure(island)
+        return super().failure(state, island)
+
+    def where(self, state, world: int) -> str:
+        """Where the largest residual was, and what to do."""
+        sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
+        worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
+        place = Tangent(self.model).parts[-1].where(worst)
+        return f"largest residual {sizes[worst]:.3g} N at {place}; {self._remedy(state, world)}"
+
+    def _remedy(self, state, world: int) -> str:
+        """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
+        x = state.net.q.numpy().reshape(self.model.worlds, -1, 3)[world]
+        found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
+        return next(filter(None, found), "") or self._tightest(state, world)
+
+    def _tightest(self, state, world: int) -> str:
+        """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart; and advice.
+
+        Where there is no room, or a motion drives two held things into each other, a smaller dt or a looser rtol makes none.
+        """
+        if not self.newton.contact:
+            return self.advice(state)
+        reason = int(self.islands.reason.numpy()[world])
+        begin = state.time - self.integrator._dt_host
+        told = self.newton.contact.blocked(Tangent(self.model), state, begin, state.time)
+        told = told or self.newton.contact.tightest(state.net.q, reason)
+        helped = told.endswith(", ")
+        return told + ("or check its loads and supports" if helped else self.advice(state))

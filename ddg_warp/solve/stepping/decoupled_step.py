@@ -1,0 +1,274 @@
+"""Decoupled step: rods of the coupled system without contact are stepped as uncoupled rods.
+
+Rods that only contact couples obey the equations of uncoupled rods while no pair is within the activation distance. The step is tried
+this way in worlds without pairs in range at its start. If none came in range during the motion either, no contact force and no
+friction act, and the result is the solution of the coupled system. Otherwise the coupled solver repeats the world's step from its
+start. The decision depends only on the positions at both ends, not on earlier searches, so that a resumed run takes the same steps.
+
+Culling of rods: while rods stay in bounds that do not overlap, no search is needed. The step is therefore tried before any test, then
+tested by bounds, and where these are inconclusive, tried again with a test of pairs. All of that is below one graph condition.
+"""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile.chains import ChainGroup, compile_chains
+from ddg_warp.compile.rods import net_rods
+from ddg_warp.kernels.collision.broad_phase.rod_culling import KNOWN
+from ddg_warp.kernels.stepping import decoupled_rods as kernels
+from ddg_warp.model.group import Group
+from ddg_warp.model.rod_elements import RodElements
+from ddg_warp.solve.collision.rod_culling import Runs
+from ddg_warp.solve.stepping.rod_step import ChainStep
+
+
+class Alone:
+    """Rods of a `NetStep` as uncoupled rod groups, whose states are scratch.
+
+    Attributes:
+        `chains`: steps of the rod groups.
+        runs: culling of rods; None if there are primitives other than edges.
+        left: worlds of the last step that the coupled solver takes (worlds,).
+    """
+
+    def __init__(self, step, groups: list[Group]):
+        self.step_of, self.model, self.net = step, step.model, step.net
+        real, device, worlds = self.model.types.real, self.model.wp_device, self.net.worlds
+        self.chains = [self._chain(group) for group in groups]
+        self._states = [self.model.group_state(group) for group in groups]
+        self._places = [Places(self.net, group) for group in groups]
+        self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
+        self._search = step.newton.contact.search
+        self.runs = Runs(self._search) if len(self._search.lists) == 1 else None
+        # without culling all worlds are in doubt
+        self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
+        self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
+        self._wait, self._stay, self._follow = kernels.place_kernels(real, arrays.serial(device))
+        self._told = wp.zeros((kernels.TOLD, worlds), dtype=int, device=device)
+        self.left, self._tried = (self._told[row] for row in (kernels.LEFT, kernels.TRIED))
+        self._any_tried, self._some, self._again = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
+        obstacles = np.concatenate([np.zeros(0, int), *self.net.host.obstacles]).astype(np.int32)
+        self._obstacles = wp.array(obstacles, dtype=int, device=device)
+        self._mixed = not all(places.whole for places in self._places)
+
+    def _chain(self, group: Group, **options) -> ChainStep:
+        chain = ChainStep(self.step_of.integrator, self.model, group, **options)
+        if chain.motion:
+            chain.motion.go_by(self.step_of.motion)
+        return chain
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture, without the kernels of rod groups."""
+        loaded = [
+            self._begin,
+            self._hope,
+            self._near,
+            self._judge,
+            *(kernel for each in self._kernels for kernel in each),
+        ]
+        loaded += self.runs.kernels if self.runs else []
+        loaded += [self._wait] if self.net.worlds > 1 else []
+        return loaded + ([self._stay, self._follow] if len(self._obstacles) else [])
+
+    def adapt(self, s: float, parameters_changed: bool = False) -> bool:
+        """Update parameters and solver selection for a step of s [s], as `NetStep.adapt`; return True if graphs are outdated."""
+        changed = any([places.take_parameters() for places in self._places])
+        for i, chain in enumerate(self.chains):
+            if (means := chain.suited(s, parameters_changed)) != chain.means or (
+                parameters_changed and chain.newton.outdated
+            ):
+                self.chains[i], changed = self._chain(chain.group, means=means, counts_of=chain), True
+        return changed
+
+    def renew(self) -> None:
+        """Rebuild the BVH of runs, on devices where tests only refit."""
+        if self.runs and self.model.wp_device.is_cuda:
+            self.runs.build()
+
+    def step(self, before, after) -> None:
+        """Launch the step; worlds with pairs in range are solved by the coupled system."""
+        step = self.step_of
+        inputs = [*step.islands.arrays, self._told, self._known]
+        self._launch(self._begin, self.net.worlds, inputs, [step.remaining, self._again])
+        if self.runs is None:
+            self._by_pairs(before, after)
+            wp.capture_if(step.remaining, lambda: step.go_on(before, after))
+            return
+        self._try(before, after, lambda: self.runs.hold(before.q, after.q, self._tried))
+        self._judge_by(0)
+        wp.capture_if(step.remaining, lambda: self._ask(before, after))
+
+    def _ask(self, before, after) -> None:
+        """Test open worlds with new bounds of runs, then by pairs; leave the remainder to the coupled system."""
+        step = self.step_of
+        wp.capture_if(self._again, lambda: self._look(before, after))
+        wp.capture_if(step.remaining, lambda: self._by_pairs(before, after))
+        wp.capture_if(step.remaining, lambda: step.go_on(before, after))
+
+    def _look(self, before, after) -> None:
+        self.step_of.remaining.zero_()
+        self.runs.look(before.q, after.q, self._tried)
+        self._judge_by(0)
+
+    def _by_pairs(self, before, after) -> None:
+        """Try the step in open worlds without pairs in range at the start, during the motion and at the end."""
+        step, search = self.step_of, self._search
+        for signal in (step.remaining, self._any_tried, self._some):
+            signal.zero_()
+        search.update(before.q)
+        search.measure(before.q, enough=search.reach)
+        inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1], self._told]
+        self._launch(self._hope, self.net.worlds, inputs, [self._any_tried, step.remaining])
+        wp.capture_if(self._any_tried, lambda: self._try_and_search(before, after))
+
+    def _try_and_search(self, before, after) -> None:
+        worlds, blocks, search = self.net.worlds, self.net.blocks, self._search
+        self._try(before, after)
+        if worlds > 1:
+            arrays.sweep(self._wait, blocks, [self._told, blocks, before.q], [after.q], self.net.device, worlds=worlds)
+        search.update(before.q, after.q, search.every)
+        for pairs in search.lists:
+            self._launch(self._near, 1, [pairs.count], [self._some])
+        wp.capture_if(self._some, lambda: self._measure(before, after))
+        self._judge_by(1)
+        if self.runs:
+            self.runs.look(before.q, after.q, self._tried)
+
+    def _try(self, before, after, test_runs=None) -> None:
+        """Solve the rods of tried worlds once; `test_runs` reads positions only and runs in parallel with the remaining launches."""
+        rod_steps = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))
+        for rod_step in rod_steps:
+            self._solve(before, after, *rod_step)
+        self._move(before, after)
+
+        def complete() -> None:
+            for rod_step in rod_steps:
+                self._complete(after, *rod_step)
+
+        arrays.side_by_side([test_runs, complete] if test_runs else [complete], self.model.wp_device)
+        if self._mixed:
+            self.net.update_strains(after)
+
+    def _solve(self, before, after, chain, state, places, rod_kernels) -> None:
+        """Solve the rods of a group once, and write their positions."""
+        gather, scatter_positions, _ = rod_kernels
+        group, world_status = chain.group, self._told
+        lists = [places.rows, group.count]
+        rod_arrays = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
+        inputs = [
+            *lists,
+            world_status,
+            places.sizes,
+            self.net.host.nodes,
+            before.q,
+            before.v,
+            before.a,
+            *places.lagged(before),
+        ]
+        self._launch(gather, group.node_threads, inputs, [*rod_arrays, *chain.islands.arrays])
+        chain.move(state, state)
+        inputs = [*lists, places.sizes, state.x, state.theta, chain.islands.arrays[0]]
+        self._launch(scatter_positions, group.node_threads, inputs, [world_status, after.q])
+
+    def _complete(self, after, chain, state, places, rod_kernels) -> None:
+        """Write all results of a rod group but positions."""
+        *_, scatter = rod_kernels
+        chain.complete(state, state)
+        group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.net.host.nodes]
+        inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
+        self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])
+
+    def _move(self, before, after) -> None:
+        """Move obstacles to the end of the step."""
+        step, blocks = self.step_of, self.net.blocks
+        if not len(self._obstacles):
+            return
+        dim, inputs = (len(self._obstacles), self.net.worlds), [self._obstacles, self._told, blocks, before.q]
+        self._launch(self._stay, dim, inputs, [after.q])
+        if step.motion:
+            step.motion.place(step.islands, after.q)
+        self._launch(self._follow, dim, [*inputs, after.q, step.integrator._dt], [after.v, after.a])
+
+    def _judge_by(self, searched: int) -> None:
+        """End the step of worlds without pairs in range, tested by bounds (`searched` 0) or by pairs (1)."""
+        step, search = self.step_of, self._search
+        inputs = [searched, self._some, search.gap, search.reach, search.crossed, search.overflow, step.rounded]
+        inputs += [self._known, self._told, *step.islands.arrays, step.newton.contact.tally.counts]
+        outputs = [step.tally, step.work, step.remaining, self._again]
+        self._launch(self._judge, self.net.worlds, inputs, outputs)
+
+    def _measure(self, before, after) -> None:
+        self._search.passing(before.q, self.step_of.newton.contact.touch.keep)
+        self._search.measure(after.q, enough=self._search.reach)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+
+class Places:
+    """Dof map of a rod group within the coupled system.
+
+    Attributes:
+        rows (8, R): see `kernels.stepping.decoupled_rods`; sizes: numbers of blocks, rod edges, and elements of both element sets
+            in a world.
+        whole: True if the coupled system lags the same strains of these rods as the group.
+    """
+
+    def __init__(self, net, group: Group):
+        host, kind = net.host, group.kind
+        self._group, self._taken = group, {}
+        by_rod = {rod.rod: rod for rod in host.rods}
+        rods = [by_rod[rod] for rod in group.host.rods.tolist()]
+        self._elements = RodElements(net, kind, group.host.rods, group.nodes)
+        self._sets, elements = self._elements.sets, self._elements.lists
+        none = [np.zeros(0, int)] * len(rods)
+        lists = [rod.all_nodes for rod in rods], [rod.all_edges for rod in rods], elements.get(2, none), elements[1]
+        rows = np.concatenate([np.transpose([_evenly(places) for places in each]) for each in lists])
+        self.rows = wp.array(np.ascontiguousarray(rows, np.int32), dtype=int, device=net.device)
+        sizes = [net.sets[self._sets[span]].elements if span in self._sets else 0 for span in (2, 1)]
+        self.sizes = wp.vec4i(net.blocks, net.edges, *sizes)
+        self.whole = all(
+            net.sets[self._sets[term.measure.span]].term.density.lagged == term.density.lagged for term in kind.terms
+        )
+
+    def take_parameters(self) -> bool:
+        """Copy changed parameters of the coupled system to the group; return True if arrays were reallocated."""
+        changed = self._elements.parameters(self._taken)
+        return bool(changed) and self._group.parameters.set(**changed)
+
+    def lagged(self, state) -> list[wp.array]:
+        """Return the lagged data of a coupled state: frames, bending data, bending strains and stretch strains."""
+        bending, stretch = self._sets.get(2, self._sets[1]), self._sets[1]
+        return [state.frame, state.lag[bending], state.last[bending], state.last[stretch]]
+
+
+def uncoupled(model) -> bool:
+    """Return True if only contact couples the rods of a model, and all rods are open."""
+    host, scene = model.net.host, model.scene
+    if not host.touching or not host.rods or any(rod.piece.kind.closed for rod in host.rods):
+        return False
+    return not any((scene.shells, scene.axisymmetric_shells, scene.joints, scene.attachments, scene.magnets))
+
+
+def suits(integrator) -> bool:
+    """Return True if an integrator allows decoupled steps: default solver, implicit Euler, no control loads."""
+    usual = integrator.solver == "newton" and integrator.linear == "auto" and integrator.scheme == "implicit_euler"
+    return usual and integrator.given is None and not integrator.whole
+
+
+def rods_of(model) -> list[Group]:
+    """Return the rods of the coupled system as uncoupled rod groups."""
+    real, device = model.types.real, model.wp_device
+    chains: list[ChainGroup] = compile_chains(model.scene, net_rods(model.scene))
+    return [Group(chain, model.scene, model.worlds, device, real) for chain in chains]
+
+
+def _evenly(indices: np.ndarray) -> tuple[int, int]:
+    """Return the first of some indices, and their constant stride."""
+    if len(indices) < 2:
+        return (int(indices[0]) if len(indices) else 0), 0
+    strides = np.diff(indices)
+    assert (strides == strides[0]).all(), "a net numbers what lies along a rod evenly"
+    return int(indices[0]), int(strides[0])

@@ -1,0 +1,469 @@
+"""Time integration on the device: implicit Euler and implicit midpoint rule, with retries."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arguments, arrays
+from ddg_warp.compile import memory
+from ddg_warp.compile.precision import lost_in_rounding
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.core import outcome
+from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls, checked
+from ddg_warp.model.model import check_model
+from ddg_warp.model.state import State, check_state
+from ddg_warp.solve.forces.control_loads import LOADS, Given
+from ddg_warp.solve.forces.gyroscopic import Gyroscope
+from ddg_warp.solve.forces.prescribed_motion import counts_turns, turns_between
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from ddg_warp.solve.stepping import energy_drift
+from ddg_warp.solve.stepping.coupled_step import NetStep
+from ddg_warp.solve.stepping.graph_cache import Graphs
+from ddg_warp.solve.stepping.local_error import Changes
+from ddg_warp.solve.stepping.rod_step import NET_ONLY, ChainStep
+from ddg_warp.solve.stepping.state_buffers import Buffer
+from ddg_warp.solve.stepping.world_reset import Worlds, outcomes
+from ddg_warp.threads import launches, stays_here
+
+FAILURES = ("raise", "flag")
+SOLVERS = ("newton", "projective")
+SCHEMES = ("implicit_euler", "implicit_midpoint")
+
+
+@arguments.sealed
+@stays_here
+@launches
+class Integrator:
+    """Implicit time integrator of a model.
+
+        integrator = Integrator(model)
+        state = model.state()
+        for _ in range(100):
+            state = integrator.step(state, dt=0.01)
+
+    In mixed precision, stiff rods, fine meshes and long steps may make float32 factors inaccurate. Such groups take the mixed
+    axial-force formulation. Where it fails or is unavailable (closed rods, rods joined to moving nodes), they are solved in float64.
+    `statistics()["linear"]` reports the choice. In float32, rounding may leave residuals above 1e-4 of the load scale at a node. If
+    further iterations do not reduce them, the step counts as `converged_to_rounding`, and one warning is issued.
+
+    A step is one captured graph without allocation or host synchronisation. On CUDA, outcomes are read every `check_every` steps. Until
+    then a failed rod stays at its last good state while others continue.
+
+    Args:
+        model: model to integrate.
+        scheme: "implicit_euler" (first order, damps unresolved motion) or "implicit_midpoint" (second order, A-stable, conserves the
+            energy of linear oscillations).
+        solver: "newton", or "projective": modified Newton, with the Hessian of the first iterate throughout a step.
+        linear: linear solver. Rod groups take `"sweep"` (block LDL^T), `"partitioned"` (block cyclic reduction), or PCG with the
+            preconditioner `"jacobi"`, `"block_jacobi"` or `"chain"` (substructuring). The coupled system takes PCG with
+            `"block_jacobi"`, `"chain"`, `"multilevel"` (fewer, longer iterations for large sheets) or `"chain_multilevel"` (both).
+            For rod groups `"auto"` takes the sweep, cyclic reduction for few long rods on CUDA, and `"chain"` for closed rods. For the
+            coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods coupled by contact
+            alone as uncoupled rods, per world, while no pair is in range.
+        rtol, max_iterations, ...: see `NewtonOptions`.
+        retry_limit: consecutive retries of a failed step: first a cold start, then half the step, and so on, down to
+            2^-(retry_limit / 2) of the step.
+        energy_bound: largest energy drift of the midpoint rule, per uncoupled rod and per world of the coupled system. It is a fraction
+            of the largest kinetic and elastic energy so far plus the work of damping and drag; None for no bound. Work of loads and
+            supports and the rounding floor do not count. A step beyond the bound is retried at half length, and then fails with the
+            outcome `energy_drift`. The count starts at a state from outside (a resumed run counts from zero). Resolved motion
+            conserves the energy to about 1e-3, while an unstable run multiplies it within some steps: the default of a tenth lies
+            between. Implicit Euler dissipates and is not watched. See `kernels.stepping.rod_energy_drift`.
+        check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
+        failures: "raise" raises an error for a failed step. With "flag" nothing is read or raised, and `outcomes` lists the outcomes.
+            A world with a failed step keeps the state before the step until `reset`, or until the integrator gets a state from
+            outside, while other worlds continue.
+        gyroscopic: True if the spin of a rod about its tangent resists rotation of the tangent. By default True from states with given
+            spins (`Model.state`) on. Set it if motors or moments spin up a rod that then tumbles. If a rod spins no faster than it
+            rotates, the effect is of the order of the neglected rotary inertia, (radius / length)^2. See `kernels.forces.gyroscopic`.
+
+    Attributes:
+        whole: True if rods out of contact are solved in the coupled system regardless; see `step_whole`.
+
+    Raises:
+        SceneError: a free node has neither mass nor drag along and across its rod; the scheme is unknown, or implicit Euler has an
+            energy bound.
+    """
+
+    def __init__(
+        self,
+        model,
+        scheme: str = "implicit_euler",
+        *,
+        solver: str = "newton",
+        linear: str = "auto",
+        retry_limit: int = 20,
+        energy_bound: float | None = energy_drift.BOUND,
+        check_every: int | None = None,
+        failures: str = "raise",
+        gyroscopic: bool | None = None,
+        **options,
+    ):
+        check_model("Integrator", model)
+        arguments.choice("scheme", scheme, SCHEMES)
+        arguments.choice("solver", solver, SOLVERS)
+        if model.net is None and linear in NET_ONLY:
+            raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
+        self.failures = arguments.choice("failures", failures, FAILURES)
+        self.gyroscopic = None if gyroscopic is None else arguments.flag("gyroscopic", gyroscopic)
+        if check_every is not None:
+            arguments.count("check_every", check_every)
+        self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
+        self.options = arguments.options("Integrator", NewtonOptions, options, arguments.names(Integrator))
+        if self.options.outliers and not model.scene.touching:
+            raise SceneError(
+                f"outliers = {self.options.outliers!r} is of scenes with contact, whose bodies wait for each other; this one has none"
+            )
+        self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
+        self.energy_bound = energy_drift.bound(energy_bound, scheme)
+        self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
+        validate.require_mass(model)
+        self.given: Given | None = None  # control loads, made with the first one
+        # uniform magnetic field of controls in every world
+        self.field, self.whole = None, False
+        if model.magnetic:
+            self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
+        with memory.named("Integrator", model.wp_device):
+            self._chains = [ChainStep(self, model, group) for group in model.groups]
+            self._net = NetStep(self, model) if model.net is not None else None
+            self._worlds, self._first = Worlds(model), (None, None)
+            self._buffers = [Buffer(model), Buffer(model)]
+        self._graphs = Graphs(model, self._load_modules)
+        self._steps_since_check = 0
+        self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
+        self._dt_host = None
+        self._longest, self._version = 0.0, model.version
+        self._changes: Changes | None = None
+        self._gyroscope: Gyroscope | None = None  # made on first use
+        self._spinning = False  # True if the current step has gyroscopic couples
+        self._doubted = False  # True once the rounding warning is issued
+
+    def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
+        """Return the state after a step of dt [s]. States that the caller keeps stay unchanged: see `State`.
+
+        Args:
+            state: start of the step; dt: step length [s].
+            controls: poses of grips, control loads, gravity and magnetic field of this step, per world; see `Controls`.
+
+        Raises:
+            SolverError: a rod failed within the retries, or float32 would lose the motion in rounding; the message names rod and
+                outcome. Also if supports or obstacles rotate farther in contact than substeps resolve, or a grip by more than half
+                a revolution (`turned_too_far`).
+            SceneError: controls do not fit the model, or a shell has a curved membrane.
+        """
+        dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
+        check_state("step", self.model, state)
+        inputs = checked(controls, self.model)
+        source = self._own(state)
+        self._vacate(1 - source)
+        target = self._buffers[1 - source].state
+        self._prepare(dt, state)
+        self._control(inputs, source)
+        self._spin(self.resists(state))
+        self.advance(source, state.time, dt)
+        target.time = state.time + dt
+        target.spun = state.spun
+        target.lead = 0.5 * dt if self.scheme == "implicit_midpoint" else 0.0
+        self._steps_since_check += 1
+        if self.failures == "raise" and self._steps_since_check >= self.check_every:
+            self.check(target)
+        for callback in self.model.scene.callbacks:
+            callback(target)
+        return target
+
+    def _begin(self, source: int) -> None:
+        """Launch the preparation of a step from an outside state in a buffer."""
+        self.forget()
+        before, after = self._buffers[source].own, self._buffers[1 - source].own
+        self._worlds.bar(self._parts, before, after, self._handed(after))
+
+    def _handed(self, after: State) -> list[wp.array]:
+        """Return the arrays of controls of a step to a state."""
+        loads = (
+            [getattr(self.given, name).flatten() for name in LOADS] if self.given is not None and self.given.any else []
+        )
+        return [*loads, *([self.field] if self.field is not None else []), *([after.grips.pose] if after.grips else [])]
+
+    def resists(self, state: State) -> bool:
+        """Return True if a step from a state has gyroscopic couples; see `gyroscopic`."""
+        check_state("resists", self.model, state)
+        return state.spun if self.gyroscopic is None else self.gyroscopic
+
+    def _spin(self, wanted: bool) -> None:
+        """Include or exclude gyroscopic couples from the next step on."""
+        self._spinning = wanted
+        if wanted and self._gyroscope is None:
+            self._gyroscope = Gyroscope(self.model, self._dt)
+            self._graphs.clear()
+
+    def _prepare(self, dt: float, state: State) -> None:
+        """Set the step length, the solver selection and the limits for steps of dt [s]."""
+        changed = dt != self._dt_host or self.model.version != self._version
+        if changed:
+            validate.refuse_curved_membranes(self.model)
+            self._dt.fill_(dt)
+            self._dt_host = dt
+        self._weigh(dt, state)
+        if changed:
+            for part in self._parts:
+                part.limit(self._solved(dt))
+
+    def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
+        """Step from one buffer at the time `start` to the other; `anew` for an outside state: see `forget`."""
+        for part in self._parts:
+            part.prescribe(start, start + dt)
+
+        # with contact, a capacity overflow repeats the step, so it begins in a graph of its own
+        repeatable = anew and self._net is not None and self._net.newton.contact is not None
+        controlled = self.given is not None and self.given.any
+
+        def launch():
+            if anew and not repeatable:
+                self._begin(source)
+            self._launch(source)
+
+        def replay():
+            self._graphs.replay((source, anew, controlled, self._spinning), launch)
+
+        if repeatable:
+            self._graphs.replay(("begin", source, controlled), lambda: self._begin(source))
+
+        net = self._buffers[source].own.net
+        # a graph of its own: the step needs no capture with and without it
+        if self._net is not None and (trees := self._net.outdated(anew)):
+            self._graphs.replay(("renew", source, trees), lambda: self._net.renew(net, trees))
+        replay()
+        while self._net is not None and self._net.outgrown(net):
+            self._graphs.clear()
+            replay()
+
+    def check(self, state: State) -> None:
+        """Read the outcomes of all steps since the last reading.
+
+        Raises:
+            SolverError: a rod has been given up, and failures are not flagged.
+        """
+        check_state("check", self.model, state)
+        self._steps_since_check = 0
+        for part in self._parts if self.failures == "raise" else ():
+            part.raise_failures(state)
+            if self.model.precision == "float32" and not self._doubted:
+                self._doubted = part.warn_of_doubt()
+
+    def outcomes(self) -> np.ndarray:
+        """Return the outcome of every world (worlds,): "converged", or the name of the outcome of its failure."""
+        return outcomes(self.model, self._parts, self._worlds.resting)
+
+    def failure(self, state: State, world: int) -> str:
+        """Return the failed object of a world, the location of the failure and the remedy; empty without failure.
+
+        Args:
+            state: last state of the world.
+            world: index.
+        """
+        check_state("failure", self.model, state)
+        if not 0 <= arguments.index("world", world) < self.model.worlds:
+            raise SceneError(f"world {world} does not exist; the model has {self.model.worlds}")
+        return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
+
+    def reset(self, state: State, mask, to: State | None = None) -> State:
+        """Return a state with the masked worlds replaced by another state; other worlds stay bitwise equal.
+
+        Outcomes, retries and energy accounts of the replaced worlds are cleared, so they step as in a new integrator. Time is common to
+        all worlds and continues: loads, fields and flows as functions of time do not restart (`Controls` holds data per world).
+
+        Args:
+            state: state of this model; it stays unchanged.
+            mask: bools (worlds,), True for worlds to reset.
+            to: replacement: a state of this model, world by world, or of the same scene built with worlds=1 for all of them. By default
+                the initial state of the model.
+
+        Raises:
+            SceneError: the mask or the state does not fit, or a `Motion` has moved supports by the time of the state.
+        """
+        check_state("reset", self.model, state)
+        mask = self._worlds.mask(mask)
+        to_initial = to is None
+        if to_initial and self._first[0] != self.model.version:
+            self._first = self.model.version, self.model.state()
+        to = self._first[1] if to_initial else to
+        self._worlds.check_source(to, state)
+        self._worlds.load_modules()
+        source = self._own(state)
+        self._vacate(1 - source)
+        current, following = (self._buffers[i] for i in (source, 1 - source))
+
+        def launch():
+            following.own.assign(current.own)
+            self._worlds.reset(self._parts, mask, to, following.own)
+
+        if to_initial:
+            self._graphs.replay(("reset", source), launch)
+        else:  # arrays of a given state may be freed before the next call
+            launch()
+        following.state.time, following.state.lead, following.state.stable = state.time, state.lead, None
+        following.state.spun = state.spun or to.spun
+        if self._net is not None:
+            self._net.arrive()
+        return following.state
+
+    def statistics(self) -> dict:
+        """Return counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
+
+        "energy", if watched, has the energy drift, the work of damping [J] and the largest relative drift since the last state from
+        outside; see `energy_bound`. For "contact" see `NetContact.statistics`.
+        """
+        tally = sum(part.tally.numpy() for part in self._parts)
+        work = np.array([part.work.numpy() for part in self._parts])
+        solves = max(1, int(work[:, 2].sum()))
+        return {
+            "newton_iterations": {"mean": float(work[:, 0].sum() / solves), "max": int(work[:, 1].max())},
+            "pcg_iterations": sum(part.newton.pcg_iterations() for part in self._parts),
+            "retries": int(work[:, 3].sum()),
+            "lost_pivots": int(work[:, 4].sum()),
+            "linear": [str(part.means) for part in self._parts],
+            "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
+        } | self._more_statistics()
+
+    def _more_statistics(self) -> dict:
+        result = {}
+        if self.energy_bound is not None:
+            result["energy"] = energy_drift.summary([part.energy for part in self._parts])
+        if self._net is not None and self._net.newton.contact:
+            result["contact"] = self._net.newton.contact.statistics()
+        return result
+
+    def _control(self, inputs: dict[str, np.ndarray], source: int) -> None:
+        """Upload the controls of a step from a buffer; rebuild the steppers with the first control load."""
+        if self.given is None and any(name in inputs for name in LOADS):
+            self.given = Given(self.model)
+            self._remake()
+        if self.given is not None:
+            self.given.upload(inputs)
+        if self.model.magnetic:
+            field = np.broadcast_to(inputs.get("field", 0.0), (self.model.worlds, 3))
+            self.field.assign(np.ascontiguousarray(field.T))
+        if self.model.grips:
+            current, following = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
+            if "poses" in inputs:
+                if counts_turns(inputs["poses"]):
+                    begin = self._buffers[source].own.poses().reshape(self.model.worlds, -1, 6)
+                    turns_between(begin, np.broadcast_to(inputs["poses"], begin.shape))
+                poses = np.broadcast_to(inputs["poses"], (self.model.worlds, *inputs["poses"].shape[1:]))
+                following.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
+            else:
+                wp.copy(following, current)
+
+    def _remake(self) -> None:
+        """Rebuild all steppers, keeping counters."""
+        self._chains = [ChainStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
+        if self._net is not None:
+            self._net = NetStep(self, self.model, self._net.means, counts_of=self._net)
+        self._graphs.clear()
+
+    @property
+    def _parts(self) -> list:
+        """Steppers of the rod groups and of the coupled system."""
+        return self._chains if self._net is None else [*self._chains, self._net]
+
+    def _solved(self, dt: float) -> float:
+        """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.rod_step`."""
+        return 0.5 * dt if self.scheme == "implicit_midpoint" else dt
+
+    def _weigh(self, dt: float, state: State) -> None:
+        """Repeat the solver selection for longer steps or new parameters; refuse steps lost in rounding."""
+        changed = self.model.version != self._version
+        if not changed and dt <= self._longest:
+            return
+        s = self._solved(dt)
+        if self.model.precision == "float32":
+            lost = lost_in_rounding(self.model, s, state)
+            rounded = outcome.LOST_IN_ROUNDING if lost else outcome.CONVERGED_TO_ROUNDING
+            for part in self._parts:
+                if part.rounded != rounded and (lost or changed):
+                    part.rounded = rounded
+                    self._graphs.clear()
+        self._adapt(s, changed)
+        self._version, self._longest = self.model.version, dt
+
+    def _adapt(self, s: float, changed: bool = False) -> None:
+        """Select the solver for steps of s [s] and, unless parameters have `changed`, for earlier ones; see `Means`."""
+        for i, chain in enumerate(self._chains):
+            if (means := chain.suited(s, changed)) != chain.means or (changed and chain.newton.outdated):
+                self._chains[i] = ChainStep(self, self.model, chain.group, means, counts_of=chain)
+                self._graphs.clear()
+        net = self._net
+        if net is not None and ((means := net.suited(s, changed)) != net.means or (changed and net.newton.outdated)):
+            self._net = NetStep(self, self.model, means, counts_of=self._net)
+            self._graphs.clear()
+        if self._net is not None and self._net.adapt(s, changed):
+            self._graphs.clear()
+
+    def _own(self, state: State) -> int:
+        for i, buffer in enumerate(self._buffers):
+            if state is buffer.state:
+                return i
+        self._vacate(0)
+        self._buffers[0].state.assign(state)
+        self.forget()
+        if self._net is not None:
+            self._net.arrive()
+            if self._net.newton.contact:
+                self._net.newton.contact.check(self._buffers[0].own.net.q)
+        return 0
+
+    def step_whole(self) -> None:
+        """Solve rods out of contact in the coupled system, too: gradients read the data of its solves."""
+        self.whole = True
+        if self._net is not None and self._net.adapt(self._longest):
+            self._graphs.clear()
+
+    def watch_changes(self) -> Changes:
+        """Return the sums of velocity changes of steps, evaluated from the next step on."""
+        if self._changes is None:
+            self._changes = Changes(self.model)
+            self._graphs.clear()
+        return self._changes
+
+    def forget(self) -> None:
+        """Reset energy accounts and failed worlds, for a state from outside."""
+        for part in self._parts:
+            if part.energy:
+                part.energy.account.zero_()
+        if self.failures == "flag":  # with "raise" a failure must stay until it is read
+            self._worlds.forget(self._parts)
+
+    def _vacate(self, index: int) -> None:
+        """Detach a state that the caller keeps from a buffer."""
+        if self._buffers[index].vacate():
+            self._graphs.clear()
+
+    def _launch(self, source: int) -> None:
+        """Launch a step of all steppers from one buffer to the other."""
+        before, after = self._buffers[source].own, self._buffers[1 - source].own
+        for part in self._parts:
+            if part.motion:
+                part.motion.follow(before, after)
+            if self.given is not None:
+                part.loads.give()
+        start = self._gyroscope.begin(before, self._chains, self._net) if self._spinning else before
+        for chain in self._chains:
+            chain.step(start.groups[chain.index], after.groups[chain.index])
+        if self._net is not None:
+            self._net.step(start.net, after.net)
+        if self._spinning:
+            self._gyroscope.finish(after, self._chains, self._net)
+        if self.failures == "flag":
+            self._worlds.settle(self._parts, before, after)
+        if self._changes:
+            self._changes(before, after)
+
+    def _load_modules(self) -> None:
+        for part in self._parts:
+            part.load_modules()
+        if self._gyroscope:
+            arrays.load_kernels(self._gyroscope.kernels, self.model.wp_device)
+        if self.failures == "flag":
+            self._worlds.load_modules()
+        if self._changes:
+            arrays.load_kernels(self._changes.kernels, self.model.wp_device)

@@ -1,0 +1,202 @@
+"""A time step of a group of rods on their own:
+
+predictor, prescribed motion and loads, Newton, end update. See `kernels.stepping.rod_step`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ddg_warp import arrays
+from ddg_warp.compile.precision import largest_carried
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.elements import element_path
+from ddg_warp.kernels.elements.rod_layout import rod_storage
+from ddg_warp.kernels.stepping import rod_step, rod_warm_start
+from ddg_warp.solve.forces.control_loads import ChainScale, ControlledLoads
+from ddg_warp.solve.forces.drag import ChainDrag
+from ddg_warp.solve.forces.loads import Loads
+from ddg_warp.solve.forces.prescribed_motion import Motion
+from ddg_warp.solve.linear.solver_selection import automatic
+from ddg_warp.solve.newton.rod_newton import ChainNewton
+from ddg_warp.solve.newton.rod_newton_parallel import PartitionedNewton
+from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton, ProjectiveNewton
+from ddg_warp.solve.stepping import energy_drift
+from ddg_warp.solve.stepping.step_driver import USUAL, PartStep
+
+DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
+NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
+
+
+class ChainStep(PartStep):
+    """Steps the rods of a group in all worlds, each an island.
+
+    Args:
+        means: what solves take; see `Means`. The psd mode "auto" takes second derivatives of stiff rods.
+        counts_of: the step that this one replaces; see `PartStep`.
+    """
+
+    def __init__(self, integrator, model, group, means=USUAL, counts_of=None):
+        super().__init__(integrator, model, _newton(model, group, integrator, means), means, counts_of)
+        self.group = group
+        kind, real = group.kind, model.types.real
+        self._begin = rod_step.begin_kernel(kind, real, self.midpoint)
+        self._foresee = rod_warm_start.foresee_kernel(kind, real, self.newton.linear)
+        predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
+        self._predicted, self._predicted_angle = (arrays.allocate(*given) for given in predicted)
+        self._nodes = rod_step.finish_nodes_kernel(kind, real, self.midpoint)
+        self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
+        self.outer = group.outer
+        if (given := integrator.given) is not None:
+            self.newton.take_loads()
+            scale = ChainScale(model, group)
+            self.outer, self.loads = scale.load, ControlledLoads(model, group, self.midpoint, given, scale)
+        elif group.host.timed or group.host.followers:
+            self.loads = Loads(model, group, self.midpoint)
+        self.energy = (
+            energy_drift.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
+        )
+        self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
+        self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
+
+    @property
+    def index(self) -> int:
+        """Which of the model's groups it is."""
+        return self.model.groups.index(self.group)
+
+    def attempt(self, before, after) -> None:
+        """One solve of every rod that has not finished the step, from state `before` to `after`."""
+        self.move(before, after)
+        self.complete(before, after)
+
+    def move(self, before, after) -> None:
+        """Positions of an attempt, and their rates."""
+        group, newton = self.group, self.newton
+        self._launch(
+            self._begin,
+            group.node_threads,
+            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
+            + [self.integrator._dt, self.damping, self.outer, *self.islands.arrays],
+            [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle],
+        )
+        if self.motion:
+            self.motion.place(self.islands, newton.x)
+        newton.predict(before)
+        if self.motion:
+            self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
+        if self.loads:
+            self.loads.apply(newton.x, newton.load, newton.load_angle)
+        if self.drag:
+            self.drag.resist(before, newton, self.islands)
+        if not self.midpoint:
+            self._start_further(before)
+        self.islands.bent.zero_()
+        newton.solve(before.last)
+        if self.energy:
+            self.energy.judge(before)
+        self._launch(
+            self._nodes,
+            group.node_threads,
+            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, before.a, before.alpha]
+            + [self._predicted, self._predicted_angle, group.count, *self.islands.arrays],
+            [after.x, after.v, after.theta, after.omega, after.a, after.alpha],
+        )
+        if self.drag:
+            self.drag.settle(before, after, newton, self.islands)
+
+    def complete(self, before, after) -> None:
+        """Frames and strains that go with the positions."""
+        group, newton = self.group, self.newton
+        if self._frames:
+            self._launch(
+                self._frames,
+                group.element_threads,
+                [after.x, newton.frame, before.frame, group.count, self.islands.moved],
+                [after.frame],
+            )
+        if group.kind.viscous:
+            self.model.strains(group, after, after.last)
+
+    def _start_further(self, before) -> None:
+        """Start from where accelerations lead from the predictor, and keep that."""
+        group, newton = self.group, self.newton
+        self._launch(
+            self._foresee,
+            group.node_threads,
+            [before.a, before.alpha, group.fixed, group.count, *self.islands.arrays],
+            [newton.x, newton.theta, self._predicted, self._predicted_angle, newton.direction],
+        )
+        newton.go_further(before, self._predicted)
+
+    @property
+    def own_kernels(self) -> list:
+        """Kernels of an attempt, without those of the solver."""
+        kernels = [self._begin, self._nodes, *([self._frames] if self._frames else [])]
+        kernels += [] if self.midpoint else [self._foresee]
+        if self.group.kind.viscous:
+            real = self.model.types.real
+            kernels.append(element_path.strain_kernel(rod_storage(self.group.kind, real), real))
+        return kernels
+
+    @property
+    def stiffness_version(self) -> int:
+        """As of `PartStep`."""
+        return self.group.parameters.version
+
+    def float32_errors(self, s: float) -> np.ndarray:
+        """Of every rod; see `precision.float32_error`."""
+        return self.group.float32_errors(s)
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """Of every rod; infinite where the solver cannot take tensions for unknowns."""
+        return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
+
+    def _find_limits(self, s: float) -> dict[str, np.ndarray]:
+        """As of `PartStep`; and what float32 matrices carry."""
+        return super()._find_limits(s) | {"carried": largest_carried(self.group.stiffnesses(s)[2])}
+
+    def who(self, column: int) -> str:
+        """The rod of a column, and its world where there are several."""
+        rod = self._rod(column)
+        world = f" of world {column // self.group.rods}" if self.model.worlds > 1 else ""
+        return f"rod {rod} ('{self.model.curves.names[rod]}'){world}"
+
+    def rods_of(self, columns: np.ndarray) -> list[int]:
+        """Rods of columns, as the user counts them."""
+        return [self._rod(column) for column in columns]
+
+    def where(self, state, column: int) -> str:
+        """Where the largest residual was, estimated by the element forces that meet there, and what to do."""
+        size = float(self.islands.residual.numpy()[column])
+        direction = np.abs(arrays.download(self.newton.direction)[:, :, column]).max(0)
+        largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
+        node = largest - int(self.group.host.first[column % self.group.rods])
+        return f"residual {size:.3g} N at node {node}; {self._remedy(state, column)}"
+
+    def _rod(self, column: int) -> int:
+        return int(self.group.host.rods[column % self.group.rods])
+
+    def _remedy(self, state, column: int) -> str:
+        """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
+        host, kind, rod = self.group.host, self.group.kind, column % self.group.rods
+        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column]
+        return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
+
+
+def _newton(model, group, integrator, means) -> ChainNewton:
+    """The solver of a group that the integrator's `linear` asks for."""
+    linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
+    options = integrator.options
+    if options.psd == "auto" and means.stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
+        options = replace(options, psd="progressive")
+    given = (model, group, options)
+    last = (means.linear, integrator.scheme == "implicit_midpoint")
+    if integrator.solver == "projective":
+        return ProjectiveNewton(*given, *last)
+    if linear in tuple(DIRECT) and group.kind.closed:
+        raise SceneError(
+            f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
+        )
+    if linear in tuple(DIRECT):
+        return DIRECT[linear](*given, *last, split=means.split)
+    return PcgNewton(*given, linear, *last)

@@ -1,0 +1,255 @@
+"""Time stepper of a rod group or of the coupled system: attempts, retries, outcomes."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile.precision import FLOAT32_LIMIT, stiff, straight_turns
+from ddg_warp.errors import SolverError
+from ddg_warp.geometry import polyline
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import DETOURS_ALLOWED, LEAST
+from ddg_warp.kernels.newton.line_search import ROUNDED
+from ddg_warp.kernels.stepping import rod_step as step
+from ddg_warp.solve.forces.prescribed_motion import jump_between
+
+KEPT = 16  # number of step lengths with cached limits
+FOLDED = 1e-5  # angle to opposite edges [rad] that messages call folded
+
+
+class Means(NamedTuple):
+    """Solver selection of a stepper.
+
+    Attributes:
+        linear: scalar type of the linear algebra; None for the type of the model.
+        stiff: True if a rod is stiff over the step; see `compile.precision.stiff`.
+        split: True for the mixed axial-force formulation; see `kernels.linear.mixed_axial_force`.
+    """
+
+    linear: type | None = None
+    stiff: bool = False
+    split: bool = False
+
+    def __str__(self) -> str:
+        return self.linear.__name__ + self.split * " with tensions"
+
+
+USUAL = Means()
+
+
+def suited(precision: str, before: Means, errors: float, split_errors: float) -> Means:
+    """Return the solver selection for float32 errors without and with the mixed formulation, and for `before`."""
+    linear, was_stiff, split = before
+    if precision == "mixed" and errors > FLOAT32_LIMIT:
+        split = linear is wp.float32 and bool(split_errors <= FLOAT32_LIMIT)
+        linear = wp.float32 if split else wp.float64
+    return Means(linear, was_stiff or bool(stiff(errors)), split)
+
+
+class PartStep:
+    """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.rod_step`.
+
+    Subclasses define the attempt (`attempt`) and its kernels (`own_kernels`). For a failed island they return its name (`who`), its
+    rods (`rods_of`) and the location of the failure (`where`). `float32_errors` returns the float32 errors of the islands of a world
+    over a solve.
+
+    Args:
+        integrator: owner of the stepper; model: model to step.
+        newton: nonlinear solver, with its islands.
+        means: solver selection.
+        counts_of: replaced stepper, which passes on counters, the rounding outcome and the state of the islands.
+
+    Attributes:
+        energy, motion, loads, field, drag: energy watch, motion of supports, loads in time, magnetic field, drag; None without.
+        rounded: outcome of solves that end by rounding.
+        tally, work: counts of outcomes and of work; see `kernels.stepping.rod_step.advance_kernel`.
+    """
+
+    energy = motion = loads = field = drag = None
+
+    def __init__(self, integrator, model, newton, means: Means, counts_of: "PartStep | None" = None):
+        self.means = means._replace(linear=newton.linear)
+        self.integrator, self.model, self.newton = integrator, model, newton
+        real, device = model.types.real, model.wp_device
+        self.midpoint = integrator.scheme == "implicit_midpoint"
+        self.rounded = outcome.CONVERGED_TO_ROUNDING
+        self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
+        self.work = wp.zeros(5, dtype=wp.int64, device=device)
+        self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        if counts_of is not None:
+            self.tally, self.work, self.rounded = counts_of.tally, counts_of.work, counts_of.rounded
+            for target, source in zip(newton.islands.arrays, counts_of.newton.islands.arrays, strict=True):
+                wp.copy(target, source)  # solvers keep rows of these arrays
+        if 0.5 ** (integrator.retry_limit // 2) < LEAST:
+            newton.islands.patience.fill_(DETOURS_ALLOWED)
+        self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
+        # cached limits by length of a solve, version of their stiffnesses, current limits of the islands
+        self._limits, self._limited, self._set = {}, None, None
+
+    @property
+    def islands(self):
+        """See `kernels.core.islands`."""
+        return self.newton.islands
+
+    @property
+    def islands_each(self) -> int:
+        """Number of islands in a world."""
+        return len(self.islands) // self.model.worlds
+
+    def suited(self, s: float, parameters_changed: bool = False) -> Means:
+        """Return the solver selection for solves over s [s] and, unless `parameters_changed`, for earlier ones."""
+        means = USUAL._replace(linear=self.model.types.linear) if parameters_changed else self.means
+        return suited(self.model.precision, means, self.float32_errors(s).max(), self.split_errors(s).max())
+
+    @property
+    def stiffness_version(self) -> int:
+        """Version of the stiffnesses behind `limits` and float32 errors; zero for the stiffnesses of the scene."""
+        return 0
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """Return float32 errors over s [s] in the mixed axial-force formulation; infinite if unavailable."""
+        return np.array([np.inf])
+
+    def limit(self, s: float) -> None:
+        """Set the limits of the islands for solves over s [s]."""
+        limits = self.limits(s)
+        if limits is not self._set:
+            for name, values in limits.items():
+                getattr(self.islands, name).assign(values)
+            self._set = limits
+
+    def limits(self, s: float) -> dict[str, np.ndarray]:
+        """Return the limits of islands by name for a solve of length s [s].
+
+        The limit is the largest edge rotation of a straight update [rad], see `precision.straight_turns`. Limits of the last lengths
+        are cached, since steps alternate between few.
+
+        Measured: 24 ms for 10,000 rods.
+        """
+        if self._limited != self.stiffness_version:
+            self._limits, self._limited = {}, self.stiffness_version
+        if s not in self._limits:
+            if len(self._limits) == KEPT:
+                del self._limits[next(iter(self._limits))]
+            self._limits[s] = self._find_limits(s)
+        return self._limits[s]
+
+    def _find_limits(self, s: float) -> dict[str, np.ndarray]:
+        return {"turn": np.resize(straight_turns(self.float32_errors(s)), len(self.islands))}
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """Upload supports, loads, magnetic field and flow between t0 and t1."""
+        for part in filter(None, (self.motion, self.loads, self.field, self.drag)):
+            part.upload(t0, t1)
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one state to another; capturable."""
+        self._launch(self._start, len(self.islands), self.islands.arrays, [])
+        self._try(before, after)
+        wp.capture_while(self.remaining, lambda: self._try(after, after))
+
+    def _try(self, before, after) -> None:
+        """Launch one solve of every unfinished island, and the retry logic."""
+        self.attempt(before, after)
+        self.remaining.zero_()
+        limit = self.integrator.retry_limit
+        inputs = [*self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
+        self._launch(self._advance, len(self.islands), inputs, [self.tally, self.work, self.remaining])
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+    def load_modules(self) -> None:
+        """Compile and load every kernel before a capture."""
+        kernels = [self._start, self._advance, *self.own_kernels, *self.newton.kernels]
+        for part in filter(None, (self.motion, self.loads, self.field, self.drag, self.energy)):
+            kernels += part.kernels
+        arrays.load_kernels(kernels, self.model.wp_device)
+
+    def raise_failures(self, state) -> None:
+        """Raise for failed islands.
+
+        Raises:
+            SolverError: names the first failed island, its outcome, the location and the remedy.
+        """
+        if not self._counted()[outcome.MAX_ITERATIONS :].any():
+            return
+        failed = np.flatnonzero(self.islands.status.numpy() == outcome.GIVEN_UP)
+        if not failed.size:
+            return
+        first = int(failed[0])
+        name, text = self.failure(state, first)
+        raise SolverError(
+            f"{self.who(first)} could not be stepped to t = {state.time:g} s: {text}",
+            state=state,
+            outcome=name,
+            rods=self.rods_of(failed),
+        )
+
+    def warn_of_doubt(self) -> bool:
+        """Warn if rounding ended a solve with residuals above `ROUNDED`; return True if so. Reads from the device."""
+        doubted = np.flatnonzero(self.islands.doubted.numpy())
+        if doubted.size:
+            warnings.warn(
+                f"{self.who(int(doubted[0]))}: in precision 'float32' rounding has ended steps (converged_to_rounding) with residuals "
+                f"above {ROUNDED:g} of the loads and nodes that iterations still move; take 'mixed' or 'float64'",
+                stacklevel=5,
+            )
+        return bool(doubted.size)
+
+    def _counted(self) -> np.ndarray:
+        """`tally` after the last step."""
+        return self.tally.numpy()
+
+    def failure(self, state, island: int) -> tuple[str, str]:
+        """Return the outcome of a failed island, and the message."""
+        name = outcome.NAMES[int(self.islands.reason.numpy()[island])]
+        if self.energy and name == "energy_drift":
+            text = self.energy.failure(island)
+        else:
+            text = self.where(state, island)
+        return name, f"{name} within {self.integrator.retry_limit} retries, {text}"
+
+    def failure_in(self, state, world: int) -> str:
+        """Return the message on the first failed island of a world, empty without failure."""
+        flags = self.islands.status.numpy() == outcome.GIVEN_UP, self.islands.reason.numpy() != 0
+        failed = np.flatnonzero(flags[0] & flags[1])
+        failed = failed[failed // self.islands_each == world]
+        return f"{self.who(int(failed[0]))}: {self.failure(state, int(failed[0]))[1]}" if failed.size else ""
+
+    @staticmethod
+    def dead_end(x: np.ndarray, first: int, kind, suffix: str = "") -> str:
+        """Return the remedy for a rod with zero-length or folded edges at nodes x (n, dim); empty for others.
+
+        Args:
+            first: number of ghosts before the first node.
+            kind: `ChainKind` of the rod; suffix: suffix of edge names in the message.
+        """
+        edges = polyline.edge_vectors(x[None].astype(float), kind.closed)
+        lengths = np.linalg.norm(edges, axis=-1)
+        if not (lengths > 0.0).all():
+            k = int(np.argmin(lengths[0] > 0.0)) - first
+            return f"edge {k}{suffix} has no length in the last good state; move a node of the state it starts from"
+        if kind.span < 2:
+            return ""
+        before, after = polyline.ahead(edges / lengths[..., None], kind.closed)
+        k = int(np.argmin(np.sum(before * after, -1)[0]))
+        if np.linalg.norm(before[0, k] + after[0, k]) >= FOLDED:
+            return ""
+        k, after = k - first, (k + 1) % lengths.shape[1] - first
+        return (
+            f"edges {k} and {after}{suffix} fold back by 180 degrees in the last good state, where curvature is infinite or has no "
+            f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
+        )
+
+    def advice(self, state) -> str:
+        """Return the remedy for a failed step without a specific cause."""
+        jump = jump_between(self.model, state.time - self.integrator._dt_host, state.time)
+        grips = "move grips less in a step, " if self.model.grips else ""
+        if not jump and self.model.precision != "float64" and self.islands.reason.numpy().max() == outcome.NON_FINITE:
+            return f"take precision 'float64', or units in which numbers stay far from the ends of float32; or {grips}a smaller dt"
+        return jump or f"{grips}take a smaller dt, a looser rtol, or check its loads and supports"
