@@ -13,24 +13,24 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp import io
-    from ddg_warp.ask import inquiry
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.geometry import meshes
     from ddg_warp.model import rest_shapes
     from ddg_warp.model.controls import Controls
     from ddg_warp.model.model import Model
     from ddg_warp.model.state import State
+    from ddg_warp.postprocess import quantities
     from ddg_warp.run import bench
     from ddg_warp.run.check import Check
-    from ddg_warp.run.record import Recorder
+    from ddg_warp.run.recorder import Recorder
     from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
     from ddg_warp.scene.drag import Granular, Viscous
+    from ddg_warp.scene.equilibrium_path import Displacement, Stop
     from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.law import Law
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
-    from ddg_warp.scene.motion import Motion
     from ddg_warp.scene.obstacles import Box, Capsule, Mesh, Plane, Sphere
-    from ddg_warp.scene.path import Displacement, Stop
+    from ddg_warp.scene.prescribed_motion import Motion
     from ddg_warp.scene.scene import Scene
     from ddg_warp.solve.equilibrium import continuation, stability, statics
     from ddg_warp.solve.stepping.adaptive_step import StepControl
@@ -72,9 +72,9 @@ __all__ = [
     "Viscous",
     "bench",
     "continuation",
-    "inquiry",
     "io",
     "meshes",
+    "quantities",
     "rest_shapes",
     "stability",
     "statics",
@@ -86,7 +86,7 @@ _HOME = {
     "Check": "run.check",
     "Circle": "scene.material",
     "Controls": "model.controls",
-    "Displacement": "scene.path",
+    "Displacement": "scene.equilibrium_path",
     "Dynamics": "scene.descriptions",
     "Ellipse": "scene.material",
     "Granular": "scene.drag",
@@ -96,9 +96,9 @@ _HOME = {
     "Material": "scene.material",
     "Mesh": "scene.obstacles",
     "Model": "model.model",
-    "Motion": "scene.motion",
+    "Motion": "scene.prescribed_motion",
     "Plane": "scene.obstacles",
-    "Recorder": "run.record",
+    "Recorder": "run.recorder",
     "Rectangle": "scene.material",
     "Ribbon": "scene.material",
     "Scene": "scene.scene",
@@ -110,14 +110,14 @@ _HOME = {
     "Statics": "scene.descriptions",
     "StepControl": "solve.stepping.adaptive_step",
     "Stiffness": "scene.material",
-    "Stop": "scene.path",
+    "Stop": "scene.equilibrium_path",
     "Trace": "scene.descriptions",
     "Viscous": "scene.drag",
 }
 _MODULES = {
     "bench": "run.bench",
     "continuation": "solve.equilibrium.continuation",
-    "inquiry": "ask.inquiry",
+    "quantities": "postprocess.quantities",
     "meshes": "geometry.meshes",
     "rest_shapes": "model.rest_shapes",
     "stability": "solve.equilibrium.stability",

@@ -30,7 +30,7 @@ def as_drawn(points: np.ndarray, **about) -> dict:
         points: drawn equilibrium.
         about: section and material.
     """
-    from ddg_warp.ask import sag_free  # imports SciPy, which scenes of hair do without
+    from ddg_warp.postprocess import sag_free  # imports SciPy, which scenes of hair do without
 
     scene = ddg.Scene()
     scene.clamp(scene.add_rods(points, **about), edges=[0])

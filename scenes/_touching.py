@@ -3,7 +3,7 @@
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.io.tube import SIDES, tube_faces, tube_points
+from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
 from ddg_warp.solve.equilibrium.tangent import Tangent
 
 HALVED = 0.1  # allowed fraction of failed solves, whose steps are then halved

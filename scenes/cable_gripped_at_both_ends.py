@@ -81,7 +81,7 @@ def equilibrium(model):
 
 def writhe(points: np.ndarray) -> float:
     """Return the writhe of the cable (n, 3), extended along x and closed far away."""
-    from ddg_warp.ask.inquiry import writhe
+    from ddg_warp.postprocess.quantities import writhe
 
     first, last = points[0], points[-1]
     along, aside = np.array([FAR, 0.0, 0.0]), np.array([0.0, 0.0, FAR])
@@ -90,7 +90,7 @@ def writhe(points: np.ndarray) -> float:
 
 def observe(model, state) -> dict[str, float]:
     """Return revolutions of the last end, twist and writhe, and the position error of end nodes [m]."""
-    from ddg_warp.ask.inquiry import total_twist
+    from ddg_warp.postprocess.quantities import total_twist
 
     points = state.points().reshape(-1, 3)[: model.curves.counts[0]]
     rest, supports = model.scene.batches[0].points[0], model.scene.supports

@@ -12,7 +12,7 @@ and clamped ends give (Greenhill 1883; van der Heijden & Thompson, Nonlinear Dyn
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask.buckled import buckled_points
+from ddg_warp.postprocess.mode_shape import buckled_points
 
 LENGTH = 1.0  # m
 B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2], of which C only sets the end rotation

@@ -7,8 +7,8 @@ corners carry half the weight each, and the lowest vertex agrees with a finer me
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask.inquiry import energies
 from ddg_warp.geometry import meshes
+from ddg_warp.postprocess.quantities import energies
 from ddg_warp.run.check import once_reached
 
 SIDE = 1.0  # m

@@ -7,7 +7,7 @@ limit load. Limit loads agree with a Ritz solution by Kirchhoff and Love's theor
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.scenes import _sze
 
 RADIUS, HALF_LENGTH, HALF_ANGLE = 2540.0, 254.0, 0.1  # mm, mm, rad

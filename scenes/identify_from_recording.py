@@ -1,6 +1,6 @@
 """Identification from motion capture: EI, GJ and damping of a cable gripped by two robots, from published recordings.
 
-Recordings are read by `ddg_warp.learn.mocap`: pickles of markers over time in `train`, for the fit, and `eval`, for validation. An
+Recordings are read by `ddg_warp.data.mocap`: pickles of markers over time in `train`, for the fit, and `eval`, for validation. An
 example is data_set/DLO1 of a clone of the public repository named there. Without a folder the scene writes one in that format: a
 cable of other edges, steps and scheme than the fitted one, with noise on every coordinate and lost markers. Windows of half a
 second are worlds of one simulator. Each starts with positions, velocities and twist estimated from frames: around the start for the
@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.data import mocap
 from ddg_warp.geometry import meshes
-from ddg_warp.learn import mocap
 from ddg_warp.run.check import once_reached
 from ddg_warp.scenes import _cable, _learn
 

@@ -100,7 +100,7 @@ def size(result) -> tuple[int, int]:
 
 def check(result) -> list[ddg.Check]:
     """Check positions against the drawing, except for stretch, and the natural shape against statics."""
-    from ddg_warp.ask import inquiry
+    from ddg_warp.postprocess import quantities
 
     strands, nodes = size(result)
     drawn, natural = shapes(strands, nodes), learn(strands, nodes)
@@ -109,7 +109,7 @@ def check(result) -> list[ddg.Check]:
     weights = [GRAVITY * section.mass_per_length for section in sections]
     arc = np.linalg.norm(np.diff(drawn, axis=1), axis=2).sum(1).max()
 
-    stresses = inquiry.stresses(result.model, result.state)["rod_bend_twist"]
+    stresses = quantities.stresses(result.model, result.state)["rod_bend_twist"]
     moments = np.stack([np.linalg.norm(stress, axis=-1) for stress in stresses[:strands]])
     expected = _strands.moments(drawn[:-1], weights[0])
 

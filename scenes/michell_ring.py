@@ -7,7 +7,7 @@ its radius (Michell 1889; Zajac, J. Appl. Mech. 29, 1962). Here the frames are c
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask.buckled import buckled_points
+from ddg_warp.postprocess.mode_shape import buckled_points
 
 RADIUS = 1.0  # m
 B = 1.0  # bending stiffness [N m^2]

@@ -9,7 +9,7 @@ the loaded plate.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask.buckled import buckled_points
+from ddg_warp.postprocess.mode_shape import buckled_points
 from ddg_warp.scenes.plate_square import SIDE, plate_mesh
 
 THICKNESS = 1e-3  # m

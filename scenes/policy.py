@@ -112,7 +112,7 @@ def off(episode_state):
 
 def environment(n: int, step: float, worlds: int):
     """Return episodes of a cable of n edges with a time step [s]."""
-    from ddg_warp.learn.environment import Environment, GripRates
+    from ddg_warp.rl.environment import Environment, GripRates
     from ddg_warp.torch import Simulator
 
     scene = ddg.Scene(mass_damping=0.3)

@@ -8,7 +8,7 @@ second variation of Kirchhoff rods that are rigid in the plane, by a spectral Ri
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask.buckled import buckled_points
+from ddg_warp.postprocess.mode_shape import buckled_points
 
 LEG, WIDTH, THICKNESS = 240.0, 30.0, 0.6  # mm
 E, NU = 71240.0, 0.31  # N/mm^2

@@ -1,7 +1,7 @@
 """Sag-free hair: rest shapes with which 512 curled strands of a groom hang under their weight as drawn.
 
 With the drawn shape as natural shape, as in `strands`, they sag. Here each strand has the rest stretches, natural curvatures and
-twists that put the drawn shape in equilibrium (`ddg_warp.ask.sag_free`). The run starts without weight, where strands stand out
+twists that put the drawn shape in equilibrium (`ddg_warp.postprocess.sag_free`). The run starts without weight, where strands stand out
 from the head, and applies it. Strands that are too soft are unstable in the drawn shape, far from their natural one, and flip over.
 
 Measured: the first strand is unstable at 1.3e8 Pa, half of them at 1e8 Pa, the last at 8e7 Pa. At the 4e7 Pa of `strands` none
@@ -14,7 +14,7 @@ from functools import cache
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask import sag_free
+from ddg_warp.postprocess import sag_free
 from ddg_warp.scenes import _learn, _strands
 from ddg_warp.scenes.strands import GROOM, groom
 
@@ -72,7 +72,7 @@ def distances(points: np.ndarray, batch) -> np.ndarray:
 
 def check(result) -> list[ddg.Check]:
     """Check stable strands against the drawing, counts of unstable ones, moments against statics, and a zero gradient."""
-    from ddg_warp.ask import inquiry
+    from ddg_warp.postprocess import quantities
 
     (batch,) = result.model.scene.batches
     least = young(batch) * sag_free.least_stiffness(result.model, result.model.state())[0]
@@ -86,7 +86,7 @@ def check(result) -> list[ddg.Check]:
         return checks
     before = distances(sagged(result.model), batch)
     note = f"drawn; with that as natural shape {100.0 * before.mean():.3g} cm on average, {100.0 * before.max():.3g} at most"
-    stresses = inquiry.stresses(result.model, result.state)["rod_bend_twist"]
+    stresses = quantities.stresses(result.model, result.state)["rod_bend_twist"]
     moments = np.stack([np.linalg.norm(stress, axis=-1) for stress in stresses])[~unstable]
     exact = _strands.moments(batch.points, _strands.GRAVITY * batch.section.mass_per_length)[~unstable]
     away = np.abs(moments - exact).max() / exact.max()

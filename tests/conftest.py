@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 
 
 def pytest_addoption(parser):
@@ -17,7 +17,7 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     if config.getoption("--many-threads"):
-        arrays.serial = lambda device: False
+        device_arrays.serial = lambda device: False
 
 
 def pytest_collection_modifyitems(config, items):

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 
 LENGTH = 100_000
 
@@ -35,7 +35,7 @@ def test_concurrent_launches_end_before_dependent_ones(device):
     """Concurrent launches, some nested, direct, captured, and in a conditional graph."""
     values = wp.array(np.arange(LENGTH) % 7, dtype=float, device=device)
     first, second, third, total = (wp.zeros(LENGTH, dtype=float, device=device) for _ in range(4))
-    arrays.load_kernels([slow_sum, add], device)
+    device_arrays.load_kernels([slow_sum, add], device)
 
     def launch():
         for array in (first, second, third, total):
@@ -45,10 +45,12 @@ def test_concurrent_launches_end_before_dependent_ones(device):
             wp.launch(slow_sum, LENGTH, [values, rounds], [out], device=device)
 
         def inner():
-            arrays.side_by_side([partial(sum_up, values, 300, first), partial(sum_up, values, 200, second)], device)
+            device_arrays.side_by_side(
+                [partial(sum_up, values, 300, first), partial(sum_up, values, 200, second)], device
+            )
             sum_up(second, 2, first)  # 300 + 2 * 200
 
-        arrays.side_by_side([inner, partial(sum_up, values, 100, third)], device)
+        device_arrays.side_by_side([inner, partial(sum_up, values, 100, third)], device)
         wp.launch(add, LENGTH, [first, second, third], [total], device=device)
 
     expected = (700 + 200 + 100) * (np.arange(LENGTH) % 7)
@@ -67,7 +69,7 @@ def test_concurrent_launches_end_before_dependent_ones(device):
 
 def test_readings_see_earlier_launches(device):
     values = wp.zeros(5, dtype=wp.int64, device=device)
-    reading = arrays.Reading(values)
+    reading = device_arrays.Reading(values)
     np.testing.assert_array_equal(reading(), 0)
     for number in (3, 4):
         values.fill_(number)
@@ -78,10 +80,10 @@ def test_readings_see_earlier_launches(device):
 
 def test_columns_are_views_in_the_order_of_memory(device):
     values = np.arange(2.0 * 3 * 5 * 4).reshape(6, 5, 4)  # rows, nodes, rods
-    array = arrays.upload(values, wp.float64, device)
-    order = (0, 2, 1) if arrays.serial(device) else (0, 1, 2)  # rod by rod on the CPU, node by node on a GPU
+    array = device_arrays.upload(values, wp.float64, device)
+    order = (0, 2, 1) if device_arrays.serial(device) else (0, 1, 2)  # rod by rod on the CPU, node by node on a GPU
     expected = values.transpose(order).reshape(6, -1)
-    np.testing.assert_array_equal(arrays.columns(array).numpy(), expected)
-    np.testing.assert_array_equal(arrays.columns(array, 2, 3).numpy(), expected.reshape(2, 3, -1))
-    arrays.columns(array).fill_(7.0)
-    np.testing.assert_array_equal(arrays.download(array), 7.0)
+    np.testing.assert_array_equal(device_arrays.columns(array).numpy(), expected)
+    np.testing.assert_array_equal(device_arrays.columns(array, 2, 3).numpy(), expected.reshape(2, 3, -1))
+    device_arrays.columns(array).fill_(7.0)
+    np.testing.assert_array_equal(device_arrays.download(array), 7.0)

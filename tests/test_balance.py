@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddg_warp.run.catalog import load_scene, scene_files
+from ddg_warp.run.scene_registry import load_scene, scene_files
 from ddg_warp.scene.descriptions import Statics
 from ddg_warp.solve.equilibrium.statics import Equilibrium
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.run import bench, bench_overview, catalog
-from ddg_warp.run.catalog import InputError, load_scene
+from ddg_warp.run import bench, bench_overview, scene_registry
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import InputError, load_scene
 
 ROOT = Path(__file__).parents[1]
 COLUMNS = "study rods nodes precision rtol ms_per_step newton_mean newton_max outcomes residual error".split()
@@ -175,7 +175,7 @@ def test_settings_are_varied_one_by_one(cantilever, study, device, tmp_path):
 def scenes() -> list:
     """Return names of all scenes; scenes that learn at build are slow and need torch."""
     marks = (pytest.mark.slow, pytest.mark.skipif(find_spec("torch") is None, reason="needs torch"))
-    learned = {name: "require_torch" in path.read_text() for name, path in catalog.scene_files().items()}
+    learned = {name: "require_torch" in path.read_text() for name, path in scene_registry.scene_files().items()}
     return [pytest.param(name, marks=marks) if is_learned else name for name, is_learned in learned.items()]
 
 

@@ -49,7 +49,7 @@ def test_pretwisted_rod(device, edges, joined):
         np.testing.assert_allclose(stresses["rod_bend_twist"][rod][:, 2], SECTION.GJ * rate, rtol=1e-9)
         if joined:
             np.testing.assert_allclose(stresses["rigid_joint"][rod][:, 2], SECTION.GJ * rate, rtol=1e-9)
-    revolutions = sum(ddg.inquiry.total_twist(model, state, rod) for rod in rods)
+    revolutions = sum(ddg.quantities.total_twist(model, state, rod) for rod in rods)
     assert revolutions == pytest.approx(rate / (2.0 * np.pi), rel=1e-9)
     first, last = model.reactions(state)
     np.testing.assert_allclose(first.moment, -SECTION.GJ * rate * X, rtol=1e-8, atol=1e-8)

@@ -142,7 +142,7 @@ def test_resumed_equals_straight(fall):
 
 def test_resumed_runs_end_at_the_requested_duration(fall, monkeypatch):
     """The duration of a killed run applies when resumed; a new duration applies to later resumes."""
-    from ddg_warp.run.record import Recorder
+    from ddg_warp.run.recorder import Recorder
 
     record = Recorder.record
 
@@ -304,7 +304,7 @@ def test_unwritable_path_is_named(path, fall, tmp_path, capsys):
 def test_run_in_progress_is_not_touched(fall, capsys):
     """The message names the other process that records there."""
     import ddg_warp as ddg
-    from ddg_warp.run.record import Recorder
+    from ddg_warp.run.recorder import Recorder
 
     scene = ddg.Scene()
     scene.add_rod(np.eye(3), section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=0.1))
@@ -497,7 +497,7 @@ def test_info_names_versions(capsys):
 
 @pytest.mark.parametrize("passed", [True, False])
 def test_check_prints_the_derivative_table(monkeypatch, capsys, device, passed):
-    from ddg_warp.run import derivatives
+    from ddg_warp.run import derivative_checks
 
     calls = []
 
@@ -505,7 +505,7 @@ def test_check_prints_the_derivative_table(monkeypatch, capsys, device, passed):
         calls.append(arguments)
         return [{"term": "rod_bend", "check": "gradient", "error": 1e-9, "tolerance": 1e-7, "passed": passed}]
 
-    monkeypatch.setattr(derivatives, "table", table)
+    monkeypatch.setattr(derivative_checks, "table", table)
     assert main(["check", "rod_bend", "--precision", "float32", "--device", device]) == (0 if passed else 1)
     assert calls == [("rod_bend", "float32", device)]
     assert ("passed" if passed else "FAILED") in capsys.readouterr().out.splitlines()[1]

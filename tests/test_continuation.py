@@ -9,7 +9,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.path import Displacement, Stop
+from ddg_warp.scene.equilibrium_path import Displacement, Stop
 from ddg_warp.scenes import lee_frame, post_buckling, roll_up
 from ddg_warp.solve.equilibrium import stability
 from ddg_warp.solve.equilibrium.continuation import Continuation

@@ -5,8 +5,8 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import statics
-from ddg_warp.ask import inquiry
 from ddg_warp.geometry import meshes
+from ddg_warp.postprocess import quantities
 
 RUBBER = ddg.Material(young=1e7, poisson=0.35, density=1000.0)
 SECTION = ddg.Rectangle(0.04, 0.02)
@@ -223,7 +223,7 @@ def test_three_revolutions_in_steps(device):
             poses_given = np.zeros((2, 1, 6))
             poses_given[:, 0, 3] = angles
             state = integrator.step(state, 10.0, ddg.Controls(poses_given))  # so slow that the twist is uniform
-        np.testing.assert_allclose(inquiry.total_twist(model, state), [3.0, -1.5], atol=1e-9)
+        np.testing.assert_allclose(quantities.total_twist(model, state), [3.0, -1.5], atol=1e-9)
         np.testing.assert_allclose(state.angles()[:, -1], [6.0 * np.pi, -3.0 * np.pi], atol=1e-9)
         results.append(state.points())
     np.testing.assert_allclose(*results, atol=1e-9)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, point_fields
 from ddg_warp.geometry import meshes
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.run.record import Recorder
+from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS, point_fields
+from ddg_warp.run.recorder import Recorder
 
 RADIUS, EA, EI, GJ = 2.0, 1e3, 3.0, 5.0
 SECTION = ddg.Stiffness(EA=EA, EI1=EI, GJ=GJ, mass_per_length=1.0, radius=0.01, rotary_inertia=1e-3)

@@ -16,7 +16,7 @@ from test_predictors import (
 )
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.core.islands import LOAD_SCALE, SCALARS
 from ddg_warp.kernels.newton.edge_rotation import LEAP, edge_functions
 from ddg_warp.kernels.stepping import coupled_warm_start
@@ -125,7 +125,7 @@ def test_warm_start_is_exact_in_free_flight(device, options):
     for dt in STEPS[1:]:
         state = integrator.step(state, dt)
     assert integrator.statistics()["newton_iterations"]["max"] == 0
-    added = [arrays.download(group.a) for group in state.groups]
+    added = [device_arrays.download(group.a) for group in state.groups]
     result = model.order.nodes(added, state.net and state.net.a)
     np.testing.assert_allclose(result, np.tile([0.0, 0.0, -9.81], (model.points_count, 1)), rtol=0.0, atol=1e-4)
     fall = 9.81 * np.sum(STEPS * np.cumsum(STEPS))  # by implicit Euler
@@ -168,7 +168,10 @@ def test_warm_start_weight_follows_the_persistence_of_corrections(device):
     """The weight is the cosine with the last correction, limited to a fourfold growth; shocks get 1/20, corrections
     below tolerance 0.
     """
-    real, (*_, trust) = wp.float64, coupled_warm_start.foresight_kernels(wp.float64, wp.float64, arrays.serial(device))
+    real, (*_, trust) = (
+        wp.float64,
+        coupled_warm_start.foresight_kernels(wp.float64, wp.float64, device_arrays.serial(device)),
+    )
     rtol = 0.1
     # m a.b, m a.a, m b.b, m |a|, and the weight
     cases = [

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.learn.gradient_objects import OBJECTS, scene_of
-from ddg_warp.model.recipe import Recipe
+from ddg_warp.model.rebuild import Recipe
 from ddg_warp.solve.equilibrium import statics
+from ddg_warp.torch.gradient_check_scenes import OBJECTS, scene_of
 
 WORLDS, DT = 2, 2e-3
 FAST = (

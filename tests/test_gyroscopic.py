@@ -139,7 +139,7 @@ def test_gyroscopic_couples_act_only_on_states_with_spins(device):
 
 def test_gradients_are_refused(device):
     pytest.importorskip("torch")
-    from ddg_warp.learn.adjoint import Adjoint
+    from ddg_warp.adjoint.implicit import Adjoint
     from ddg_warp.torch import Simulator
 
     top = Top(device, -0.5 * LENGTH)

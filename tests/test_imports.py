@@ -9,9 +9,22 @@ import pytest
 import ddg_warp
 
 PACKAGE = Path(ddg_warp.__file__).parent
-LAYERS = ("geometry", "scene", "compile", "io", "model", "solve", "ask", "run", "learn")
+LAYERS = (
+    "geometry",
+    "scene",
+    "compile",
+    "io",
+    "model",
+    "solve",
+    "postprocess",
+    "adjoint",
+    "run",
+    "torch",
+    "data",
+    "rl",
+)
 # Methods of lower-layer objects that import their implementation when called.
-FACADES = {"scene/scene.py": "model", "model/model.py": "ask", "run/cli.py": "learn"}
+FACADES = {"scene/scene.py": "model", "model/model.py": "postprocess", "run/cli.py": "data"}
 
 
 def layer(module: str) -> int:
@@ -59,3 +72,28 @@ def test_io_and_geometry_import_no_solver():
     for path in (path for path in FILES if path.relative_to(PACKAGE).parts[0] in ("io", "geometry")):
         imported = {*imports(path, lazy=False), *imports(path, lazy=True)}
         assert not [module for module in imported if layer(module) > LAYERS.index("io")]
+
+
+def graph() -> dict[str, set[str]]:
+    """Return the modules of the package that each module imports, without lazy imports of the facades."""
+    kernels = Path(ddg_warp.kernels.__path__[0])
+    files = {
+        ".".join([prefix, *path.relative_to(folder).with_suffix("").parts]).removesuffix(".__init__").strip("."): path
+        for folder, prefix in ((PACKAGE, ""), (kernels, "kernels"))
+        for path in folder.rglob("*.py")
+    }
+    edges = {}
+    for module, path in files.items():
+        facade = module.replace(".", "/") + ".py" in FACADES
+        names = [*imports(path, lazy=False), *([] if facade else imports(path, lazy=True))]
+        modules = {name if name in files else name.rpartition(".")[0] for name in names}
+        edges[module] = (modules & files.keys()) - {module, ""}  # the package itself imports on request
+    del edges[""]
+    return edges
+
+
+def test_imports_form_no_circle():
+    edges = graph()
+    while leaves := {module for module, names in edges.items() if not names}:
+        edges = {module: names - leaves for module, names in edges.items() if module not in leaves}
+    assert not edges

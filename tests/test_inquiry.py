@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.ask.inquiry import reactions, stresses, total_twist, writhe
+from ddg_warp.postprocess.quantities import reactions, stresses, total_twist, writhe
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.equilibrium.tangent import Tangent
 

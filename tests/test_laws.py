@@ -9,14 +9,14 @@ import pytest
 from test_readme import BLOCKS
 
 import ddg_warp as ddg
-from ddg_warp.ask import inquiry
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, MAGNETS, REGISTRY
-from ddg_warp.run import derivatives
-from ddg_warp.run.catalog import load_file
+from ddg_warp.postprocess import quantities
+from ddg_warp.run import derivative_checks
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import load_file
 from ddg_warp.solve.equilibrium.statics import solve
 
 FILE = Path(tempfile.mkdtemp()) / "my_law.py"  # the README's law, in a file, since Warp reads the source of functions
@@ -122,7 +122,7 @@ def test_a_joined_rod_keeps_its_law(device):
 @pytest.mark.parametrize("damped", [False, True])
 def test_derivatives_of_a_user_law(device, damped):
     term = replace(REGISTRY["rod_bend_twist"], density=saturating).damped(damped)
-    for row in derivatives.table(term, "float64", device):
+    for row in derivative_checks.table(term, "float64", device):
         assert row["passed"], row
 
 
@@ -317,8 +317,8 @@ def test_shells_with_and_without_a_law_are_two_sets(device):
 def test_fields_of_triangles_know_the_law_of_the_material_alone(device):
     model = with_laws("shell_bend_dof").build(device, "float64")
     with pytest.raises(ValueError, match=r"triangle_fields: shell_bend_dof of shell 0 .* has the law 'saturating'"):
-        inquiry.triangle_fields(model, model.state())
-    assert inquiry.energies(model, model.state())
+        quantities.triangle_fields(model, model.state())
+    assert quantities.energies(model, model.state())
 
 
 def test_parameters_of_shells_are_of_the_law_of_their_material():

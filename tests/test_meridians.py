@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.io.revolve import Revolution
-from ddg_warp.run.record import Recorder, export_usd
+from ddg_warp.io.surface_of_revolution import Revolution
+from ddg_warp.run.recorder import Recorder, export_usd
 from ddg_warp.solve.equilibrium.statics import Equilibrium, solve
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.ask.inquiry import triangle_fields
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.terms import CONTACT, FRICTION
+from ddg_warp.postprocess.quantities import triangle_fields
 from ddg_warp.run.cli import main
-from ddg_warp.run.record import Recorder
+from ddg_warp.run.recorder import Recorder
 from ddg_warp.solve.equilibrium.statics import solve
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.compile.net.outwards import outwards
+from ddg_warp.compile.coupled.rod_ordering import outwards
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.newton.rod_iterate import RELAG
 from ddg_warp.solve.newton.coupled_newton import NetNewton, NewtonOptions

@@ -8,8 +8,8 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
 import ddg_warp as ddg
-from ddg_warp.compile.net import blocks
-from ddg_warp.compile.net.blocks import compile_net
+from ddg_warp.compile.coupled import builder
+from ddg_warp.compile.coupled.builder import compile_net
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -509,7 +509,7 @@ def test_results_do_not_depend_on_the_rod_numbering(device, monkeypatch):
     """Numbering rod by rod (CPU) and node by node (GPU): a ring, curled rods with ghost nodes and a stiffened sheet."""
     results = []
     for by_node in (False, True):
-        monkeypatch.setattr(blocks, "compile_net", lambda scene, along, by_node=by_node: compile_net(scene, by_node))
+        monkeypatch.setattr(builder, "compile_net", lambda scene, along, by_node=by_node: compile_net(scene, by_node))
         (scene, *_), t = stiffened(), np.linspace(0.0, 1.0, 12, endpoint=False)
         circle = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), 0 * t], 1)
         kind = {"section": ddg.Circle(0.02), "material": RUBBER}

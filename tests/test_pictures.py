@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.io.tube import SIDES
+from ddg_warp.io.rod_tubes import SIDES
 from ddg_warp.run import figure
-from ddg_warp.run.catalog import load_scene, one_liner, scene_files
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import load_scene, one_liner, scene_files
 from ddg_warp.run.simulate import simulate
 from ddg_warp.scenes import _touching
 

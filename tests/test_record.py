@@ -13,9 +13,9 @@ from ddg_warp.geometry import meshes
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.io.journal import transaction
 from ddg_warp.run import simulate as simulate_module
-from ddg_warp.run.catalog import InputError
-from ddg_warp.run.record import Recorder
+from ddg_warp.run.recorder import Recorder
 from ddg_warp.run.run_directory import RunDirectory
+from ddg_warp.run.scene_registry import InputError
 from ddg_warp.run.simulate import simulate
 from ddg_warp.run.summary import summary
 

@@ -5,7 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.geometry.shell_forms import edge_kinds, metric, second_form
+from ddg_warp.geometry.fundamental_forms import edge_kinds, metric, second_form
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.model.rest_shapes import bilayer_curvature, grown_metric, principal_form
 from ddg_warp.solve.equilibrium.statics import solve

@@ -9,7 +9,7 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.kernels.densities.ribbon import LAWS
 from ddg_warp.kernels.terms import REGISTRY
-from ddg_warp.run import derivatives
+from ddg_warp.run import derivative_checks
 from ddg_warp.scenes import ribbon_bistable, ribbon_helix
 from ddg_warp.solve.equilibrium.statics import solve
 
@@ -58,7 +58,7 @@ def energy(name: str, k, t, device, width: float = WIDTH, natural=(0.0, 0.0, 0.0
 @pytest.mark.parametrize("damped", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives(device, name, damped):
-    for row in derivatives.table(
+    for row in derivative_checks.table(
         replace(REGISTRY["rod_bend_twist"], density=LAWS[name]).damped(damped), "float64", device
     ):
         assert row["passed"], row
@@ -69,10 +69,10 @@ def test_derivatives(device, name, damped):
 def test_the_exact_matrix_holds_where_the_law_is_not_convex(device, name):
     """Twist beyond the crossover softens the ribbon, which the exact matrix contains and the Gauss-Newton factor omits."""
     term = replace(REGISTRY["rod_bend_twist"], density=LAWS[name])
-    (sample,) = derivatives.samples_of(term, "float64", device, chains=(False,))
+    (sample,) = derivative_checks.samples_of(term, "float64", device, chains=(False,))
     sample.data["buffer"][term.parameter_names.index("crossover")] /= 8.0
-    assert derivatives.relative(sample.evaluate()[0], sample.evaluate(exact=True)[0]) > 1e-3
-    assert derivatives.exact(sample) < 1e-13
+    assert derivative_checks.relative(sample.evaluate()[0], sample.evaluate(exact=True)[0]) > 1e-3
+    assert derivative_checks.exact(sample) < 1e-13
 
 
 @pytest.mark.parametrize("real", [wp.float64, pytest.param(wp.float32, marks=pytest.mark.slow)])

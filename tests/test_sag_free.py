@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.ask.sag_free import least_stiffness, rest_strains
 from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import set_rest_strains
+from ddg_warp.postprocess.sag_free import least_stiffness, rest_strains
 from ddg_warp.solve.equilibrium.stability import spectrum
 from ddg_warp.solve.equilibrium.statics import solve
 

@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.run.catalog import load_scene
 from ddg_warp.run.check import Check, once_reached
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import load_scene
 from ddg_warp.run.simulate import Result, simulate
 from ddg_warp.run.summary import checks_table
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.run.catalog import load_scene, parameters, scene_files
+from ddg_warp.run.scene_registry import load_scene, parameters, scene_files
 from ddg_warp.run.simulate import simulate
 
 SMALL = {

@@ -8,7 +8,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.geometry.shell_forms import second_form
+from ddg_warp.geometry.fundamental_forms import second_form
 from ddg_warp.scenes import _sze
 from ddg_warp.scenes.hinged_roof import HALF_ANGLE, HALF_LENGTH, POISSON, RADIUS, YOUNG
 from ddg_warp.solve.equilibrium.stability import spectrum

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.compile.storage import gathered
+from ddg_warp.compile.dof_map import gathered
 from ddg_warp.solve.equilibrium.tangent import Tangent
 
 ROD = ddg.Stiffness(EA=1e3, EI1=0.5, EI2=0.8, GJ=0.4, mass_per_length=0.6, rotary_inertia=0.01)

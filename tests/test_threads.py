@@ -58,7 +58,7 @@ def test_threads_with_separate_models(device):
 
 
 def test_capture_waits_for_launches():
-    from ddg_warp.threads import capturing, launches
+    from ddg_warp.capture_lock import capturing, launches
 
     inside, events, release = threading.Event(), [], threading.Event()
 
@@ -89,7 +89,7 @@ def test_capture_waits_for_launches():
 @pytest.mark.parametrize("shared", [False, True])
 def test_launches_are_exclusive_on_a_shared_stream(monkeypatch, shared):
     """The second of two launching threads waits for the first on a shared stream, and overlaps it elsewhere."""
-    from ddg_warp import threads
+    from ddg_warp import capture_lock as threads
 
     monkeypatch.setattr(threads._turns, "shared", shared)
     inside, overlapped, release = threading.Event(), threading.Event(), threading.Event()

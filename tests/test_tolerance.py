@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.compile.tolerance import FAN, outer_forces
+from ddg_warp.compile.residual_tolerance import FAN, outer_forces
 from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 from ddg_warp.solve.newton.rod_newton import NewtonOptions

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddg_warp.geometry.turning import turned
+from ddg_warp.geometry.edge_rotation import turned
 
 BOW = np.stack([np.linspace(-1.0, 1.0, 21), 0.0 * np.ones(21), 0.5 * np.cos(np.linspace(-1.5, 1.5, 21))], axis=1)
 

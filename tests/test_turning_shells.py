@@ -5,7 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.path import Stop
+from ddg_warp.scene.equilibrium_path import Stop
 from ddg_warp.solve.equilibrium.continuation import Continuation
 from ddg_warp.solve.equilibrium.statics import solve
 from ddg_warp.solve.equilibrium.tangent import Tangent

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function
 from ddg_warp.kernels.collision.primitives import EDGES, pair_functions, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
@@ -112,7 +112,7 @@ def measure(edges: int, device, repeats: int) -> dict:
     shapes, points = strands(edges)
     x = wp.array(points, dtype=wp.vec3d, device=device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    arrays.load_kernels(search.kernels, device)
+    device_arrays.load_kernels(search.kernels, device)
     pairs = search.lists[0]
     number, number_of_pairs = pairs.first.count, int(pairs.count.numpy()[0])
     row = {

@@ -23,9 +23,9 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays
-from ddg_warp.learn.chains import ChainAdjoint
-from ddg_warp.learn.net import NetAdjoint
+from ddg_warp import device_arrays
+from ddg_warp.adjoint.coupled_step import NetAdjoint
+from ddg_warp.adjoint.rod_step import ChainAdjoint
 from ddg_warp.run.summary import machine, table, write_table
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
@@ -103,7 +103,7 @@ def cubin(data: bytes) -> dict:
 
 def registers() -> list[dict]:
     """Return a row for every kind of element."""
-    arrays.serial = lambda device: False  # kernels as a GPU runs them: one thread an element
+    device_arrays.serial = lambda device: False  # kernels as a GPU runs them: one thread an element
     rows = []
     for kind, precision in KINDS:
         model = scene(kind, 2, 9).build("cpu", precision)

@@ -23,7 +23,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.model import rest_shapes
-from ddg_warp.run.catalog import load_scene
+from ddg_warp.run.scene_registry import load_scene
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 

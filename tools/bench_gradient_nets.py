@@ -19,7 +19,7 @@ import torch
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.scenes import gridshell_dome, hanging_sheet
 from ddg_warp.torch import Simulator

@@ -23,7 +23,7 @@ import warp as wp
 from bench_tolerance import rods, sheet
 
 import ddg_warp as ddg
-from ddg_warp.ask.report import bytes_per_node
+from ddg_warp.postprocess.model_report import bytes_per_node
 from ddg_warp.run.summary import machine, table, write_table
 
 EXACT_RTOL = 1e-12  # of the reference, limited by rounding

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.geometry import meshes
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
@@ -59,7 +59,7 @@ def equilibrium(cells: int, pressure: float, solver: str, device) -> dict:
     Equilibrium(small, StaticsOptions(solver=solver)).load(small.state(), 1)  # compiles
     search = Equilibrium(model, StaticsOptions(solver=solver))
     if search.net:
-        arrays.load_kernels(search.net.newton.kernels, device)
+        device_arrays.load_kernels(search.net.newton.kernels, device)
     clock = time.perf_counter if device.is_cuda else time.process_time
     began = clock()
     state = search.load(model.state(), 1)

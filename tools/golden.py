@@ -4,7 +4,7 @@
     DDG_WARP_FP_CONTRACT=off python tools/golden.py compare FILE [SCENE ...]
 
 `write` keeps all arrays of the state after a few steps, and the counts of Newton and PCG iterations; with torch, also gradients of a
-loss by what steps read, of objects of `ddg_warp.learn.gradient_objects`. `compare` prints, by scene, the
+loss by what steps read, of objects of `ddg_warp.torch.gradient_check_scenes`. `compare` prints, by scene, the
 largest difference over the largest entry of the array that differs most, and fails where iteration counts differ or differences exceed
 1e-9. Without fused multiply-adds (DDG_WARP_FP_CONTRACT=off) versions that compute the same are equal bit for bit.
 """
@@ -176,7 +176,7 @@ CASES: dict[str, tuple[Callable[[], ddg.Scene], str, float, dict]] = {
 }
 
 
-# Name -> object of `ddg_warp.learn.gradient_objects`, analysis.
+# Name -> object of `ddg_warp.torch.gradient_check_scenes`, analysis.
 GRADIENTS = {
     "grad_rod": ("rod", "implicit_euler"),
     "grad_midpoint": ("rod", "implicit_midpoint"),
@@ -192,7 +192,7 @@ GRADIENTS = {
 
 def gradient(name: str) -> tuple[dict[str, np.ndarray], str]:
     """Return the derivatives of a loss by everything that steps, or equilibria, of an object read."""
-    from ddg_warp.learn.gradient_cases import Case
+    from ddg_warp.torch.gradient_check_cases import Case
 
     found = {}
     for own in Case(*GRADIENTS[name], "cpu").inputs():

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp import arguments
-from ddg_warp.compile.elements import ElementSet
+from ddg_warp import argument_checks
+from ddg_warp.compile.element_set import ElementSet
 from ddg_warp.compile.loads import Load
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import AXISYMMETRIC
@@ -147,8 +147,10 @@ def _explicit(shell, n: int):
         f"axisymmetric shell '{shell.name}': rest is two arrays, a positive metric {(n - 1, 2)} and curvature {(n, 2)}"
     )
     if not isinstance(shell.rest, list | tuple) or len(shell.rest) != 2:
-        raise SceneError(f"{rule}; it is {arguments.shown(shell.rest)}")
-    metric, curvature = (arguments.broadcast(rule, v, (k, 2)) for v, k in zip(shell.rest, (n - 1, n), strict=True))
+        raise SceneError(f"{rule}; it is {argument_checks.shown(shell.rest)}")
+    metric, curvature = (
+        argument_checks.broadcast(rule, v, (k, 2)) for v, k in zip(shell.rest, (n - 1, n), strict=True)
+    )
     if not (metric > 0.0).all():
         raise SceneError(rule)
     return metric, curvature
@@ -199,7 +201,7 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
     stretch = material.young * shell.thickness / (1.0 - nu**2)
     bend = stretch * shell.thickness**2 / 12.0
     for name, values in (("membrane stiffness", stretch), ("bending stiffness", bend)):
-        arguments.sized(f"shell of revolution: {name}", values)
+        argument_checks.sized(f"shell of revolution: {name}", values)
 
     def law(area, stiffness, poisson, metric, rest):
         zero = np.zeros(len(area))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 
 
 class Load:
@@ -28,7 +28,9 @@ class Load:
         Raises:
             SolverError: the amplitude is not finite; names the function and the time.
         """
-        return otherwise if self.amplitude is None else float(arguments.value_at("the amplitude", self.amplitude, t))
+        return (
+            otherwise if self.amplitude is None else float(argument_checks.value_at("the amplitude", self.amplitude, t))
+        )
 
 
 @dataclass

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.newton.edge_rotation import TURNED
 
@@ -39,7 +39,7 @@ def choose(name: str | None, device) -> Precision:
     """
     if name is None:
         name = "mixed" if device.is_cuda else "float64"
-    return PRECISIONS[arguments.choice("precision", name, PRECISIONS)]
+    return PRECISIONS[argument_checks.choice("precision", name, PRECISIONS)]
 
 
 FLOAT32_LIMIT = 0.02  # relative error of a search direction that Newton still corrects quickly; beyond it float32 states are doubtful

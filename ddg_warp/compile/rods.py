@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from ddg_warp.compile.ghosts import Ghosts, end_director, ghost_node
+from ddg_warp.compile.ghost_nodes import Ghosts, end_director, ghost_node
 from ddg_warp.compile.half_cells import HalfCells
 from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.errors import SceneError

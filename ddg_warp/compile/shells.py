@@ -22,11 +22,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments
-from ddg_warp.compile.elements import ElementSet
+from ddg_warp import argument_checks
+from ddg_warp.compile.element_set import ElementSet
 from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.errors import SceneError
-from ddg_warp.geometry.shell_forms import (
+from ddg_warp.geometry.fundamental_forms import (
     CLAMPED,
     FREE,
     MEMBRANES,
@@ -139,7 +139,7 @@ def plate(
     }
     made = Plate(abar, bbar, angle, **material, laws=laws or {})
     for name in ("membrane_stiffness", "bending_stiffness"):
-        arguments.sized(name.replace("_", " "), getattr(made, name))
+        argument_checks.sized(name.replace("_", " "), getattr(made, name))
     return made
 
 

@@ -6,7 +6,7 @@ The vertex (i, j) of a grid with m vertices in a row is i + m j.
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -30,7 +30,7 @@ def rectangle(nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), pattern:
     """
     _check_counts(nx=nx, ny=ny)
     size = _size(size)
-    arguments.choice("pattern", pattern, ("right", "alternating", "crossed", "equilateral"))
+    argument_checks.choice("pattern", pattern, ("right", "alternating", "crossed", "equilateral"))
     scale = np.array([size[0] / nx, size[1] / ny])
     if pattern == "equilateral":
         flat, triangles = _equilateral(nx, ny)
@@ -56,8 +56,8 @@ def jittered_rectangle(
 
     _check_counts(nx=nx, ny=ny)
     size = _size(size)
-    arguments.number("jitter", jitter, "a fraction of a cell, from 0 to less than 0.5", lambda v: 0.0 <= v < 0.5)
-    arguments.count("seed", seed, 0)
+    argument_checks.number("jitter", jitter, "a fraction of a cell, from 0 to less than 0.5", lambda v: 0.0 <= v < 0.5)
+    argument_checks.count("seed", seed, 0)
     flat = _lattice(nx, ny)
     inside = ((flat > 0) & (flat < [nx, ny])).all(axis=1)
     flat[inside] += np.random.default_rng(seed).uniform(-jitter, jitter, (np.count_nonzero(inside), 2))
@@ -89,7 +89,7 @@ def annulus(
     Vertex (i, j) is i + (n_radial + 1) j, with i from the inner circle outwards and j around, from +x towards +y.
     """
     _check_counts(n_radial=n_radial)
-    _check_around("n_around", n_around, 1 if arguments.flag("slit", slit) else 3)
+    _check_around("n_around", n_around, 1 if argument_checks.flag("slit", slit) else 3)
     _check_lengths(inner=inner, outer=outer)
     if inner >= outer:
         raise SceneError(f"inner = {inner}, outer = {outer}; the inner radius is less than the outer one")
@@ -115,7 +115,7 @@ def cylinder_panel(
     _check_counts(n_around=n_around, n_along=n_along)
     _check_lengths(radius=radius, length=length)
     rule = "an angle in radians, more than 0 and less than 2 pi"
-    arguments.number("angle", angle, rule, lambda v: 0.0 < v < 2.0 * np.pi)
+    argument_checks.number("angle", angle, rule, lambda v: 0.0 < v < 2.0 * np.pi)
     i, j = _lattice(n_around, n_along).T
     points = radius * _polar(np.ones(len(i)), angle * (i / n_around - 0.5))
     points[:, 2] = length * j / n_along
@@ -143,7 +143,7 @@ def sphere(subdivisions: int, radius: float = 1.0) -> Mesh:
     """
     from ddg_warp.geometry.surface import Surface
 
-    arguments.count("subdivisions", subdivisions, 0)
+    argument_checks.count("subdivisions", subdivisions, 0)
     _check_lengths(radius=radius)
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     points = np.array([[0.0, s, t * golden] for s in (-1, 1) for t in (-1, 1)])
@@ -170,7 +170,9 @@ def spherical_cap(rings: int, radius: float = 1.0, angle: float = 0.5 * np.pi) -
     """
     distance, around, triangles = _rings(rings)
     _check_lengths(radius=radius)
-    arguments.number("angle", angle, "an angle in radians, more than 0 and less than pi", lambda v: 0.0 < v < np.pi)
+    argument_checks.number(
+        "angle", angle, "an angle in radians, more than 0 and less than pi", lambda v: 0.0 < v < np.pi
+    )
     points = _polar(np.sin(angle * distance), around)
     points[:, 2] = np.cos(angle * distance)
     return radius * points, triangles
@@ -225,8 +227,11 @@ def weld(points, triangles, tolerance: float) -> Mesh:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    arguments.positive("weld: tolerance", tolerance, "m")
-    points, triangles = arguments.array("weld: points", points), arguments.triangles("weld: triangles", triangles)
+    argument_checks.positive("weld: tolerance", tolerance, "m")
+    points, triangles = (
+        argument_checks.array("weld: points", points),
+        argument_checks.triangles("weld: triangles", triangles),
+    )
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise SceneError(f"weld: points have shape {points.shape}; give finite numbers (P, 3)")
     for t in np.flatnonzero(((triangles < 0) | (triangles >= len(points))).any(1))[:1]:
@@ -246,20 +251,20 @@ def weld(points, triangles, tolerance: float) -> Mesh:
 
 def _check_counts(**counts: int) -> None:
     for name, value in counts.items():
-        arguments.count(name, value)
+        argument_checks.count(name, value)
 
 
 def _check_around(name: str, value: int, least: int) -> None:
-    arguments.count(f"{name} (cells around)", value, least)
+    argument_checks.count(f"{name} (cells around)", value, least)
 
 
 def _check_lengths(**lengths: float) -> None:
     for name, value in lengths.items():
-        arguments.positive(name, value, "m")
+        argument_checks.positive(name, value, "m")
 
 
 def _size(size) -> np.ndarray:
-    size = arguments.broadcast("size", size, (2,))
+    size = argument_checks.broadcast("size", size, (2,))
     if np.any(size <= 0.0):
         raise SceneError(f"size = {tuple(size.tolist())}; give two positive lengths [m]")
     return size
@@ -282,7 +287,7 @@ def _polar(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 def _grid(nx: int, ny: int, pattern: str, wrap_x: bool = False, wrap_y: bool = False) -> np.ndarray:
     """Return the triangles of nx x ny cells; a wrapped grid has its first row or column of vertices as its last."""
-    arguments.choice("pattern", pattern, ("right", "alternating"))
+    argument_checks.choice("pattern", pattern, ("right", "alternating"))
     mx, my = nx if wrap_x else nx + 1, ny if wrap_y else ny + 1
     j, i = np.divmod(np.arange(nx * ny), nx)
     a, b = i + mx * j, (i + 1) % mx + mx * j

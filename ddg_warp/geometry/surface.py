@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.polyline import cross, length
 
@@ -150,16 +150,16 @@ class Surface:
         return f"surface '{self.name}'"
 
     def _checked_points(self, points) -> np.ndarray:
-        points = arguments.array(f"{self._name}: points", points, "give (P, 3)").copy()
+        points = argument_checks.array(f"{self._name}: points", points, "give (P, 3)").copy()
         if points.ndim != 2 or points.shape[1] != 3:
             raise SceneError(f"{self._name}: points have shape {points.shape}; give (P, 3)")
         for vertex in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
             raise SceneError(f"{self._name}: vertex {vertex} is at a non-finite position; check the points")
-        arguments.sized(f"{self._name}: points", points, "vertex")
+        argument_checks.sized(f"{self._name}: points", points, "vertex")
         return points
 
     def _checked_triangles(self, triangles) -> np.ndarray:
-        triangles, count = arguments.triangles(f"{self._name}: triangles", triangles), len(self.points)
+        triangles, count = argument_checks.triangles(f"{self._name}: triangles", triangles), len(self.points)
         for t in np.flatnonzero(((triangles < 0) | (triangles >= count)).any(axis=1))[:1]:
             raise SceneError(
                 f"{self._name}: triangle {t} has the vertices {triangles[t].tolist()}, but there are {count}; "

@@ -4,7 +4,7 @@
 (text in).
 """
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.io.curves import CurveSet
 from ddg_warp.io.paths import CurveError, MeshError, MissingFileError, as_path
 from ddg_warp.io.shapes import Curves, Shapes, Surfaces
@@ -24,7 +24,7 @@ def read(path, outside: bool = False) -> list[CurveSet]:
         CurveError: The file holds no usable curves.
         TrajectoryError: An HDF5 file is damaged, or refers to another file without permission.
     """
-    outside = arguments.flag("read: outside", outside)
+    outside = argument_checks.flag("read: outside", outside)
     suffix = as_path("the file to read", path, MissingFileError).suffix.lower()
     if suffix in {".usd", ".usda", ".usdc", ".usdz"}:
         from ddg_warp.io.usd import read_curves

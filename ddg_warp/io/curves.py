@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.io.paths import CurveError
 
 
@@ -58,7 +58,7 @@ def checked_curves(points, counts, closed, radius, path: str, source: str) -> Cu
         source: File name, for messages.
     """
     where = f"{source}, {path}"
-    points, counts = arguments.floats(points), arguments.floats(counts).reshape(-1)
+    points, counts = argument_checks.floats(points), argument_checks.floats(counts).reshape(-1)
     if (points.ndim < 2 and points.size) or (points.ndim and points.shape[-1] != 3 and points.size):
         raise CurveError(
             f"{where}: the points have shape {points.shape} or are no numbers; give (P, 3), three numbers each"
@@ -78,7 +78,7 @@ def checked_curves(points, counts, closed, radius, path: str, source: str) -> Cu
         )
     closed = np.broadcast_to(closed.astype(bool), counts.shape).copy()
     if radius is not None:
-        radius = arguments.floats(radius)
+        radius = argument_checks.floats(radius)
         if radius.shape not in ((), (1,), (len(points),)):
             raise CurveError(
                 f"{where}: there are {radius.size} radii for {len(points)} points; give one, or one a point"

@@ -36,7 +36,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddg_warp.io.contacts import Contacts
+from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.hdf5_read import (
     COUNTS,
     CURVE_FIELDS,

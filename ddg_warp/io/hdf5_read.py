@@ -12,9 +12,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddg_warp import arguments
-from ddg_warp.io.contacts import FIELDS as PAIR_FIELDS
-from ddg_warp.io.contacts import Contacts, Touching
+from ddg_warp import argument_checks
+from ddg_warp.io.contact_records import FIELDS as PAIR_FIELDS
+from ddg_warp.io.contact_records import Contacts, Touching
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.journal import TrajectoryError, open_to_read
 from ddg_warp.io.obstacles import Obstacles
@@ -242,7 +242,7 @@ class TrajectoryReader:
             self._file = open_to_read(self.path)
         try:
             with undamaged(self.path):
-                if not arguments.flag("outside", outside):
+                if not argument_checks.flag("outside", outside):
                     refuse_links(self._file, self.path)
                 self._read()
         except BaseException:
@@ -359,7 +359,7 @@ def read_rods(path, frame: int = -1, world: int = 0, *, outside: bool = False) -
     Raises:
         CurveError, TrajectoryError: The file holds no rods, or no such frame or world.
     """
-    path, frame, world = existing(path), arguments.index("frame", frame), arguments.index("world", world)
+    path, frame, world = existing(path), argument_checks.index("frame", frame), argument_checks.index("world", world)
     with undamaged(path), open_to_read(path) as file:
         if not outside:
             refuse_links(file, path)

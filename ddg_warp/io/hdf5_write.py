@@ -9,7 +9,7 @@ from dataclasses import fields
 import h5py
 import numpy as np
 
-from ddg_warp.io.contacts import FIELDS, WHOLE, Contacts
+from ddg_warp.io.contact_records import FIELDS, WHOLE, Contacts
 from ddg_warp.io.hdf5_read import CURVE_FIELDS, SURFACE_FIELDS
 
 CHUNK_BYTES = 2**20

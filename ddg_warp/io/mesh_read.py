@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneWarning
 from ddg_warp.io.faces import triangulated
 from ddg_warp.io.paths import MeshError, existing, shown
@@ -44,7 +44,7 @@ def read_mesh(
     from ddg_warp.geometry import meshes
 
     path = existing(path)
-    points, triangles, name = _read(path, prim, arguments.flag("read_mesh: outside", outside))
+    points, triangles, name = _read(path, prim, argument_checks.flag("read_mesh: outside", outside))
     used, count = meshes.drop_unused(points, triangles), len(points)
     if len(used[0]) < count:
         first = np.argmin(np.isin(np.arange(count), triangles))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.io.paths import CurveError
 
@@ -25,7 +25,7 @@ def checked_observed(observed, names=None) -> dict[str, float]:
     numbers = {}
     for name, value in (observed or {}).items():
         _check_name("observed", name)
-        numbers[name] = arguments.number(f"observed {name!r}", value)
+        numbers[name] = argument_checks.number(f"observed {name!r}", value)
     if names is not None and numbers.keys() != set(names):
         raise SceneError(
             f"observed {sorted(numbers)}, before {sorted(names)}; give the same names at every call, or record the run anew"

@@ -10,8 +10,8 @@ import numpy as np
 
 from ddg_warp.geometry import meshes, polyline
 from ddg_warp.geometry.operators import face_normals, vertex_normals
-from ddg_warp.io.revolve import Revolution
 from ddg_warp.io.shapes import Curves
+from ddg_warp.io.surface_of_revolution import Revolution
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 
 BEYOND = 0.25  # margin of displayed planes around all other objects, over their size

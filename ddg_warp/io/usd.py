@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Tf, Usd, UsdGeom, Vt
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.io.colors import PALETTE
-from ddg_warp.io.contacts import Contacts, Touching
+from ddg_warp.io.contact_records import Contacts, Touching
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.paths import CurveError
 from ddg_warp.io.shapes import Curves, Shapes
@@ -68,7 +68,7 @@ class CurvesWriter:
         obstacles: Obstacles | None = None,
         touching: Touching | None = None,
     ):
-        arguments.positive("CurvesWriter: fps", fps, "1/s")
+        argument_checks.positive("CurvesWriter: fps", fps, "1/s")
         self.path = Path(path)
         self._partial = self.path.with_name(f"{self.path.stem}.partial{self.path.suffix}")
         self._partial.unlink(missing_ok=True)
@@ -131,7 +131,7 @@ class CurvesWriter:
         Raises:
             CurveError: The time code is not later than the frame before, or the number of points is wrong.
         """
-        time, points = arguments.number("CurvesWriter: time", time), np.asarray(points)
+        time, points = argument_checks.number("CurvesWriter: time", time), np.asarray(points)
         if points.shape != (self._rows, 3):
             raise CurveError(
                 f"{self.path}: points have shape {points.shape}, not ({self._rows}, 3); give those of all curves"

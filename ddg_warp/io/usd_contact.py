@@ -7,7 +7,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.colors import CONTACT, OBSTACLE
-from ddg_warp.io.contacts import Touching
+from ddg_warp.io.contact_records import Touching
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.usd_prims import Frame, PointsPrim, define_mesh, floats, vectors
 

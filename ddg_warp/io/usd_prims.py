@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.colors import on_scale
-from ddg_warp.io.contacts import Contacts
+from ddg_warp.io.contact_records import Contacts
+from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
 from ddg_warp.io.shapes import Curves, Surfaces
-from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd_materials import bind_preview_surface
 
 HEADER = 64  # largest overhead of a value in a file [bytes]
@@ -33,7 +33,7 @@ class ColorBy:
     high: float
 
     def __post_init__(self):
-        low, high = (arguments.number(f"color_by: {end} end", getattr(self, end)) for end in ("low", "high"))
+        low, high = (argument_checks.number(f"color_by: {end} end", getattr(self, end)) for end in ("low", "high"))
         if not isinstance(self.name, str) or low >= high:
             raise SceneError(f"color_by = {(self.name, low, high)}; give a name, and a low end below the high end")
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Ar, Sdf, Tf, Usd, UsdGeom
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneWarning
 from ddg_warp.io import cubic
 from ddg_warp.io.curves import CurveSet, checked_curves
@@ -49,7 +49,7 @@ def read_curves(path, prim: str | None = None, samples: int = 1, outside: bool =
     Raises:
         CurveError: The file has no curves to read, or a curve that no rod can be built from; names prim and curve.
     """
-    path, samples = existing(path), arguments.count("read_curves: samples", samples)
+    path, samples = existing(path), argument_checks.count("read_curves: samples", samples)
     with opened(path, CurveError, outside) as stage:
         curves, unread = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
         unread = [each for each in unread if each.IsA(UsdGeom.Curves)]
@@ -113,7 +113,7 @@ def opened(path: Path, error: type[ValueError], outside: bool) -> Iterator[Usd.S
         error: Class of the error.
         outside: Whether layers outside the folder of the file may be opened.
     """
-    arguments.flag("outside", outside)
+    argument_checks.flag("outside", outside)
     try:
         layers = _layers(path, error, outside)
         stage = Usd.Stage.Open(layers[0])

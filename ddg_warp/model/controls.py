@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True, eq=False)
 class Controls:
     """Control inputs of one step, constant over it: `integrator.step(state, dt, controls)`.
@@ -61,7 +61,7 @@ def checked(controls: Controls | None, model, call: str = "step") -> dict[str, n
         return {}
     if not isinstance(controls, Controls):
         raise SceneError(
-            f"{call}: controls are {arguments.shown(controls)}; give "
+            f"{call}: controls are {argument_checks.shown(controls)}; give "
             "Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
         )
     return controls.checked(model)
@@ -69,7 +69,7 @@ def checked(controls: Controls | None, model, call: str = "step") -> dict[str, n
 
 def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
     """Return the values of a field as a checked float array with an axis of worlds."""
-    values = arguments.array(f"Controls: {name}", values)
+    values = argument_checks.array(f"Controls: {name}", values)
     if values.shape not in (shape, (worlds, *shape)):
         raise SceneError(
             f"Controls: {name} have shape {values.shape}; they are {shape}, or {(worlds, *shape)} for each of the worlds"

@@ -5,29 +5,29 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments, arrays
+from ddg_warp import argument_checks, device_arrays
+from ddg_warp.capture_lock import launches, one_at_a_time
 from ddg_warp.compile import memory
-from ddg_warp.compile.chains import compile_chains
-from ddg_warp.compile.conditions import scene_motions
+from ddg_warp.compile.boundary_conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
+from ddg_warp.compile.rod_groups import compile_chains
 from ddg_warp.errors import SceneError
-from ddg_warp.io.contacts import Touching
+from ddg_warp.io.contact_records import Touching
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step
-from ddg_warp.model import glue
-from ddg_warp.model.group import Group
-from ddg_warp.model.order import Order
+from ddg_warp.model import rod_shell_coupling
 from ddg_warp.model.parameters import valid_numbers
-from ddg_warp.model.recipe import Recipe
+from ddg_warp.model.rebuild import Recipe
+from ddg_warp.model.rod_group import Group
 from ddg_warp.model.state import GripState, GroupState, State, check_state
+from ddg_warp.model.user_numbering import Order
 from ddg_warp.scene.grip import Grip
-from ddg_warp.threads import launches, one_at_a_time
 
 
-@arguments.sealed
+@argument_checks.sealed
 @launches
 class Model:
     """A built scene; see `Scene.build`.
@@ -69,8 +69,8 @@ class Model:
         self.order = Order(self)
 
     def _build_net(self):
-        from ddg_warp.compile.net.blocks import compile_net
-        from ddg_warp.model.net import DeviceNet
+        from ddg_warp.compile.coupled.builder import compile_net
+        from ddg_warp.model.coupled_model import DeviceNet
 
         supports = [*self.scene.shell_supports, *self.scene.ring_supports]
         turning = [s.motion is not None and s.motion.turns for s in supports]
@@ -152,54 +152,54 @@ class Model:
 
     def report(self) -> str:
         """Return a text: content of the model, cost, and omissions."""
-        from ddg_warp.ask.report import report
+        from ddg_warp.postprocess.model_report import report
 
         return report(self)
 
     @one_at_a_time
     def energies(self, state: State) -> dict[str, float]:
-        """Return energies by term at a state [J]; see `ddg_warp.ask.inquiry`."""
-        from ddg_warp.ask.inquiry import energies
+        """Return energies by term at a state [J]; see `ddg_warp.postprocess.quantities`."""
+        from ddg_warp.postprocess.quantities import energies
 
         check_state("energies", self, state)
         return energies(self, state)
 
     @one_at_a_time
     def reactions(self, state: State, **options) -> list:
-        """Return forces and moments of the supports; see `ddg_warp.ask.inquiry.reactions`."""
-        from ddg_warp.ask.inquiry import reactions
+        """Return forces and moments of the supports; see `ddg_warp.postprocess.quantities.reactions`."""
+        from ddg_warp.postprocess.quantities import reactions
 
         check_state("reactions", self, state)
         return reactions(self, state, **options)
 
     @one_at_a_time
     def drag(self, state: State):
-        """Return forces and power of the drag on rods; see `ddg_warp.ask.inquiry.drag`."""
-        from ddg_warp.ask.inquiry import drag
+        """Return forces and power of the drag on rods; see `ddg_warp.postprocess.quantities.drag`."""
+        from ddg_warp.postprocess.quantities import drag
 
         check_state("drag", self, state)
         return drag(self, state)
 
     @one_at_a_time
     def pushed_apart(self, state: State, gap: float | None = None) -> tuple[State, float]:
-        """Return a state without overlaps and the largest node displacement [m]; see `ask.pushed_apart`."""
-        from ddg_warp.ask.pushed_apart import pushed_apart
+        """Return a state without overlaps and the largest node displacement [m]; see `postprocess.overlap_resolution`."""
+        from ddg_warp.postprocess.overlap_resolution import pushed_apart
 
         check_state("pushed_apart", self, state)
         return pushed_apart(self, state, gap)
 
     @one_at_a_time
     def contacts(self, state: State):
-        """Return the contact pairs of a state, an `io.contacts.Contacts`; see `ask.contacts`."""
-        from ddg_warp.ask.contacts import contacts
+        """Return the contact pairs of a state, an `io.contact_records.Contacts`; see `postprocess.contact_pairs`."""
+        from ddg_warp.postprocess.contact_pairs import contacts
 
         check_state("contacts", self, state)
         return contacts(self, state)
 
     @one_at_a_time
     def stresses(self, state: State) -> dict:
-        """Return conjugate stresses of rods and shells by term; see `ddg_warp.ask.inquiry.stresses`."""
-        from ddg_warp.ask.inquiry import stresses
+        """Return conjugate stresses of rods and shells by term; see `ddg_warp.postprocess.quantities.stresses`."""
+        from ddg_warp.postprocess.quantities import stresses
 
         check_state("stresses", self, state)
         return stresses(self, state)
@@ -324,26 +324,26 @@ class Model:
             ValueError: a shape does not fit, or a value is not finite.
         """
         state = self.empty_state()
-        state.spun = spins is not None and bool(arguments.floats(spins).any())
+        state.spun = spins is not None and bool(argument_checks.floats(spins).any())
         for group, data in zip(self.groups, state.groups, strict=True):
             x = np.concatenate([group.host.x] * self.worlds, axis=1)
             if points is not None:
                 self.order.put_nodes(group, points, x, "points")
-            arrays.assign(data.x, x)
+            device_arrays.assign(data.x, x)
             if velocities is not None:
                 v = np.zeros_like(x)
                 self.order.put_nodes(group, velocities, v, "velocities")
-                arrays.assign(data.v, v)
+                device_arrays.assign(data.v, v)
             if group.kind.twist:
-                arrays.assign(data.frame, np.concatenate([group.host.frame] * self.worlds, axis=-1))
+                device_arrays.assign(data.frame, np.concatenate([group.host.frame] * self.worlds, axis=-1))
                 if spins is not None:
                     omega = np.zeros((group.nodes, group.columns))
                     self.order.put_edges(group, spins, omega)
-                    arrays.assign(data.omega, omega)
+                    device_arrays.assign(data.omega, omega)
                 if angles is not None:
                     theta = np.zeros((group.nodes, group.columns))
                     self.order.put_edges(group, angles, theta, "angles")
-                    arrays.assign(data.theta, theta)
+                    device_arrays.assign(data.theta, theta)
         if self.net is not None:
             state.net = self.net.rest()
             for values, array, label in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
@@ -361,7 +361,9 @@ class Model:
         if points is not None:
             self.carry_frames(state)
         if self.net is not None:
-            glue.follow(self.net, state.net, angles=points is not None, rates=velocities is not None and spins is None)
+            rod_shell_coupling.follow(
+                self.net, state.net, angles=points is not None, rates=velocities is not None and spins is None
+            )
         self.update_strains(state)
         return state
 
@@ -394,7 +396,7 @@ class Model:
                     raise ValueError(
                         f"snapshot is of another model: {name} has shape {values.shape}, not {array.shape}"
                     )
-                arrays.assign(array, values)
+                device_arrays.assign(array, values)
         state.time, state.spun = float(snapshot["time"]), "spun" in snapshot
         return state
 
@@ -405,7 +407,7 @@ class Model:
         nodes = (group.nodes, group.columns)
 
         def make(shape, dtype, needed=True):
-            return arrays.allocate(shape if needed else (1,) * len(shape), dtype, self.wp_device)
+            return device_arrays.allocate(shape if needed else (1,) * len(shape), dtype, self.wp_device)
 
         return GroupState(
             x=make(nodes, vector),
@@ -422,7 +424,7 @@ class Model:
         """Transport reference frames of a state to the current tangents."""
         for group, data in zip(self.groups, state.groups, strict=True):
             if group.kind.twist:
-                new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
+                new = device_arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
                 every = wp.full(group.columns, 1, dtype=int, device=self.wp_device)
                 wp.launch(
                     rod_step.finish_frames_kernel(group.kind, self.types.real),
@@ -449,7 +451,7 @@ class Model:
             element_path.strain_kernel(rod_storage(group.kind, self.types.real), self.types.real),
             (group.elements, group.columns),
             [group.element_inputs(data, data.last), int(stress is not None)],
-            [arrays.columns(out), arrays.columns(out if stress is None else stress)],
+            [device_arrays.columns(out), device_arrays.columns(out if stress is None else stress)],
             device=self.wp_device,
         )
 

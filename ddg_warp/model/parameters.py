@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 
 
 class ParameterTable:
@@ -81,7 +81,7 @@ def valid_numbers(name: str, values, rule: str, holds) -> np.ndarray:
     Raises:
         ValueError: a value is no number, not finite, or breaks the rule.
     """
-    values = np.array(arguments.array(name, values, "give numbers"))
+    values = np.array(argument_checks.array(name, values, "give numbers"))
     invalid = np.flatnonzero(~(np.isfinite(values) & holds(values)))
     if invalid.size:
         raise ValueError(f"{name}: value {invalid[0]} is {values.ravel()[invalid[0]]:g}; it is finite and {rule}")

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.compile import shells
-from ddg_warp.geometry import shell_forms
+from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import DEGENERATE, Surface
 from ddg_warp.model.model import check_model
 
@@ -39,7 +39,7 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
     """
     (u1, u2), (v1, v2) = np.moveaxis(edges_along(points, triangles, direction), 0, -1)
     count = (len(np.asarray(triangles)),)
-    first, second = (arguments.broadcast(name, v, count) for name, v in (("first", first), ("second", second)))
+    first, second = (argument_checks.broadcast(name, v, count) for name, v in (("first", first), ("second", second)))
     return np.stack(
         [first * u * v + second * p * q for u, v, p, q in ((u1, u1, v1, v1), (u1, u2, v1, v2), (u2, u2, v2, v2))], -1
     )
@@ -58,7 +58,7 @@ def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
     a1, a2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(a1, a2)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    direction = arguments.broadcast("direction", direction, a1.shape, own=1)
+    direction = argument_checks.broadcast("direction", direction, a1.shape, own=1)
     along = direction - normal * _dot(direction, normal)[:, None]
     length = np.linalg.norm(along, axis=1)
     for t in np.flatnonzero(~(length > 1e-9 * np.linalg.norm(direction, axis=1)))[:1]:
@@ -74,7 +74,7 @@ def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0
     Arguments as in `principal_form`; `second` is by default `first`. A stretch of 1.1 is a growth by a tenth in length.
     """
     second = first if second is None else second
-    first, second = (arguments.array(name, values) for name, values in (("first", first), ("second", second)))
+    first, second = (argument_checks.array(name, values) for name, values in (("first", first), ("second", second)))
     return principal_form(points, triangles, np.square(first), np.square(second), direction)
 
 
@@ -92,8 +92,8 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
         young1, young2: Young's moduli, in any unit.
     """
     for name, value in (("h1", h1), ("h2", h2), ("young1", young1), ("young2", young2)):
-        arguments.positive(f"bilayer_curvature: {name}", value)
-    arguments.number("bilayer_curvature: mismatch", mismatch)
+        argument_checks.positive(f"bilayer_curvature: {name}", value)
+    argument_checks.number("bilayer_curvature: mismatch", mismatch)
     m, n, h = h1 / h2, young1 / young2, h1 + h2
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
@@ -101,7 +101,7 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
 def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
     """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
     check_model("set_rest", model)
-    if model.net is None or not 0 <= arguments.index("set_rest: shell", shell) < len(model.net.host.shells):
+    if model.net is None or not 0 <= argument_checks.index("set_rest: shell", shell) < len(model.net.host.shells):
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
     net_shell, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
@@ -114,10 +114,10 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         raise ValueError("bending 'isometric' keeps its flat rest shape; use 'midedge_dof' or 'hinge'")
     if points is not None:
         points = _shaped("points", points, surface.points.shape)
-        _refuse_without_area("points", shell_forms.metric(surface, points))
-        changes["abar"] = shell_forms.metric(surface, points)
-        changes["bbar"] = shell_forms.second_form(surface, points, net_shell.kinds)
-        changes["angle"] = shell_forms.edge_angles(surface, points, net_shell.kinds)
+        _refuse_without_area("points", fundamental_forms.metric(surface, points))
+        changes["abar"] = fundamental_forms.metric(surface, points)
+        changes["bbar"] = fundamental_forms.second_form(surface, points, net_shell.kinds)
+        changes["angle"] = fundamental_forms.edge_angles(surface, points, net_shell.kinds)
     if metric is not None:
         changes["abar"] = _shaped("metric", metric, (count, 3))
         _refuse_without_area("metric", changes["abar"])
@@ -144,7 +144,7 @@ def set_rest_strains(model, strains: dict) -> None:
     Args:
         model: a built scene.
         strains: values (elements,) or (worlds, elements) by name, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m].
-            Elements are of all rods, rod by rod, clamped ends included. `ddg_warp.ask.sag_free.rest_strains` computes some.
+            Elements are of all rods, rod by rod, clamped ends included. `ddg_warp.postprocess.sag_free.rest_strains` computes some.
 
     Raises:
         ValueError: no uncoupled rod has such a rest strain, or coupled rods have it too; values do not fit or are not finite.
@@ -155,7 +155,9 @@ def set_rest_strains(model, strains: dict) -> None:
     coupled = {part.term.name for part in model.net.sets} if model.net is not None else set()
     allowed, updates = sorted(name for name in uncoupled if name.partition(".")[0] not in coupled), []
     if not isinstance(strains, Mapping):
-        raise ValueError(f"set_rest_strains: strains are {arguments.shown(strains)}; give values by name, of {allowed}")
+        raise ValueError(
+            f"set_rest_strains: strains are {argument_checks.shown(strains)}; give values by name, of {allowed}"
+        )
     for name, values in strains.items():
         if name not in allowed:
             why = (
@@ -181,10 +183,10 @@ def _refuse_without_area(name: str, metric: np.ndarray) -> None:
 
 
 def _shaped(name: str, values, shape: tuple) -> np.ndarray:
-    values = arguments.array(name, values, f"give finite numbers of shape {shape}")
+    values = argument_checks.array(name, values, f"give finite numbers of shape {shape}")
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{name} has shape {values.shape}; give finite numbers of shape {shape}")
-    arguments.sized(name, values)
+    argument_checks.sized(name, values)
     return values
 
 

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments, arrays
+from ddg_warp import argument_checks
+from ddg_warp import device_arrays as arrays
+from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.threads import launches
 
 EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # set by static solvers
 VELOCITIES = ("v", "omega", "a", "alpha")
@@ -74,7 +75,7 @@ class Sliding:
         return wp.array(q.numpy() - self.increment * self.velocity.numpy(), dtype=q.dtype, device=q.device)
 
 
-@arguments.sealed
+@argument_checks.sealed
 @launches
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
@@ -256,7 +257,7 @@ def check_state(call: str, model, state) -> None:
     """Raise SceneError if an argument is no state of the model."""
     if not isinstance(state, State):
         raise SceneError(
-            f"{call}: the state is {arguments.shown(state)}; give one of this model, such as model.state()"
+            f"{call}: the state is {argument_checks.shown(state)}; give one of this model, such as model.state()"
         )
     if state.model is not model:
         raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ddg_warp.run.catalog import InputError, load_scene, parameters, scene_name
+from ddg_warp.run.scene_registry import InputError, load_scene, parameters, scene_name
 from ddg_warp.run.simulate import Result, simulate
 from ddg_warp.scene.scene import Dynamics
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddg_warp.run.catalog import scene_files
+from ddg_warp.run.scene_registry import scene_files
 
 LEVELS = (1e-2, 1e-3, 1e-4)  # relative errors
 STEM = "overview"

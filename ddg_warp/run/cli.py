@@ -11,7 +11,8 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from ddg_warp.run.catalog import (
+from ddg_warp.run.run_directory import FULL, PICTURES, SUMMARY, RunDirectory, refuse_to_replace, told
+from ddg_warp.run.scene_registry import (
     RUN_SETTINGS,
     InputError,
     add_parameters,
@@ -24,7 +25,6 @@ from ddg_warp.run.catalog import (
     scene_name,
     stored_settings,
 )
-from ddg_warp.run.run_directory import FULL, PICTURES, SUMMARY, RunDirectory, refuse_to_replace, told
 
 DONE, FAILED, MISTAKE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
 PRECISIONS = ("float64", "mixed", "float32")
@@ -75,7 +75,7 @@ def _of_a_place(error: Exception) -> Exception:
 
 def parser(arguments: list[str]) -> Parser:
     """Build the parser; `run SCENE`, `sweep SCENE` and `bench SCENE` add the flags of the scene."""
-    from ddg_warp.learn import command
+    from ddg_warp.data import sweep_command as command
 
     top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
@@ -376,10 +376,10 @@ def check_terms(chosen: argparse.Namespace) -> int:
         raise InputError(f"there is no term '{term}'; there are {', '.join(ALL)}; or give FILE.py:NAME of your own")
 
     require_device(chosen.device)
-    from ddg_warp.run import derivatives
+    from ddg_warp.run import derivative_checks
 
     with refused():
-        rows = derivatives.table(term, chosen.precision, chosen.device)
+        rows = derivative_checks.table(term, chosen.precision, chosen.device)
     print(table([{**row, "passed": "passed" if row["passed"] else "FAILED"} for row in rows]))
     return DONE if all(row["passed"] for row in rows) else FAILED
 
@@ -409,7 +409,7 @@ def bench_scene(chosen: argparse.Namespace) -> int:
 
 def export_run(chosen: argparse.Namespace) -> int:
     """Write trajectory.h5 as USD."""
-    from ddg_warp.run.record import export_usd
+    from ddg_warp.run.recorder import export_usd
 
     source = chosen.directory / "trajectory.h5"
     if not source.is_file():

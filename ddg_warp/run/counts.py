@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ddg_warp.threads import launches
+from ddg_warp.capture_lock import launches
 
 
 @launches

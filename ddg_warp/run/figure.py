@@ -217,7 +217,7 @@ def path_plot(path, file, title: str = "", unit: str = "m") -> None:
     """Draw the load parameter over watched displacements: full lines stable, broken ones unstable, special points marked.
 
     Args:
-        path: A `ddg_warp.scene.path.Path`.
+        path: A `ddg_warp.scene.equilibrium_path.Path`.
         file: The picture to write; its suffix is the format.
         title: A line above.
         unit: Unit of displacements.

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SolverError
 from ddg_warp.io.observed import checked_observed
-from ddg_warp.run.catalog import RUN_SETTINGS, InputError
 from ddg_warp.run.progress import progress_bar
+from ddg_warp.run.scene_registry import RUN_SETTINGS, InputError
 from ddg_warp.scene.descriptions import Dynamics, Statics
 from ddg_warp.scene.scene import Scene
 
@@ -45,7 +45,7 @@ class Result:
         counted_from: Time [s] from which statistics and times count, if the run was resumed from a file without counters.
         failure: Reason of an early end, or "".
         outcome: "converged", or the name of the outcome that ended the run early.
-        path: Followed path of equilibria (`ddg_warp.scene.path.Path`), if that was the analysis.
+        path: Followed path of equilibria (`ddg_warp.scene.equilibrium_path.Path`), if that was the analysis.
         learned: Data that the scene's check learned from the run, for its plot; None without.
     """
 
@@ -136,7 +136,8 @@ def simulate(
         resume: Directory of an earlier run to continue, with its time step, precision, worlds and fields. A finished run is not
             stepped or written: the result is as recorded.
         force: Whether to replace a run in `out`.
-        fields: Fields to record in addition to positions: "velocities", "directors", "contacts" and names of `ddg_warp.ask.fields`.
+        fields: Fields to record in addition to positions: "velocities", "directors", "contacts" and names of
+            `ddg_warp.postprocess.fields`.
         usd: Whether to record scene.usdc, too.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
@@ -258,9 +259,9 @@ def simulate(
 
 def _judge(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
     """Raise an error that names the first invalid argument of `simulate`."""
-    arguments.count("worlds", worlds)
+    argument_checks.count("worlds", worlds)
     for name, value in flags.items():
-        arguments.flag(name, value)
+        argument_checks.flag(name, value)
     for name, value in functions.items():
         if value is not None and not callable(value):
             raise InputError(f"{name} is {value!r}; give a function, or leave it out")
@@ -441,7 +442,7 @@ def continue_from(result: Result, directory: Path, duration: float) -> dict[str,
 
 def open_recorder(model, out, resume, dt, *, provenance, fields, **options):
     """Return the recorder of a run in `out`, or of the run to resume."""
-    from ddg_warp.run.record import Recorder, frame_rate
+    from ddg_warp.run.recorder import Recorder, frame_rate
 
     again = resume is not None
     if again:  # provenance stays, except the duration

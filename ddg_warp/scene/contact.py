@@ -6,12 +6,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law, is_law
-from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.obstacles import Capsule, Mesh, Obstacle, Plane, Sphere
+from ddg_warp.scene.prescribed_motion import Motion
 
 LAWS = ("barrier", "penalty")
 FRICTION_LAWS = ("logistic", "polynomial")
@@ -55,7 +55,7 @@ class Between:
     range: float | None
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Contacts:
     """Contact and obstacles of a scene."""
@@ -117,26 +117,26 @@ class Contacts:
         if self.touching is not None:
             raise SceneError("contact: this scene has contact already; use contact_between for what differs")
         call = "contact: "
-        range = None if range is None else arguments.positive(f"{call}range", range, "m")
-        stiffness = None if stiffness is None else arguments.positive(f"{call}stiffness", stiffness, "N/m")
+        range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
+        stiffness = None if stiffness is None else argument_checks.positive(f"{call}stiffness", stiffness, "N/m")
         if apart is not None:
-            apart = arguments.number(f"{call}apart", apart, "an arc length, zero or more [m]", lambda v: v >= 0.0)
+            apart = argument_checks.number(f"{call}apart", apart, "an arc length, zero or more [m]", lambda v: v >= 0.0)
         if radius is not None and not isinstance(radius, Mapping):
             raise SceneError(
-                f"{call}radius is {arguments.shown(radius)}; give a dictionary from names of objects to radii [m]"
+                f"{call}radius is {argument_checks.shown(radius)}; give a dictionary from names of objects to radii [m]"
             )
         for name, value in (radius or {}).items():
-            arguments.text(f"{call}a name in radius", name)
-            arguments.positive(f"{call}radius of {name!r}", value, "m")
+            argument_checks.text(f"{call}a name in radius", name)
+            argument_checks.positive(f"{call}radius of {name!r}", value, "m")
         self.touching = Contact(
-            law if is_law(law) else arguments.choice(f"{call}law", law, LAWS),
+            law if is_law(law) else argument_checks.choice(f"{call}law", law, LAWS),
             range,
             stiffness,
             _friction(f"{call}friction", friction, ONE),
-            arguments.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
-            arguments.positive(f"{call}velocity", velocity, "m/s"),
-            arguments.count(f"{call}lags", lags),
-            arguments.flag(f"{call}rolling", rolling),
+            argument_checks.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
+            argument_checks.positive(f"{call}velocity", velocity, "m/s"),
+            argument_checks.count(f"{call}lags", lags),
+            argument_checks.flag(f"{call}rolling", rolling),
             apart,
             MappingProxyType(dict(radius or {})),
             None if objects is None else _names(f"{call}objects", objects),
@@ -166,17 +166,17 @@ class Contacts:
             SceneError: an invalid argument; at `build`, three coefficients between other objects than rods and an obstacle.
         """
         for argument, name in (("one", one), ("other", other)):
-            arguments.text(f"contact_between: {argument}", name)
+            argument_checks.text(f"contact_between: {argument}", name)
         call = f"contact_between {one!r} and {other!r}: "
-        stiffness = None if stiffness is None else arguments.positive(f"{call}stiffness", stiffness, "N/m")
-        range = None if range is None else arguments.positive(f"{call}range", range, "m")
+        stiffness = None if stiffness is None else argument_checks.positive(f"{call}stiffness", stiffness, "N/m")
+        range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
         if np.iterable(friction) and not isinstance(friction, str):
-            friction = arguments.vector(f"{call}friction forwards, backwards and across", friction)
+            friction = argument_checks.vector(f"{call}friction forwards, backwards and across", friction)
             for direction, value in zip(WAYS, friction, strict=True):
                 _friction(f"{call}friction {direction}", value)
         elif friction is not None:
             friction = _friction(f"{call}friction", friction)
-        ignore = arguments.flag(f"{call}ignore", ignore)
+        ignore = argument_checks.flag(f"{call}ignore", ignore)
         overrides = [
             name
             for name, value in (("friction", friction), ("stiffness", stiffness), ("range", range))
@@ -208,7 +208,7 @@ class Contacts:
         Raises:
             SceneError: an invalid shape, or a motion that does not fit.
         """
-        arguments.text("add_obstacle: name", name)
+        argument_checks.text("add_obstacle: name", name)
         if not isinstance(shape, Plane | Sphere | Capsule | Mesh):
             raise SceneError(f"add_obstacle '{name}': shape is {shape!r}; give Plane, Sphere, Capsule, Box or Mesh")
         if motion is not None and not isinstance(motion, Motion | Grip):
@@ -294,9 +294,13 @@ def _names(label: str, values) -> tuple[str, ...]:
     """Return names without repetition, from one or several."""
     names = [values] if isinstance(values, str) else list(values) if np.iterable(values) else []
     if not names or not all(isinstance(name, str) for name in names):
-        raise SceneError(f"{label} is {arguments.shown(values)}; give a name or a list of names of rods and shells")
+        raise SceneError(
+            f"{label} is {argument_checks.shown(values)}; give a name or a list of names of rods and shells"
+        )
     return tuple(dict.fromkeys(names))
 
 
 def _friction(label: str, value: float, more: str = "") -> float:
-    return arguments.number(label, value, f"a coefficient, zero or more{more}", lambda v: v >= 0.0 and np.isfinite(v))
+    return argument_checks.number(
+        label, value, f"a coefficient, zero or more{more}", lambda v: v >= 0.0 and np.isfinite(v)
+    )

@@ -5,19 +5,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.surface import Surface
+from ddg_warp.scene.equilibrium_path import Displacement, Stop
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law
 from ddg_warp.scene.material import Material, Stiffness
-from ddg_warp.scene.motion import Motion
-from ddg_warp.scene.path import Displacement, Stop
+from ddg_warp.scene.prescribed_motion import Motion
 
 RUN = 2**16  # nodes
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Dynamics:
     """Time integration with steps dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
@@ -35,16 +35,16 @@ class Dynamics:
     outliers: float = 0.0
 
     def __post_init__(self):
-        arguments.positive("Dynamics: dt", self.dt, "s")
-        arguments.positive("Dynamics: duration", self.duration, "s")
-        arguments.positive("Dynamics: rtol", self.rtol)
-        arguments.part("Dynamics: outliers", self.outliers)
-        arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
+        argument_checks.positive("Dynamics: dt", self.dt, "s")
+        argument_checks.positive("Dynamics: duration", self.duration, "s")
+        argument_checks.positive("Dynamics: rtol", self.rtol)
+        argument_checks.part("Dynamics: outliers", self.outliers)
+        argument_checks.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
         if self.precision is not None:
-            arguments.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))
+            argument_checks.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Statics:
     """Equilibrium by load stepping: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
@@ -52,10 +52,10 @@ class Statics:
     load_steps: int = 1
 
     def __post_init__(self):
-        arguments.count("Statics: load_steps", self.load_steps)
+        argument_checks.count("Statics: load_steps", self.load_steps)
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Trace:
     """Arc-length continuation of equilibria from load parameter 0, through limit points.
@@ -74,12 +74,13 @@ class Trace:
 
     def __post_init__(self):
         for name in ("step", "max_step", "load_scale"):
-            arguments.positive(f"Trace: {name}", getattr(self, name))
+            argument_checks.positive(f"Trace: {name}", getattr(self, name))
         if not isinstance(self.stop, Stop):
             raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
         if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
             raise SceneError(
-                f"Trace: watch is {arguments.shown(self.watch)}; give displacements by name, {{'tip': Displacement.of(row, axis)}}"
+                f"Trace: watch is {argument_checks.shown(self.watch)}; give displacements by name, "
+                "{'tip': Displacement.of(row, axis)}"
             )
 
 

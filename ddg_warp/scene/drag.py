@@ -6,7 +6,7 @@ from math import log, pi
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
 
 # c_t and c_n of `Viscous`
@@ -45,7 +45,7 @@ class Resistance:
         return [self.tangential, self.normal, self.rotational, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True, eq=False)
 class Viscous:
     """Drag of a viscous fluid on a slender rod, neglecting inertia of the fluid, walls and neighbours.
@@ -71,12 +71,12 @@ class Viscous:
     radius: float | np.ndarray | None = None
 
     def __post_init__(self):
-        arguments.positive("Viscous: viscosity", self.viscosity, "Pa s")
+        argument_checks.positive("Viscous: viscosity", self.viscosity, "Pa s")
         if self.radius is not None:
             object.__setattr__(self, "radius", _numbers("Viscous: radius", self.radius, "m", "positive", np.greater))
-        arguments.choice("Viscous: theory", self.theory, tuple(THEORIES))
+        argument_checks.choice("Viscous: theory", self.theory, tuple(THEORIES))
         if self.scale is not None:
-            arguments.positive("Viscous: scale", self.scale, "m")
+            argument_checks.positive("Viscous: scale", self.scale, "m")
         elif self.theory != "cox":
             raise SceneError(f"Viscous: theory {self.theory!r} needs a scale [m], the length of a wave")
 
@@ -110,7 +110,7 @@ class Viscous:
         ]
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Granular:
     """Drag of a granular medium, a function of the direction of velocity only: see `kernels.forces.drag` (Maladen et al. 2009).
@@ -139,9 +139,11 @@ class Granular:
         _not_negative("Granular: lateral", self.lateral, "N/m")
         friction = _not_negative("Granular: friction", self.friction, "N/m")
         rule = f"a number of at least -friction, {-friction:g} N/m"
-        arguments.number("Granular: leading", self.leading, rule, lambda v: v >= -friction)
-        arguments.number("Granular: angle", self.angle, "an angle between 0 and pi / 2", lambda v: 0.0 < v < 0.5 * pi)
-        arguments.positive("Granular: speed", self.speed, "m/s")
+        argument_checks.number("Granular: leading", self.leading, rule, lambda v: v >= -friction)
+        argument_checks.number(
+            "Granular: angle", self.angle, "an angle between 0 and pi / 2", lambda v: 0.0 < v < 0.5 * pi
+        )
+        argument_checks.positive("Granular: speed", self.speed, "m/s")
 
     def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
         """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
@@ -154,7 +156,11 @@ def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
     Raises:
         error: the flow is not finite, or leaves the plane of a planar scene; names the function and the time.
     """
-    flow = arguments.value_at("flow", scene.flow, t, 3, error) if callable(scene.flow) else np.array(scene.flow, float)
+    flow = (
+        argument_checks.value_at("flow", scene.flow, t, 3, error)
+        if callable(scene.flow)
+        else np.array(scene.flow, float)
+    )
     if flow.shape != (3,):
         raise error(f"flow has shape {flow.shape} at t = {t:g}; it is uniform, give (3,)")
     if scene.dimension == 2 and flow[1] != 0.0:
@@ -172,17 +178,17 @@ def check_flow(scene) -> None:
 
 
 def _not_negative(label: str, value, unit: str) -> float:
-    return arguments.number(label, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
+    return argument_checks.number(label, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
 
 
 def _numbers(label: str, values, unit: str, rule: str = "not negative", holds=np.greater_equal) -> float | np.ndarray:
     """Return a number, or numbers along rods (n,) or (rods, n), compared with zero by `holds`; or refuse them, naming `label`."""
-    numbers = arguments.floats(values) if not isinstance(values, bool) else np.array(np.nan)
+    numbers = argument_checks.floats(values) if not isinstance(values, bool) else np.array(np.nan)
     if numbers.ndim > 2 or not numbers.size or not (np.isfinite(numbers).all() and holds(numbers, 0.0).all()):
         raise SceneError(
-            f"{label} is {arguments.shown(values)}; give a number, or numbers along the rod, finite and {rule} [{unit}]"
+            f"{label} is {argument_checks.shown(values)}; give a number, or numbers along the rod, finite and {rule} [{unit}]"
         )
-    arguments.sized(label, numbers)
+    argument_checks.sized(label, numbers)
     return numbers.copy() if numbers.ndim else float(numbers)
 
 

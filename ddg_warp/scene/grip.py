@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True, eq=False)
 class Grip:
     """Kinematic support with a pose given in each step: `integrator.step(state, dt, Controls(poses=...))`; see `Controls`.
@@ -31,7 +31,7 @@ class Grip:
     planar = True
 
     def __post_init__(self):
-        object.__setattr__(self, "pivot", arguments.vector("Grip: pivot", self.pivot))
+        object.__setattr__(self, "pivot", argument_checks.vector("Grip: pivot", self.pivot))
 
     def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
         """Return the row of `Motion.pose` (1, 21) of a grip at rest; the device adds the pose."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 
 
@@ -26,10 +26,10 @@ class Law:
     def __init__(self, density, **values):
         for name, entry in values.items():
             for number in entry if isinstance(entry, list | tuple) else [entry]:
-                array = arguments.array(
+                array = argument_checks.array(
                     f"Law: {name}", number, "give a number, an array, or a list with one for each strain"
                 )
-                arguments.sized(f"Law: {name}", array)
+                argument_checks.sized(f"Law: {name}", array)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "values", deepcopy(values))
 

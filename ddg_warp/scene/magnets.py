@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
 
 
@@ -33,7 +33,9 @@ class MagneticField:
             SolverError: a function is not finite, or no magnetic field; names the function and the time.
         """
         value, gradient = (
-            arguments.value_at(f"the magnetic {label}", source, t, 3, error) if callable(source) else otherwise * source
+            argument_checks.value_at(f"the magnetic {label}", source, t, 3, error)
+            if callable(source)
+            else otherwise * source
             for label, source in (("field", self.value), ("field's gradient", self.gradient))
         )
         self._check(value, gradient, t, error)
@@ -56,7 +58,7 @@ class MagneticField:
             wrong = "have a curl, which no field has away from its currents; the gradient is symmetric"
         if wrong:
             text = f"magnetic_field: value and gradient at t = {t:g} {wrong}"
-            raise error(text, outcome=arguments.PRESCRIBED) if error is SolverError else error(text)
+            raise error(text, outcome=argument_checks.PRESCRIBED) if error is SolverError else error(text)
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Dipoles:
     cutoff: float
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Magnets:
     """Magnetism of a scene."""
@@ -92,15 +94,15 @@ class Magnets:
         Raises:
             SceneError: an edge that does not exist, or a component that the rod has no director for.
         """
-        rods, added = arguments.once("magnetize: rods", self._rods(rods)), []
-        vector = arguments.floats(magnetisation)
+        rods, added = argument_checks.once("magnetize: rods", self._rods(rods)), []
+        vector = argument_checks.floats(magnetisation)
         vector = vector * [0.0, 0.0, 1.0] if vector.ndim == 0 else vector
         for batch in self._batches(rods):
             batch_rods = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
             where = f"magnetize: rod {batch_rods[0]} ('{batch.name}')"
             _, chosen = self._on_rods("magnetize", batch_rods, "edge", slice(None) if edges is None else edges)
-            chosen = arguments.once(f"{where}: edges", np.array(chosen) % batch.edges)
-            each = arguments.broadcast(f"{where}: magnetisation", vector, (len(chosen), 3))
+            chosen = argument_checks.once(f"{where}: edges", np.array(chosen) % batch.edges)
+            each = argument_checks.broadcast(f"{where}: magnetisation", vector, (len(chosen), 3))
             if not batch.twist and self.dimension == 3 and each[:, :2].any():
                 raise SceneError(
                     f"{where} has no twist, and so no directors; give the component along its tangent alone"
@@ -132,11 +134,11 @@ class Magnets:
         """
         if self.applied_field is not None:
             raise SceneError("magnetic_field: the scene has a field; give one that is the sum of both")
-        origin = np.array(arguments.vector("magnetic_field: origin", origin))
-        value = value if callable(value) else np.array(arguments.vector("magnetic_field: value", value))
+        origin = np.array(argument_checks.vector("magnetic_field: origin", origin))
+        value = value if callable(value) else np.array(argument_checks.vector("magnetic_field: value", value))
         if not callable(gradient):
             gradient = np.zeros((3, 3)) if gradient is None else gradient
-            gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3), own=2)
+            gradient = argument_checks.broadcast("magnetic_field: gradient", gradient, (3, 3), own=2)
         applied = MagneticField(value, gradient, origin, self.dimension == 2)
         applied.at(0.0, 1.0, SceneError)
         self.applied_field = applied
@@ -151,6 +153,6 @@ class Magnets:
             rods: magnetised rods; by default all magnetised rods.
             cutoff: [m]; none by default.
         """
-        rods = None if rods is None else arguments.once("add_dipoles: rods", self._rods(rods))
-        cutoff = np.inf if cutoff is None else arguments.positive("add_dipoles: cutoff", cutoff, "m")
+        rods = None if rods is None else argument_checks.once("add_dipoles: rods", self._rods(rods))
+        cutoff = np.inf if cutoff is None else argument_checks.positive("add_dipoles: cutoff", cutoff, "m")
         self.dipoles.append(Dipoles(rods, cutoff))

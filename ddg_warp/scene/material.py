@@ -6,14 +6,14 @@ from math import pi
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.law import Law
 
 DRAWN = 1e-3  # displayed radius of rods without one [m]
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Material:
     """Isotropic linear elastic material with Kelvin-Voigt damping.
@@ -42,7 +42,7 @@ class Material:
         return self.young / (2.0 * (1.0 + self.poisson))
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Stiffness:
     """Stiffness and inertia of a section as numbers.
@@ -82,7 +82,7 @@ def stiffness_of(label: str, section, material: Material | None) -> Stiffness:
     """
     if isinstance(section, type) or not hasattr(section, "stiffness"):
         raise SceneError(
-            f"{label}: section {arguments.shown(section)} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
+            f"{label}: section {argument_checks.shown(section)} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
         )
     if isinstance(section, Stiffness) and material is not None:
         raise SceneError(f"{label}: a Stiffness is given outright, and takes nothing of a material; leave material out")
@@ -100,10 +100,10 @@ def stiffness_of(label: str, section, material: Material | None) -> Stiffness:
 
 def _require(label: str, value, rule: str, holds) -> None:
     """Refuse values that are not finite, or violate a rule."""
-    numbers = arguments.array(label, value, rule)
+    numbers = argument_checks.array(label, value, rule)
     if not (numbers.size and np.isfinite(numbers).all() and np.all(holds(numbers))):
-        raise SceneError(f"{label} = {arguments.shown(value)}; {rule}")
-    arguments.sized(label, numbers)
+        raise SceneError(f"{label} = {argument_checks.shown(value)}; {rule}")
+    argument_checks.sized(label, numbers)
 
 
 def _require_sizes(section, *names: str) -> None:
@@ -134,7 +134,7 @@ def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
     )
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Circle:
     """Solid circular section of `radius` [m]; a number, or an array that broadcasts to (rods, edges)."""
@@ -150,7 +150,7 @@ class Circle:
         return _elastic(material, pi * np.asarray(self.radius) ** 2, i, i, 2.0 * i)
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Ellipse:
     """Solid elliptic section with semi-axes a, b [m] along the first and second director."""
@@ -168,7 +168,7 @@ class Ellipse:
         return _elastic(material, pi * a * b, pi * a**3 * b / 4.0, pi * a * b**3 / 4.0, torsion)
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Rectangle:
     """Solid rectangular section, `width` along the first and `height` along the second director [m]."""
@@ -189,7 +189,7 @@ class Rectangle:
         return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, torsion)
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Ribbon:
     """Thin flat section that deforms with bending and twist like a strip of plate.
@@ -212,7 +212,7 @@ class Ribbon:
         _require_sizes(self, "width", "thickness")
         if not np.all(np.asarray(self.thickness) < np.asarray(self.width)):
             raise SceneError(f"Ribbon: thickness = {self.thickness!r}; it is less than the width, {self.width!r}")
-        arguments.choice("Ribbon: law", self.law, ("audoly_neukirch", "sano_wada", "sadowsky"))
+        argument_checks.choice("Ribbon: law", self.law, ("audoly_neukirch", "sano_wada", "sadowsky"))
 
     def stiffness(self, material: Material) -> Stiffness:
         """Return the stiffness of a strip of plate: I1 = h W^3 / 12, I2 = W h^3 / 12, J = W h^3 / 3."""

@@ -4,15 +4,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
-from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.prescribed_motion import Motion
 
 PLANE, BALL, CAPSULE, MESH = "plane", "ball", "capsule", "mesh"
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Plane:
     """Half-space behind the plane through `point` with outward `normal`."""
@@ -24,15 +24,15 @@ class Plane:
     kind, radius, cells = PLANE, 0.0, np.array([[0, 1, 2]])
 
     def __post_init__(self):
-        point = np.array(arguments.vector("Plane: point", self.point))
-        normal = arguments.direction("Plane: normal", self.normal)
+        point = np.array(argument_checks.vector("Plane: point", self.point))
+        normal = argument_checks.direction("Plane: normal", self.normal)
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         # three points, for rigid motions
         object.__setattr__(self, "points", np.stack([point, point + first, point + np.cross(normal, first)]))
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Sphere:
     """Ball of a `radius` [m] about `center` [m]."""
@@ -43,8 +43,8 @@ class Sphere:
     kind, cells = BALL, np.array([[0]])
 
     def __post_init__(self):
-        arguments.vector("Sphere: center", self.center)
-        arguments.positive("Sphere: radius", self.radius, "m")
+        argument_checks.vector("Sphere: center", self.center)
+        argument_checks.positive("Sphere: radius", self.radius, "m")
 
     @property
     def points(self) -> np.ndarray:
@@ -52,7 +52,7 @@ class Sphere:
         return np.array([self.center], float)
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Capsule:
     """Points within a `radius` [m] of the segment from `start` to `end` [m]."""
@@ -65,8 +65,8 @@ class Capsule:
 
     def __post_init__(self):
         for name in ("start", "end"):
-            arguments.vector(f"Capsule: {name}", getattr(self, name))
-        arguments.positive("Capsule: radius", self.radius, "m")
+            argument_checks.vector(f"Capsule: {name}", getattr(self, name))
+        argument_checks.positive("Capsule: radius", self.radius, "m")
         if np.array_equal(self.start, self.end):
             raise SceneError("Capsule: start and end are one point; use Sphere(center, radius)")
 
@@ -76,7 +76,7 @@ class Capsule:
         return np.array([self.start, self.end], float)
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class Mesh:
     """Triangle mesh with contact on both sides, open or closed.
@@ -93,16 +93,16 @@ class Mesh:
     kind = MESH
 
     def __post_init__(self):
-        points = arguments.array("Mesh: points", self.points, "give (points, 3) [m]").copy()
-        cells = arguments.triangles("Mesh: triangles", self.cells)
+        points = argument_checks.array("Mesh: points", self.points, "give (points, 3) [m]").copy()
+        cells = argument_checks.triangles("Mesh: triangles", self.cells)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise SceneError(f"Mesh: points have shape {points.shape}; they are finite, (points, 3) [m]")
-        arguments.sized("Mesh: points", points, "vertex")
+        argument_checks.sized("Mesh: points", points, "vertex")
         for triangle in np.flatnonzero(((cells < 0) | (cells >= len(points))).any(1))[:1]:
             raise SceneError(
                 f"Mesh: triangle {triangle} has corners {cells[triangle]}; vertices are 0 to {len(points) - 1}"
             )
-        arguments.number("Mesh: radius", self.radius, "a length, zero or more [m]", lambda v: v >= 0.0)
+        argument_checks.number("Mesh: radius", self.radius, "a length, zero or more [m]", lambda v: v >= 0.0)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "cells", cells)
 
@@ -113,12 +113,12 @@ SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2,
 
 def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
     """Return a box about `center` [m] with half lengths `half` (3,) [m], a `rotation` (3, 3), rounded by `radius` [m]."""
-    center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
+    center, half = (np.array(argument_checks.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():
         raise SceneError(f"Box: half = {half}; half lengths are positive [m]")
-    turn = np.eye(3) if rotation is None else arguments.broadcast("Box: rotation", rotation, (3, 3), own=2)
+    turn = np.eye(3) if rotation is None else argument_checks.broadcast("Box: rotation", rotation, (3, 3), own=2)
     if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0.0):
-        raise SceneError(f"Box: rotation = {arguments.shown(rotation)} is no rotation matrix (3, 3)")
+        raise SceneError(f"Box: rotation = {argument_checks.shown(rotation)} is no rotation matrix (3, 3)")
     cells = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
     return Mesh(center + (CORNERS * half) @ turn.T, cells, radius)
 

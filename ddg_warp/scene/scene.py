@@ -8,18 +8,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Load, RodBatch, Statics, Support, Trace
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Stiffness, stiffness_of
-from ddg_warp.scene.motion import Motion
-from ddg_warp.scene.structures import Structures
+from ddg_warp.scene.prescribed_motion import Motion
+from ddg_warp.scene.shells_and_joints import Structures
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(kw_only=True, repr=False, eq=False)
 class Scene(Structures):
     """Description of rods and shells with supports and loads, from which `build` compiles a model.
@@ -61,7 +61,7 @@ class Scene(Structures):
 
     def _need_attribute(self, name: str) -> None:
         if name not in self.__dataclass_fields__:
-            raise SceneError(f"Scene has no attribute {name!r}{arguments.meant(name, self.__dataclass_fields__)}")
+            raise SceneError(f"Scene has no attribute {name!r}{argument_checks.meant(name, self.__dataclass_fields__)}")
 
     def __repr__(self) -> str:
         joined = f", {len(self.joints)} joints, {len(self.attachments)} attachments" if self.joints else ""
@@ -103,7 +103,7 @@ class Scene(Structures):
     ) -> int:
         """Add one rod with points (n, 3) and return its index; arguments as in `add_rods`, a director (3,) or (edges, 3)."""
         if director is not None:
-            director = arguments.array(f"rods '{name}': director", director, "give (3,) or (edges, 3)")
+            director = argument_checks.array(f"rods '{name}': director", director, "give (3,) or (edges, 3)")
             director = director[None] if director.ndim == 2 and len(director) > 1 else director
         options = {"closed": closed, "natural": natural, "twist": twist, "bend": bend, "name": name}
         options |= {"laws": laws, "curvature": curvature}
@@ -152,20 +152,22 @@ class Scene(Structures):
         Raises:
             SceneError: no valid rod; the message names rod and node.
         """
-        arguments.text("add_rods: name", name)
-        points = arguments.array(f"rods '{name}': points", points, "give (rods, nodes, 3)").copy()
+        argument_checks.text("add_rods: name", name)
+        points = argument_checks.array(f"rods '{name}': points", points, "give (rods, nodes, 3)").copy()
         if director is not None:
-            director = arguments.array(f"rods '{name}': director", director, "give (3,), (rods, 3) or (rods, edges, 3)")
+            director = argument_checks.array(
+                f"rods '{name}': director", director, "give (3,), (rods, 3) or (rods, edges, 3)"
+            )
             director = director.copy()
         if points.ndim == 2:
             points = points[None]
         if points.ndim != 3 or points.shape[2] != 3:
             raise SceneError(f"rods '{name}': points have shape {points.shape}; give (rods, nodes, 3)")
-        arguments.sized(f"rods '{name}': points", points, "rod", "node")
+        argument_checks.sized(f"rods '{name}': points", points, "rod", "node")
         flags = {"closed": closed, "twist": twist, "bend": bend}
-        closed, twist, bend = (arguments.flag(f"rods '{name}': {flag}", value) for flag, value in flags.items())
+        closed, twist, bend = (argument_checks.flag(f"rods '{name}': {flag}", value) for flag, value in flags.items())
         stiffness = stiffness_of(f"rods '{name}'", section, material)
-        if arguments.choice(f"rods '{name}': curvature", curvature, ("tangent", "angle")) == "angle" and not bend:
+        if argument_checks.choice(f"rods '{name}': curvature", curvature, ("tangent", "angle")) == "angle" and not bend:
             raise SceneError(f"rods '{name}': curvature is 'angle' and bend is False; without bending leave it out")
         if bend and not closed and points.shape[1] == 2:
             warnings.warn(
@@ -228,7 +230,7 @@ class Scene(Structures):
         Raises:
             SceneError: an invalid end, tangent or director; the message names it.
         """
-        arguments.choice("clamp_end: end", end, ("first", "last"))
+        argument_checks.choice("clamp_end: end", end, ("first", "last"))
         rods = self._rods(rods)
         tangent = None if tangent is None else validate.directions("clamp_end: tangent", tangent, rods)
         director = None if director is None else validate.directions("clamp_end: director", director, rods)
@@ -261,14 +263,14 @@ class Scene(Structures):
 
     def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Add a dead force [N] on a node, times amplitude(t). In statics it grows with the load parameter if amplitude is None."""
-        force = arguments.vector(f"add_force: force on node {node}", force)
+        force = argument_checks.vector(f"add_force: force on node {node}", force)
         self._in_plane("add_force: force", force, (1,))
         self._load("add_force", rods, "node", node, amplitude, force=force)
 
     def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> None:
         """Add a moment [N m] about the tangent of an edge, conjugate to the twist angle."""
         self._need_twist("add_twisting_moment", self._rods(rods))
-        moment = arguments.number(f"add_twisting_moment: moment on edge {edge}", moment)
+        moment = argument_checks.number(f"add_twisting_moment: moment on edge {edge}", moment)
         self._load("add_twisting_moment", rods, "edge", edge, amplitude, moment=moment)
 
     def add_couple(self, rods, edge: int, couple, amplitude=None) -> None:
@@ -277,15 +279,15 @@ class Scene(Structures):
         Out of plane it has no potential (Ziegler, Principles of Structural Stability, 1968). Statics treats it exactly; in
         dynamics its forces are time-lagged, evaluated on the predicted edge.
         """
-        couple = arguments.vector(f"add_couple: couple on edge {edge}", couple)
+        couple = argument_checks.vector(f"add_couple: couple on edge {edge}", couple)
         self._in_plane("add_couple: couple", couple, (0, 2))
         self._load("add_couple", rods, "edge", edge, amplitude, couple=couple)
 
     def add_mass(self, rods, node: int, mass: float) -> None:
         """Add a point mass [kg] on a node."""
-        rods = arguments.once("add_mass: rods", self._rods(rods))
-        rods, (node,) = self._on_rods("add_mass", rods, "node", arguments.index("add_mass: node", node))
-        mass = arguments.positive(f"add_mass: mass at node {node}", mass, "kg")
+        rods = argument_checks.once("add_mass: rods", self._rods(rods))
+        rods, (node,) = self._on_rods("add_mass", rods, "node", argument_checks.index("add_mass: node", node))
+        mass = argument_checks.positive(f"add_mass: mass at node {node}", mass, "kg")
         self.masses.append((rods, node, mass))
 
     def drag(self, rods=None, law=None, *, tangential=None, normal=None, rotational=0.0, nodes=None) -> None:
@@ -313,7 +315,7 @@ class Scene(Structures):
                 if shells:
                     raise SceneError(f"drag: {kind} 0 ('{shells[0].name}') can feel none; name the rods that do")
             rods = range(self.rod_count)
-        rods = arguments.once("drag: rods", self._rods(rods))
+        rods = argument_checks.once("drag: rods", self._rods(rods))
         self.drags.append(drag.rod_drag(self.batches, rods, law, tangential, normal, rotational, nodes))
 
     def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):
@@ -332,8 +334,8 @@ class Scene(Structures):
         from ddg_warp.model.validate import refuse_underflow
 
         validate.check_scene(self)
-        worlds = arguments.count("worlds", worlds)
-        allow_rounding = arguments.flag("build: allow_rounding", allow_rounding)
+        worlds = argument_checks.count("worlds", worlds)
+        allow_rounding = argument_checks.flag("build: allow_rounding", allow_rounding)
         options = {"device": device, "precision": precision, "worlds": worlds, "allow_rounding": allow_rounding}
         model = Model(self.copy(), **options)
         refuse_underflow(model)
@@ -351,7 +353,7 @@ class Scene(Structures):
         return result
 
     def _rods(self, rods) -> np.ndarray:
-        index = arguments.indices("rods", rods, self.rod_count)
+        index = argument_checks.indices("rods", rods, self.rod_count)
         missing = index[(index < 0) | (index >= self.rod_count)]
         if missing.size:
             raise SceneError(f"rod {missing[0]} does not exist; the scene has {self.rod_count} rods so far")
@@ -362,7 +364,9 @@ class Scene(Structures):
         rods = self._rods(rods)
         batches = self._batches(rods)
         sizes = np.array([getattr(batch, kind + "s") for batch in batches])
-        chosen = arguments.indices(f"{call}: {kind}s", chosen, int(sizes[0]) if (sizes == sizes[0]).all() else None)
+        chosen = argument_checks.indices(
+            f"{call}: {kind}s", chosen, int(sizes[0]) if (sizes == sizes[0]).all() else None
+        )
         starts = [batch.first for batch in batches]
         size = sizes[np.searchsorted(starts, rods, side="right") - 1]
         for item in chosen[(chosen >= sizes.min()) | (chosen < -sizes.min())][:1].tolist():
@@ -370,7 +374,7 @@ class Scene(Structures):
         return rods, tuple(chosen.tolist())
 
     def _support(self, call: str, rods: np.ndarray, *, motion, components: str = "xyz", **dofs) -> None:
-        arguments.components(call, components)
+        argument_checks.components(call, components)
         validate.check_motion(call, motion, planar=self.dimension == 2)
         if motion is not None and motion.count is not None:
             if call != "fix":
@@ -382,9 +386,9 @@ class Scene(Structures):
         self.supports.append(Support(rods, components=components, motion=motion, call=call, **dofs))
 
     def _load(self, call: str, rods, kind: str, item, amplitude, **load) -> None:
-        rods = arguments.once(f"{call}: rods", self._rods(rods))
-        rods, (item,) = self._on_rods(call, rods, kind, arguments.index(f"{call}: {kind}", item))
-        self.loads.append(Load(rods, amplitude=arguments.amplitude(call, amplitude), **{kind: item}, **load))
+        rods = argument_checks.once(f"{call}: rods", self._rods(rods))
+        rods, (item,) = self._on_rods(call, rods, kind, argument_checks.index(f"{call}: {kind}", item))
+        self.loads.append(Load(rods, amplitude=argument_checks.amplitude(call, amplitude), **{kind: item}, **load))
 
     def _need_twist(self, call: str, rods: np.ndarray) -> None:
         for batch in self._batches(rods):

@@ -5,14 +5,14 @@ import warnings
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import polyline
 from ddg_warp.scene import drag
 from ddg_warp.scene.contact import check_contact
 from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
 from ddg_warp.scene.grip import Grip
-from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.prescribed_motion import Motion
 
 DOUBLED = 1e-10  # edge length over the longest of the rod below which both nodes coincide
 STARTS = 1e-9  # displacement over the size of the scene, or angle [rad], up to which a motion starts at zero
@@ -24,14 +24,14 @@ def check_settings(scene) -> None:
     Raises:
         SceneError: the first error.
     """
-    arguments.vector("gravity", scene.gravity)
+    argument_checks.vector("gravity", scene.gravity)
     if not (isinstance(scene.dimension, numbers.Integral) and scene.dimension in (2, 3)):
-        raise SceneError(f"dimension = {arguments.shown(scene.dimension)}; a scene is of dimension 2 or 3")
-    arguments.number(
+        raise SceneError(f"dimension = {argument_checks.shown(scene.dimension)}; a scene is of dimension 2 or 3")
+    argument_checks.number(
         "mass_damping", scene.mass_damping, "one number, finite and not negative [1/s]", lambda v: v >= 0.0
     )
     if not callable(scene.flow):
-        arguments.vector("flow", scene.flow)
+        argument_checks.vector("flow", scene.flow)
     if not isinstance(scene.analysis, Dynamics | Statics | Trace):
         raise SceneError(f"analysis is {scene.analysis!r}; give Dynamics(...), Statics(...) or Trace(...)")
     if scene.initial is not None and not callable(scene.initial):
@@ -112,9 +112,9 @@ def check_motion(call: str, motion, planar: bool) -> None:
 
 def directions(label: str, value, rods: np.ndarray) -> np.ndarray:
     """Return unit vectors (rods, 3) from a direction (3,), or one a rod."""
-    result = arguments.array(label, value, f"give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
+    result = argument_checks.array(label, value, f"give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
     if result.shape not in ((3,), (1, 3), (len(rods), 3)):
-        shown = arguments.shown(value)
+        shown = argument_checks.shown(value)
         raise SceneError(f"{label} is {shown}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods")
     result = np.broadcast_to(result, (len(rods), 3))
     faulty = np.flatnonzero(~(np.isfinite(result).all(1) & result.any(1)))
@@ -122,7 +122,7 @@ def directions(label: str, value, rods: np.ndarray) -> np.ndarray:
         raise SceneError(
             f"{label} of rod {rods[faulty[0]]} is {result[faulty[0]]}; give a finite vector that is not zero"
         )
-    return arguments.unit(result)
+    return argument_checks.unit(result)
 
 
 def check_batch(batch, dimension: int) -> None:
@@ -144,16 +144,16 @@ def check_batch(batch, dimension: int) -> None:
         if parameter == "radius" and section.radius is None:
             continue
         try:
-            value = arguments.array(parameter, getattr(section, parameter))
+            value = argument_checks.array(parameter, getattr(section, parameter))
             np.broadcast_to(value, (batch.rods, batch.edges))
         except ValueError:
             raise SceneError(
-                f"rod {batch.first} {name}: {parameter} = {arguments.shown(getattr(section, parameter))}; give a "
+                f"rod {batch.first} {name}: {parameter} = {argument_checks.shown(getattr(section, parameter))}; give a "
                 f"number, or numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
             ) from None
         if not np.all(np.isfinite(value)) or np.any(value < 0.0):
             raise SceneError(f"rod {batch.first} {name}: {parameter} = {value}; it must be finite and not negative")
-        arguments.sized(f"rod {batch.first} {name}: {parameter}", value)
+        argument_checks.sized(f"rod {batch.first} {name}: {parameter}", value)
     needed = ["EA"] + (["EI1", "EI2"] if batch.bend else []) + (["GJ"] if batch.twist else [])
     for parameter in needed:
         if np.any(np.asarray(getattr(section, parameter)) == 0.0):
@@ -197,20 +197,20 @@ def _check_natural(batch, dimension: int) -> None:
     where = f"rod {batch.first} ('{batch.name}')"
     several = isinstance(natural, list | tuple) or getattr(natural, "ndim", 0)
     if not several or len(natural) != count:
-        shown = arguments.shown(natural)
+        shown = argument_checks.shown(natural)
         raise SceneError(f"{where}: natural is {shown}; give 'shape', 'straight' or {count} arrays [1/m]")
     for value in natural:
         try:
-            value = np.broadcast_to(arguments.array(f"{where}: natural", value), (batch.rods, vertices))
+            value = np.broadcast_to(argument_checks.array(f"{where}: natural", value), (batch.rods, vertices))
         except ValueError:
             raise SceneError(
-                f"{where}: natural holds {arguments.shown(value)}; give numbers that broadcast to the {batch.rods} rods "
+                f"{where}: natural holds {argument_checks.shown(value)}; give numbers that broadcast to the {batch.rods} rods "
                 f"and {vertices} vertices"
             ) from None
         _refuse(
             ~np.isfinite(value), batch, "natural curvature or twist is not finite at vertex {k}; give finite numbers"
         )
-        arguments.sized(f"{where}: natural", value)
+        argument_checks.sized(f"{where}: natural", value)
 
 
 def _check_director(batch, dimension: int) -> None:

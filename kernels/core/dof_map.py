@@ -1,4 +1,4 @@
-"""Dof map of `ddg_warp.compile.storage` for kernels of both rod groups and the coupled system.
+"""Dof map of `ddg_warp.compile.dof_map` for kernels of both rod groups and the coupled system.
 
 Arrays of nodes and of twist angles run [node][column]; the coupled system has one column per world. A dof index of a world with
 `columns` counts all columns of the first node or angle, then of the second, and so on.

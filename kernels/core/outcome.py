@@ -18,7 +18,7 @@ CROSSED = 10  # Primitives would have crossed.
 NO_ROOM = 11  # Minimum gap reached: the forces of the barrier, which grow without bound, have lost their digits.
 TURNED_TOO_FAR = 12  # Supports or obstacles would rotate farther in a step than substeps resolve.
 INVALID_INPUT = 13  # A parameter or control of a step, given as a tensor, is not finite or not allowed.
-NO_GRADIENT = 14  # A converged step through which no gradient goes; see `ddg_warp.learn.engine`.
+NO_GRADIENT = 14  # A converged step through which no gradient goes; see `ddg_warp.torch.engine`.
 
 NAMES = {
     CONVERGED: "converged",

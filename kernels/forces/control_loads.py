@@ -14,7 +14,7 @@ from ddg_warp.kernels.core.launch import CPU_OPTIONS
 def load_kernel(real):
     """Build the kernel of loads.
 
-    `add`: write loads at all dof indices of every world, and their sizes as in `ddg_warp.compile.tolerance`.
+    `add`: write loads at all dof indices of every world, and their sizes as in `ddg_warp.compile.residual_tolerance`.
     """
     V = wp.types.vector(3, real)
 

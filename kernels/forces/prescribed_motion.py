@@ -1,4 +1,4 @@
-"""Prescribed motion of supports over a time step on the device, as in `ddg_warp.scene.motion.Motion.pose`.
+"""Prescribed motion of supports over a time step on the device, as in `ddg_warp.scene.prescribed_motion.Motion.pose`.
 
 A pose is a row of an array: rotation vector of the step (3), rotation at its start (9), pivot (3), translations at start and end (3
     each). The fraction of the step is s. The rotation has a constant rate, so that substeps follow arcs, not chords. For grips,

@@ -46,7 +46,7 @@ class Measure:
         advance: None, or real -> advance(q, s): lagged data behind the frames at the end of a step, from the dofs and frames there
             and the old data.
         stale: None, or real -> stale(q, s): True if frames have to be updated before the next step of a solve.
-        sample: None, or (random, count) -> non-default data of sample elements for `ddg_warp.run.derivatives`, by name. `nodes
+        sample: None, or (random, count) -> non-default data of sample elements for `ddg_warp.run.derivative_checks`, by name. `nodes
             (nodes, 3)`: centres of the nodes. `data (data_size, count)`. `frame (6, frames * count)`: the first frames of all
             elements first. `lag (rows, count)`: behind the frames. `felt (slots, count)`: local nodes that the strains depend on.
             Default nodes are unit steps along x, z and y in alternation, data between 0.5 and 1.5, frames 25 degrees old, the lag

@@ -43,7 +43,7 @@ def given_type(real, drag: bool):
     """Return the struct of inputs of the residual but for elements.
 
     `push`, `pressed`: contact forces of blocks, and bounds of the contact stiffness.
-    `allowed`: residual tolerance of a block at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`.
+    `allowed`: residual tolerance of a block at rtol = 1, over `load_scale`; see `ddg_warp.compile.residual_tolerance`.
     `arm`: length [m] by which moments are compared with forces.
     `settled` [m]: a node that an update moves by more is not moved by rounding alone; see `kernels.newton.line_search`.
     `longest` [m]: longest edge, which bounds coordinates of both ends and so the rounding of an edge vector.

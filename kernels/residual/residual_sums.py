@@ -1,4 +1,4 @@
-"""Subset residual test: sums of residuals over hierarchical clusters, and limits; see `ddg_warp.compile.tolerance`."""
+"""Subset residual test: sums of residuals over hierarchical clusters, and limits; see `ddg_warp.compile.residual_tolerance`."""
 
 from functools import cache
 

@@ -6,7 +6,7 @@ iterate, by node, and tests convergence, so that the last iterate costs no sweep
     |residual| <= max(rtol * load scale, floor) ,   floor = floor_factor * eps * (H_ii |x| + sum of |element forces|) ,
 
 where the floor bounds the rounding of coordinates and forces. Moments are compared over the length of the rod. Sums of residuals
-have to be small, too; see `compile.tolerance`. After a full Newton step they are, of second order. At the start, or after a
+have to be small, too; see `compile.residual_tolerance`. After a full Newton step they are, of second order. At the start, or after a
 shortened step, the limit is divided by the number of nodes instead.
 """
 

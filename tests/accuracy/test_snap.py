@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from convergence import order
 
-from ddg_warp.scene.path import Stop
+from ddg_warp.scene.equilibrium_path import Stop
 from ddg_warp.scenes import deep_arch, lee_frame, right_angle_frame
 from ddg_warp.solve.equilibrium.continuation import Continuation
 

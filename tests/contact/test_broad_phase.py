@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.solve.collision import bvh
 from ddg_warp.solve.collision.broad_phase import BroadPhase
@@ -187,7 +187,7 @@ def test_captured_update_searches_only_where_needed(device):
     shapes, points = scene(6, 0.5, rods=20, triangles=60)
     x = upload(points, device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    arrays.load_kernels(search.kernels, device)
+    device_arrays.load_kernels(search.kernels, device)
     with wp.ScopedCapture(device=device) as capture:
         search.update(x)
     rng, position = np.random.default_rng(7), points.copy()
@@ -214,7 +214,7 @@ def test_captured_motion_equals_uncaptured(device):
     rng = np.random.default_rng(14)
     x, move = upload(points, device), upload(0.02 * rng.normal(size=points.shape), device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    arrays.load_kernels(search.kernels, device)
+    device_arrays.load_kernels(search.kernels, device)
 
     def step():
         search.rebuild(x)

@@ -12,7 +12,7 @@ from ddg_warp.kernels.collision.contact.closest_points import (
     tangents_function,
 )
 from ddg_warp.kernels.terms import CONTACT
-from ddg_warp.run.contact_samples import ContactSample
+from ddg_warp.run.derivative_samples_contact import ContactSample
 
 COUNT = 1000
 RIGHT = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -18,7 +18,7 @@ from pair_cases import (
     upload,
 )
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.densities.contact import smooth_penalty
 from ddg_warp.solve.collision.broad_phase import BroadPhase
@@ -114,7 +114,7 @@ def test_captured_steps_equal_uncaptured(device, conditional):
         result.search.update(start)
         result.lag(start)
 
-    arrays.load_kernels([*result.search.kernels, *result.kernels], device)
+    device_arrays.load_kernels([*result.search.kernels, *result.kernels], device)
     with wp.ScopedCapture(device=device) as capture:
         if conditional:
             wp.capture_if(wanted, lag)

@@ -6,7 +6,7 @@ import warp as wp
 from brute_force import candidate_pairs, scene, upload
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.solve.collision import bvh, candidate_list
 from ddg_warp.solve.collision.broad_phase import BroadPhase
 
@@ -18,7 +18,7 @@ def many(monkeypatch):
     """Return a switch to one thread per item, with several blocks of overlapping boxes."""
 
     def switch():
-        monkeypatch.setattr(arrays, "serial", lambda device: False)
+        monkeypatch.setattr(device_arrays, "serial", lambda device: False)
         monkeypatch.setattr(candidate_list, "LEAST", 16)
 
     return switch

@@ -7,7 +7,7 @@ from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 from motion_cases import MARGIN, REACH, Motion, ccd_bodies, tangle
 from test_impact import gaps, random_pairs
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.additive_ccd import NEAR, REST
 from ddg_warp.kernels.collision.ccd.step_fractions import ROUNDS
@@ -210,7 +210,7 @@ def test_captured_filter_equals_uncaptured(device):
         motion.search.search(motion.base)
         step = motion.launch
         if captured:
-            arrays.load_kernels(motion.search.kernels, device)
+            device_arrays.load_kernels(motion.search.kernels, device)
             with wp.ScopedCapture(device=device) as capture:
                 motion.launch()
             step = lambda: wp.capture_launch(capture.graph)  # noqa: E731

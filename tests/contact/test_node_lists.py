@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from pair_cases import hessian_product, move, state, terms
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.collision.contact.incidence import list_kernels
 from ddg_warp.kernels.collision.primitives import EDGES, POINT_TRIANGLE, Kind
@@ -54,7 +54,7 @@ def test_thread_mappings_agree_for_a_node_in_thousands_of_pairs(device, monkeypa
         ]
 
     one = run()
-    monkeypatch.setattr(arrays, "serial", lambda device: False)
+    monkeypatch.setattr(device_arrays, "serial", lambda device: False)
     many = run()
     for first, second in zip(one, many, strict=True):
         assert np.abs(first).max() > 0.0

@@ -20,7 +20,7 @@ from pair_cases import (
     upload,
 )
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.densities.contact import smooth_penalty
 from ddg_warp.solve.collision.broad_phase import BroadPhase
@@ -195,7 +195,7 @@ def test_captured_evaluation_follows_motion(device):
     result, positions = terms(shapes, x, device)
     v = np.random.default_rng(5).normal(size=x.shape)
     direction, out = upload(v, device), upload(0.0 * v, device)
-    arrays.load_kernels([*result.search.kernels, *result.kernels], device)
+    device_arrays.load_kernels([*result.search.kernels, *result.kernels], device)
     with wp.ScopedCapture(device=device) as capture:
         result.search.update(positions)
         result.evaluate(positions)

@@ -11,7 +11,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.path import Displacement, Stop
+from ddg_warp.scene.equilibrium_path import Displacement, Stop
 from ddg_warp.solve.equilibrium.continuation import Continuation
 
 LENGTH = 1.1  # m, of the bars of the truss

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.ask.pushed_apart import BEYOND, PART
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.postprocess.overlap_resolution import BEYOND, PART
 
 RADIUS, RANGE = 2e-3, 1e-3
 MATERIAL = ddg.Material(young=1e6, density=1000.0, poisson=0.5)

@@ -11,8 +11,8 @@ from bad_inputs import DEVICE, INF, NAN, clamped, each, model, refuse
 import ddg_warp as ddg
 from ddg_warp.io import read
 from ddg_warp.io.mesh_read import read_mesh
-from ddg_warp.run.catalog import InputError
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import InputError
 from ddg_warp.run.simulate import simulate
 
 

@@ -20,9 +20,9 @@ from bad_inputs import (
 )
 
 import ddg_warp as ddg
-from ddg_warp.ask import fields, inquiry, sag_free
 from ddg_warp.geometry import meshes
 from ddg_warp.model import rest_shapes
+from ddg_warp.postprocess import fields, quantities, sag_free
 from ddg_warp.solve.equilibrium import continuation, stability, statics
 from ddg_warp.solve.stepping.adaptive_step import StepControl
 
@@ -51,7 +51,7 @@ each("kinds: numbers", "EA", NUMBERS, lambda v: built(rods(section=ddg.Stiffness
 each("kinds: numbers", "mass", NUMBERS, lambda v: clamped().add_mass(0, -1, v), "mass")
 each("kinds: numbers", "pressure", NUMBERS, lambda v: sheet().add_pressure(0, v), "add_pressure: pressure")
 each("kinds: numbers", "load of a spectrum", NUMBERS, lambda v: stability.spectrum(model(), model().state(), load=v), "spectrum: load")
-each("kinds: numbers", "factor of reactions", NUMBERS, lambda v: inquiry.reactions(model(), model().state(), factor=v), "factor")
+each("kinds: numbers", "factor of reactions", NUMBERS, lambda v: quantities.reactions(model(), model().state(), factor=v), "factor")
 each("kinds: numbers", "values under control", NUMBERS,
      lambda v: continuation.Continuation(model(), {"tip": ddg.Displacement.of(6, "z")}).control("tip", v), "control: values")
 refuse("kinds: numbers", {
@@ -69,7 +69,7 @@ for kind, words, action in (
     ("points of a mesh", "Mesh: points", lambda v: ddg.Mesh(v, [[0, 1, 2]])),
     ("points of a state", "points", lambda v: model().state(points=v)),
     ("spins of a state", "spins", lambda v: model().state(spins=v)),
-    ("points of a writhe", "writhe: points", inquiry.writhe),
+    ("points of a writhe", "writhe: points", quantities.writhe),
     ("force", "add_force: force", lambda v: clamped().add_force(0, -1, [v, v, v])),
     ("natural", "natural", lambda v: built(rods(natural=[v, 0.0, 0.0]))),
     ("rest of a meridian", "rest", lambda v: built(dome(rest=(v, v)), lambda s: s.hold_ring(0, 5))),
@@ -148,7 +148,10 @@ refuse("kinds: flags", {
 })
 
 # --- models and states ---
-QUESTIONS = (inquiry.energies, inquiry.reactions, inquiry.drag, inquiry.stresses, inquiry.triangle_fields, inquiry.total_twist)
+QUESTIONS = tuple(
+    getattr(quantities, name)
+    for name in ("energies", "reactions", "drag", "stresses", "triangle_fields", "total_twist")
+)
 for question in (*QUESTIONS, sag_free.rest_strains, sag_free.least_stiffness):
     refuse("kinds: models", {
         f"{question.__name__} of a scene": (lambda q=question: q(clamped(), model().state()), question.__name__, "scene.build()"),

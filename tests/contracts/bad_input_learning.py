@@ -14,14 +14,14 @@ import numpy as np
 from bad_inputs import DEVICE, INF, NAN, STIFFNESS, clamped, each, line, refuse
 
 import ddg_warp as ddg
-from ddg_warp.learn import plain_pickle
-from ddg_warp.learn.episodes import Episode, Episodes, EpisodeWriter
-from ddg_warp.learn.mocap import Recording, read, recordings
-from ddg_warp.learn.ranges import Choice, LogUniform, Uniform, draw, parsed, seed_of
-from ddg_warp.learn.splits import split_of
-from ddg_warp.learn.sweep import sweep
-from ddg_warp.run.catalog import InputError
+from ddg_warp.data import safe_pickle
+from ddg_warp.data.episodes import Episode, Episodes, EpisodeWriter
+from ddg_warp.data.mocap import Recording, read, recordings
+from ddg_warp.data.parameter_ranges import Choice, LogUniform, Uniform, draw, parsed, seed_of
+from ddg_warp.data.splits import split_of
+from ddg_warp.data.sweep import sweep
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import InputError
 
 
 def in_folder(action):
@@ -30,7 +30,7 @@ def in_folder(action):
         return action(Path(directory))
 
 
-def read_pickle(content: bytes, action=plain_pickle.load, name: str = "a.pkl"):
+def read_pickle(content: bytes, action=safe_pickle.load, name: str = "a.pkl"):
     """Read a temporary file of given bytes."""
 
     def reading(folder):
@@ -126,12 +126,12 @@ refuse(
             "a.pkl",
             "damaged",
         ),
-        "no file": (lambda: plain_pickle.load("nowhere.pkl"), "nowhere.pkl", "does not exist"),
-        "a folder": (lambda: in_folder(plain_pickle.load), "does not exist"),
-        "a name of 300 letters": (lambda: plain_pickle.load("a" * 300), "does not exist"),
+        "no file": (lambda: safe_pickle.load("nowhere.pkl"), "nowhere.pkl", "does not exist"),
+        "a folder": (lambda: in_folder(safe_pickle.load), "does not exist"),
+        "a name of 300 letters": (lambda: safe_pickle.load("a" * 300), "does not exist"),
     },
 )
-each("pickles", "path", [None, 3, b"a.pkl", "", "a\0b", ["a.pkl"]], plain_pickle.load, "path", "pathlib.Path")
+each("pickles", "path", [None, 3, b"a.pkl", "", "a\0b", ["a.pkl"]], safe_pickle.load, "path", "pathlib.Path")
 
 # --- ranges ---
 each(
@@ -723,8 +723,8 @@ refuse(
 if find_spec("torch"):
     import torch
 
-    from ddg_warp.learn.dataset import Recordings
-    from ddg_warp.learn.environment import Environment, GripRates
+    from ddg_warp.data.dataset import Recordings
+    from ddg_warp.rl.environment import Environment, GripRates
     from ddg_warp.torch import PositiveParameters, Simulator
 
     @functools.cache

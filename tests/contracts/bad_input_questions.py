@@ -5,8 +5,8 @@ import numpy as np
 from bad_inputs import INF, NAN, RING, STIFFNESS, built, clamped, each, integrator, line, model, refuse, rods
 
 import ddg_warp as ddg
-from ddg_warp.ask import inquiry
 from ddg_warp.model import rest_shapes
+from ddg_warp.postprocess import quantities
 
 
 # --- Integrator and step ---
@@ -194,8 +194,8 @@ for question in ("energies", "reactions", "stresses"):
     each("inquiries", question, [None, 3, "rest"], ask, question, "model.state()")
     refuse("inquiries", {f"{question} of another": (lambda a=ask: a(model("net").state()), "another model")})
 refuse("inquiries", {
-    "twist of no rod": (lambda: inquiry.total_twist(model(), model().state(), 7), "rod 7", "twist"),
-    "fields of no surface": (lambda: inquiry.triangle_fields(model(), model().state()), "no surfaces"),
+    "twist of no rod": (lambda: quantities.total_twist(model(), model().state(), 7), "rod 7", "twist"),
+    "fields of no surface": (lambda: quantities.triangle_fields(model(), model().state()), "no surfaces"),
 })
 
 # --- parameters ---

@@ -15,7 +15,7 @@ from ddg_warp.io.curves import checked_curves
 from ddg_warp.io.dismech import read_rods
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.paths import existing
-from ddg_warp.io.revolve import Revolution
+from ddg_warp.io.surface_of_revolution import Revolution
 from ddg_warp.io.usd import read_curves, validate
 from ddg_warp.io.usd_prims import ColorBy
 

@@ -18,10 +18,10 @@ from ddg_warp.io import CurveSet, journal
 from ddg_warp.io.hdf5 import TrajectoryReader, read_rods
 from ddg_warp.io.journal import transaction
 from ddg_warp.io.usd import CurvesWriter
-from ddg_warp.run.catalog import InputError
 from ddg_warp.run.cli import main
-from ddg_warp.run.record import export_usd
+from ddg_warp.run.recorder import export_usd
 from ddg_warp.run.run_directory import RunDirectory
+from ddg_warp.run.scene_registry import InputError
 from ddg_warp.run.simulate import simulate
 
 TRAJECTORY, LOCK = "trajectory.h5", "run.lock"

@@ -6,7 +6,7 @@ import numpy as np
 from effects import ARC, CALLS, DEVICE, DT, MAGNET, RUBBER, SHEET, Call, Change, line, observe_state
 
 import ddg_warp as ddg
-from ddg_warp.ask import inquiry
+from ddg_warp.postprocess import quantities
 from ddg_warp.solve.equilibrium import continuation, stability, statics
 from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions
 from ddg_warp.solve.equilibrium.statics import StaticsOptions
@@ -141,12 +141,12 @@ def observe_reactions(**named) -> list:
     """Observe reactions."""
     return [
         (reaction.force, reaction.moment, reaction.point)
-        for reaction in inquiry.reactions(model(), model().state(), **named)
+        for reaction in quantities.reactions(model(), model().state(), **named)
     ]
 
 
 CALLS["reactions"] = Call(
-    inquiry.reactions, observe_reactions, {}, {"point": (1, 0, 0), "factor": 2.0}, ("model", "state")
+    quantities.reactions, observe_reactions, {}, {"point": (1, 0, 0), "factor": 2.0}, ("model", "state")
 )
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from objects import UP, Object
 
 import ddg_warp as ddg
-from ddg_warp.ask import inquiry
 from ddg_warp.kernels.terms import ALL, AXISYMMETRIC, SHELLS
+from ddg_warp.postprocess import quantities
 from ddg_warp.solve.equilibrium import stability, statics
 from ddg_warp.solve.equilibrium.continuation import Continuation
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -134,16 +134,16 @@ def _kind_of_term(term: str) -> str:
 def total_twist(kind, variant):
     """The total twist of the first rod is zero at rest with transported directors."""
     model, state, _ = rest_model(kind, variant)
-    assert np.abs(variant.each(inquiry.total_twist(model, state, 0))).max() < 1e-9 or model.scene.batches[0].closed
+    assert np.abs(variant.each(quantities.total_twist(model, state, 0))).max() < 1e-9 or model.scene.batches[0].closed
 
 
 def fields(kind, variant):
     """Triangle fields (strain, curvature, energy) are zero at rest and positive where the surface is strained."""
     model, rest, _ = rest_model(kind, variant)
-    for name, values in inquiry.triangle_fields(model, rest).items():
+    for name, values in quantities.triangle_fields(model, rest).items():
         assert values.shape[0] == variant.worlds, name
         assert np.abs(values).max() < 1e-9
-    assert inquiry.triangle_fields(model, strained_state(model, variant))["strain"].max() > 1e-5
+    assert quantities.triangle_fields(model, strained_state(model, variant))["strain"].max() > 1e-5
 
 
 def report(kind, variant):

@@ -15,14 +15,14 @@ from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader, read_rods
 from ddg_warp.io.journal import transaction
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.usd import validate
-from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.run.recorder import SCENE, TRAJECTORY, Recorder, export_usd
 from ddg_warp.run.run_directory import LOCK
 
 BLOCK = 4
 FULL = """
 import resource, sys
 from stand_in import Model, step, surfaces
-from ddg_warp.run.record import Recorder, RecordError
+from ddg_warp.run.recorder import Recorder, RecordError
 
 model = Model(surfaces=surfaces())
 for size in map(int, sys.argv[2:]):

@@ -16,7 +16,7 @@ from stand_in import Model, step
 from ddg_warp.io import CurveError, MissingFileError, journal, read
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader, TrajectoryWriter, read_rods
 from ddg_warp.io.journal import open_to_read, transaction
-from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.run.recorder import SCENE, TRAJECTORY, Recorder, export_usd
 
 BLOCK = 4
 MODEL = Model()
@@ -238,7 +238,7 @@ def test_checkpoints_alternate_outside_the_journal(tmp_path, monkeypatch):
 CHILD = """
 import sys
 from stand_in import Model, step
-from ddg_warp.run.record import Recorder
+from ddg_warp.run.recorder import Recorder
 from ddg_warp.io.hdf5 import TrajectoryReader
 directory, resume = sys.argv[1], sys.argv[2] == "True"
 model = Model()

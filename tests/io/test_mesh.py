@@ -16,7 +16,7 @@ from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader, TrajectoryWriter
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.usd import CurvesWriter, validate
 from ddg_warp.run.figure import rods_picture
-from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.run.recorder import SCENE, TRAJECTORY, Recorder, export_usd
 
 NO_RODS = Curves(np.zeros(0, int), np.zeros(0, bool), np.zeros(0), np.zeros(0, object), np.zeros(0, int))
 PYRAMID = """

@@ -9,7 +9,7 @@ from stand_in import curves, rest_points
 
 from ddg_warp.errors import SceneWarning
 from ddg_warp.io import CurveError, MissingFileError, read
-from ddg_warp.io.tube import SIDES, tube_faces, tube_points
+from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd import CurvesWriter, read_curves, validate
 
 GROOM = Path(__file__).resolve().parents[2] / "scenes" / "data" / "strands.usdc"

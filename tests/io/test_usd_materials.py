@@ -7,7 +7,7 @@ from stand_in import Model, step, surfaces
 
 from ddg_warp.io import CurveError
 from ddg_warp.io.usd import read_curves, validate
-from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.run.recorder import SCENE, TRAJECTORY, Recorder, export_usd
 
 ATTRIBUTES = {
     "hairId": np.array([7, 8, 9]),

@@ -6,7 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.compile.axisymmetric import BandPressure
 from ddg_warp.kernels.terms import AXISYMMETRIC
-from ddg_warp.run.derivatives import relative, samples_of
+from ddg_warp.run.derivative_checks import relative, samples_of
 from ddg_warp.solve.equilibrium.tangent import Tangent
 
 STATIC = [name for name in AXISYMMETRIC if "damped" not in name]

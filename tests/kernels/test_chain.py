@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import element_path
@@ -53,14 +53,14 @@ class Problem:
         self.count = np.tile(self.group.host.count, 2)
         newton = self.newton = ChainNewton(self.model, self.group, NewtonOptions(**options))
         state = self.model.state().groups[0]
-        x = arrays.download(state.x)
-        arrays.assign(newton.x, x + noise * random.normal(size=x.shape))
-        arrays.assign(newton.target, x + noise * random.normal(size=x.shape))
+        x = device_arrays.download(state.x)
+        device_arrays.assign(newton.x, x + noise * random.normal(size=x.shape))
+        device_arrays.assign(newton.target, x + noise * random.normal(size=x.shape))
         if self.kind.twist:
             shape = newton.theta.shape
             wp.copy(newton.frame, state.frame)
-            arrays.assign(newton.theta, 2.0 * noise * random.normal(size=shape))
-            arrays.assign(newton.target_angle, 2.0 * noise * random.normal(size=shape))
+            device_arrays.assign(newton.theta, 2.0 * noise * random.normal(size=shape))
+            device_arrays.assign(newton.target_angle, 2.0 * noise * random.normal(size=shape))
         newton.islands.coefficient.assign(inertia * random.uniform(0.5, 1.5, size=4))
         newton.islands.rate.fill_(1.0)
         newton.islands.clamped.fill_(1)  # these states are compressed so much that the matrix would be indefinite
@@ -71,24 +71,24 @@ class Problem:
 
     def dofs(self, position, angle) -> np.ndarray:
         """Return device arrays of nodes and angles as (columns, n, dofs of a node)."""
-        q = np.moveaxis(arrays.download(position), 0, 1)
-        return np.concatenate([q, arrays.download(angle).T[..., None]], -1) if self.kind.twist else q
+        q = np.moveaxis(device_arrays.download(position), 0, 1)
+        return np.concatenate([q, device_arrays.download(angle).T[..., None]], -1) if self.kind.twist else q
 
     def iterate_dofs(self) -> np.ndarray:
         return self.dofs(self.newton.x, self.newton.theta)
 
     def put(self, q) -> None:
         """Make q the iterate."""
-        arrays.assign(self.newton.x, np.ascontiguousarray(np.moveaxis(q[..., : self.kind.dim], 0, 1)))
+        device_arrays.assign(self.newton.x, np.ascontiguousarray(np.moveaxis(q[..., : self.kind.dim], 0, 1)))
         if self.kind.twist:
-            arrays.assign(self.newton.theta, np.ascontiguousarray(q[..., self.kind.dim].T))
+            device_arrays.assign(self.newton.theta, np.ascontiguousarray(q[..., self.kind.dim].T))
 
     def direction(self) -> np.ndarray:
-        return arrays.download(self.newton.direction).transpose(2, 1, 0)
+        return device_arrays.download(self.newton.direction).transpose(2, 1, 0)
 
     def age(self, q: np.ndarray, column: int):
         """Return cosines to lagged tangents, twist less lagged twist, and cosines of bends of a rod at q (n, dofs)."""
-        n, frame = self.count[column], arrays.download(self.newton.frame)[:, :, column]
+        n, frame = self.count[column], device_arrays.download(self.newton.frame)[:, :, column]
         t, (u0, t0) = polyline.unit(np.diff(q[:n, :3], axis=0)), (frame[row : row + 3, : n - 1].T for row in (0, 3))
         u = polyline.transport(u0, t0, t)
         twist = polyline.signed_angle(polyline.transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:]) - frame[6, : n - 2]
@@ -111,15 +111,15 @@ class Problem:
     def inertia(self, column: int):
         """Return the diagonal of inertia, target, and external force of a rod."""
         host, kind, n = self.group.host, self.kind, self.count[column]
-        rod, c = column % 2, float(arrays.download(self.newton.islands.coefficient)[column])
+        rod, c = column % 2, float(device_arrays.download(self.newton.islands.coefficient)[column])
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = (
-            host.mass[:n, rod, None] * self.group.gravity_host + arrays.download(self.group.load)[:n, rod]
+            host.mass[:n, rod, None] * self.group.gravity_host + device_arrays.download(self.group.load)[:n, rod]
         )
         if kind.twist:
             diagonal[:, kind.dim] = c * host.rotary[:n, rod]
-            force[:, kind.dim] = arrays.download(self.group.load_angle)[:n, rod]
+            force[:, kind.dim] = device_arrays.download(self.group.load_angle)[:n, rod]
         target = self.dofs(self.newton.target, self.newton.target_angle)[column, :n]
         return diagonal.ravel(), target.ravel(), force.ravel()
 
@@ -130,7 +130,7 @@ class Problem:
     def dense(self, column: int, q: np.ndarray):
         """Return Gauss-Newton matrix and residual of a rod at q, from the output of the evaluate kernel."""
         kind, n = self.kind, self.count[column]
-        F, g = arrays.download(self.newton.factor), arrays.download(self.newton.gradient)
+        F, g = device_arrays.download(self.newton.factor), device_arrays.download(self.newton.gradient)
         diagonal, target, force = self.inertia(column)
         H, r = np.diag(diagonal), force - diagonal * (q - target)
         edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
@@ -152,15 +152,15 @@ class Problem:
         self.put(q)
         total = np.zeros(group.columns)
         for i in range(len(kind.terms)):
-            out = arrays.allocate((group.nodes, group.columns), real, self.device)
+            out = device_arrays.allocate((group.nodes, group.columns), real, self.device)
             wp.launch(
                 element_path.term_kernels(rod_storage(kind, real), i, real)[0],
                 (group.elements, group.columns),
                 [group.element_inputs(newton, self.last, newton.islands.rate)],
-                [arrays.columns(out)],
+                [device_arrays.columns(out)],
                 device=self.device,
             )
-            total += arrays.download(out).sum(0)
+            total += device_arrays.download(out).sum(0)
         self.put(kept)
         for column in range(group.columns):
             diagonal, target, force = self.inertia(column)
@@ -181,7 +181,7 @@ def test_sweep_equals_a_dense_solve(device, name, precision):
     problem = Problem(name, device, precision)
     before = problem.iterate_dofs()
     problem.iterate()
-    direction, decrement = problem.direction(), arrays.download(problem.newton.islands.decrement)
+    direction, decrement = problem.direction(), device_arrays.download(problem.newton.islands.decrement)
     tolerance = 1e-12 if precision == "float64" else 1e-4
     for column, n in enumerate(problem.count):
         H, r = problem.dense(column, before[column, :n].ravel())
@@ -193,8 +193,8 @@ def test_sweep_equals_a_dense_solve(device, name, precision):
         assert scale > 0.01
         np.testing.assert_allclose(direction[column, :n].ravel(), expected, rtol=0, atol=tolerance * scale)
         np.testing.assert_allclose(decrement[column], r[free] @ expected[free], rtol=tolerance)
-    assert (arrays.download(problem.newton.islands.status) == outcome.ACTIVE).all()
-    assert (arrays.download(problem.newton.islands.lost) == 0).all()
+    assert (device_arrays.download(problem.newton.islands.status) == outcome.ACTIVE).all()
+    assert (device_arrays.download(problem.newton.islands.lost) == 0).all()
 
 
 @EVERY_KIND
@@ -204,7 +204,7 @@ def test_step_follows_the_direction(device, name, noise, inertia):
     problem = Problem(name, device, noise=noise, inertia=inertia)
     before, dim = problem.iterate_dofs(), problem.kind.dim
     problem.iterate()
-    taken = arrays.download(problem.newton.islands.step_length)[:, None, None]
+    taken = device_arrays.download(problem.newton.islands.step_length)[:, None, None]
     moved, step = problem.iterate_dofs() - before, problem.direction() * taken
     for column, n in enumerate(problem.count):
         fixed = ~problem.free(column).reshape(n, -1)
@@ -222,7 +222,7 @@ def test_no_edge_rotates_beyond_the_cap(device, name):
     problem = Problem(name, device, rotation_cap=cap)
     before, dim = problem.iterate_dofs(), problem.kind.dim
     problem.iterate()
-    direction, taken = problem.direction(), arrays.download(problem.newton.islands.step_length)
+    direction, taken = problem.direction(), device_arrays.download(problem.newton.islands.step_length)
     for column, n in enumerate(problem.count):
         edges, edge_steps = (np.diff(v[column, :n, :dim], axis=0) for v in (before, direction))
         worst = (np.linalg.norm(edge_steps, axis=1) / np.linalg.norm(edges, axis=1)).max()
@@ -235,15 +235,15 @@ def test_overshooting_step_is_backtracked_by_the_energy(device, name):
     problem = Problem(name, device, noise=0.05, inertia=1e3)
     newton, start = problem.newton, problem.iterate_dofs()
     problem.iterate()
-    direction, decrement = problem.direction(), arrays.download(newton.islands.decrement)
+    direction, decrement = problem.direction(), device_arrays.download(newton.islands.decrement)
     problem.put(start + 3.0 * direction)
     newton.islands.step_length.fill_(3.0)
     change = problem.energy(start + 3.0 * direction) - problem.energy(start)
     assert (change > 0.0).all()
     problem.iterate()
-    shorter = arrays.download(newton.islands.step_length)
-    assert (arrays.download(newton.islands.halvings) == 1).all()
-    assert (arrays.download(newton.islands.iteration) == 1).all()
+    shorter = device_arrays.download(newton.islands.step_length)
+    assert (device_arrays.download(newton.islands.halvings) == 1).all()
+    assert (device_arrays.download(newton.islands.iteration) == 1).all()
     assert (
         (0.31 < shorter) & (shorter < 1.49)
     ).all()  # strictly between a tenth and half, so that the parabola decided
@@ -254,8 +254,8 @@ def test_overshooting_step_is_backtracked_by_the_energy(device, name):
         error = np.abs(moved[column, :n] - step[column, :n]).max()
         assert error <= second_order(start[column, :n, :dim], step[column, :n, :dim])
     problem.iterate()
-    assert (arrays.download(newton.islands.halvings) == 0).all()  # the shorter step is taken
-    assert (arrays.download(newton.islands.iteration) == 2).all()
+    assert (device_arrays.download(newton.islands.halvings) == 0).all()  # the shorter step is taken
+    assert (device_arrays.download(newton.islands.iteration) == 2).all()
 
 
 @EVERY_KIND
@@ -268,11 +268,11 @@ def test_accepted_steps_lower_the_energy(device, name):
     length, iteration, rejected = np.zeros(4), np.zeros(4, int), 0
     for _ in range(400):
         problem.iterate()
-        active = arrays.download(newton.islands.status) == outcome.ACTIVE
+        active = device_arrays.download(newton.islands.status) == outcome.ACTIVE
         if not active.any():
             break
-        energy, new_length = problem.energy(trial), arrays.download(newton.islands.step_length)
-        current = arrays.download(newton.islands.iteration)
+        energy, new_length = problem.energy(trial), device_arrays.download(newton.islands.step_length)
+        current = device_arrays.download(newton.islands.iteration)
         for column in np.flatnonzero(active):
             if current[column] > iteration[column]:
                 assert energy[column] <= lowest[column] + 1e-12 * abs(lowest[column])
@@ -281,7 +281,7 @@ def test_accepted_steps_lower_the_energy(device, name):
                 assert new_length[column] <= 0.5 * length[column]
                 rejected += 1
         trial, length, iteration = problem.iterate_dofs(), new_length, current
-    assert set(arrays.download(newton.islands.status)) <= {outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING}
+    assert set(device_arrays.download(newton.islands.status)) <= {outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING}
     assert rejected > 0 or name == "untwisted"  # where every step is a good one
     assert (iteration > 2).all()
 
@@ -324,7 +324,7 @@ def test_frames_are_updated_before_they_degenerate(device, case):
     newton, start = problem.newton, degenerate_frames(problem, AGED[case])
     energy = problem.energy(start)
     problem.iterate()
-    if not arrays.download(newton.islands.step_length).any():
+    if not device_arrays.download(newton.islands.step_length).any():
         problem.iterate()  # one to take new frames, one to step
     np.testing.assert_allclose(problem.energy(start), energy, rtol=1e-12)
     for column in range(4):
@@ -333,7 +333,9 @@ def test_frames_are_updated_before_they_degenerate(device, case):
         assert np.abs(twist).max() < 1.8
     h = 1e-6 / np.abs(problem.direction()).max(axis=(1, 2))
     ends = [problem.energy(start + sign * h[:, None, None] * problem.direction()) for sign in (1.0, -1.0)]
-    np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * h), -arrays.download(newton.islands.decrement), rtol=1e-6)
+    np.testing.assert_allclose(
+        (ends[0] - ends[1]) / (2.0 * h), -device_arrays.download(newton.islands.decrement), rtol=1e-6
+    )
 
 
 def tip(device, **options) -> np.ndarray:

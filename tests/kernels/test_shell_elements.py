@@ -6,7 +6,7 @@ from shell_cases import Surface, gather, square
 
 from ddg_warp.compile import shells
 from ddg_warp.errors import SceneError
-from ddg_warp.geometry.shell_forms import edge_angles, edge_kinds, metric, second_form
+from ddg_warp.geometry.fundamental_forms import edge_angles, edge_kinds, metric, second_form
 
 NU = 0.3
 UNIT_D = 12.0 * (1.0 - NU**2)  # Young's modulus of a plate of thickness 1 with D = 1

@@ -5,7 +5,7 @@ import pytest
 
 from ddg_warp.geometry.polyline import unit
 from ddg_warp.kernels.terms import SHELLS
-from ddg_warp.run import derivatives
+from ddg_warp.run import derivative_checks
 
 COUNT = 8
 # Every term compiles the kernels of the derivative table, so that tests of the same terms are not slow here and there.
@@ -18,9 +18,9 @@ def cases(names):
     return [pytest.param(name, marks=() if name in DAILY else pytest.mark.slow) for name in names]
 
 
-def sample_of(name: str, device: str, precision: str = "float64") -> derivatives.Sample:
+def sample_of(name: str, device: str, precision: str = "float64") -> derivative_checks.Sample:
     """Return the random elements of the derivative table."""
-    (sample,) = derivatives.samples_of(SHELLS[name], precision, device)
+    (sample,) = derivative_checks.samples_of(SHELLS[name], precision, device)
     return sample
 
 
@@ -32,7 +32,7 @@ def strains(name: str, device: str, nodes, angles: int = 0, data=None) -> np.nda
     return sample_of(name, device).strains(q=q, constants=data)[0].T
 
 
-def folded(name: str, device: str) -> derivatives.Sample:
+def folded(name: str, device: str) -> derivative_checks.Sample:
     """Return the sample with edges folded by 90 to 170 degrees, to either side, and clamped normals as far from the triangles'."""
     sample, random = sample_of(name, device), np.random.default_rng(3)
     q, data = sample.data["q"].copy(), sample.data["constants"].copy()
@@ -67,7 +67,7 @@ def test_derivatives_agree_at_sharp_folds(device, name):
         size = np.degrees(np.abs(sample.strains()[0])) * np.where(halved, 2.0, 1.0)
         assert size.min() > 89.0 and size.max() < 171.0
     for check in ("gradient", "hessian", "symmetry", "factor"):
-        row = derivatives.row(sample, check)
+        row = derivative_checks.row(sample, check)
         assert row["passed"], row
 
 
@@ -91,7 +91,7 @@ def test_curvature_grows_with_the_fold(device, kind):
 def test_tension_completes_the_hessian(device, name):
     """F^T F + C, compression included, with the blocks c_ij I is the exact Hessian of the membrane."""
     sample = sample_of(name, device)
-    assert derivatives.relative(sample.evaluate(exact=True)[0], sample.hessian()) < 1e-13
+    assert derivative_checks.relative(sample.evaluate(exact=True)[0], sample.hessian()) < 1e-13
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])

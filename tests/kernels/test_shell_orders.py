@@ -12,7 +12,7 @@ import pytest
 from shell_cases import Surface, cylinder, gather, relaxed_angles, saddle, sphere, square
 
 from ddg_warp.compile import shells
-from ddg_warp.geometry.shell_forms import edge_kinds
+from ddg_warp.geometry.fundamental_forms import edge_kinds
 
 NU = 0.3
 RADIUS = 2.0

@@ -6,7 +6,7 @@ from scipy.sparse.linalg import spsolve
 from shell_cases import Surface, factor, gather, square
 
 from ddg_warp.compile import shells
-from ddg_warp.geometry.shell_forms import edge_kinds
+from ddg_warp.geometry.fundamental_forms import edge_kinds
 
 NU = 0.3
 CENTRE = {

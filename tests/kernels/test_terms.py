@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 
 from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, REGISTRY
-from ddg_warp.run import derivatives
-from ddg_warp.run.catalog import load_file
+from ddg_warp.run import derivative_checks
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import load_file
 
 # Terms with kernels of their own, tested daily: every density and element kind, for rods edges and vertices, damped, in space and in
 # the plane. (A stretch has the measure of the damped one and the density of bending.)
@@ -26,7 +26,7 @@ SAMPLES = {
     (precision, name, sample.chain): sample
     for precision in ("float64", "float32")
     for name, term in ALL.items()
-    for sample in derivatives.samples_of(term, precision)
+    for sample in derivative_checks.samples_of(term, precision)
 }
 CASES = [
     pytest.param(
@@ -36,7 +36,7 @@ CASES = [
         id="-".join((*key, check)),
     )
     for key, sample in SAMPLES.items()
-    for check in derivatives.checks_of(sample)
+    for check in derivative_checks.checks_of(sample)
 ]
 # User-defined terms in a file: one right, one with an error of 0.1 % in an entry of the Jacobian.
 OWN = """
@@ -82,16 +82,16 @@ plane = replace(right, measure=replace(right.measure, dim=2))
 
 
 @cache
-def sample_on(device: str, precision: str, term: str, chain: str) -> derivatives.Sample:
+def sample_on(device: str, precision: str, term: str, chain: str) -> derivative_checks.Sample:
     """Return the sample on the device under test."""
     closed = {"open": (False,), "closed": (True,)}.get(chain, ())
-    (sample,) = derivatives.samples_of(ALL[term], precision, device, closed)
+    (sample,) = derivative_checks.samples_of(ALL[term], precision, device, closed)
     return sample
 
 
 @pytest.mark.parametrize(("precision", "term", "chain", "check"), CASES)
 def test_derivative(device, precision, term, chain, check):
-    row = derivatives.row(sample_on(device, precision, term, chain), check)
+    row = derivative_checks.row(sample_on(device, precision, term, chain), check)
     assert row["passed"], f"error {row['error']:.2e}, tolerance {row['tolerance']:.0e}"
 
 
@@ -114,15 +114,15 @@ def test_a_wrong_derivative_fails(device, own_term_file, capsys):
 
 
 def test_what_is_no_number_fails():
-    assert np.isnan(derivatives.largest([derivatives.relative(np.array([np.nan, 1.0]), np.ones(2)), 0.0]))
-    assert derivatives.relative(np.ones(2), np.zeros(2)) > 1.0
+    assert np.isnan(derivative_checks.largest([derivative_checks.relative(np.array([np.nan, 1.0]), np.ones(2)), 0.0]))
+    assert derivative_checks.relative(np.ones(2), np.zeros(2)) > 1.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_a_term_of_ones_own_passes(device, own_term_file, precision):
     term = load_file(str(own_term_file)).right
-    for row in derivatives.table(term, precision, device):
+    for row in derivative_checks.table(term, precision, device):
         assert row["passed"], row
 
 
@@ -141,7 +141,7 @@ def test_every_term_has_every_check():
         }[chain]
         left_out = left_out | ({"downcast"} if precision == "float32" else set())
         left_out = left_out | ({"rest"} if name.startswith(("magnetic", "dipoles")) else set())
-        assert set(derivatives.CHECKS) - set(derivatives.checks_of(sample)) == left_out
+        assert set(derivative_checks.CHECKS) - set(derivative_checks.checks_of(sample)) == left_out
 
 
 def test_every_day_has_every_kind():
@@ -192,9 +192,9 @@ def test_sample_of_nets_is_general():
 @pytest.mark.slow
 def test_table_has_chains_and_nets(device):
     """Rows of rods and indexed elements have equal columns, so that one table shows them."""
-    chain, net = (derivatives.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
+    chain, net = (derivative_checks.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
     assert chain[0].keys() == net[0].keys()
-    count = len(derivatives.CHECKS) - 2  # without the checks of collisions
+    count = len(derivative_checks.CHECKS) - 2  # without the checks of collisions
     assert [row["chain"] for row in chain] == ["open"] * count + ["closed"] * count
     assert {row["chain"] for row in net} == {"net"}
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import arrays
-from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp import device_arrays
+from ddg_warp.adjoint.implicit import Adjoint
 
 DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
@@ -83,19 +83,19 @@ def directions(model, state, seed: int, strains: float = 1e-3) -> dict[str, np.n
     result = {}
     for name, array in entries(state).items():
         size = strains if "last" in name else 1.0
-        result[name] = size * meaning.keep(name, random.normal(size=arrays.download(array).shape))
+        result[name] = size * meaning.keep(name, random.normal(size=device_arrays.download(array).shape))
     return result
 
 
 def put(state, values: dict[str, np.ndarray], factor: float = 1.0) -> None:
     """Add values to the entries of a state."""
     for name, array in entries(state).items():
-        arrays.assign(array, arrays.download(array) + factor * values[name])
+        device_arrays.assign(array, device_arrays.download(array) + factor * values[name])
 
 
 def product(state, values: dict[str, np.ndarray]) -> float:
     """Sum of the entries of a state times values."""
-    return sum(float((arrays.download(array) * values[name]).sum()) for name, array in entries(state).items())
+    return sum(float((device_arrays.download(array) * values[name]).sum()) for name, array in entries(state).items())
 
 
 def cotangent(model, weights: dict[str, np.ndarray]):
@@ -184,10 +184,12 @@ class Difference:
         state.time = self.state.time
         axes = {}
         for name, array in self.state.arrays().items():
-            values, new = arrays.download(array), state.arrays()[name]
-            size = arrays.download(new).shape
+            values, new = device_arrays.download(array), state.arrays()[name]
+            size = device_arrays.download(new).shape
             axes[name] = world_axis(self.model, name, values) if size != values.shape else None
-            arrays.assign(new, np.tile(values, [all_ // one for all_, one in zip(size, values.shape, strict=True)]))
+            device_arrays.assign(
+                new, np.tile(values, [all_ // one for all_, one in zip(size, values.shape, strict=True)])
+            )
         for name, array in (self.model.net.touching if self.model.net else {}).items():
             wide.net.touching[name].assign(np.tile(array.numpy(), (len(SIDES),) + (1,) * (array.ndim - 1)))
         for shift in (shift for shift in shifts if shift.axis is not None):
@@ -195,7 +197,7 @@ class Difference:
         after, losses = self.advancing(wide)(state), np.zeros(len(SIDES))
         for name, array in entries(after).items():
             if axes[name] is not None:
-                pieces = np.split(arrays.download(array), len(SIDES), axes[name])
+                pieces = np.split(device_arrays.download(array), len(SIDES), axes[name])
                 losses += [float((piece * self.weights[name]).sum()) for piece in pieces if name in self.weights]
         return float(losses @ WEIGHTS) / step
 
@@ -220,11 +222,11 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
     for name, array in entries(state).items():
         rate = name.rpartition("/")[2]
         if rate in ("v", "omega"):
-            values = arrays.download(array)
+            values = device_arrays.download(array)
             more = random.normal(size=values.shape) * (spin if rate == "omega" else speed)
             if name == "net/v":
                 more[model.net.host.nodes :] *= spin / speed
-            arrays.assign(array, values + meaning.keep(name, more))
+            device_arrays.assign(array, values + meaning.keep(name, more))
     return state
 
 
@@ -263,7 +265,7 @@ def tables(model) -> list:
 
 def by_parameters(model, inputs: list) -> list[np.ndarray]:
     """Derivatives by the parameters of each table, (rows, ...)."""
-    found = [arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
+    found = [device_arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
     return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.net else [])
 
 
@@ -279,10 +281,10 @@ def state_shifts(model, gradient, state) -> list[Shift]:
     """Return a direction in every array of the first state."""
     shifts = []
     for name, meant in directions(model, state, 7).items():
-        values, slopes = arrays.download(entries(state)[name]), arrays.download(entries(gradient)[name])
+        values, slopes = device_arrays.download(entries(state)[name]), device_arrays.download(entries(gradient)[name])
 
         def write(_model, wide, new, name=name):
-            arrays.assign(wide.arrays()[name], new)
+            device_arrays.assign(wide.arrays()[name], new)
 
         shifts.append(Shift(name, values, slopes, along(slopes, meant), write, world_axis(model, name, values)))
     return shifts

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.compile import precision
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
-from ddg_warp.learn.adjoint import Adjoint
 from tests.learn.differences import (
     TIGHT,
     built,

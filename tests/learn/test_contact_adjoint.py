@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
+from ddg_warp.adjoint.coupled_linear_solve import NetSolve
+from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.contact import FRICTION, RANGE, STIFFNESS
-from ddg_warp.learn.adjoint import Adjoint
-from ddg_warp.learn.net_solve import NetSolve
 from ddg_warp.solve.linear.exact_system import ExactSystem
 from tests.learn.contact_cases import DT, SCENES, scene_of, touching
 from tests.learn.differences import (
@@ -170,7 +170,7 @@ def test_elements_of_what_touches(lags):
 def test_gradients_repeat_bit_by_bit(lags):
     first, second = (differentiated("sheets", "barrier", 2, SLIDING, lags=lags, **RUBBING)[1:3] for _ in range(2))
     for name, array in entries(first[0]).items():
-        np.testing.assert_array_equal(arrays.download(array), arrays.download(entries(second[0])[name]))
+        np.testing.assert_array_equal(device_arrays.download(array), device_arrays.download(entries(second[0])[name]))
     for name in (*ROWS, "radius"):
         np.testing.assert_array_equal(by_number(first[1], name), by_number(second[1], name))
 

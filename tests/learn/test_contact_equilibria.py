@@ -8,8 +8,8 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import statics
+from ddg_warp.adjoint.implicit import EquilibriumAdjoint
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.learn.adjoint import EquilibriumAdjoint
 from tests.learn import differences
 from tests.learn.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
 from tests.learn.differences import built, check, cotangent, parameter_shifts

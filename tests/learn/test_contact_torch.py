@@ -10,8 +10,8 @@ from tests.learn.contact_cases import DT, RADIUS, RANGE, SOFT, bar, scene_of, to
 from tests.learn.differences import TIGHT
 
 torch = pytest.importorskip("torch")
-from ddg_warp.learn.contact_places import contact_elements  # noqa: E402
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
+from ddg_warp.torch.contact_parameters import contact_elements  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
 
 RUBBING = {"friction": 0.3, "velocity": 0.05}

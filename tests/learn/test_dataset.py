@@ -9,14 +9,14 @@ import pytest
 from test_episodes import filled, record
 
 import ddg_warp as ddg
+from ddg_warp.data.episodes import EpisodeWriter
 from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io import read
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
-from ddg_warp.learn.episodes import EpisodeWriter
 from ddg_warp.run.simulate import simulate
 
 torch = pytest.importorskip("torch", reason="torch, an extra, is not installed")
-Recordings = import_module("ddg_warp.learn.dataset").Recordings
+Recordings = import_module("ddg_warp.data.dataset").Recordings
 FIELDS = ["velocities", "directors", "axial_force"]
 
 
@@ -136,7 +136,7 @@ def test_no_open_file_is_pickled(tmp_path):
 
 
 def test_few_files_are_open_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr("ddg_warp.learn.dataset.OPEN_FILES", 3)
+    monkeypatch.setattr("ddg_warp.data.dataset.OPEN_FILES", 3)
     filled(tmp_path, 8)
     data = Recordings(tmp_path, window=3)
     assert [data[index]["file"] for index in range(8)] == list(range(8))

@@ -10,9 +10,9 @@ from tests.learn.differences import CLOSE, TIGHT, built
 from tests.learn.test_adjoint import DT, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
-from ddg_warp.learn.environment import Environment, GripRates  # noqa: E402
-from ddg_warp.learn.rotations import turned  # noqa: E402
+from ddg_warp.rl.environment import Environment, GripRates  # noqa: E402
 from ddg_warp.torch import Simulator  # noqa: E402
+from ddg_warp.torch.rotations import turned  # noqa: E402
 
 POINTS = np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 7)
 RATES = (GripRates(axes="xz", speed=0.5), GripRates(about="yz", spin=3.0))

@@ -10,7 +10,7 @@ import pytest
 from ddg_warp.errors import SceneError
 
 torch = pytest.importorskip("torch")
-from ddg_warp.learn.environment import Environment  # noqa: E402
+from ddg_warp.rl.environment import Environment  # noqa: E402
 from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripped, observe, off  # noqa: E402
 
 
@@ -20,9 +20,9 @@ from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripp
 )
 def test_what_is_not_installed_is_told_with_its_extra(module, package, extra, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, f"ddg_warp.learn.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, f"ddg_warp.rl.{module}", raising=False)
     with pytest.raises(ModuleNotFoundError, match=rf"pip install 'ddg-warp\[{extra}\]'"):
-        importlib.import_module(f"ddg_warp.learn.{module}")
+        importlib.import_module(f"ddg_warp.rl.{module}")
 
 
 # gymnasium
@@ -30,7 +30,7 @@ def test_what_is_not_installed_is_told_with_its_extra(module, package, extra, mo
 
 def vector(**options):
     pytest.importorskip("gymnasium")
-    from ddg_warp.learn.gymnasium_env import VectorEnvironment
+    from ddg_warp.rl.gymnasium_env import VectorEnvironment
 
     return VectorEnvironment(environment(**options))
 
@@ -40,7 +40,7 @@ def test_gymnasium_finds_nothing_wrong():
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
-    from ddg_warp.learn.gymnasium_env import VectorEnvironment
+    from ddg_warp.rl.gymnasium_env import VectorEnvironment
 
     class One(gymnasium.Env):
         """The only world of a vector environment."""
@@ -143,7 +143,7 @@ def test_torchrl_finds_nothing_wrong():
     pytest.importorskip("torchrl")
     from torchrl.envs.utils import check_env_specs
 
-    from ddg_warp.learn.torchrl_env import TorchRLEnvironment
+    from ddg_warp.rl.torchrl_env import TorchRLEnvironment
 
     check_env_specs(TorchRLEnvironment(environment(), differentiable=False), seed=0)
 
@@ -153,7 +153,7 @@ def test_rollouts_of_torchrl_have_gradients():
     pytest.importorskip("torchrl")
     from tensordict.nn import TensorDictModule
 
-    from ddg_warp.learn.torchrl_env import TorchRLEnvironment
+    from ddg_warp.rl.torchrl_env import TorchRLEnvironment
 
     found = environment()
     torch.manual_seed(0)
@@ -185,7 +185,7 @@ def test_rollouts_of_torchrl_have_gradients():
 )
 def test_what_is_no_environment_is_refused(module, wrapper):
     pytest.importorskip({"gymnasium_env": "gymnasium", "torchrl_env": "torchrl"}[module])
-    made = getattr(importlib.import_module(f"ddg_warp.learn.{module}"), wrapper)
+    made = getattr(importlib.import_module(f"ddg_warp.rl.{module}"), wrapper)
     for other in (None, 3, gripped()):
         with pytest.raises(SceneError, match=f"{wrapper}: .* is no environment"):
             made(other)

@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 import pytest
 
+from ddg_warp.data.episodes import Episodes, EpisodeWriter
+from ddg_warp.data.splits import SPLITS, split_of
 from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.learn.episodes import Episodes, EpisodeWriter
-from ddg_warp.learn.splits import SPLITS, split_of
 
 
 def record(directory, frames: int = 3, points: int = 2) -> None:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import arrays, statics
+from ddg_warp import device_arrays, statics
+from ddg_warp.adjoint.implicit import EquilibriumAdjoint
 from ddg_warp.errors import SolverError
-from ddg_warp.learn.adjoint import EquilibriumAdjoint
 from tests.learn.differences import Difference, built, check, close, cotangent, directions, parameter_shifts, product
 from tests.learn.test_adjoint import SCENES
 
@@ -73,7 +73,7 @@ def test_an_equilibrium_by_its_loads(name):
     model, _, inputs, difference = solved(name)
     if model.groups:
         host, (k, column) = model.groups[0].host, (3, 0)
-        found, place = arrays.download(inputs[0].load)[:3, k, column], k * len(host.rods) + column
+        found, place = device_arrays.download(inputs[0].load)[:3, k, column], k * len(host.rods) + column
     else:
         host, place = model.net.host, model.net.host.nodes - 1
         found = inputs[-1].load.numpy()[place]

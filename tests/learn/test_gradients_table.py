@@ -9,8 +9,11 @@ from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CURVE, DT, SCENES
 
 torch = pytest.importorskip("torch")
-from ddg_warp.learn import gradient_objects, gradients  # noqa: E402
-from ddg_warp.torch import Simulator  # noqa: E402
+from ddg_warp.torch import (  # noqa: E402
+    Simulator,
+    gradient_check,
+    gradient_check_scenes,
+)
 
 FAST = (
     ("rod", "statics"),
@@ -35,31 +38,33 @@ WORDS = ("no gradient goes", "does not differentiate", "serves statics and spect
 
 
 def right(rows: list[dict]) -> None:
-    bad = [row for row in rows if row["result"] not in (gradients.RIGHT, gradients.NONE, gradients.REFUSED)]
+    bad = [
+        row for row in rows if row["result"] not in (gradient_check.RIGHT, gradient_check.NONE, gradient_check.REFUSED)
+    ]
     assert rows
     assert not bad
     for row in rows:
-        assert row["result"] != gradients.REFUSED or any(word in row["reason"] for word in WORDS), row
+        assert row["result"] != gradient_check.REFUSED or any(word in row["reason"] for word in WORDS), row
 
 
 @pytest.mark.parametrize(
     ("name", "analysis"),
     [
         pytest.param(name, analysis, marks=() if (name, analysis) in FAST else pytest.mark.slow)
-        for name in gradients.OBJECTS
-        for analysis in gradients.ANALYSES
+        for name in gradient_check.OBJECTS
+        for analysis in gradient_check.ANALYSES
     ],
 )
 def test_every_input_is_right_or_refused(device, name, analysis):
-    rows = list(gradients.table([name], [analysis], device))
+    rows = list(gradient_check.table([name], [analysis], device))
     refusing = {"implicit_euler": (), "implicit_midpoint": IN_CONTACT, "statics": FALLING}
     if name in refusing[analysis]:
-        assert [row["result"] for row in rows] == [gradients.REFUSED]
+        assert [row["result"] for row in rows] == [gradient_check.REFUSED]
         assert rows[0]["reason"].startswith("no equilibrium" if analysis == "statics" else "contact: ")
         return
     right(rows)
     if "curved" not in name or analysis == "statics":  # whose dynamics is refused
-        refused = [row["input"] for row in rows if row["result"] == gradients.REFUSED]
+        refused = [row["input"] for row in rows if row["result"] == gradient_check.REFUSED]
         assert set(refused) <= ({"positions", "angles"} if analysis == "statics" else {"time step"})
 
 
@@ -72,8 +77,8 @@ def test_a_law_of_ones_own(device, analysis, monkeypatch):
     def add(scene, material):
         scene.clamp(scene.add_rod(CURVE, section=ddg.Circle(0.004), material=material, laws=law, natural="straight"))
 
-    monkeypatch.setitem(gradient_objects.OBJECTS, "own", (3, add))
-    rows = list(gradients.table(["own"], [analysis], device))
+    monkeypatch.setitem(gradient_check_scenes.OBJECTS, "own", (3, add))
+    rows = list(gradient_check.table(["own"], [analysis], device))
     right(rows)
     assert {"rod_bend_twist.modulus", "rod_bend_twist.limit"} <= {r["input"] for r in rows if r["result"] == "right"}
 
@@ -104,9 +109,9 @@ def test_the_command_prints_it(tmp_path, capsys, device):
 
 def test_what_is_wrong_fails(monkeypatch, capsys, device):
     """A gradient that is lost, and one that is off."""
-    usual = gradients.Input.found
+    usual = gradient_check.Input.found
     spoilt = {"velocities": 0.0, "gravity": 1.01}
-    monkeypatch.setattr(gradients.Input, "found", lambda own: usual(own) * spoilt.get(own.name, 1.0))
+    monkeypatch.setattr(gradient_check.Input, "found", lambda own: usual(own) * spoilt.get(own.name, 1.0))
     assert main(["gradients", "planar rod", "--analysis", "implicit_euler", "--device", device]) == 1
     printed = capsys.readouterr().out
     assert "SILENT ZERO" in printed

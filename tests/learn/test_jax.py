@@ -41,7 +41,7 @@ def function(own: Simulator):
 
 def test_gradients_in_jax_are_those_of_differences(jax):
     """In a jitted function, with operations of JAX on both sides, by both inputs."""
-    from ddg_warp.learn.jax import from_torch
+    from ddg_warp.torch.jax import from_torch
 
     own = simulator()
     of_torch = function(own)
@@ -70,7 +70,7 @@ def test_gradients_in_jax_are_those_of_differences(jax):
 
 def test_batches_in_jax(jax):
     """vmap calls one after the other, as a loop does."""
-    from ddg_warp.learn.jax import from_torch
+    from ddg_warp.torch.jax import from_torch
 
     own = simulator()
     call = from_torch(lambda k: own.step(own.initial_state(), {NAME: k}).positions[0], (own.model.points_count, 3))
@@ -80,7 +80,7 @@ def test_batches_in_jax(jax):
 
 
 def test_another_shape_is_refused(jax):
-    from ddg_warp.learn.jax import from_torch
+    from ddg_warp.torch.jax import from_torch
 
     call = from_torch(lambda x: torch.stack([x, x]), (3,))
     with pytest.raises(Exception, match=r"the function gives \(2,\); give a tensor of shape \(3,\)") as told:
@@ -134,7 +134,7 @@ def test_arrays_of_states_pass_without_a_copy(name, device):
     ],
 )
 def test_what_is_no_function_or_shape_is_refused(jax, given, said):
-    from ddg_warp.learn.jax import from_torch
+    from ddg_warp.torch.jax import from_torch
 
     with pytest.raises(SceneError, match=f"from_torch: .*{said}"):
         from_torch(*given)

@@ -10,8 +10,12 @@ from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
 
 torch = pytest.importorskip("torch")
-from ddg_warp.learn import gradient_objects  # noqa: E402
-from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
+from ddg_warp.torch import (  # noqa: E402
+    RodParameters,
+    ShellParameters,
+    Simulator,
+    gradient_check_scenes,
+)
 from tests.learn.test_torch import check, normal  # noqa: E402
 
 SECTIONS = {
@@ -170,7 +174,7 @@ def test_a_rod_and_its_shell_have_masses_of_their_own():
 
     def stiffened(density: float = 1.0) -> ddg.Scene:
         scene = a_scene()
-        gradient_objects.OBJECTS["rod on a shell"][1](scene, gradient_objects.soft(density))
+        gradient_check_scenes.OBJECTS["rod on a shell"][1](scene, gradient_check_scenes.soft(density))
         return scene
 
     own = simulator(stiffened())

@@ -5,9 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
+from ddg_warp.data.mocap import VARIABLE, Recording, read, recordings
+from ddg_warp.data.safe_pickle import UnsafePickleError
 from ddg_warp.errors import DataError, SceneError
-from ddg_warp.learn.mocap import VARIABLE, Recording, read, recordings
-from ddg_warp.learn.plain_pickle import UnsafePickleError
 
 FRAMES, MARKERS = 50, 13
 

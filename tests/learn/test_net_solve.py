@@ -8,9 +8,9 @@ import torch
 import warp as wp
 
 import ddg_warp as ddg
+from ddg_warp.adjoint.implicit import Adjoint
+from ddg_warp.adjoint.linear_solve import HostSolve
 from ddg_warp.geometry import meshes
-from ddg_warp.learn.adjoint import Adjoint
-from ddg_warp.learn.solve import HostSolve
 from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
 from ddg_warp.solve.linear.pcg import ConjugateGradients

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from ddg_warp.learn.plain_pickle import UnsafePickleError, load
+from ddg_warp.data.safe_pickle import UnsafePickleError, load
 
 ARRAY = np.arange(24.0).reshape(2, 3, 4)
 VALUES = {
@@ -83,7 +83,7 @@ def test_a_malicious_pickle_does_not_run(tmp_path, protocol):
         ("numpy.core.multiarray", "fromfile"),
         ("numpy.testing._private.utils", "runstring"),
         ("pandas.core.frame", "DataFrame"),
-        ("ddg_warp.learn.plain_pickle", "load"),
+        ("ddg_warp.data.safe_pickle", "load"),
         ("numpy", "ndarray.tofile"),
     ],
 )

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from ddg_warp.data.parameter_ranges import DESIGNS, GROWING, Choice, LogUniform, Uniform, draw, parsed, seed_of
 from ddg_warp.errors import SceneError
-from ddg_warp.learn.ranges import DESIGNS, GROWING, Choice, LogUniform, Uniform, draw, parsed, seed_of
 
 RANGES = {"b": Uniform(-1.0, 3.0), "a": LogUniform(1e-3, 1e2), "n": Choice(range(5, 8)), "c": 4.0}
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from ddg_warp.data.mocap import Recording, recordings
 from ddg_warp.errors import DataError
-from ddg_warp.learn.mocap import Recording, recordings
-from ddg_warp.run.catalog import load_scene
+from ddg_warp.run.scene_registry import load_scene
 from ddg_warp.run.simulate import simulate
 
 pytest.importorskip("torch")

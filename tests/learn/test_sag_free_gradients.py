@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddg_warp.ask.sag_free import rest_strains
+from ddg_warp.postprocess.sag_free import rest_strains
 from tests.learn import differences
 from tests.test_sag_free import scene_of_all
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from test_episodes import record
 
+from ddg_warp.data.episodes import Episodes
+from ddg_warp.data.executors import in_processes
+from ddg_warp.data.parameter_ranges import Choice, LogUniform, Uniform
+from ddg_warp.data.sweep import SweepError, sweep
 from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.learn.episodes import Episodes
-from ddg_warp.learn.ranges import Choice, LogUniform, Uniform
-from ddg_warp.learn.sweep import SweepError, sweep
-from ddg_warp.learn.work import in_processes
-from ddg_warp.run.catalog import InputError
 from ddg_warp.run.cli import main
+from ddg_warp.run.scene_registry import InputError
 
 SCENE = '''"""A rod that falls freely, thrown at random."""
 
@@ -253,8 +253,8 @@ def test_the_command(scene, device, capsys):
 KILLED = """
 import sys
 sys.path.insert(0, {here!r})
-from ddg_warp.learn.ranges import Uniform
-from ddg_warp.learn.sweep import sweep
+from ddg_warp.data.parameter_ranges import Uniform
+from ddg_warp.data.sweep import sweep
 from test_sweep import noted
 sweep(noted, {{"load": Uniform(0.0, 1.0)}}, 40, out={out!r})
 """

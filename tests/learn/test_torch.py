@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp.adjoint import linear_solve
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import meshes
-from ddg_warp.learn import solve
 from tests.learn import differences
 from tests.learn.differences import CLOSE, TIGHT, built
 from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, a_scene
@@ -472,7 +472,7 @@ def test_what_does_not_fit_is_refused(parameters, controls, message):
 @pytest.mark.parametrize(("young", "radius", "passes"), [(1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)])
 def test_float32_solves_for_what_inertia_does_not_give(monkeypatch, young, radius, passes, solver):
     """Within the error of as many solutions; of w itself, dt times those by velocities, float32 leaves 1e-4 of the first gradients."""
-    monkeypatch.setattr(solve, "automatic", lambda group: solver)
+    monkeypatch.setattr(linear_solve, "automatic", lambda group: solver)
     scene, points = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.zeros((24, 3))
     points[:, 0] = np.linspace(0.0, 1.0, len(points))
     material = ddg.Material(young=young, poisson=0.5, density=1000.0)

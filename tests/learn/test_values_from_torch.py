@@ -11,7 +11,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import GradientWarning, SceneError
-from ddg_warp.learn.gradient_objects import scene_of
+from ddg_warp.torch.gradient_check_scenes import scene_of
 from tests.learn import differences
 
 torch = pytest.importorskip("torch")

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from chain_system import system
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear.rod_dof_map import place_dofs
 from ddg_warp.solve.linear.twisted_factorisation import BothEnds
 
@@ -59,20 +59,20 @@ def test_solutions_match_dense_solves(device, twist, span, in_place):
     total = FROM[-1] * (2 if twist else 1)
     columns = worlds * WIDTH
     inputs = (
-        arrays.upload(places.astype(np.int32), int, device),
-        arrays.upload(fixed, wp.uint8, device),
+        device_arrays.upload(places.astype(np.int32), int, device),
+        device_arrays.upload(fixed, wp.uint8, device),
         wp.array(COUNTS, dtype=int, device=device),
         wp.array(np.arange(columns) % WIDTH == inactive, dtype=int, device=device),
     )
     both = BothEnds(SimpleNamespace(twist=twist, span=span, block=nb), columns, wp.float64, device, 32)
     rows = np.concatenate([np.tile(bands, (1, 1, worlds)), np.zeros((nb, LONGEST, columns))])
-    factors = arrays.upload(rows, wp.float64, device)
-    matrix = factors if in_place else arrays.upload(rows[:-nb], wp.float64, device)
+    factors = device_arrays.upload(rows, wp.float64, device)
+    matrix = factors if in_place else device_arrays.upload(rows[:-nb], wp.float64, device)
     wanted, lost = wp.array([1, 0], dtype=int, device=device), wp.zeros(worlds, dtype=int, device=device)
     residual = rng.normal(size=(worlds * total, 3))
     z = wp.array(np.full((worlds * total, 3), 7.0), dtype=wp.vec3d, device=device)
     dots = wp.array(np.full((worlds, total), 7.0), dtype=wp.float64, device=device)
-    values = arrays.allocate((nb, LONGEST, columns), wp.float64, device)
+    values = device_arrays.allocate((nb, LONGEST, columns), wp.float64, device)
     both.factorise(matrix, *inputs[2:], wanted, factors, lost)
     solve_inputs = wp.array(residual, dtype=wp.vec3d, device=device), *inputs, wanted, total
     both.solve(factors, solve_inputs, values, z, dots)
@@ -105,7 +105,7 @@ def test_negative_pivots_are_counted(device, node):
     bands = np.zeros((3 * nb**2 + nb, n, 1))
     bands[: nb**2 : nb + 1] = 1.0
     bands[nb + 1, node] = -1.0
-    factors = arrays.upload(bands, wp.float64, device)
+    factors = device_arrays.upload(bands, wp.float64, device)
     both = BothEnds(SimpleNamespace(twist=False, span=2, block=nb), 1, wp.float64, device, 32)
     count, inactive = wp.full(1, n, dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
     lost = wp.zeros(1, dtype=int, device=device)

@@ -6,7 +6,7 @@ import warp as wp
 from test_tension import advance
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.scenes import hair
 from ddg_warp.solve.newton.coupled_newton import NetNewton
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
@@ -74,7 +74,7 @@ def test_directions_match_full_matrix(device, twist):
         along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
         element = newton.chains.plan.elements(newton.net.host, element_set.host)[1]
         k, c = np.nonzero(element >= 0)
-        longer = arrays.download(newton.chains.longer).reshape(2, newton.chains.longest, 2, -1)
+        longer = device_arrays.download(newton.chains.longer).reshape(2, newton.chains.longest, 2, -1)
         slack, lengthening = longer[:, k, :, c].transpose(1, 2, 0)
         assert (slack > 0.0).any() == (carried < 1e9)
         expected = along[:, element[k, c]]

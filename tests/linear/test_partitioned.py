@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.solve.linear import solver_selection
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
@@ -52,13 +52,13 @@ def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
     model = scene_of(name, **options).build(device, precision, worlds=2)
     for group, state in zip(model.groups, model.state().groups, strict=True):
         newton = PartitionedNewton(model, group, NewtonOptions())
-        x = arrays.download(state.x)
+        x = device_arrays.download(state.x)
         for array in (newton.x, newton.target):
-            arrays.assign(array, x + noise * random.normal(size=x.shape))
+            device_arrays.assign(array, x + noise * random.normal(size=x.shape))
         if group.kind.twist:
             wp.copy(newton.frame, state.frame)
             for array in (newton.theta, newton.target_angle):
-                arrays.assign(array, 2.0 * noise * random.normal(size=array.shape))
+                device_arrays.assign(array, 2.0 * noise * random.normal(size=array.shape))
         newton.islands.coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
         newton.islands.rate.fill_(1.0)
         newton.islands.clamped.fill_(int(clamped))
@@ -69,14 +69,14 @@ def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and residual of a rod from assembled blocks."""
     kind, n = newton.group.kind, int(newton.group.count.numpy()[column])
     nb = kind.block
-    stored = arrays.download(newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
+    stored = device_arrays.download(newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
     H = np.zeros((n, nb, n, nb))
     for k in range(n):
         H[k, :, k] = stored[0, ..., k]
         for offset in range(1, min(kind.span, n - 1 - k) + 1):
             H[k, :, k + offset] = stored[offset, ..., k]
             H[k + offset, :, k] = stored[offset, ..., k].T
-    return H.reshape(n * nb, n * nb), arrays.download(newton.right)[:, :n, column].T.ravel()
+    return H.reshape(n * nb, n * nb), device_arrays.download(newton.right)[:, :n, column].T.ravel()
 
 
 @pytest.mark.parametrize(
@@ -98,13 +98,13 @@ def test_direction_matches_dense_solve(device, name, precision, tolerance):
     for newton, state in solvers(name, device, clamped=True, precision=precision):
         columns += newton.group.columns
         newton.iterate(state.last)
-        arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
+        device_arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
         wanted = newton.islands.wanted.numpy()
         assert wanted.all()
         wanted[-1] = 0
         newton.islands.wanted.assign(wanted)
         newton.direct()
-        direction, decrement = arrays.download(newton.direction), newton.islands.decrement.numpy()
+        direction, decrement = device_arrays.download(newton.direction), newton.islands.decrement.numpy()
         assert (direction[..., -1] == 7.0).all()
         assert (newton.islands.lost.numpy() == 0).all()
         for column in range(newton.group.columns - 1):
@@ -123,9 +123,12 @@ def test_indefinite_matrices_lose_pivots(device):
     outcomes = set()
     for newton, state in solvers("untwisted", device, clamped=False, noise=0.25):
         newton.islands.coefficient.fill_(0.3)
-        before = arrays.download(newton.x)
+        before = device_arrays.download(newton.x)
         newton.iterate(state.last)
-        clamped, moved = newton.islands.clamped.numpy(), np.abs(arrays.download(newton.x) - before).max(axis=(0, 2))
+        clamped, moved = (
+            newton.islands.clamped.numpy(),
+            np.abs(device_arrays.download(newton.x) - before).max(axis=(0, 2)),
+        )
         for column in range(newton.group.columns):
             indefinite = np.linalg.eigvalsh(dense(newton, column)[0])[0] < 0.0
             outcomes.add(bool(indefinite))
@@ -151,7 +154,7 @@ def adjust_serially(newton, todo: int):
         device=newton.device,
     )
     newton.islands.todo.fill_(todo)  # the serial kernel has reset it
-    return [arrays.download(array) for array in copies[:3]]
+    return [device_arrays.download(array) for array in copies[:3]]
 
 
 @EVERY_KIND
@@ -162,16 +165,16 @@ def test_edge_rotations_match_serial_kernel(device, name, supported):
     for newton, state in solvers(name, device, clamped=True, supported=supported):
         newton.iterate(state.last)
         group = newton.group
-        mask = (arrays.download(group.fixed) >> np.arange(group.kind.block)[:, None, None]) & 1
+        mask = (device_arrays.download(group.fixed) >> np.arange(group.kind.block)[:, None, None]) & 1
         step = 0.5 * random.normal(size=newton.direction.shape) * (mask == 0)
-        arrays.assign(newton.direction, step)
+        device_arrays.assign(newton.direction, step)
         newton.islands.step_length.fill_(0.7)
         newton.islands.angle_change.fill_(-0.3)
         expected = adjust_serially(newton, rod_iterate.PLACE)
-        straight = arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
+        straight = device_arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
         newton.move()
         inside = np.arange(group.nodes)[:, None] < np.tile(group.host.count, 2)
-        x, theta = arrays.download(newton.x), arrays.download(newton.theta)
+        x, theta = device_arrays.download(newton.x), device_arrays.download(newton.theta)
         np.testing.assert_allclose(x[inside], expected[0][inside], rtol=0, atol=1e-12)
         assert np.abs(x - straight)[inside].max() > 0.05
         if group.kind.twist:
@@ -182,12 +185,12 @@ def test_frame_updates_match_serial_kernel(device):
     for newton, state in solvers("twist", device, clamped=True, noise=0.3):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
-            before, (x, _, expected) = arrays.download(newton.frame), adjust_serially(newton, rod_iterate.RELAG)
+            before, (x, _, expected) = device_arrays.download(newton.frame), adjust_serially(newton, rod_iterate.RELAG)
             newton.move()
-            frames = arrays.download(newton.frame)
+            frames = device_arrays.download(newton.frame)
             np.testing.assert_allclose(frames, expected, rtol=0, atol=1e-13)
             assert np.abs(frames - before).max() > 0.1
-            np.testing.assert_array_equal(arrays.download(newton.x), x)
+            np.testing.assert_array_equal(device_arrays.download(newton.x), x)
 
 
 def advance(scene, device, linear, *, dt=0.01, steps=10, precision="float64", start=None, **options):

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import rod_matrix, rod_pcg
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
@@ -62,39 +62,39 @@ class Problem:
             self.model, self.group, NewtonOptions(linear_rtol=1e-13, **options), preconditioner
         )
         state = self.model.state().groups[0]
-        x = arrays.download(state.x)
-        arrays.assign(newton.x, scale * x + 0.1 * random.normal(size=x.shape))
-        arrays.assign(newton.target, x + 0.1 * random.normal(size=x.shape))
+        x = device_arrays.download(state.x)
+        device_arrays.assign(newton.x, scale * x + 0.1 * random.normal(size=x.shape))
+        device_arrays.assign(newton.target, x + 0.1 * random.normal(size=x.shape))
         if self.kind.twist:
             wp.copy(newton.frame, state.frame)
-            arrays.assign(newton.theta, 0.2 * random.normal(size=newton.theta.shape))
-            arrays.assign(newton.target_angle, 0.2 * random.normal(size=newton.theta.shape))
+            device_arrays.assign(newton.theta, 0.2 * random.normal(size=newton.theta.shape))
+            device_arrays.assign(newton.target_angle, 0.2 * random.normal(size=newton.theta.shape))
         newton.islands.coefficient.assign(random.uniform(1.0, 3.0, size=4))
         newton.islands.rate.fill_(1.0)
         self.before = self.dofs()
         newton.iterate(state.last)
 
     def dofs(self) -> np.ndarray:
-        q = np.moveaxis(arrays.download(self.newton.x), 0, 1)
-        return np.concatenate([q, arrays.download(self.newton.theta).T[..., None]], -1) if self.kind.twist else q
+        q = np.moveaxis(device_arrays.download(self.newton.x), 0, 1)
+        return np.concatenate([q, device_arrays.download(self.newton.theta).T[..., None]], -1) if self.kind.twist else q
 
     def dense(self, column: int):
         """Return matrix (identity on fixed dofs), residual (zero there) and free mask, from element factors and gradients."""
         kind, host, n = self.kind, self.group.host, int(self.count[column])
-        F, g = (arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
-        c, rod = float(arrays.download(self.newton.islands.coefficient)[column]), column % 2
+        F, g = (device_arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
+        c, rod = float(device_arrays.download(self.newton.islands.coefficient)[column]), column % 2
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = (
-            host.mass[:n, rod, None] * self.group.gravity_host + arrays.download(self.group.load)[:n, rod]
+            host.mass[:n, rod, None] * self.group.gravity_host + device_arrays.download(self.group.load)[:n, rod]
         )
-        target = np.moveaxis(arrays.download(self.newton.target), 0, 1)[column, :n]
+        target = np.moveaxis(device_arrays.download(self.newton.target), 0, 1)[column, :n]
         if kind.twist:
             diagonal[:, kind.dim], force[:, kind.dim] = (
                 c * host.rotary[:n, rod],
-                arrays.download(self.group.load_angle)[:n, rod],
+                device_arrays.download(self.group.load_angle)[:n, rod],
             )
-            target = np.concatenate([target, arrays.download(self.newton.target_angle).T[column, :n, None]], -1)
+            target = np.concatenate([target, device_arrays.download(self.newton.target_angle).T[column, :n, None]], -1)
         H, r = np.diag(diagonal.ravel()), (force - diagonal * (self.before[column, :n] - target)).ravel()
         edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
         for k in range(n if kind.closed else n - 1):
@@ -125,7 +125,7 @@ class Problem:
     def blocks(self, column: int) -> np.ndarray:
         """Return the dense matrix of the kernel's blocks."""
         nb, n = self.kind.block, int(self.count[column])
-        stored = arrays.download(self.newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
+        stored = device_arrays.download(self.newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
         H = np.zeros((n, nb, n, nb))
         for k in range(n):
             H[k, :, k] += stored[0, ..., k]
@@ -138,7 +138,7 @@ class Problem:
 
     def vector(self, array) -> np.ndarray:
         """Return a device block vector as (columns, n, block)."""
-        return arrays.download(array).transpose(2, 1, 0)
+        return device_arrays.download(array).transpose(2, 1, 0)
 
     def launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim, inputs, outputs, device=self.device)
@@ -167,8 +167,8 @@ def test_product_matches_dense(device, name, closed):
     newton, (nodes, columns) = problem.newton, (problem.group.nodes, problem.group.columns)
     random = np.random.default_rng(2)
     v = random.normal(size=(problem.kind.block, nodes, columns))
-    arrays.assign(newton.p, v)
-    arrays.assign(newton.q, np.full_like(v, 7.0))
+    device_arrays.assign(newton.p, v)
+    device_arrays.assign(newton.q, np.full_like(v, 7.0))
     newton.islands.wanted.assign(np.array([1, 1, 0, 1], np.int32))
     _, product, _ = rod_pcg.solver_kernels(problem.kind, newton.linear, "chain")
     problem.launch(
@@ -216,7 +216,7 @@ def test_factors_solve_without_seam(device, name, closed):
         expected = np.linalg.solve(H, r)
         np.testing.assert_allclose(solution[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
         assert total.numpy()[column] == pytest.approx(r @ expected, rel=1e-12)
-    assert (arrays.download(newton.islands.lost) == 0).all()
+    assert (device_arrays.download(newton.islands.lost) == 0).all()
 
 
 @EVERY_CHAIN
@@ -225,8 +225,8 @@ def test_direction_matches_dense_solve(device, name, closed, preconditioner):
     """PCG matches; with the exact preconditioner an open rod takes one iteration."""
     problem = Problem(name, closed, device, preconditioner)
     newton = problem.newton
-    direction, decrement = problem.vector(newton.direction), arrays.download(newton.islands.decrement)
-    iterations = arrays.download(newton.iterations)
+    direction, decrement = problem.vector(newton.direction), device_arrays.download(newton.islands.decrement)
+    iterations = device_arrays.download(newton.iterations)
     for column, n in enumerate(problem.count):
         H, r, _ = problem.dense(column)
         expected = np.linalg.solve(H, r)

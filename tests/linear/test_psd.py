@@ -6,7 +6,7 @@ import warp as wp
 from test_pcg import EVERY_CHAIN, Problem
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.core import outcome
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
@@ -18,7 +18,7 @@ CONVERGED = {"converged", "converged_to_rounding"}
 def elastic(problem: Problem, column: int) -> np.ndarray:
     """Return the Newton matrix of a rod on free dofs, without inertia."""
     host, kind, n, rod = problem.group.host, problem.kind, int(problem.count[column]), column % 2
-    c = float(arrays.download(problem.newton.islands.coefficient)[column])
+    c = float(device_arrays.download(problem.newton.islands.coefficient)[column])
     inertia = np.repeat(c * host.mass[:n, rod, None], kind.block, 1)
     if kind.twist:
         inertia[:, kind.dim] = c * host.rotary[:n, rod]
@@ -35,9 +35,9 @@ def exact(problem: Problem) -> list[np.ndarray]:
     """Return the exact elastic Hessian of every rod on free dofs, by reverse-mode differentiation of the gradient."""
     kind, state = problem.kind, problem.model.state()
     data = state.groups[0]
-    arrays.assign(data.x, np.ascontiguousarray(np.moveaxis(problem.before[..., : kind.dim], 0, 1)))
+    device_arrays.assign(data.x, np.ascontiguousarray(np.moveaxis(problem.before[..., : kind.dim], 0, 1)))
     if kind.twist:
-        arrays.assign(data.theta, np.ascontiguousarray(problem.before[..., kind.dim].T))
+        device_arrays.assign(data.theta, np.ascontiguousarray(problem.before[..., kind.dim].T))
     full, size = Tangent(problem.model).hessian(state).toarray(), problem.group.nodes * kind.block
     result = []
     for column in range(len(problem.count)):
@@ -94,11 +94,11 @@ def deflected_helix(solver, device, psd: str):
     (group,) = model.groups
     newton = solver(model, group, NewtonOptions(psd=psd, rtol=1e-13, linear_rtol=1e-14))
     data = model.state().groups[0]
-    x = arrays.download(data.x)
+    x = device_arrays.download(data.x)
     wp.copy(newton.frame, data.frame)
-    arrays.assign(newton.x, x)
-    arrays.assign(newton.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
-    arrays.assign(newton.target_angle, np.ascontiguousarray(s[:, None]))
+    device_arrays.assign(newton.x, x)
+    device_arrays.assign(newton.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
+    device_arrays.assign(newton.target_angle, np.ascontiguousarray(s[:, None]))
     newton.islands.coefficient.fill_(500.0)
     newton.islands.active.fill_(1)
     return newton, data.last

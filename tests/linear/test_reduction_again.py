@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from chain_system import system
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction
 
 COUNTS = (2, 3, 4, 5, 17, 31, 32, 33, 50, 64)
@@ -20,14 +20,14 @@ def test_further_right_hand_sides_match_dense_solves(device, nb):
     lost, active = wp.zeros(columns, dtype=int, device=device), np.arange(columns) % 5 != 0
     for _ in range(2):
         bands, matrices = system(nb, COUNTS, rng)
-        matrix = arrays.upload(bands, wp.float64, device)
+        matrix = device_arrays.upload(bands, wp.float64, device)
         right = rng.normal(size=(2, nb, max(COUNTS), columns))
-        inputs = [arrays.upload(values, wp.float64, device) for values in right]
-        solution = arrays.upload(np.full(right.shape[1:], 7.0), wp.float64, device)
+        inputs = [device_arrays.upload(values, wp.float64, device) for values in right]
+        solution = device_arrays.upload(np.full(right.shape[1:], 7.0), wp.float64, device)
         reduction.solve(matrix, inputs[0], count, every, inputs[0], lost)
         reduction.again(inputs[1], count, wp.array(np.where(active, 1, 2), dtype=int, device=device), 1, solution)
         assert (lost.numpy() == 0).all()
-        first, second = arrays.download(inputs[0]), arrays.download(solution)
+        first, second = device_arrays.download(inputs[0]), device_arrays.download(solution)
         for column, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
             expected = np.linalg.solve(H, right[0, :, :n, column].T.ravel())
             np.testing.assert_allclose(
@@ -50,17 +50,17 @@ def test_in_place_solve_skips_inactive_worlds(device):
     H[0] = 10.0 * np.eye(nb)[:, :, None, None]
     H[1:] = 0.5 * rng.normal(size=H[1:].shape)
     reduction = CyclicReduction(nb, n, 6, wp.float64, device, repeated=True)
-    matrix = arrays.upload(H.reshape(3 * nb**2, n, 6), wp.float64, device)
+    matrix = device_arrays.upload(H.reshape(3 * nb**2, n, 6), wp.float64, device)
     count, every = wp.full(6, n, dtype=int, device=device), wp.full(6, 1, dtype=int, device=device)
     right = rng.normal(size=(nb, n, 6))
     right_sides, lost = (
-        (arrays.upload(right, wp.float64, device) for _ in range(2)),
+        (device_arrays.upload(right, wp.float64, device) for _ in range(2)),
         wp.zeros(6, dtype=int, device=device),
     )
     first, second = right_sides
     reduction.solve(matrix, first, count, every, first, lost)
     reduction.again(second, count, wp.array([1, 2], dtype=int, device=device), 3, second)
-    first_solution, second_solution = arrays.download(first), arrays.download(second)
+    first_solution, second_solution = device_arrays.download(first), device_arrays.download(second)
     np.testing.assert_allclose(second_solution[..., :3], first_solution[..., :3], rtol=1e-12, atol=1e-13)
     assert (second_solution[..., 3:] == right[..., 3:]).all()
 
@@ -73,9 +73,11 @@ def test_rods_of_two_nodes_match_dense_solve(device):
     bands = np.zeros((3, nb, nb, 2, 1))
     bands[0, :, :, 0, 0], bands[0, :, :, 1, 0], bands[1, :, :, 0, 0] = H[:nb, :nb], H[nb:, nb:], H[:nb, nb:]
     reduction = CyclicReduction(nb, 2, 1, wp.float64, device, repeated=True)
-    matrix = arrays.upload(bands.reshape(3 * nb**2, 2, 1), wp.float64, device)
+    matrix = device_arrays.upload(bands.reshape(3 * nb**2, 2, 1), wp.float64, device)
     count, wanted, lost = (wp.array([value], dtype=int, device=device) for value in (2, 1, 0))
     for again, r in enumerate(right):
-        solution = arrays.upload(r.reshape(2, nb).T[..., None], wp.float64, device)
+        solution = device_arrays.upload(r.reshape(2, nb).T[..., None], wp.float64, device)
         reduction.solve(matrix, solution, count, wanted, solution, lost, again=again > 0)
-        np.testing.assert_allclose(arrays.download(solution)[..., 0].T.ravel(), np.linalg.solve(H, r), rtol=1e-10)
+        np.testing.assert_allclose(
+            device_arrays.download(solution)[..., 0].T.ravel(), np.linalg.solve(H, r), rtol=1e-10
+        )

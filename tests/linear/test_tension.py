@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.scenes import hair as curled
 from ddg_warp.solve.linear import solver_selection
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
@@ -59,30 +59,30 @@ def directions(
     model = scene.build(device, "float64")
     for group, state in zip(model.groups, model.state().groups, strict=True):
         newton = DIRECT[solver](model, group, NewtonOptions(psd=psd), linear, split=carried is not None)
-        x = arrays.download(state.x)
+        x = device_arrays.download(state.x)
         noise = 1e-3 * random.normal(size=x.shape)
-        mask = (arrays.download(group.fixed)[..., None] >> np.arange(group.kind.dim)) & 1
+        mask = (device_arrays.download(group.fixed)[..., None] >> np.arange(group.kind.dim)) & 1
         iterate = x + noise * (mask == 0)
         if kept:
             edges = np.diff(iterate, axis=0)
             size = np.linalg.norm(np.diff(x, axis=0), axis=-1, keepdims=True)
             edges *= size / np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-300)
             iterate[1:] = iterate[0] + np.cumsum(edges, axis=0)
-        arrays.assign(newton.x, iterate)
-        arrays.assign(newton.target, x)
+        device_arrays.assign(newton.x, iterate)
+        device_arrays.assign(newton.target, x)
         if group.kind.twist:
             wp.copy(newton.frame, state.frame)
         newton.islands.coefficient.fill_(2.0 if psd == "gauss_newton" else 100.0)
         newton.islands.rate.fill_(1.0)
         if carried is not None:
             newton.islands.carried.fill_(carried)
-        edges = np.diff(arrays.download(newton.x), axis=0)
+        edges = np.diff(device_arrays.download(newton.x), axis=0)
         for _ in range(2):  # a second one for rods with an indefinite matrix under compression
             newton.iterate(state.last)
             if newton.islands.iteration.numpy().all():
                 break
         inside = np.arange(group.nodes)[:, None] < group.host.count
-        results.append((arrays.download(newton.direction).astype(float) * inside, edges, group.host.count))
+        results.append((device_arrays.download(newton.direction).astype(float) * inside, edges, group.host.count))
     return results
 
 
@@ -162,9 +162,9 @@ def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
     """Solve [H r^T, r -s] in float64 from the same blocks, rows and slacks; return (nodes, dofs) and lengthenings."""
     kind, n = newton.group.kind, newton.group.nodes
     nb = kind.block
-    blocks = arrays.download(newton.blocks)[..., 0].astype(float).reshape(3, nb, nb, n)
-    factor = arrays.download(newton.factor)[..., 0].astype(float)
-    fixed = (arrays.download(newton.group.fixed)[:, :1] >> np.arange(nb)) & 1
+    blocks = device_arrays.download(newton.blocks)[..., 0].astype(float).reshape(3, nb, nb, n)
+    factor = device_arrays.download(newton.factor)[..., 0].astype(float)
+    fixed = (device_arrays.download(newton.group.fixed)[:, :1] >> np.arange(nb)) & 1
     slack, H, rows = factor[-1, :-1], np.zeros((n, nb, n, nb)), np.zeros((n - 1, n, nb))
     for k in range(n):
         for offset in range(min(3, n - k)):
@@ -176,7 +176,7 @@ def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
         rows[k, k + 1, : kind.dim] = factor[first : first + kind.dim, k]
     rows *= fixed == 0
     H, rows = H.reshape(n * nb, n * nb), rows.reshape(n - 1, n * nb)
-    right = np.concatenate([arrays.download(newton.right)[..., 0].astype(float).T.ravel(), np.zeros(n - 1)])
+    right = np.concatenate([device_arrays.download(newton.right)[..., 0].astype(float).T.ravel(), np.zeros(n - 1)])
     solution = np.linalg.solve(np.block([[H, rows.T], [rows, -np.diag(slack)]]), right)
     return solution[: n * nb].reshape(n, nb), slack * solution[n * nb :] / np.sqrt(newton.islands.carried.numpy()[0])
 
@@ -185,7 +185,7 @@ def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
 def test_cyclic_reduction_matches_dense_solve(device, axial):
     """Float32 with 150 nodes, one in 15 at or next to a support: within a thousandth at any EA."""
     newton = mixed_wavy_rod(150, axial, device)
-    direction = arrays.download(newton.direction)[..., 0].T
+    direction = device_arrays.download(newton.direction)[..., 0].T
     expected, longer = dense(newton)
     np.testing.assert_allclose(direction[:, :-1], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
     np.testing.assert_allclose(direction[:-1, -1], longer, rtol=0, atol=1e-3 * np.abs(longer).max())

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
@@ -95,14 +95,14 @@ class BroadPhase:
         self._memory = wp.zeros(2 + MORE, dtype=wp.int64, device=self.device)
         counters = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
         self.overflow, self._lost, self.searches, self.looks = (counters[k : k + 1] for k in range(4))
-        self._reading = arrays.Reading(self._memory)
+        self._reading = device_arrays.Reading(self._memory)
         self.more, self.more_read = self._memory[2:], np.zeros(MORE, np.int64)
         self.sought = (0, 0)
         # candidates outdated, outdated for the check of a whole step, searched by the last `update`
         self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._edges = primitives[2]
         self._walked = [part for part in self._things if part.walked]
-        self._motion = motion_kernels(real, arrays.serial(self.device))
+        self._motion = motion_kernels(real, device_arrays.serial(self.device))
         self.rebuild(x)
         several_worlds = worlds > 1
         sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
@@ -185,7 +185,7 @@ class BroadPhase:
             pairs.meet()
             pairs.judge(x, move, together, self.reach, self._around)
 
-        arrays.side_by_side([partial(find, pairs) for pairs in self.lists], self.device)
+        device_arrays.side_by_side([partial(find, pairs) for pairs in self.lists], self.device)
         _, _, mark, _ = self._motion
         outputs = [self._start, self._end, self._stale, self._done, self.searches]
         self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
@@ -353,7 +353,7 @@ class BroadPhase:
             primitives.enclose(x, move, self._shift, radius_fraction, margin, self._lost)
 
     def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, len(x), inputs, outputs, self.device)
+        device_arrays.sweep(kernel, len(x), inputs, outputs, self.device)
 
 
 def _checked_keep(keep: float) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.broad_phase.aabb import box_kernel, bundle, encode
 from ddg_warp.kernels.collision.primitives import surface_struct
@@ -113,7 +113,7 @@ class Things:
         corners = (self.lower, self.upper) if self._single else None
         self.leaves = Boxes(len(starts) - 1, worlds, device, corners)
         self.walked = size != 1  # points query other BVHs and are not queried
-        self.order = WalkOrder(self.leaves) if size in WALKERS and not arrays.serial(device) else None
+        self.order = WalkOrder(self.leaves) if size in WALKERS and not device_arrays.serial(device) else None
         self._enclose = box_kernel(nodes.shape[1], size == PLANES, real)
         self.kernels = [self._enclose] if self._single else [self._enclose, bundle]
         self.kernels += [encode] if self.order else []

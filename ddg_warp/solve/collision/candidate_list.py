@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.collision.broad_phase.aabb import Trees
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import gap_kernel
@@ -93,7 +93,7 @@ class PairList:
         self._judge, self._fill = candidate_kernels(kind, real, self.single)
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
         self.count = wp.zeros(1, dtype=int, device=self.device)
-        parts = 1 if arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
+        parts = 1 if device_arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
         self._counters = wp.zeros((parts, LINE), dtype=int, device=self.device)
         self._found = self._counters[:, 0]
         # largest numbers of pairs and of overlapping leaves since the last reallocation
@@ -157,7 +157,7 @@ class PairList:
         lists, room = [self._links, self._last], [self.overflow, self._needed]
         self.partners.zero_()
         inputs = [self.sides, self.trees, self._wide, x, move, together, reach, around, self._found, self._met]
-        arrays.take_turns(self._judge, len(self._met), inputs, [*lists, self.partners, *room], self.device)
+        device_arrays.take_turns(self._judge, len(self._met), inputs, [*lists, self.partners, *room], self.device)
         self._sums()
         inputs = [*lists, self.starts, self.partners]
         wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
@@ -166,14 +166,14 @@ class PairList:
         """Launch a kernel of `kernels.collision.ccd.additive_ccd` on the pairs with overlapping swept AABBs."""
         inputs = [self.sides, self.trees, self._found, self._met, x, move, keep, room]
         outputs = [*outputs, self.overflow, self._needed]
-        arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)
+        device_arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)
 
     def measure(self, x, gap, enough: float) -> None:
         """Lower the smallest gaps of worlds to the gaps of pairs, until below `enough`."""
         inputs = [self.pairs, self.count, self.sides, x, enough]
-        arrays.take_turns(self._gaps, self.capacity, inputs, [gap], self.device)
+        device_arrays.take_turns(self._gaps, self.capacity, inputs, [gap], self.device)
 
     def cross(self, x, move, crossed, keep: float = 0.0, reach: float = 0.0) -> None:
         """Count pairs by world that interpenetrate in the motion from x, or come within `keep` of the thickness."""
         inputs = [self.pairs, self.count, self.sides, x, move, keep, reach]
-        arrays.take_turns(self._passing, self.capacity, inputs, [crossed], self.device)
+        device_arrays.take_turns(self._passing, self.capacity, inputs, [crossed], self.device)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ddg_warp.compile.conditions import pose_starts
+from ddg_warp.compile.boundary_conditions import pose_starts
 
 
 def number_bodies(host) -> tuple[np.ndarray, int]:

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.solve.collision.candidate_list import PairList
@@ -58,12 +58,14 @@ class PairElements:
         self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
-        self.factor.row = arrays.allocate((self.rows, capacity), wp.types.vector(assembly.ROW, linear), self.device)
+        self.factor.row = device_arrays.allocate(
+            (self.rows, capacity), wp.types.vector(assembly.ROW, linear), self.device
+        )
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         items, angle_capacity = (assembly.ITEMS, capacity) if self.rolls else (assembly.SLOTS, 0)
-        self.gradient = arrays.allocate((items, capacity), wp.types.vector(3, self.real), self.device)
+        self.gradient = device_arrays.allocate((items, capacity), wp.types.vector(3, self.real), self.device)
         self.factor.angles = wp.zeros(angle_capacity, dtype=wp.vec2i, device=self.device)
-        self.factor.lever = arrays.allocate(
+        self.factor.lever = device_arrays.allocate(
             (self.rows, angle_capacity), wp.types.vector(assembly.ANGLES, linear), self.device
         )
         self._items.reserve(capacity)
@@ -77,4 +79,4 @@ class PairElements:
         return used, -self.gradient.numpy()[: self.found.kind.first, used].sum(0)
 
     def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.take_turns(kernel, count, inputs, outputs, self.device)
+        device_arrays.take_turns(kernel, count, inputs, outputs, self.device)

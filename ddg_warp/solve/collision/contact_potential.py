@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.densities import Density
@@ -124,7 +124,7 @@ class PairTerms:
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
-        made = assembly.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
+        made = assembly.collect_kernels(self.real, self.linear, device_arrays.serial(self.device), self.rolls)
         self._collect, self._join, self._roll = made
         edges = len(self.between) if self.rolls else 0
         types = (*(wp.types.vector(3, self.linear),) * 2, self.linear)
@@ -201,7 +201,9 @@ class PairTerms:
             part.write(x, law, self.gap)
             friction.lag(law, x, again, self.more)
 
-        arrays.side_by_side([partial(lag, *both) for both in zip(self.lists, self.frictions, strict=True)], self.device)
+        device_arrays.side_by_side(
+            [partial(lag, *both) for both in zip(self.lists, self.frictions, strict=True)], self.device
+        )
         if not again:
             wp.copy(self.start, x)
         self._lagged = self._version
@@ -237,12 +239,12 @@ class PairTerms:
                 part.evaluate(x, start, rate, iterates)
 
         push = [partial(part.evaluate, x, self.law, self.gap) for part in self.lists]
-        arrays.side_by_side([*push, *([rub] if self.frictions else [])], self.device)
-        arrays.side_by_side([self._sum_up, partial(self._totals, self.search.overflow)], self.device)
+        device_arrays.side_by_side([*push, *([rub] if self.frictions else [])], self.device)
+        device_arrays.side_by_side([self._sum_up, partial(self._totals, self.search.overflow)], self.device)
 
     def _sum_up(self) -> None:
         outputs = [self.forces, self.diagonal, self.stiffness, self._told]
-        arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
+        device_arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
 
     def _start_anew(self) -> None:
         """Reset the smallest gaps, and refuse lists that have grown since `fit`."""
@@ -292,10 +294,10 @@ class PairTerms:
         """Write `between` and `turned` of the last `evaluate`."""
         edges = self.search.lists[0].first
         inputs = [self.products.sets, edges.surface, edges.count]
-        arrays.sweep(self._join, len(self.between), inputs, [self.between, self._told_edges], self.device)
+        device_arrays.sweep(self._join, len(self.between), inputs, [self.between, self._told_edges], self.device)
         if self.rolls:
             inputs = [self.products.sets, self._angles, len(self.search.shapes.points)]
-            arrays.sweep(self._roll, len(self.between), inputs, self.turned, self.device)
+            device_arrays.sweep(self._roll, len(self.between), inputs, self.turned, self.device)
 
     def _check(self, rate: wp.array) -> None:
         """Refuse rates of the wrong shape or type, and friction without `lag`."""

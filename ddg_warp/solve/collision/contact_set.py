@@ -7,7 +7,7 @@ from functools import partial
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.pair_evaluation import evaluate_kernels, exact_product_kernel
 from ddg_warp.kernels.collision.contact.potential import rows_of
 from ddg_warp.kernels.collision.primitives import EDGES
@@ -37,7 +37,7 @@ class ContactElements(PairElements):
         kind = candidates.kind
         super().__init__(candidates, rows_of(kind), nodes, real, linear, silent)
         self.density = law
-        serial = arrays.serial(self.device)
+        serial = device_arrays.serial(self.device)
         self._sieve, self._pack, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
         self._exact = exact_product_kernel(kind, law, real, linear)
         self.kernels += [self._sieve, self._evaluate, self._exact]
@@ -47,7 +47,7 @@ class ContactElements(PairElements):
 
     def reserve(self) -> None:
         super().reserve()
-        serial = arrays.serial(self.device)
+        serial = device_arrays.serial(self.device)
         self._marks = wp.zeros(0 if serial else self.found.capacity, dtype=int, device=self.device)
         self._running = None if serial else RunningSums(self._marks)
         if self.mollified:
@@ -62,7 +62,7 @@ class ContactElements(PairElements):
         """Find and evaluate the active pairs as `write`, and build the incidence lists."""
         self._find(x, law, gap)
         list_pairs = partial(self._items.list, self.count, self.factor)
-        arrays.side_by_side([partial(self._push, x, law), list_pairs], self.device)
+        device_arrays.side_by_side([partial(self._push, x, law), list_pairs], self.device)
 
     def _find(self, x: wp.array, law, gap: wp.array) -> None:
         candidates, data = self.found, [self.found.sides, law, x]

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import SLOTS
 from ddg_warp.kernels.collision.contact.pair_evaluation import columns_kernel
 
@@ -29,12 +29,15 @@ def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.nda
     number = int(elements.count.numpy()[0])
     if not number:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-    out = arrays.allocate((COLUMNS, SLOTS, number), wp.types.vector(3, elements.linear), x.device)
-    threads, every = arrays.takers(COLUMNS * number, x.device), wp.array(np.arange(number), dtype=int, device=x.device)
+    out = device_arrays.allocate((COLUMNS, SLOTS, number), wp.types.vector(3, elements.linear), x.device)
+    threads, every = (
+        device_arrays.takers(COLUMNS * number, x.device),
+        wp.array(np.arange(number), dtype=int, device=x.device),
+    )
     kernel = columns_kernel(elements.found.kind, elements.density, elements.real, elements.linear)
     inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, every, elements.count, threads]
     wp.launch(kernel, threads, inputs, [out], device=x.device)
-    values = arrays.download(out).astype(float).transpose(2, 0, 1, 3).reshape(number, COLUMNS, COLUMNS)
+    values = device_arrays.download(out).astype(float).transpose(2, 0, 1, 3).reshape(number, COLUMNS, COLUMNS)
     nodes = elements.factor.nodes.numpy()[:number]
     dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(number, COLUMNS)
     columns, rows = (np.broadcast_to(v, values.shape) for v in (dofs[:, :, None], dofs[:, None, :]))

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import ANGLES
 from ddg_warp.kernels.collision.friction.potential import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
@@ -68,15 +68,15 @@ class FrictionElements(PairElements):
             getattr(self, name).zero_()
         capacity = self.found.capacity
         pair = wp.types.vector(2, self.real)
-        self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
+        self._slip, self._along = (device_arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
         self.work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
         self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self.real), device=self.device)
         vector = wp.types.vector(3, self.real)
-        self.lagged.tangent = arrays.allocate((self._rows, capacity), vector, self.device)
+        self.lagged.tangent = device_arrays.allocate((self._rows, capacity), vector, self.device)
         spinning = capacity if self._spins.any else 0
         self.lagged.spinning = wp.zeros(spinning, dtype=int, device=self.device)
         self.lagged.arm = wp.zeros(spinning, dtype=vector, device=self.device)
-        self.lagged.lever = arrays.allocate((ANGLES, capacity if self.rolls else 0), vector, self.device)
+        self.lagged.lever = device_arrays.allocate((ANGLES, capacity if self.rolls else 0), vector, self.device)
 
     def lag(self, law, x: wp.array, again: bool, more: wp.array) -> None:
         """Copy the active contact pairs as evaluated last, at x; `again`: within a solve, with the directions of slips.
@@ -110,7 +110,7 @@ class FrictionElements(PairElements):
         self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
 
     def _upload(self, values: np.ndarray) -> wp.array:
-        return arrays.upload(values.astype(np.int32), wp.vec2i, self.device)
+        return device_arrays.upload(values.astype(np.int32), wp.vec2i, self.device)
 
     def couples(self) -> np.ndarray:
         """Return the torques of pairs on rotating objects (worlds, objects, 3) [N m], as evaluated last. Reads from the device."""

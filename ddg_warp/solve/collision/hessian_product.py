@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import set_struct
 from ddg_warp.kernels.collision.contact.geometric_stiffness import KINDS
 from ddg_warp.kernels.collision.contact.hessian_product import product_kernels
@@ -22,7 +22,9 @@ class PairProduct:
         self._parts, self._real, self._linear, self._device = pair_sets, real, linear, pair_sets[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
-        made = product_kernels(real, linear, arrays.serial(self._device), any(pair_set.rolls for pair_set in pair_sets))
+        made = product_kernels(
+            real, linear, device_arrays.serial(self._device), any(pair_set.rolls for pair_set in pair_sets)
+        )
         self._multiply, self._gather, self._meet, self._settle = made
         self.kernels = [*made]
         self.kernels += [kernel for pair_set in self._mollified for kernel in pair_set.kernels]
@@ -60,7 +62,7 @@ class PairProduct:
     def place(self, v, x=None, wanted=None) -> None:
         """Write the contributions of pairs to a product; arguments as of `__call__`."""
         exact_at = self._nothing if wanted is None else [wanted, x]
-        arrays.take_turns(self._multiply, self.most, [self.sets, *exact_at, v], [], self._device)
+        device_arrays.take_turns(self._multiply, self.most, [self.sets, *exact_at, v], [], self._device)
         for edges in self._mollified if wanted is not None else ():
             if not edges.keeps:
                 edges.multiply(v)
@@ -80,4 +82,4 @@ class PairProduct:
         return struct
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, count, inputs, outputs, self._device)
+        device_arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import ANGLES
 from ddg_warp.kernels.collision.contact.incidence import list_kernels
 from ddg_warp.kernels.collision.primitives import Kind
@@ -28,13 +28,13 @@ class NodeItems:
         self.numbers, self._filled = self._both[0], self._both[1]
         self._running = RunningSums(self.numbers)
         self.places = self._running.starts
-        self._number, self._fill, self._sort = list_kernels(kind, arrays.serial(self.device), rolls)
+        self._number, self._fill, self._sort = list_kernels(kind, device_arrays.serial(self.device), rolls)
         self.kernels = [self._number, self._fill, self._sort, *self._running.kernels]
 
     def reserve(self, capacity: int) -> None:
         """Make room for the items of `capacity` pairs."""
         self.items = wp.zeros((self._size + self._angles) * capacity, dtype=int, device=self.device)
-        self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
+        self._unordered = self.items if device_arrays.serial(self.device) else wp.zeros_like(self.items)
         self.ranks = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.angle_ranks = wp.zeros(capacity if self._angles else 0, dtype=wp.vec2i, device=self.device)
 
@@ -52,4 +52,4 @@ class NodeItems:
             self._take_turns(self._sort, len(nodes), inputs, [self.items, *ranks])
 
     def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.take_turns(kernel, count, inputs, outputs, self.device)
+        device_arrays.take_turns(kernel, count, inputs, outputs, self.device)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import SLOTS
 from ddg_warp.kernels.collision.contact.pair_evaluation import columns_kernel, exact_product_kernel, mark_kernel
 from ddg_warp.kernels.collision.primitives import EDGES
@@ -43,7 +43,7 @@ class Mollified:
         self.starts = self._running.starts
         self._chosen = wp.zeros(room, dtype=int, device=elements.device)
         vector = wp.types.vector(3, elements.linear)
-        self.columns = arrays.allocate((3 * SLOTS, SLOTS, room), vector, elements.device)
+        self.columns = device_arrays.allocate((3 * SLOTS, SLOTS, room), vector, elements.device)
 
     def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
         """Find near-parallel pairs at positions x and differentiate, in `wanted` worlds."""
@@ -53,12 +53,12 @@ class Mollified:
         self._running()
         chosen = [self._chosen, self._number]
         self._sweep(choose, len(self.marks), [elements.count, self.marks, self.starts], chosen)
-        threads = arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), elements.device)
+        threads = device_arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), elements.device)
         inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, *chosen, threads]
         wp.launch(self._differentiate, threads, inputs, [self.columns], device=elements.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.take_turns(kernel, count, inputs, outputs, self._of.device)
+        device_arrays.take_turns(kernel, count, inputs, outputs, self._of.device)
 
 
 class Unkept:
@@ -82,4 +82,4 @@ class Unkept:
         """Write products of the Hessians with v."""
         elements, (x, law) = self._of, self._at
         inputs = [elements.pairs, elements.count, elements.found.sides, law, x, elements.factor, v, elements.ranks]
-        arrays.take_turns(self._multiply, elements.found.capacity, inputs, [elements.placed], elements.device)
+        device_arrays.take_turns(self._multiply, elements.found.capacity, inputs, [elements.placed], elements.device)

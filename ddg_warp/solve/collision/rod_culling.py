@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, DOUBT, KNOWN, run_kernels
 from ddg_warp.solve.collision.bvh import Boxes
@@ -63,7 +63,7 @@ class Runs:
         self.doubt.fill_(1)
         self.known[AHEAD].fill_(FIRST)
         self._again, self.looks = wp.zeros(1, dtype=int, device=device), search.looks
-        serial = arrays.serial(device)
+        serial = device_arrays.serial(device)
         *_, self._common = motion_kernels(real, serial)
         made = run_kernels(worlds > 1, real, serial)
         self._clear, self._enclose, self._meet, self._settle, self._hold, self._follow = made
@@ -108,7 +108,7 @@ class Runs:
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
         """Launch over the edges of every world."""
-        arrays.sweep(kernel, self._edges, inputs, outputs, self._boxes.device, worlds=self._search.worlds)
+        device_arrays.sweep(kernel, self._edges, inputs, outputs, self._boxes.device, worlds=self._search.worlds)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self._boxes.device)

@@ -4,7 +4,7 @@ from functools import partial
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.step_fractions import limit_kernels, share_kernels
 
@@ -21,7 +21,7 @@ class MotionFilter:
 
     def __init__(self, lists: list, nodes: int, worlds: int, real, device):
         self._lists, self._nodes, self._worlds, self._device = lists, nodes, worlds, device
-        serial = arrays.serial(device)
+        serial = device_arrays.serial(device)
         made = [limit_kernels(pairs.kind, real) for pairs in lists]
         self._picks, self._limits = zip(*made, strict=True)
         self._start, self._turn, self._settle, self._finish, self._shorten = share_kernels(real, serial)
@@ -67,15 +67,17 @@ class MotionFilter:
             if again:
                 number.zero_()
                 inputs = [pairs.pairs, count, pairs.sides, unit, units, shares, before]
-                arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, number], self._device)
+                device_arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, number], self._device)
                 count, picked = number, pairs.picked
             inputs = [pairs.pairs, count, picked, pairs.sides, base, move, keep, reach, unit, units, shares]
-            arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
+            device_arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
 
         def go(times: wp.array, again: bool = True) -> None:
             wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
             of_lists = zip(self._picks, self._limits, self._lists, self._numbers, strict=True)
-            arrays.side_by_side([partial(lower, times, again, *list_data) for list_data in of_lists], self._device)
+            device_arrays.side_by_side(
+                [partial(lower, times, again, *list_data) for list_data in of_lists], self._device
+            )
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
 
@@ -86,4 +88,4 @@ class MotionFilter:
         self._sweep(self._shorten, len(q), [base, move, unit, units, shares, done, together], [q, *motion])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, count, inputs, outputs, self._device)
+        device_arrays.sweep(kernel, count, inputs, outputs, self._device)

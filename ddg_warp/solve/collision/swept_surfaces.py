@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp.compile.conditions import pose_starts
+from ddg_warp.compile.boundary_conditions import pose_starts
 from ddg_warp.scene.grip import Grip
-from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.obstacles import PLANE
+from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.solve.collision.ccd_bodies import number_bodies
 
 TILT = 0.25  # largest rotation of a half-space in a substep [rad]: it reaches arbitrarily far

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.world_sums import ROWS, total_kernels, written_struct
 from ddg_warp.solve.linear.sparse_system import Sums
 
@@ -25,7 +25,7 @@ class Totals:
         self._of_things = wp.zeros((ROWS * worlds, primitives), dtype=real, device=device)
         self._of_worlds = wp.zeros((ROWS, worlds), dtype=real, device=device)
         self._sum = Sums(ROWS * worlds, primitives, real, device)
-        self._add, self._tell = total_kernels(real, arrays.serial(device))
+        self._add, self._tell = total_kernels(real, device_arrays.serial(device))
         self.kernels = [self._add, self._tell, *self._sum.kernels]
         self.fit()
 
@@ -38,7 +38,9 @@ class Totals:
     def __call__(self, overflow: wp.array) -> None:
         """Sum the last evaluation over each world."""
         inputs = [self._written_by, self._worlds]
-        arrays.sweep(self._add, self._of_things.shape[1], inputs, [self._of_things], self._device, worlds=self._worlds)
+        device_arrays.sweep(
+            self._add, self._of_things.shape[1], inputs, [self._of_things], self._device, worlds=self._worlds
+        )
         self._sum(self._of_things, self._of_worlds.flatten())
         outputs = [self.energy, self.touching, self.dissipated]
         wp.launch(self._tell, self._worlds, [self._of_worlds, overflow], outputs, device=self._device)

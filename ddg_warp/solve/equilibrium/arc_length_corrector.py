@@ -13,18 +13,18 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State
-from ddg_warp.scene.path import REGULAR, Displacement, Point
+from ddg_warp.scene.equilibrium_path import REGULAR, Displacement, Point
 from ddg_warp.solve.equilibrium import stability
 from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 from ddg_warp.solve.linear.bordered import Bordered
 from ddg_warp.solve.linear.sparse_direct import Factorisation, SingularError
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class ContinuationOptions:
     """Options of a continuation.
@@ -53,7 +53,7 @@ class ContinuationOptions:
     def __post_init__(self):
         positive = ("step", "max_step", "min_step", "rotation_cap", "tolerance", "rtol", "floor_factor")
         scaled = () if self.load_scale is None else ("load_scale",)
-        arguments.check_options(self, positive + scaled, ("iterations", "max_iterations"))
+        argument_checks.check_options(self, positive + scaled, ("iterations", "max_iterations"))
         for name in ("step", "max_step"):
             if getattr(self, name) < self.min_step:
                 raise SceneError(

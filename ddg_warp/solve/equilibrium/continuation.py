@@ -19,12 +19,12 @@ from numbers import Real
 import numpy as np
 from scipy.optimize import brentq
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
+from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.state import State, check_state
-from ddg_warp.scene.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
+from ddg_warp.scene.equilibrium_path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
 from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions, Corrector, Failed
-from ddg_warp.threads import launches, stays_here
 
 FORK = 1e-2  # Relative work of the load along the path below which a stationary load is no limit point.
 CONTROLLED = 0.2  # Largest deviation of a controlled change from the mean of the end rates, relative.
@@ -32,7 +32,7 @@ LEAP = 4.0  # Distance of two points over their arc length beyond which paths di
 BISECTIONS = 12  # Bisections of a bifurcation before linear interpolation of the critical eigenvalue.
 
 
-@arguments.sealed
+@argument_checks.sealed
 @stays_here
 @launches
 class Continuation:
@@ -49,13 +49,15 @@ class Continuation:
 
     def __init__(self, model, watch: Mapping[str, Displacement] | None = None, **options):
         if watch is not None and not isinstance(watch, Mapping):
-            raise SceneError(f"Continuation: watch is {arguments.shown(watch)}; give displacements by name")
+            raise SceneError(f"Continuation: watch is {argument_checks.shown(watch)}; give displacements by name")
         for name, displacement in (watch or {}).items():
-            arguments.text("Continuation: a name in watch", name)
+            argument_checks.text("Continuation: a name in watch", name)
             if not isinstance(displacement, Displacement):
                 raise SceneError(f"watch[{name!r}] is {displacement!r}; give Displacement.of(row, axis)")
         self.model = model
-        self.options = arguments.options("Continuation", ContinuationOptions, options, arguments.names(Continuation))
+        self.options = argument_checks.options(
+            "Continuation", ContinuationOptions, options, argument_checks.names(Continuation)
+        )
         self.corrector = Corrector(model, watch or {}, self.options)
         self.tangent, self.watched = self.corrector.tangent, self.corrector.watched
 
@@ -80,7 +82,7 @@ class Continuation:
         """
         if not (isinstance(direction, Real) and direction in (1, -1)):
             raise SceneError(
-                f"direction = {arguments.shown(direction)}; it is 1, with the load growing at first, or -1"
+                f"direction = {argument_checks.shown(direction)}; it is 1, with the load growing at first, or -1"
             )
         first = self._start(state, start)
         stop = self._stop(stop)
@@ -92,12 +94,12 @@ class Continuation:
         """Return the first point of a path, near `state`."""
         if state is not None:
             check_state("continuation", self.model, state)
-        return self.corrector.start(state or self.model.state(), arguments.number("continuation: start", start))
+        return self.corrector.start(state or self.model.state(), argument_checks.number("continuation: start", start))
 
     def _stop(self, stop: Stop | None) -> Stop:
         """Return the checked end of a path."""
         if stop is not None and not isinstance(stop, Stop):
-            raise SceneError(f"stop is {arguments.shown(stop)}; give Stop(...)")
+            raise SceneError(f"stop is {argument_checks.shown(stop)}; give Stop(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
             raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
         return stop or Stop()
@@ -109,7 +111,9 @@ class Continuation:
         """
         for point in points if isinstance(points, Sequence) else [points]:
             if not isinstance(point, Point):
-                raise SceneError(f"statistics: {arguments.shown(point)} is no point; give a list of those of a path")
+                raise SceneError(
+                    f"statistics: {argument_checks.shown(point)} is no point; give a list of those of a path"
+                )
             self.corrector.equilibrium.count(point.state, 0.0)
         return self.corrector.equilibrium.statistics()
 
@@ -128,11 +132,11 @@ class Continuation:
         """
         if not isinstance(bifurcation, Point):
             raise ValueError(
-                f"switch: {arguments.shown(bifurcation)} is no point of a path; give one of path.bifurcations"
+                f"switch: {argument_checks.shown(bifurcation)} is no point of a path; give one of path.bifurcations"
             )
         if not (isinstance(side, Real) and side in (1, -1)):
-            raise SceneError(f"side = {arguments.shown(side)}; it is 1 or -1, the sense of the mode")
-        step = self.options.step if step is None else arguments.positive("switch: step", step)
+            raise SceneError(f"side = {argument_checks.shown(side)}; it is 1 or -1, the sense of the mode")
+        step = self.options.step if step is None else argument_checks.positive("switch: step", step)
         if bifurcation.kind != BIFURCATION:
             raise ValueError(f"the point is a {bifurcation.kind}; a path branches at a bifurcation")
         across = np.append(bifurcation.mode, 0.0)
@@ -178,13 +182,13 @@ class Continuation:
                 larger values need a jump; carries the path so far as `path`.
         """
         if not isinstance(displacement, str) or displacement not in self.watched:
-            shown = arguments.shown(displacement)
+            shown = argument_checks.shown(displacement)
             raise SceneError(f"no displacement {shown} is watched; give watch={{{shown}: Displacement...}}")
         row = np.append(self.watched[displacement], 0.0)
-        values = np.atleast_1d(arguments.array("control: values", values, "give finite numbers"))
+        values = np.atleast_1d(argument_checks.array("control: values", values, "give finite numbers"))
         if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise SceneError(f"control: values have shape {values.shape}; give finite numbers (values,), one at least")
-        arguments.count("control: max_cuts", max_cuts, 0)
+        argument_checks.count("control: max_cuts", max_cuts, 0)
         current, path = self._start(state, start), Path()
         for value in values:
             reached, cuts = current.values[displacement], 0

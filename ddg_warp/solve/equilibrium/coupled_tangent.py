@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp.compile.tolerance import largest_excess
-from ddg_warp.geometry.turning import turned
+from ddg_warp.compile.residual_tolerance import largest_excess
+from ddg_warp.geometry.edge_rotation import turned
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage, linear_stress_kernel
 from ddg_warp.model import validate
@@ -157,7 +157,7 @@ class NetTangent(Part):
         state.net.q.assign(self.back(q).reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.geometry.turning`.
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.geometry.edge_rotation`.
 
         Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
         """
@@ -254,7 +254,7 @@ class NetTangent(Part):
         return np.concatenate(result)
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:
-        """Residuals at rtol = 1 (size,) [N, N m] of bodies with such loads; see `ddg_warp.compile.tolerance`."""
+        """Residuals at rtol = 1 (size,) [N, N m] of bodies with such loads; see `ddg_warp.compile.residual_tolerance`."""
         blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.net.worlds, -1)]
         return np.repeat(np.concatenate(blocks), 3)
 

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, rub_kernel
 from ddg_warp.kernels.collision.contact.assembly import ITEMS, SLOTS
 from ddg_warp.kernels.terms import FRICTION_LAWS
@@ -44,7 +44,7 @@ class Rubbing:
             zeros(ROLLED, self._rolls),
             zeros(NUMBERS, True),
         )
-        self._start_parts, self._lagged_parts = (arrays.allocate(shape, vector, device) for _ in range(2))
+        self._start_parts, self._lagged_parts = (device_arrays.allocate(shape, vector, device) for _ in range(2))
         self.by_direction = wp.zeros(most if self._leads else 1, dtype=vector, device=device)
 
     def pull(self, index: int, of: tuple, at: tuple, w: wp.array, rate: wp.array, numbers: wp.array) -> list[wp.array]:
@@ -62,7 +62,7 @@ class Rubbing:
         inputs += [*at, w, self._velocity, rate, *rub.directions, terms.spins.places, terms.spins.turned.flatten()]
         written = [rub.gradient, self._start_parts, self._lagged_parts]
         more = [numbers, self.by_direction, self.spun, self.radii]
-        arrays.take_turns(self.kernels[index], rub.found.capacity, inputs, [*written, *more], self.net.device)
+        device_arrays.take_turns(self.kernels[index], rub.found.capacity, inputs, [*written, *more], self.net.device)
         return written
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
@@ -93,9 +93,9 @@ class Rubbing:
         felt = (rub.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
         felt[:, rub.found.kind.first + rub.found.kind.second : SLOTS] = False
         apart = np.where(felt, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
-        nodes = arrays.upload(apart[:, :SLOTS], wp.vec4i, device)
+        nodes = device_arrays.upload(apart[:, :SLOTS], wp.vec4i, device)
         if rub.rolls:
-            angles = arrays.upload(apart[:, SLOTS:], wp.vec2i, device)
+            angles = device_arrays.upload(apart[:, SLOTS:], wp.vec2i, device)
         if rub.directions[0]:
             world, first = np.divmod(rub.pairs.numpy()[:count, 0], rub.found.first.count)
             ends = rub.directions[0].numpy()[first] + world[:, None] * self.net.blocks

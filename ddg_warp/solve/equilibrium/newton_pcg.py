@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core import outcome
@@ -230,7 +230,7 @@ class NetEquilibrium:
         self._size = float(np.ptp(model.net.host.rest[: model.net.host.nodes], axis=0).max())
         self._start = model.net.empty()  # lagged data of a solve
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
-        self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
+        self._graphs = Graphs(model, lambda: device_arrays.load_kernels(self.newton.kernels, model.wp_device))
         self.wary = True
         self.polish = None
         if self.newton.rubs and not large_static(model):

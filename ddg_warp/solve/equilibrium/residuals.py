@@ -7,7 +7,7 @@ class Residuals:
     """Convergence test of a `Tangent` by the tolerances of a static solve.
 
     Args:
-        rtol: see `ddg_warp.compile.tolerance`.
+        rtol: see `ddg_warp.compile.residual_tolerance`.
         rounding: rounding floor of a dof, over its force contributions.
     """
 
@@ -34,7 +34,7 @@ class Residuals:
         return scale if scale.any() else scale + np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
 
     def allowed(self, scale: np.ndarray) -> np.ndarray:
-        """Return residual limits of all dofs at rtol = 1 (size,) [N, N m]; see `ddg_warp.compile.tolerance`."""
+        """Return residual limits of all dofs at rtol = 1 (size,) [N, N m]; see `ddg_warp.compile.residual_tolerance`."""
         return np.concatenate([part.allowed(part_scale) for part, part_scale in self._by_part(scale)])
 
     def _by_part(self, scale: np.ndarray):

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.model.rest_shapes import set_rest
 
@@ -102,7 +102,7 @@ class RestPath:
             raise SceneError(f"statics: rest[{key!r}]: rod {rod} has no natural {strain_key} that can be changed")
         for read, term, names, count, write in targets:
             shape = (count, len(names)) if len(names) > 1 else (count,)
-            target_values = arguments.broadcast(f"statics: rest[{key!r}][{strain_key!r}]", values, shape).reshape(
+            target_values = argument_checks.broadcast(f"statics: rest[{key!r}][{strain_key!r}]", values, shape).reshape(
                 count, -1
             )
             start = {name: read(f"{term.name}.{name}") for name in names}

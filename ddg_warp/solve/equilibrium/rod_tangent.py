@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp import arrays
-from ddg_warp.compile.tolerance import support_forces
-from ddg_warp.geometry.turning import turned
+from ddg_warp import device_arrays
+from ddg_warp.compile.residual_tolerance import support_forces
+from ddg_warp.geometry.edge_rotation import turned
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.model.parameters import ParameterTable
@@ -34,9 +34,9 @@ class ChainTangent(Part):
         self.incidence = _incidence(group)
         self.free = _free(group)
         self.angle = np.tile(np.arange(kind.block) >= kind.dim, group.columns * group.nodes)
-        self._windows = arrays.allocate((kind.window, *shape), real, device)
-        self._energies = arrays.allocate(shape, real, device)
-        self._hessian = arrays.allocate((kind.window**2, *shape), real, device)
+        self._windows = device_arrays.allocate((kind.window, *shape), real, device)
+        self._energies = device_arrays.allocate(shape, real, device)
+        self._hessian = device_arrays.allocate((kind.window**2, *shape), real, device)
 
     def accelerations(self, gravity: np.ndarray) -> np.ndarray:
         return np.append(gravity[list(self.host.axes)], 0.0)[None, : self.group.kind.block]
@@ -50,7 +50,7 @@ class ChainTangent(Part):
         for i, term in enumerate(self.group.kind.terms):
             self._energies.zero_()
             self._launch(state, i, 0, self._energies)
-            values = arrays.download(self._energies).astype(np.float64)
+            values = device_arrays.download(self._energies).astype(np.float64)
             yield term.name, values.T.reshape(self.group.worlds, -1)
 
     def gradient(self, state) -> np.ndarray:
@@ -58,7 +58,7 @@ class ChainTangent(Part):
         for i in range(len(self.group.kind.terms)):
             self._windows.zero_()
             self._launch(state, i, 1, self._windows)
-            window = arrays.download(self._windows).astype(np.float64)
+            window = device_arrays.download(self._windows).astype(np.float64)
             result += self.incidence.T @ window.transpose(2, 1, 0).ravel()
         return result
 
@@ -67,7 +67,7 @@ class ChainTangent(Part):
         for i in range(len(self.group.kind.terms)):
             self._launch(state, i, 2, self._hessian)
         w = self.group.kind.window
-        values = arrays.download(self._hessian).astype(np.float64).transpose(2, 1, 0).reshape(-1, w, w)
+        values = device_arrays.download(self._hessian).astype(np.float64).transpose(2, 1, 0).reshape(-1, w, w)
         values = 0.5 * (values + values.transpose(0, 2, 1))
         elements = len(values)
         diagonal = sparse.bsr_matrix((values, np.arange(elements), np.arange(elements + 1)))
@@ -90,7 +90,7 @@ class ChainTangent(Part):
                 table = ParameterTable(values | own, 0, self.model.types.real, self.model.wp_device)
                 self._windows.zero_()
                 self._launch(state, index, 1, self._windows, table)
-                blocks[..., first + unit] = arrays.download(self._windows).transpose(2, 1, 0)
+                blocks[..., first + unit] = device_arrays.download(self._windows).transpose(2, 1, 0)
         blocks = blocks.reshape(-1, *blocks.shape[2:])
         elements = np.arange(len(blocks) + 1)
         return sparse.csr_matrix(self.incidence.T @ sparse.bsr_matrix((blocks, elements[:-1], elements)))
@@ -108,17 +108,17 @@ class ChainTangent(Part):
     def _flat(self, nodes: wp.array, angles: wp.array) -> np.ndarray:
         kind = self.group.kind
         q = np.zeros((self.group.columns, self.group.nodes, kind.block))
-        q[..., : kind.dim] = arrays.download(nodes).transpose(1, 0, 2)
+        q[..., : kind.dim] = device_arrays.download(nodes).transpose(1, 0, 2)
         if kind.twist:
-            q[..., kind.dim] = arrays.download(angles).T
+            q[..., kind.dim] = device_arrays.download(angles).T
         return q.ravel()
 
     def assign(self, state, q: np.ndarray) -> None:
         kind, data = self.group.kind, self.data(state)
         values = self.blocks(q)
-        arrays.assign(data.x, np.ascontiguousarray(values[..., : kind.dim].transpose(1, 0, 2)))
+        device_arrays.assign(data.x, np.ascontiguousarray(values[..., : kind.dim].transpose(1, 0, 2)))
         if kind.twist:
-            arrays.assign(data.theta, np.ascontiguousarray(values[..., kind.dim].T))
+            device_arrays.assign(data.theta, np.ascontiguousarray(values[..., kind.dim].T))
 
     @cached_property
     def _motion(self) -> Motion:
@@ -151,7 +151,7 @@ class ChainTangent(Part):
         return np.maximum(total, support_forces(held, np.repeat(np.arange(columns), nodes), columns))
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:
-        """Residuals at rtol = 1 (size,) [N, N m] of rods with such loads; see `ddg_warp.compile.tolerance`."""
+        """Residuals at rtol = 1 (size,) [N, N m] of rods with such loads; see `ddg_warp.compile.residual_tolerance`."""
         lengths = np.where(self.angle, np.repeat(np.tile(self.group.host.length, self.group.worlds), self._dofs), 1.0)
         return np.repeat(loads, self._dofs) * lengths
 
@@ -196,7 +196,7 @@ class ChainTangent(Part):
         return self.host.name(k * self.group.rods + column % self.group.rods)
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.geometry.turning`."""
+        """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.geometry.edge_rotation`."""
         moved = q + step
         kind, group = self.group.kind, self.group
         x, dx = (self.blocks(v)[..., : kind.dim] for v in (q, step))
@@ -220,7 +220,7 @@ class ChainTangent(Part):
                 (*grid, window),
                 (window, window),
             )
-        wp.launch(kernel, grid, inputs, [arrays.columns(out, *rows)], device=device)
+        wp.launch(kernel, grid, inputs, [device_arrays.columns(out, *rows)], device=device)
 
 
 def _incidence(group) -> sparse.csr_matrix:

@@ -9,7 +9,7 @@ from scipy import linalg, sparse
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigs, splu
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.model.model import check_model
@@ -81,11 +81,11 @@ def spectrum(
     """
     check_model("spectrum", model)
     check_state("spectrum", model, state)
-    arguments.count("spectrum: count", count)
-    arguments.choice("spectrum: metric", metric, ("mass", "unit"))
+    argument_checks.count("spectrum: count", count)
+    argument_checks.choice("spectrum: metric", metric, ("mass", "unit"))
     if tangent is not None and not isinstance(tangent, Tangent):
-        raise SceneError(f"spectrum: tangent is {arguments.shown(tangent)}; give Tangent(model), or leave it out")
-    load = None if load is None else arguments.number("spectrum: load", load)
+        raise SceneError(f"spectrum: tangent is {argument_checks.shown(tangent)}; give Tangent(model), or leave it out")
+    load = None if load is None else argument_checks.number("spectrum: load", load)
     lost_in_rounding(model, state=state)
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
@@ -277,12 +277,12 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
         ValueError: the lowest eigenvalue has the same sign at both ends.
     """
     if not callable(equilibrium_at):
-        shown = arguments.shown(equilibrium_at)
+        shown = argument_checks.shown(equilibrium_at)
         raise SceneError(
             f"critical: equilibrium_at is {shown}; give a function of the parameter that returns (model, state)"
         )
-    low, high = arguments.number("critical: low", low), arguments.number("critical: high", high)
-    tolerance = arguments.positive("critical: tolerance", tolerance)
+    low, high = argument_checks.number("critical: low", low), argument_checks.number("critical: high", high)
+    tolerance = argument_checks.positive("critical: tolerance", tolerance)
     if low == high:
         raise SceneError(
             f"critical: low and high are both {low:g}; give two parameters between which stability is lost"
@@ -294,7 +294,7 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
         nonlocal rigid
         result = equilibrium_at(parameter)
         if not isinstance(result, tuple | list) or len(result) != 2:
-            shown = arguments.shown(result)
+            shown = argument_checks.shown(result)
             raise SceneError(f"critical: equilibrium_at gives {shown} at {parameter:g}; give (model, state)")
         model, state = result
         result = spectrum(model, state, 1, "unit")
@@ -331,7 +331,7 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
     check_model("buckling", model)
     for state in (free, loaded):
         check_state("buckling", model, state)
-    arguments.count("buckling: count", count)
+    argument_checks.count("buckling: count", count)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
     whole = tangent.stiffness(free)

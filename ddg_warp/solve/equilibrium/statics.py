@@ -20,7 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
+from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model import validate
@@ -37,7 +38,6 @@ from ddg_warp.solve.equilibrium.support_checks import require_supports
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.prescribed_motion import jump_between, poses_between
 from ddg_warp.solve.linear.solver_selection import large_static, static_solver, why_not_pcg
-from ddg_warp.threads import launches, stays_here
 
 SOLVERS = ("auto", "direct", "pcg")
 DESCENTS = 8  # descents from saddles in one solve
@@ -48,14 +48,14 @@ LOST = 1e-3  # fraction of the loads that supports and obstacles may miss by rou
 FIRST_TURN = 0.1  # rotation by which a search leaves a saddle [rad]
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class StaticsOptions:
     """Options of an equilibrium search.
 
     Attributes:
         rtol: residual over load scale (sum of external forces of a body, or largest support force) of the convergence test; see
-            `ddg_warp.compile.tolerance`.
+            `ddg_warp.compile.residual_tolerance`.
         floor_factor: rounding floor of a dof, in rounding units of its force contributions.
         max_iterations: limit of Newton iterations of a load step; with friction, of updates of the normal forces.
         rotation_cap: largest rotation of an edge or change of an angle in one update [rad].
@@ -75,9 +75,9 @@ class StaticsOptions:
     solver: str = "auto"
 
     def __post_init__(self):
-        arguments.check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
-        arguments.choice("statics: mode", self.mode, ("minimise", "follow"))
-        arguments.choice("statics: solver", self.solver, SOLVERS)
+        argument_checks.check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
+        argument_checks.choice("statics: mode", self.mode, ("minimise", "follow"))
+        argument_checks.choice("statics: solver", self.solver, SOLVERS)
         if self.solver == "pcg" and self.mode == "follow":
             raise SceneError(
                 "statics mode 'follow' passes limit points by the inertia of the tangent, which solver 'pcg' does not know; "
@@ -130,7 +130,7 @@ def solve(
     check_model("statics", model)
     if state is not None:
         check_state("statics", model, state)
-    options = arguments.options("statics.solve", StaticsOptions, options, arguments.names(solve))
+    options = argument_checks.options("statics.solve", StaticsOptions, options, argument_checks.names(solve))
     equilibrium = Equilibrium(model, options)
     return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)
 
@@ -212,10 +212,12 @@ class Equilibrium:
     ) -> State:
         """Run load stepping; see `solve`."""
         for name, value in (("start", start), ("end", end)):
-            arguments.number(f"statics: {name}", value)
-        load_steps = arguments.count("load_steps", load_steps)
+            argument_checks.number(f"statics: {name}", value)
+        load_steps = argument_checks.count("load_steps", load_steps)
         if way is not None and not isinstance(way, list):
-            raise SceneError(f"statics: way is {arguments.shown(way)}; give a list, to which equilibria are added")
+            raise SceneError(
+                f"statics: way is {argument_checks.shown(way)}; give a list, to which equilibria are added"
+            )
         if self._rubs and start == end:
             raise SceneError(
                 f"contact: friction acts against what slides along an increment of the load parameter, and from {start:g} to {end:g} "
@@ -262,7 +264,7 @@ class Equilibrium:
                 shapes.to((current - start) / (end - start))
                 if error.outcome == "lost_in_rounding" and (advice := jump_between(self.model, current, target)):
                     raise self._explained(error, state, target, f"; {advice}") from None
-                if error.outcome in (arguments.PRESCRIBED, "lost_in_rounding"):
+                if error.outcome in (argument_checks.PRESCRIBED, "lost_in_rounding"):
                     raise
                 if not balanced:  # such as after a change of rest shape: no increment is small enough
                     balanced = True

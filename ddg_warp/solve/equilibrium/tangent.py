@@ -7,8 +7,8 @@ Every rod group and the coupled system contribute a tangent block with contiguou
 import numpy as np
 from scipy import sparse
 
+from ddg_warp.capture_lock import launches
 from ddg_warp.solve.equilibrium.rod_tangent import ChainTangent
-from ddg_warp.threads import launches
 
 
 @launches

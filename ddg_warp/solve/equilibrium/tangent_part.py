@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from ddg_warp.compile.storage import gathered
+from ddg_warp.compile.dof_map import gathered
 from ddg_warp.solve.forces.control_loads import loaded_rows
 
 

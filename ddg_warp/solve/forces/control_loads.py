@@ -3,9 +3,9 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.compile import tolerance
+from ddg_warp.compile import residual_tolerance
 from ddg_warp.kernels.forces import control_loads as kernels
-from ddg_warp.model import group
+from ddg_warp.model import rod_group
 from ddg_warp.solve.forces.loads import Loads
 
 LOADS = ("forces", "moments", "gravity")
@@ -148,11 +148,11 @@ class ChainScale(_Scale):
         arm = np.ones(host.size)
         if turns:
             arm[host.nodes :] = np.tile(host.length, host.shape[0])
-        return arm, group.changing_forces(host)
+        return arm, rod_group.changing_forces(host)
 
 
 class NetScale(_Scale):
-    """Residual limits of dof blocks and clusters of the coupled system; see `compile.tolerance`.
+    """Residual limits of dof blocks and clusters of the coupled system; see `compile.residual_tolerance`.
 
     Args:
         solver: the `NetNewton` whose `allowed` and `outer` are written.
@@ -184,7 +184,7 @@ class NetScale(_Scale):
     @staticmethod
     def places(host) -> tuple[np.ndarray, np.ndarray]:
         """Return divisors of moments and absolute loads in time of all dof blocks."""
-        return host.bodies.arm, tolerance.changing_forces(host) / host.bodies.arm
+        return host.bodies.arm, residual_tolerance.changing_forces(host) / host.bodies.arm
 
     def share(self) -> None:
         """Compute limits of dof blocks and clusters from body loads and means over connected bodies."""

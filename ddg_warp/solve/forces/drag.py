@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.kernels.forces import drag
@@ -67,11 +67,13 @@ class ChainDrag(Drag):
         """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
         group, real, device = self.part, self.model.types.real, self.model.wp_device
         solve = SimpleNamespace(x=data.x)
-        solve.mass = arrays.allocate((group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device)
+        solve.mass = device_arrays.allocate(
+            (group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device
+        )
         solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
         self.upload(t, t)
         self.resist(data, solve, self._over_a_second())
-        return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
+        return device_arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
 
     def settle(self, before, after, newton, islands) -> None:
         """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
@@ -88,7 +90,7 @@ class ChainDrag(Drag):
     def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
         """Return rates of nodes and edges (node, column), of massless dofs extrapolated by `lead` [s]."""
         v, a, omega, alpha, mass, rotary = (
-            arrays.download(array).astype(float)
+            device_arrays.download(array).astype(float)
             for array in (data.v, data.a, data.omega, data.alpha, self.part.mass, self.part.rotary)
         )
         if lead > 0.0:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.forces.gyroscopic import kick_kernel
 from ddg_warp.model.state import State
 
@@ -69,11 +69,11 @@ class _Part:
         self._free = wp.array(free, dtype=vector, device=device)
         self._is_net = part is model.net
         shape = (part.worlds * part.blocks,) if self._is_net else (part.nodes, part.columns)
-        self._v = arrays.allocate(shape, vector, device)
+        self._v = device_arrays.allocate(shape, vector, device)
 
     def begin(self, state, islands):
         """Return a state component with velocities after half of the couples."""
-        arrays.copy(self._v, state.v)
+        device_arrays.copy(self._v, state.v)
         self.kick(state, self._v, islands, False)
         return replace(state, v=self._v)
 

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from ddg_warp.compile.conditions import pose_starts
+from ddg_warp.compile.boundary_conditions import pose_starts
 from ddg_warp.kernels.forces.prescribed_element_data import field_kernel, normal_kernels
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
-from ddg_warp.model.net import NetState
+from ddg_warp.model.coupled_model import NetState
 from ddg_warp.solve.forces.prescribed_motion import Motion
 
 

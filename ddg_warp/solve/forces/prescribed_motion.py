@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments
-from ddg_warp.compile.conditions import pose_starts
+from ddg_warp import argument_checks
+from ddg_warp.compile.boundary_conditions import pose_starts
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import Islands
@@ -27,7 +27,7 @@ def poses(model, t0: float, t1: float, start: float = 0.0, part: float = 1.0) ->
         raise SolverError(
             f"a motion's translation has a part along y at t = {t1:g}: {tuple(rows[np.argmax(np.abs(rows[:, 19])), 18:].tolist())}; "
             "a scene of dimension 2 stays in the plane of x and z, give 0",
-            outcome=arguments.PRESCRIBED,
+            outcome=argument_checks.PRESCRIBED,
         )
     return rows
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear.contact_bands import stiffen_kernel
 
 
@@ -20,7 +20,9 @@ class ContactBands:
         angle_edge = _turning(shapes, chains.plan, chains.net.blocks)
         self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.dtype, bool((angle_edge >= 0).any()))
         self.kernels = [self._stiffen]
-        self._ahead, self._turning = (arrays.upload(edges, int, chains.device) for edges in (next_edge, angle_edge))
+        self._ahead, self._turning = (
+            device_arrays.upload(edges, int, chains.device) for edges in (next_edge, angle_edge)
+        )
 
     def __call__(self, terms, flags: wp.array) -> None:
         """Write the sum of the bands and the blocks that `PairTerms.join` has assembled, in worlds whose flags want a direction."""

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import cyclic_reduction, cyclic_reduction_solve, mixed_pairs, rod_matrix
 from ddg_warp.solve.linear.solver_selection import LONGEST_REPEATED
 
@@ -33,7 +33,7 @@ class CyclicReduction:
         matrix_rows, right_rows, kept_rows = cyclic_reduction.level_rows(nb)
 
         def vectors(rows, blocks):
-            return arrays.allocate((rows, blocks, columns), linear, device)
+            return device_arrays.allocate((rows, blocks, columns), linear, device)
 
         self.repeats = repeated and nodes <= LONGEST_REPEATED
         levels = len(self.blocks) - 1
@@ -162,7 +162,7 @@ class Elimination:
 
     def __init__(self, kind, nodes: int, columns: int, linear, device):
         self.columns, self.device = columns, device
-        self._factors = arrays.allocate((3 * kind.block**2 + kind.block, nodes, columns), linear, device)
+        self._factors = device_arrays.allocate((3 * kind.block**2 + kind.block, nodes, columns), linear, device)
         self._first = wp.zeros(columns, dtype=int, device=device)  # first iteration of every column
         self._factor, self._direct = rod_matrix.factor_kernel(kind, linear), rod_matrix.direct_kernel(kind, linear)
 
@@ -192,9 +192,9 @@ class TensionReduction:
         matrix_rows, right_rows, _ = cyclic_reduction.level_rows(size)
         pairs = self.levels.blocks[0]
         self.matrix, self.right = (
-            arrays.allocate((rows, pairs, columns), linear, device) for rows in (matrix_rows, right_rows)
+            device_arrays.allocate((rows, pairs, columns), linear, device) for rows in (matrix_rows, right_rows)
         )
-        self.solution = arrays.allocate((size, group.nodes, columns), linear, device)
+        self.solution = device_arrays.allocate((size, group.nodes, columns), linear, device)
         self._pair = mixed_pairs.pair_kernel(kind, linear)
         self._unpair = mixed_pairs.unpair_kernel(kind, real, linear)
 

@@ -3,13 +3,13 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint.coupled_linear_solve import block_kernels, check_kernels
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.linear.exact_hessian import COUNT, FIRST, SIGN, exact_kernels
-from ddg_warp.model.net import NetState
+from ddg_warp.model.coupled_model import NetState
 from ddg_warp.solve.linear.pcg import ConjugateGradients
 from ddg_warp.solve.linear.rod_substructuring import Chains
 from ddg_warp.solve.linear.skew_supports import DevicePlanes
@@ -69,7 +69,7 @@ class ExactSystem:
             self.chains.bind(self.system, [], real, self.linear, (), drag)
         if contact:
             contact.bind(self)
-        self._begin, self._add = exact_kernels(real, self.linear, drag, arrays.serial(device))
+        self._begin, self._add = exact_kernels(real, self.linear, drag, device_arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
         self._rest, self._check = check_kernels(self.linear)
         self._hessians = [element_path.term_kernels(coupled_storage(part.term, real), 0, real)[2] for part in net.sets]
@@ -123,7 +123,7 @@ class ExactSystem:
     def assemble(self, state: NetState, rate: wp.array) -> None:
         """H of all worlds."""
         table, flags = self.system, self.islands.arrays[0]
-        every = arrays.takers(self.matrix.shape[1], self.device)
+        every = device_arrays.takers(self.matrix.shape[1], self.device)
         read = [self.mass, *self.islands.arrays, table.rows, table.columns, table.positions]
         self._launch(self._begin, every, read, [self.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):

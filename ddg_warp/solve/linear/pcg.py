@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import coupled_pcg
 from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.solve.linear.multilevel import Multilevel
@@ -145,7 +145,7 @@ class ConjugateGradients:
         if not contact:
             multiply_elements(p)
             return
-        arrays.side_by_side([partial(multiply_elements, p), partial(contact.spread, p)], newton.device)
+        device_arrays.side_by_side([partial(multiply_elements, p), partial(contact.spread, p)], newton.device)
         contact.settle(p, self.product)
 
     def multiply_bands(self, p: wp.array) -> None:

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.linear import joint_schur, rod_bands, rod_substructuring
 from ddg_warp.kernels.linear.rod_band_assembly import layout_type
@@ -77,21 +77,21 @@ class Chains:
         self.table, net, plan = table, self.net, self.plan
         plan.bind(net.host, table.rows.numpy(), table.columns.numpy(), self.kept)
         self.exact = self.banded and plan.complete and not self._contact
-        worlds, device, serial = net.worlds, net.device, arrays.serial(net.device)
+        worlds, device, serial = net.worlds, net.device, device_arrays.serial(net.device)
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
 
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        self.places = arrays.upload(plan.places.astype(np.int32), int, device)
+        self.places = device_arrays.upload(plan.places.astype(np.int32), int, device)
         self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
         self._at_none = put(np.flatnonzero(plan.where < 0))  # blocks without a place
-        self.held = arrays.upload(plan.held(net.host), wp.uint8, device)
+        self.held = device_arrays.upload(plan.held(net.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
         self.idle = wp.zeros(self.columns, dtype=int, device=device)
         block = plan.block
-        self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
+        self.factors = device_arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
         if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device), self._contact):
             repeated = not self.exact or len(plan.of_places[1]) > 0
@@ -102,16 +102,16 @@ class Chains:
         elif not self.banded or self.exact:  # nobody asks for the blocks once they are factored
             self.bands = self.factors
         else:
-            self.bands = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
+            self.bands = device_arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
         self.eliminated = self.bands  # what is factored
         if self._contact and self.banded:
-            self.eliminated = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
-        self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
-        self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
+            self.eliminated = device_arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
+        self.values = device_arrays.allocate((block, self.longest, self.columns), linear, device)
+        self.responses = device_arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
         self.coupled = len(plan.of_places[1]) > 0
         # whether chains and what is at their places are all that there is to further right-hand sides
         self._at_places = self.reduction is not None and self.reduction.repeats and not len(plan.pairs)
-        self.met = None if plan.met is None else arrays.upload(plan.met.astype(np.int32), int, device)
+        self.met = None if plan.met is None else device_arrays.upload(plan.met.astype(np.int32), int, device)
         self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
         self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
         self.colour, self.taken = put(plan.colour), put(plan.taken)
@@ -150,7 +150,7 @@ class Chains:
         if not (serial or self.joints or self.reduction or self.split):
             self._both = BothEnds(plan, self.columns, linear, device, SERIAL)
         if self.split:
-            self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
+            self.longer = device_arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = rod_bands.lengthen_kernel(terms, real, linear)
         if self.exact and serial and not (self.reduction or reuse or self.split):
             self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
@@ -192,7 +192,7 @@ class Chains:
         """Residuals of all blocks but those `elsewhere`."""
         self._launch(
             self._balance,
-            (arrays.takers(self.longest, self.device), self.columns),
+            (device_arrays.takers(self.longest, self.device), self.columns),
             [given, self.places, self.count, self._apart, *islands.arrays, self._own],
             [found],
         )
@@ -201,7 +201,7 @@ class Chains:
         """Blocks of the chains of the worlds that want a direction."""
         self._launch(
             self._assemble,
-            (arrays.takers(self.longest, self.device), self.columns),
+            (device_arrays.takers(self.longest, self.device), self.columns),
             [matrix, mass, *islands.arrays, self.layout, self._own],
             [self.bands],
         )
@@ -214,7 +214,7 @@ class Chains:
         table, net, threads = self.table, self.net, 1
         inputs = [matrix, table.columns, table.slices, barred, p, wanted, net.blocks, table.positions]
         inputs += [self.bands, self.places, self.count, self.idle]
-        if not arrays.serial(self.device):
+        if not device_arrays.serial(self.device):
             of_places = -(-self.columns // TILE) * TILE * self.longest
             inputs += [of_places, self._at_none]
             threads = of_places + net.worlds * len(self._at_none)
@@ -315,7 +315,7 @@ class Chains:
             self._eliminate(matrix, wanted, self.values, residual, self.moved)
         self._launch(
             self._finish,
-            arrays.takers(net.worlds * net.blocks, self.device),
+            device_arrays.takers(net.worlds * net.blocks, self.device),
             [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, barred, wanted]
             + [net.blocks, net.host.nodes],
             [z, dots],
@@ -330,7 +330,7 @@ class Chains:
         table, net, solves = self.table, self.net, values.shape[2] // self.columns
         self._launch(
             self._load,
-            (arrays.takers(self.longest, self.device), solves * self.columns),
+            (device_arrays.takers(self.longest, self.device), solves * self.columns),
             [matrix, table.columns, self.places, self.count, self.idle, self.held, self.starts, self.items]
             + [self.joint_row, self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
@@ -368,9 +368,9 @@ class Chains:
         part, own = self.net.sets[index], along_type(real, linear)()
         for name, array in written.items():
             setattr(own, name, array)
-        own.at = arrays.upload(self.plan.elements(self.net.host, part.host).astype(np.int32), int, self.device)
+        own.at = device_arrays.upload(self.plan.elements(self.net.host, part.host).astype(np.int32), int, self.device)
         own.elements = part.elements
         return own
 
-    def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
+    def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = device_arrays.THREADS) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)

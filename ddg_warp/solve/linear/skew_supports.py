@@ -1,4 +1,4 @@
-"""Skew supports: dofs, forces and tangents in the nodal frames of `ddg_warp.compile.net.planes`."""
+"""Skew supports: dofs, forces and tangents in the nodal frames of `ddg_warp.compile.coupled.skew_supports`."""
 
 import numpy as np
 import warp as wp

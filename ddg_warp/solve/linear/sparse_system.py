@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.linear import coupled_pcg, sliced_ell
 from ddg_warp.kernels.linear.sliced_ell import SLICE
@@ -150,7 +150,7 @@ class Assembly:
         local: tuple,
         drag: bool,
     ):
-        serial = arrays.serial(net.device)
+        serial = device_arrays.serial(net.device)
         self.net, self.table, self.kernels, self._own = net, table, [], []
         for first in range(0, len(net.sets), sliced_ell.SETS):
             sets, from_iteration, local_dofs = (
@@ -173,7 +173,7 @@ class Assembly:
         """Write H (9, positions of all worlds) in worlds that need a direction."""
         table = self.table
         for kernel, set_data in zip(self.kernels, self._own, strict=True):
-            arrays.sweep(
+            device_arrays.sweep(
                 kernel,
                 self.net.worlds * table.positions,
                 [mass, *islands.arrays, table.rows, table.columns, table.positions, *set_data],

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import twisted_factorisation
 
 
@@ -17,7 +17,7 @@ class BothEnds:
         self._columns, self._threads, self._device = columns, threads, device
         self._sides, self._middle = twisted_factorisation.factor_kernels(plan.twist, plan.span, linear)
         self._inward, self._outward = twisted_factorisation.solve_kernels(plan.twist, plan.span, linear)
-        self._taken = arrays.allocate((3 * plan.block**2, 2, columns), linear, device)
+        self._taken = device_arrays.allocate((3 * plan.block**2, 2, columns), linear, device)
 
     @property
     def kernels(self) -> list:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.newton import contact_newton as kernels
@@ -105,7 +105,7 @@ class NetContact:
             self._brace,
         ) = built
         self._kernels = list(built)
-        built = kernels.block_kernels(real, linear, arrays.serial(device))
+        built = kernels.block_kernels(real, linear, device_arrays.serial(device))
         (
             self._differ_gain,
             self._lessen,
@@ -427,7 +427,7 @@ class NetContact:
         return grown
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.newton.device, worlds=self.net.worlds)
+        device_arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.newton.device, worlds=self.net.worlds)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)

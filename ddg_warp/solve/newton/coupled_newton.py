@@ -6,8 +6,8 @@ from functools import cached_property, partial
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
-from ddg_warp.compile.tolerance import outer_forces
+from ddg_warp import device_arrays
+from ddg_warp.compile.residual_tolerance import outer_forces
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
@@ -71,7 +71,7 @@ class NetNewton:
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
-        serial = arrays.serial(device)
+        serial = device_arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
         self.chains = Chains.of(net, preconditioner, self.banded, split)
@@ -84,7 +84,7 @@ class NetNewton:
         self.load = wp.array(np.tile(host.constant_loads(), (worlds, 1)), dtype=V, device=device)
         self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
         self.change, self.noise, self.square = (self._weights[i] for i in range(3))
-        self.dots = make((worlds, arrays.takers(blocks, device)), self.real)
+        self.dots = make((worlds, device_arrays.takers(blocks, device)), self.real)
         self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else net.mass
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
@@ -126,7 +126,7 @@ class NetNewton:
         spins = np.arange(host.nodes, blocks)
         spins = spins[~np.isin(spins, capless)]
         self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
-        turning = arrays.takers(len(ends) + len(spins), device)
+        turning = device_arrays.takers(len(ends) + len(spins), device)
         self.squares = make((worlds, turning), self.real)
         self._sum = Sums(worlds, self.dots.shape[1], self.real, device)
         self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
@@ -204,7 +204,7 @@ class NetNewton:
         )
 
         def lay(rows, dtype):
-            return arrays.allocate((rows, count), dtype, self.device)
+            return device_arrays.allocate((rows, count), dtype, self.device)
 
         return {
             "factor": lay(len(measure.strains) * rows, factor),
@@ -269,7 +269,7 @@ class NetNewton:
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate, `here`."""
         parts = [partial(self._evaluate_set, state, index) for index in range(len(self.net.sets))]
-        arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
+        device_arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
 
     def _evaluate_set(self, state, index: int) -> None:
         results = element_path.results_type(self.real, self.linear, not self.local[index])()
@@ -277,7 +277,7 @@ class NetNewton:
             setattr(results, name, values)
         wp.launch(
             self._evaluate[index],
-            (self.worlds, arrays.takers(self.net.sets[index].elements, self.device)),
+            (self.worlds, device_arrays.takers(self.net.sets[index].elements, self.device)),
             [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
             [results],
             device=self.device,
@@ -297,7 +297,7 @@ class NetNewton:
         weights = self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten()
         sums = [partial(self._sum_weights, *weights), partial(self._worst, self.allowed.ratio, self.worst)]
         counts = [partial(self.outliers.count, options.rtol)] if self.outliers else []
-        arrays.side_by_side([*sums, *counts], self.device)
+        device_arrays.side_by_side([*sums, *counts], self.device)
         if self.outliers:
             self.outliers.excuse()
         if self.contact:
@@ -319,7 +319,7 @@ class NetNewton:
         if not self.contact:
             self._assemble_own()
             return
-        arrays.side_by_side([self._assemble_own, self.contact.assemble], self.device)
+        device_arrays.side_by_side([self._assemble_own, self.contact.assemble], self.device)
         self.contact.join()
 
     def _assemble_own(self) -> None:
@@ -376,7 +376,7 @@ class NetNewton:
         """Lengths of the steps along the directions."""
         blocks = self.net.blocks
         inputs = [self.right, self.direction, self.islands.wanted, blocks]
-        arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
+        device_arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
         self._sum(self.dots, self.decrease)
         self.measure_turns()
         wp.launch(
@@ -391,7 +391,7 @@ class NetNewton:
         """Largest turn that the directions make, squared; these are in space then."""
         if self.planes:
             self.planes.back(self.direction, self.islands.wanted)
-        arrays.sweep(
+        device_arrays.sweep(
             self._rotate,
             len(self.ends) + len(self.spins),
             [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
@@ -404,7 +404,7 @@ class NetNewton:
     def move(self) -> None:
         """Take the step that is to be taken, or the part of it that the search has left."""
         islands = self.islands
-        arrays.sweep(
+        device_arrays.sweep(
             self._move,
             self.net.blocks,
             [self.direction, islands.step_length, islands.todo, islands.halvings, self.net.blocks],

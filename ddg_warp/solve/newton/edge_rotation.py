@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.coupled_edge_rotation import turn_kernels
 from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
 
@@ -21,7 +21,7 @@ class Turns:
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        made = turn_kernels(newton.real, newton.linear, arrays.serial(device))
+        made = turn_kernels(newton.real, newton.linear, device_arrays.serial(device))
         self._bend, self._aim, self._turn, self._turn_longer, self._scan, self._offset, self._put = made
         loops = np.array([rod.piece.kind.closed for rod in host.rods], int)
         free = np.flatnonzero(~plan.anchored)
@@ -100,9 +100,9 @@ class Turns:
         wp.launch(kernel, (len(self._nodes), worlds), inputs, [self._sums], device=device)
         pieces = self._offsets.shape[2]
         inputs = [self._nodes, self._ahead, self._starts, todo, self._sums]
-        arrays.sweep(self._scan, pieces, inputs, [self._totals], device, BLOCK, worlds)
+        device_arrays.sweep(self._scan, pieces, inputs, [self._totals], device, BLOCK, worlds)
         inputs = [self._starts, *self._pieces, todo, self._totals]
-        arrays.sweep(self._offset, pieces, inputs, [self._offsets], device, BLOCK, worlds)
+        device_arrays.sweep(self._offset, pieces, inputs, [self._offsets], device, BLOCK, worlds)
         for nodes in self._levels:
             inputs = [nodes, *self._places, newton.held, self._sums, self._offsets, *moved, net.blocks]
-            arrays.sweep(self._put, len(nodes), inputs, [newton.q], device, worlds=worlds)
+            device_arrays.sweep(self._put, len(nodes), inputs, [newton.q], device, worlds=worlds)

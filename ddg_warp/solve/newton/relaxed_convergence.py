@@ -9,7 +9,7 @@ Measured: such slips take Newton's method as many iterations as all other rods t
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.relaxed_convergence import outlier_kernels
 
 
@@ -30,7 +30,7 @@ class Outliers:
         worlds, device = newton.worlds, newton.device
         self._out_of_balance = wp.zeros(worlds * self._bodies, dtype=int, device=device)
         self.number = wp.zeros(worlds, dtype=int, device=device)
-        self._count, self._excuse = self.kernels = outlier_kernels(newton.real, arrays.serial(device))
+        self._count, self._excuse = self.kernels = outlier_kernels(newton.real, device_arrays.serial(device))
 
     def excuse(self) -> None:
         """Mark worlds with so few unconverged bodies as converged, by the counts and the largest residuals."""
@@ -45,4 +45,4 @@ class Outliers:
         self.number.zero_()
         inputs = [newton.allowed.ratio, self._owner, self._bodies, rtol, *newton.islands.arrays]
         outputs = [self._out_of_balance, self.number]
-        arrays.sweep(self._count, len(self._owner), inputs, outputs, newton.device, worlds=newton.worlds)
+        device_arrays.sweep(self._count, len(self._owner), inputs, outputs, newton.device, worlds=newton.worlds)

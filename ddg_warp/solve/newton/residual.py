@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.line_search import SETTLED
 from ddg_warp.kernels.residual import coupled_residual
 
@@ -42,7 +42,9 @@ class Balance:
             types = int, wp.types.matrix((3, 3), real)
             self._frames = [wp.zeros(0, dtype=dtype, device=net.device) for dtype in types]
         self.kernels = [
-            coupled_residual.balance_kernel(real, linear, drag, newton.contact is not None, arrays.serial(net.device))
+            coupled_residual.balance_kernel(
+                real, linear, drag, newton.contact is not None, device_arrays.serial(net.device)
+            )
         ]
 
     def _meeting_of_sets(self):
@@ -71,7 +73,7 @@ class Balance:
         newton, total = self.newton, self.newton.worlds * self.count
         if self.chains:
             self.chains.balance(self.given, newton.islands, self.found)
-        arrays.sweep(
+        device_arrays.sweep(
             self.kernels[0],
             total,
             [self.given, self.some, self.sets, *self._frames, *newton.islands.arrays, self.count, total],

@@ -1,9 +1,9 @@
-"""Residual tolerances of the coupled system on the device; see `ddg_warp.compile.tolerance`."""
+"""Residual tolerances of the coupled system on the device; see `ddg_warp.compile.residual_tolerance`."""
 
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.residual import residual_sums
 
 
@@ -30,7 +30,9 @@ class Allowed:
 
         self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
         self.ratio = make((worlds, net.blocks + sum(len(level.weight) for level in self.bodies.levels)))
-        self.kernels = [residual_sums.part_kernel(real, linear, leaf, arrays.serial(device)) for leaf in (True, False)]
+        self.kernels = [
+            residual_sums.part_kernel(real, linear, leaf, device_arrays.serial(device)) for leaf in (True, False)
+        ]
         self._levels = []
         for level in self.bodies.levels:
             n = len(level.weight)
@@ -63,7 +65,7 @@ class Allowed:
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
-                (arrays.takers(limit.shape[1], self.net.device), self.net.worlds),
+                (device_arrays.takers(limit.shape[1], self.net.device), self.net.worlds),
                 [value, rounding, starts, items, below, limit, first_ratio, rtol, int(exact), *islands.arrays],
                 [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from ddg_warp import arguments, arrays
+from ddg_warp import argument_checks, device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path, rod_layout
@@ -21,7 +21,7 @@ FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_ne
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
-@arguments.called
+@argument_checks.called
 @dataclass(frozen=True)
 class NewtonOptions:
     """How a Newton solve searches and when it stops.
@@ -29,7 +29,7 @@ class NewtonOptions:
     Attributes:
         rtol: a dof is in equilibrium where its residual is below rtol times the load scale of its rod or shell (sum of its outer
             forces; without any, the first residual), in shells times the root of its share of the area, or below what rounding
-            leaves of it; so are sums of residuals over parts. See `ddg_warp.compile.tolerance`.
+            leaves of it; so are sums of residuals over parts. See `ddg_warp.compile.residual_tolerance`.
         floor_factor: how many rounding units of the forces that meet at a node count as rounding.
         max_iterations: Newton iterations of one solve.
         max_halvings: shortenings of one step by the line search.
@@ -63,8 +63,8 @@ class NewtonOptions:
     outliers: float = 0.0
 
     def __post_init__(self):
-        arguments.part("outliers", self.outliers)
-        arguments.check_options(
+        argument_checks.part("outliers", self.outliers)
+        argument_checks.check_options(
             self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings")
         )
         if self.psd not in PSD_MODES:
@@ -100,7 +100,7 @@ class ChainNewton:
         nodes, columns = (group.nodes, group.columns), group.columns
 
         def make(*shape, dtype=self.real):
-            return arrays.allocate(shape, dtype, device)
+            return device_arrays.allocate(shape, dtype, device)
 
         twisted = nodes if kind.twist else (1, 1)
         self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
@@ -141,9 +141,15 @@ class ChainNewton:
             self.reuse,
         )
         self._results = element_path.results_type(self.real, self.linear)()
-        self._results.factor = self._results.tension = arrays.columns(self.factor)
-        self._results.second, self._results.gradient = arrays.columns(self.geometric), arrays.columns(self.gradient)
-        self._results.energy, self._results.stiffness = arrays.columns(self.energy), arrays.columns(self.stiffness)
+        self._results.factor = self._results.tension = device_arrays.columns(self.factor)
+        self._results.second, self._results.gradient = (
+            device_arrays.columns(self.geometric),
+            device_arrays.columns(self.gradient),
+        )
+        self._results.energy, self._results.stiffness = (
+            device_arrays.columns(self.energy),
+            device_arrays.columns(self.stiffness),
+        )
         self._check = rod_residual.check_kernel(kind, self.real, self.linear)
         self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._further = None if midpoint else rod_warm_start.further_kernel(kind, self.real, self.linear)
@@ -185,8 +191,8 @@ class ChainNewton:
 
     def take_loads(self) -> None:
         """Have loads of its own, on all nodes and angles, instead of the constant ones of the group."""
-        self.load, self.loaded = arrays.allocate(self.x.shape, self.x.dtype, self.device), True
-        self.load_angle = arrays.allocate(self.theta.shape, self.real, self.device)
+        self.load, self.loaded = device_arrays.allocate(self.x.shape, self.x.dtype, self.device), True
+        self.load_angle = device_arrays.allocate(self.theta.shape, self.real, self.device)
 
     def predict(self, before) -> None:
         """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import rod_matrix
 from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
 
@@ -36,7 +36,7 @@ class AssembledNewton(ChainNewton):
     def vectors(self, rows: int | None = None) -> wp.array:
         """Zeros of the linear algebra for every node, as many as a node has dofs unless told otherwise."""
         group = self.group
-        return arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.stored, self.device)
+        return device_arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.stored, self.device)
 
     def assemble_blocks(self) -> None:
         """Blocks of active rods."""

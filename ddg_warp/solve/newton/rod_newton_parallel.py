@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.newton import line_search_parallel, rod_iterate_parallel
 from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
@@ -29,12 +29,12 @@ class PartitionedNewton(AssembledNewton):
         self.width = math.isqrt(group.nodes - 1) + 1
         self.ranges = -(-group.nodes // self.width)
         self.midpoint = midpoint
-        self.partial = arrays.allocate((4, self.ranges, columns), real, device)
-        self.sums = arrays.allocate((2, self.ranges, columns), vector, device)
-        self.prefix = arrays.allocate((group.nodes, columns), vector, device)
+        self.partial = device_arrays.allocate((4, self.ranges, columns), real, device)
+        self.sums = device_arrays.allocate((2, self.ranges, columns), vector, device)
+        self.prefix = device_arrays.allocate((group.nodes, columns), vector, device)
         self.mean = wp.zeros(columns, dtype=vector, device=device)
-        self.held = arrays.upload(_held_neighbours(group), int, device)
-        self.new_frame = arrays.allocate(self.frame.shape, real, device)
+        self.held = device_arrays.upload(_held_neighbours(group), int, device)
+        self.new_frame = device_arrays.allocate(self.frame.shape, real, device)
         if split:
             self.reduction = TensionReduction(group, real, self.linear, device)
         else:

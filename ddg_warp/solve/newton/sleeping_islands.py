@@ -14,7 +14,7 @@ twice the iterations, since barely converged rods wake repeatedly.
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.sleeping_islands import resting_kernels
 
 REST = 0.1
@@ -48,24 +48,26 @@ class Resting:
         self._where, self._idle, self._width = (
             (chains.where, chains.idle, chains.width) if chains else (put([]), put([]), 1)
         )
-        made = resting_kernels(newton.real, newton.linear, arrays.serial(device))
+        made = resting_kernels(newton.real, newton.linear, device_arrays.serial(device))
         self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 
     def __call__(self, products) -> None:
         """Find sleeping islands by the residuals of the iterate and the pairs of a `PairProduct`."""
         newton, device = self.newton, self.newton.device
-        arrays.sweep(self._begin, len(self._link), [], [self._link, self._awake, self._any], device)
+        device_arrays.sweep(self._begin, len(self._link), [], [self._link, self._awake, self._any], device)
         inputs = [newton.allowed.ratio, self.owner, self.bodies, REST * newton.options.rtol, *newton.islands.arrays]
-        arrays.sweep(self._look, len(self.owner), inputs, [self._awake, self._any], device, worlds=self._worlds)
+        device_arrays.sweep(self._look, len(self.owner), inputs, [self._awake, self._any], device, worlds=self._worlds)
         inputs = [products.sets, self._body, self.bodies, self._awake]
-        arrays.take_turns(self._join, products.most, inputs, [self._link], device)
-        arrays.sweep(self._wake, len(self._link), [], [self._link, self._awake], device)
+        device_arrays.take_turns(self._join, products.most, inputs, [self._link], device)
+        device_arrays.sweep(self._wake, len(self._link), [], [self._link, self._awake], device)
         self._bar()
         self.leave(products)
 
     def leave(self, products) -> None:
         """Exclude pairs between sleeping bodies from products, among the present pairs."""
-        arrays.take_turns(self._leave, products.most, [products.sets, self.newton.barred], [], self.newton.device)
+        device_arrays.take_turns(
+            self._leave, products.most, [products.sets, self.newton.barred], [], self.newton.device
+        )
 
     def wake(self) -> None:
         """Wake all islands; see `leave` for the pairs."""
@@ -78,4 +80,4 @@ class Resting:
         inputs = [self._link, self._awake, self._any, self.bodies, newton.stalled, newton.islands.arrays[0]]
         inputs += [self._body, newton.fixed, self._where, self._width]
         outputs = [newton.barred, self._idle]
-        arrays.sweep(self._settle, len(self._body), inputs, outputs, newton.device, worlds=self._worlds)
+        device_arrays.sweep(self._settle, len(self._body), inputs, outputs, newton.device, worlds=self._worlds)

@@ -7,20 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
+from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.forces.prescribed_motion import poses_between
 from ddg_warp.solve.stepping.integrator import Integrator
-from ddg_warp.threads import launches, stays_here
 
 HALVINGS = 4
 MOST_HALVINGS = 40  # beyond this a step is lost in the rounding of the time
 ROOM = 0.8  # fraction of the tolerance that permits doubling the step
 
 
-@arguments.sealed
+@argument_checks.sealed
 @stays_here
 @launches
 class StepControl:
@@ -58,8 +58,10 @@ class StepControl:
         if integrator.scheme != "implicit_euler":
             raise SceneError(f"StepControl estimates the error of 'implicit_euler', not of {integrator.scheme!r}")
         self.integrator, self.model = integrator, integrator.model
-        self.error = arguments.positive("StepControl: error", error, "m/s")
-        self.halvings = arguments.count("StepControl: halvings (0 for steps of one length)", halvings, 0, MOST_HALVINGS)
+        self.error = argument_checks.positive("StepControl: error", error, "m/s")
+        self.halvings = argument_checks.count(
+            "StepControl: halvings (0 for steps of one length)", halvings, 0, MOST_HALVINGS
+        )
         self.level, self.estimate, self.lengths = self.halvings, math.inf, Counter()
         self._changes, self._version = integrator.watch_changes(), None
 
@@ -77,7 +79,7 @@ class StepControl:
         Raises:
             SolverError, SceneError: as for `Integrator.step`.
         """
-        dt = arguments.positive("StepControl: dt", dt, "s")
+        dt = argument_checks.positive("StepControl: dt", dt, "s")
         between = self._between(state, controls, start)
         units, done = 2**self.halvings, 0
         while done < units:

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import coupled_frames, element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.newton import coupled_newton
-from ddg_warp.model.net import NetState
+from ddg_warp.model.coupled_model import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -74,7 +74,7 @@ class NetStep(PartStep):
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._foresight = Foresight(solver)
         self._begin, self._finish = coupled_newton.step_kernels(
-            real, self.midpoint, arrays.serial(model.wp_device), solver.contact is not None
+            real, self.midpoint, device_arrays.serial(model.wp_device), solver.contact is not None
         )
         if solver.contact and self.midpoint:
             raise SceneError(
@@ -189,7 +189,7 @@ class NetStep(PartStep):
         super().load_modules()
         if self.alone is None:
             return
-        arrays.load_kernels(self.alone.kernels, self.model.wp_device)
+        device_arrays.load_kernels(self.alone.kernels, self.model.wp_device)
         for chain in self._rods:
             chain.load_modules()
         if self.net.worlds > 1:
@@ -279,7 +279,7 @@ class NetStep(PartStep):
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
         """Over the blocks of every world."""
-        arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.model.wp_device, worlds=self.net.worlds)
+        device_arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.model.wp_device, worlds=self.net.worlds)
 
     def _start_frames(self, before):
         """The state whose lagged data serve the solve, which may renew them: for the midpoint rule carried to the predicted midpoint.

@@ -12,13 +12,13 @@ tested by bounds, and where these are inconclusive, tried again with a test of p
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
-from ddg_warp.compile.chains import ChainGroup, compile_chains
+from ddg_warp import device_arrays
+from ddg_warp.compile.rod_groups import ChainGroup, compile_chains
 from ddg_warp.compile.rods import net_rods
 from ddg_warp.kernels.collision.broad_phase.rod_culling import KNOWN
 from ddg_warp.kernels.stepping import decoupled_rods as kernels
-from ddg_warp.model.group import Group
 from ddg_warp.model.rod_elements import RodElements
+from ddg_warp.model.rod_group import Group
 from ddg_warp.solve.collision.rod_culling import Runs
 from ddg_warp.solve.stepping.rod_step import ChainStep
 
@@ -44,7 +44,7 @@ class Alone:
         # without culling all worlds are in doubt
         self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
         self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
-        self._wait, self._stay, self._follow = kernels.place_kernels(real, arrays.serial(device))
+        self._wait, self._stay, self._follow = kernels.place_kernels(real, device_arrays.serial(device))
         self._told = wp.zeros((kernels.TOLD, worlds), dtype=int, device=device)
         self.left, self._tried = (self._told[row] for row in (kernels.LEFT, kernels.TRIED))
         self._any_tried, self._some, self._again = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
@@ -127,7 +127,9 @@ class Alone:
         worlds, blocks, search = self.net.worlds, self.net.blocks, self._search
         self._try(before, after)
         if worlds > 1:
-            arrays.sweep(self._wait, blocks, [self._told, blocks, before.q], [after.q], self.net.device, worlds=worlds)
+            device_arrays.sweep(
+                self._wait, blocks, [self._told, blocks, before.q], [after.q], self.net.device, worlds=worlds
+            )
         search.update(before.q, after.q, search.every)
         for pairs in search.lists:
             self._launch(self._near, 1, [pairs.count], [self._some])
@@ -147,7 +149,7 @@ class Alone:
             for rod_step in rod_steps:
                 self._complete(after, *rod_step)
 
-        arrays.side_by_side([test_runs, complete] if test_runs else [complete], self.model.wp_device)
+        device_arrays.side_by_side([test_runs, complete] if test_runs else [complete], self.model.wp_device)
         if self._mixed:
             self.net.update_strains(after)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.stepping import coupled_energy_drift, rod_energy_drift
 from ddg_warp.solve.linear.sparse_system import Sums
@@ -20,7 +20,7 @@ def bound(fraction: float | None, scheme: str) -> float | None:
         SceneError: the bound is no fraction, or the scheme is not the midpoint rule.
     """
     if fraction is not None:
-        fraction = arguments.number(
+        fraction = argument_checks.number(
             "energy_bound", fraction, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0
         )
     if scheme == "implicit_midpoint":

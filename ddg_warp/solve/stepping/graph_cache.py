@@ -6,7 +6,7 @@ from contextlib import nullcontext
 
 import warp as wp
 
-from ddg_warp.threads import capturing
+from ddg_warp.capture_lock import capturing
 
 
 class Graphs:

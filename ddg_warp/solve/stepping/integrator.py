@@ -3,7 +3,8 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments, arrays
+from ddg_warp import argument_checks, device_arrays
+from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.compile import memory
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
@@ -23,14 +24,13 @@ from ddg_warp.solve.stepping.local_error import Changes
 from ddg_warp.solve.stepping.rod_step import NET_ONLY, ChainStep
 from ddg_warp.solve.stepping.state_buffers import Buffer
 from ddg_warp.solve.stepping.world_reset import Worlds, outcomes
-from ddg_warp.threads import launches, stays_here
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
 
-@arguments.sealed
+@argument_checks.sealed
 @stays_here
 @launches
 class Integrator:
@@ -100,21 +100,21 @@ class Integrator:
         **options,
     ):
         check_model("Integrator", model)
-        arguments.choice("scheme", scheme, SCHEMES)
-        arguments.choice("solver", solver, SOLVERS)
+        argument_checks.choice("scheme", scheme, SCHEMES)
+        argument_checks.choice("solver", solver, SOLVERS)
         if model.net is None and linear in NET_ONLY:
             raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
-        self.failures = arguments.choice("failures", failures, FAILURES)
-        self.gyroscopic = None if gyroscopic is None else arguments.flag("gyroscopic", gyroscopic)
+        self.failures = argument_checks.choice("failures", failures, FAILURES)
+        self.gyroscopic = None if gyroscopic is None else argument_checks.flag("gyroscopic", gyroscopic)
         if check_every is not None:
-            arguments.count("check_every", check_every)
+            argument_checks.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
-        self.options = arguments.options("Integrator", NewtonOptions, options, arguments.names(Integrator))
+        self.options = argument_checks.options("Integrator", NewtonOptions, options, argument_checks.names(Integrator))
         if self.options.outliers and not model.scene.touching:
             raise SceneError(
                 f"outliers = {self.options.outliers!r} is of scenes with contact, whose bodies wait for each other; this one has none"
             )
-        self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
+        self.retry_limit = argument_checks.count("retry_limit (0 for no retry)", retry_limit, 0)
         self.energy_bound = energy_drift.bound(energy_bound, scheme)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         validate.require_mass(model)
@@ -151,7 +151,7 @@ class Integrator:
                 a revolution (`turned_too_far`).
             SceneError: controls do not fit the model, or a shell has a curved membrane.
         """
-        dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
+        dt = argument_checks.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         check_state("step", self.model, state)
         inputs = checked(controls, self.model)
         source = self._own(state)
@@ -262,7 +262,7 @@ class Integrator:
             world: index.
         """
         check_state("failure", self.model, state)
-        if not 0 <= arguments.index("world", world) < self.model.worlds:
+        if not 0 <= argument_checks.index("world", world) < self.model.worlds:
             raise SceneError(f"world {world} does not exist; the model has {self.model.worlds}")
         return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
 
@@ -462,8 +462,8 @@ class Integrator:
         for part in self._parts:
             part.load_modules()
         if self._gyroscope:
-            arrays.load_kernels(self._gyroscope.kernels, self.model.wp_device)
+            device_arrays.load_kernels(self._gyroscope.kernels, self.model.wp_device)
         if self.failures == "flag":
             self._worlds.load_modules()
         if self._changes:
-            arrays.load_kernels(self._changes.kernels, self.model.wp_device)
+            device_arrays.load_kernels(self._changes.kernels, self.model.wp_device)

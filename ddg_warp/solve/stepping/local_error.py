@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.stepping.local_error import differ_kernel
 from ddg_warp.model.state import State
 from ddg_warp.solve.linear.sparse_system import Sums
@@ -17,7 +17,7 @@ class Changes:
         self._parts += [] if model.net is None else [_Part(model, None)]
         shape = len(self._parts), model.worlds
         totals = wp.zeros(shape, dtype=model.types.real, device=model.wp_device)
-        self._totals, self._reading = [totals[i] for i in range(len(self._parts))], arrays.Reading(totals)
+        self._totals, self._reading = [totals[i] for i in range(len(self._parts))], device_arrays.Reading(totals)
 
     @property
     def kernels(self) -> list:
@@ -53,7 +53,7 @@ class _Part:
         self._of, net, device, real = group or model.net, model.net, model.wp_device, model.types.real
         self._rows, self._columns = (net.host.nodes, net.worlds) if group is None else (group.nodes, group.columns)
         self._width = self._columns // model.worlds
-        self._threads = arrays.takers(self._rows, device) if group is None else 1
+        self._threads = device_arrays.takers(self._rows, device) if group is None else 1
         self._kernel = differ_kernel(3 if group is None else group.dim, real)
         self._sums = wp.zeros((model.worlds, self._width * self._threads), dtype=real, device=device)
         self._sum = Sums(*self._sums.shape, real, device)
@@ -62,7 +62,7 @@ class _Part:
 
     def masses(self) -> np.ndarray:
         """Return the masses of the worlds (worlds,) [kg]."""
-        mass = arrays.download(self._of.node_mass).astype(float)[: self._rows]
+        mass = device_arrays.download(self._of.node_mass).astype(float)[: self._rows]
         return mass.sum(0).reshape(-1, self._width).sum(1)
 
     def __call__(self, before: wp.array, after: wp.array, total: wp.array) -> None:

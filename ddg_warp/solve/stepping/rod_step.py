@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements import element_path
@@ -43,7 +43,7 @@ class ChainStep(PartStep):
         self._begin = rod_step.begin_kernel(kind, real, self.midpoint)
         self._foresee = rod_warm_start.foresee_kernel(kind, real, self.newton.linear)
         predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
-        self._predicted, self._predicted_angle = (arrays.allocate(*given) for given in predicted)
+        self._predicted, self._predicted_angle = (device_arrays.allocate(*given) for given in predicted)
         self._nodes = rod_step.finish_nodes_kernel(kind, real, self.midpoint)
         self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
         self.outer = group.outer
@@ -168,7 +168,7 @@ class ChainStep(PartStep):
     def where(self, state, column: int) -> str:
         """Where the largest residual was, estimated by the element forces that meet there, and what to do."""
         size = float(self.islands.residual.numpy()[column])
-        direction = np.abs(arrays.download(self.newton.direction)[:, :, column]).max(0)
+        direction = np.abs(device_arrays.download(self.newton.direction)[:, :, column]).max(0)
         largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
         node = largest - int(self.group.host.first[column % self.group.rods])
         return f"residual {size:.3g} N at node {node}; {self._remedy(state, column)}"
@@ -179,7 +179,7 @@ class ChainStep(PartStep):
     def _remedy(self, state, column: int) -> str:
         """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
         host, kind, rod = self.group.host, self.group.kind, column % self.group.rods
-        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column]
+        x = device_arrays.download(state.groups[self.index].x)[: host.count[rod], column]
         return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.compile.precision import FLOAT32_LIMIT, stiff, straight_turns
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
@@ -168,7 +168,7 @@ class PartStep:
         kernels = [self._start, self._advance, *self.own_kernels, *self.newton.kernels]
         for part in filter(None, (self.motion, self.loads, self.field, self.drag, self.energy)):
             kernels += part.kernels
-        arrays.load_kernels(kernels, self.model.wp_device)
+        device_arrays.load_kernels(kernels, self.model.wp_device)
 
     def raise_failures(self, state) -> None:
         """Raise for failed islands.

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
 from ddg_warp.kernels.stepping import coupled_warm_start
 from ddg_warp.solve.linear.sparse_system import Sums
 
@@ -15,7 +15,7 @@ class Foresight:
     """
 
     def __init__(self, newton):
-        net, device, serial = newton.net, newton.net.device, arrays.serial(newton.net.device)
+        net, device, serial = newton.net, newton.net.device, device_arrays.serial(newton.net.device)
         self.newton = newton
         self._foresee, self._weigh, self._trust = coupled_warm_start.foresight_kernels(
             newton.real, newton.linear, serial
@@ -24,7 +24,7 @@ class Foresight:
         self.trust = wp.ones(net.worlds, dtype=newton.real, device=device)
         self._sum = None
         if newton.contact:
-            takers, rows = arrays.takers(net.host.nodes, device), coupled_warm_start.SUMS
+            takers, rows = device_arrays.takers(net.host.nodes, device), coupled_warm_start.SUMS
             self._weights = wp.zeros((rows, net.worlds, takers), dtype=newton.real, device=device)
             self._sums = wp.zeros((rows, net.worlds), dtype=newton.real, device=device)
             self._sum = Sums(rows * net.worlds, takers, newton.real, device)
@@ -40,7 +40,7 @@ class Foresight:
         """Extrapolate from the predictor of a step from a state `before`, and keep the predictor."""
         newton, net = self.newton, self.newton.net
         inputs = [before.a, newton.held, *newton.islands.arrays, net.blocks]
-        arrays.sweep(
+        device_arrays.sweep(
             self._foresee,
             net.blocks,
             inputs,
@@ -67,7 +67,7 @@ class Foresight:
             nodes,
             net.blocks,
         ]
-        arrays.sweep(self._weigh, nodes, inputs, [self._weights], net.device, worlds=net.worlds)
+        device_arrays.sweep(self._weigh, nodes, inputs, [self._weights], net.device, worlds=net.worlds)
         self._sum(self._weights.reshape((coupled_warm_start.SUMS * net.worlds, -1)), self._sums.flatten())
         inputs = [self._sums, newton.options.rtol, newton.allowed.total, islands.arrays[1]]
         wp.launch(self._trust, net.worlds, inputs, [self.trust], device=net.device)

@@ -3,12 +3,12 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import device_arrays
+from ddg_warp.capture_lock import capturing
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.stepping.world_reset import blank_kernels, forget_kernel, island_kernels, select_kernel
 from ddg_warp.model.state import State
-from ddg_warp.threads import capturing
 
 
 def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
@@ -38,7 +38,7 @@ class Worlds:
         self.resting, self._failed, self._mask = (self._zeros(model.worlds) for _ in range(3))
         self._any = self._zeros(1)
         self._note, self._seal, self._enter, self._clear, self._find = island_kernels()
-        self._serial, self._loaded = arrays.serial(model.wp_device), False
+        self._serial, self._loaded = device_arrays.serial(model.wp_device), False
         self.invalid: wp.array | None = None
         self.start: State | None = None
 
@@ -208,7 +208,7 @@ class Worlds:
                 types |= {self.model.types.real, wp.types.vector(3, self.model.types.real)}  # types of inputs
                 kernels += [kernel for dtype in types for kernel in blank_kernels(dtype)]
             kernels += [forget_kernel(dtype) for dtype in (int, self.model.types.real)]
-            arrays.load_kernels(kernels, self.model.wp_device)
+            device_arrays.load_kernels(kernels, self.model.wp_device)
         self._loaded = True
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:

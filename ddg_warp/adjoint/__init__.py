@@ -1,0 +1,1 @@
+"""Reverse of time steps and equilibria by the implicit function theorem."""

@@ -1,0 +1,110 @@
+"""Adjoint linear solve of the coupled system."""
+
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.adjoint.linear_solve import HostSolve
+from ddg_warp.compile.dof_map import FREE
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels.adjoint.coupled_linear_solve import chain_kernel
+from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
+from ddg_warp.solve.linear.exact_system import ExactSystem
+
+
+class NetSolve:
+    """Solver of (H + c M - dL/dq)^T w = g, on the device for steps, on the host for equilibria.
+
+    Host solves use sparse factors; dL/dq is the load stiffness of equilibria.
+
+    Args:
+        drag: `NetDragAdjoint`, None without drag.
+        contact: `ExactContact`, evaluated at the solution of a step; None without contact.
+        steps: True for steps.
+
+    Attributes:
+        system: `ExactSystem`; None for equilibria.
+        failed: failure flags of `system`; None for equilibria.
+        held: of the last host solve, the load-stiffness term of the gradient by fixed dofs (W N,); None without follower loads.
+    """
+
+    def __init__(self, model, drag, contact, steps: bool):
+        net = self.net = model.net
+        self.model, self.drag = model, drag
+        self.system = ExactSystem(model, drag and drag.inertia, contact) if steps else None
+        self.failed = self.system and self.system.failed
+        self.held = None
+        self._rate = wp.zeros(net.worlds, dtype=net.real, device=net.device)
+        self._chain = chain_kernel(net.real)
+        self._left_out = self.system and self.system.bits(~net.host.fixed | _moved(net.host))
+
+    @cached_property
+    def tangent(self) -> NetTangent:
+        """Tangent of host solves."""
+        return NetTangent(self.model, 0)
+
+    @cached_property
+    def _host(self) -> HostSolve:
+        return HostSolve(self.tangent)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*self.system.kernels, self._chain] if self.system else []
+
+    def __call__(
+        self, state, rate: float, time: float, right: wp.array, w: wp.array, factors: bool = False, rubbing=None
+    ) -> None:
+        """Write w (W N,), zero at fixed dofs.
+
+        Args:
+            state: the solution with its lagged data and the strains of the last step.
+            rate: inverse step of implicit Euler [1/s], zero for an equilibrium with the load parameter `time`.
+            right: g (W N,).
+            factors: True to solve on the host, after conjugate gradients have failed.
+            rubbing: friction term of H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.rubbing`; None without.
+
+        Raises:
+            SolverError: H is singular (host only; see `failed`), or the host is to solve a step in contact, which it cannot.
+        """
+        coefficient = rate * (rate + self.model.scene.mass_damping)
+        if self.system and not factors:
+            self._rate.fill_(rate)
+            self.system.solve(state, coefficient, self._rate, right, w)
+            return
+        if self.system and self.system.contact:
+            raise SolverError(
+                "contact: conjugate gradients have not solved the reverse of the step: no gradient goes through it; take a smaller dt",
+                outcome="no_gradient",
+            )
+        tangent, host = self.tangent, self._host
+        more = self.drag.matrix if self.drag else None
+        rhs = tangent.into(right.numpy().astype(float).ravel())
+        solution = host(SimpleNamespace(net=state), rate, coefficient, None if rate else time, rhs, more, rubbing)
+        w.assign(tangent.back(solution).reshape(-1, 3))
+        if host.held is not None:
+            self.held = wp.empty_like(w)
+            self.held.assign(tangent.back(host.held).reshape(-1, 3))
+
+    def chain(self, by_lagged: wp.array, by_q: wp.array) -> None:
+        """Overwrite free entries of `by_q` (W N,) with the gradient `by_lagged`, and add `by_lagged` to its fixed entries.
+
+        The result is the right-hand side g of the friction iteration before; `by_lagged` is zeroed.
+        """
+        wp.launch(
+            self._chain, len(by_q), [self.system.fixed, self.net.blocks], [by_lagged, by_q], device=self.net.device
+        )
+
+    def stays(self, by_q: wp.array, out: wp.array) -> None:
+        """Write the entries of a gradient by fixed dofs (W N,) that belong to the start of a step: dofs without prescribed motion."""
+        self.system.part(by_q, self._left_out, out)
+
+
+def _moved(host) -> np.ndarray:
+    """Return the dofs of a world with prescribed motion (blocks, 3)."""
+    moved = np.zeros((host.blocks, 3), bool)
+    moved[host.moving[:, 0]] = host.moving[:, 1:] > FREE
+    moved[host.turning[:, 0], 0] = True
+    return moved

@@ -1,0 +1,134 @@
+"""VJP of the predictor of the coupled system; see `ddg_warp.adjoint.rod_predictor`."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import device_arrays
+from ddg_warp.kernels.adjoint import coupled_predictor
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.newton import coupled_newton
+from ddg_warp.model.coupled_model import NetState
+from ddg_warp.solve.linear.sparse_system import lists
+from ddg_warp.solve.newton.edge_rotation import Turns
+
+
+class NetPredictor:
+    """Predictor of the coupled system, with a VJP; see `ChainPredictor`.
+
+    Attributes:
+        state: predicted blocks `q` with lagged data.
+        frame: transported frames, in the midpoint rule.
+        by_q: gradient by predicted blocks, scratch.
+    """
+
+    def __init__(self, model, net, motion, midpoint: bool):
+        host, real, device = net.host, model.types.real, model.wp_device
+        self.model, self.net, self.motion, self._midpoint = model, net, motion, midpoint
+        self.carries = midpoint and net.edges > 0
+        self._islands = Islands(net.worlds, real, device)
+        self._islands.portion.fill_(1.0)
+        self._dt, self._none = (wp.zeros(net.worlds, dtype=real, device=device) for _ in range(2))
+        self._q, self._base, self._target, self.by_q, self._along = (
+            wp.zeros(net.worlds * net.blocks, dtype=net.vector, device=device) for _ in range(5)
+        )
+        self.frame, self._lag = net.lagged() if self.carries else (None, None)
+        self._begin, _ = coupled_newton.step_kernels(real, midpoint, device_arrays.serial(device))
+        self._unplace, self._pass_on, self._turn, self._pull = coupled_predictor.net_kernels(real, midpoint)
+        plan, loops = host.outwards, np.array([rod.piece.kind.closed for rod in host.rods], int)
+        rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
+        nodes, next_nodes = plan.nodes, plan.nodes[plan.ahead(loops)]
+        self._nodes, self._ahead = self._put(nodes), self._put(next_nodes)
+        anchored = device_arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
+        self._rods = [self._put(plan.start), self._nodes, anchored, self._put(plan.last_anchors()), self._put(loops)]
+        placed = np.zeros(net.blocks, np.uint8)
+        placed[nodes[~plan.anchored]] = 1
+        self._placed = device_arrays.upload(placed, wp.uint8, device)
+        self._levels = []  # last level first: rods, and their anchor nodes with the path nodes of each
+        for level in reversed(plan.levels):
+            path_nodes = np.flatnonzero(plan.anchored & np.isin(rod, level))
+            meets, index = np.unique(nodes[path_nodes], return_inverse=True)
+            starts, items = lists(index.ravel(), len(meets))
+            self._levels.append((self._put(level), *map(self._put, (meets, starts, path_nodes[items]))))
+        self._meets = [self._put(values) for values in lists(np.concatenate([nodes, next_nodes]), net.blocks)]
+        self._excess, self._added, self._by_base, self._by_step = (
+            wp.zeros((net.worlds, len(nodes)), dtype=net.vector, device=device) for _ in range(4)
+        )
+        self._solver = self._for = None
+
+    @classmethod
+    def of(cls, model, net, motion, scheme: str | None) -> "NetPredictor | None":
+        """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
+        midpoint = scheme == "implicit_midpoint"
+        needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
+        return cls(model, net, motion, midpoint) if needed else None
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture, after `suit`."""
+        kernels_of_predictor = [self._begin, self._unplace, self._pass_on, self._turn, self._pull, *self.net.carries]
+        parts = (self.motion, self._solver.turns)
+        return kernels_of_predictor + [kernel for part in parts if part for kernel in part.kernels]
+
+    def suit(self, step, s: float) -> bool:
+        """Prepare for solves of a `NetStep` over s [s]; return True if kernels or arrays have changed."""
+        if self._for != (s, self.model.version):
+            self._for = s, self.model.version
+            self._dt.fill_(2.0 * s if self._midpoint else s)
+            self._islands.turn.assign(step.limits(s)["turn"])
+        if self._solver is not None and self._solver.linear is step.newton.linear:
+            return False
+        self._solver = solver = copy.copy(step.newton)  # with arrays of its own
+        solver.q, solver.base, solver.target, solver.islands = self._q, self._base, self._target, self._islands
+        solver.direction = wp.zeros_like(solver.direction)
+        solver.turns = Turns(solver) if self._levels else None
+        return True
+
+    def find(self, before: NetState) -> None:
+        """Compute the predictor of a step from the state `before`; launches only."""
+        net, solver, islands = self.net, self._solver, self._islands
+        islands.todo.zero_()
+        inputs = [before.q, before.v, solver.held, net.moves, self._dt, self._none, self._none, *islands.arrays]
+        outputs = [self._q, self._base, self._target]
+        device_arrays.sweep(self._begin, net.blocks, [*inputs, net.blocks], outputs, net.device, worlds=net.worlds)
+        if self.motion:
+            self.motion.place(islands, self._q)
+        if solver.turns:
+            solver.turns.predict(before.v, not self._midpoint)
+        self.state = replace(before, q=self._q)
+        if self.carries:
+            self.state = replace(self.state, frame=self.frame, lag=self._lag)
+            net.carry(before, self.state)
+
+    def pull(self, before: NetState, by_fixed: wp.array, start: NetState, by_rate: wp.array) -> None:
+        """Add the gradient by the state before the step, given `by_q`, which is overwritten.
+
+        Args:
+            before: as of the last `find`.
+            by_fixed: gradient by fixed dofs.
+            start: gradient by the state before the step.
+            by_rate: gradient by the inverse step.
+        """
+        net, islands, worlds = self.net, self._islands, self.net.worlds
+        for array in (self._along, self._excess, self._added, self._by_base, self._by_step):
+            array.zero_()
+        inputs = [*self._rods, self._solver.held, islands.todo, net.blocks, self.by_q]
+        for rods, meets, starts, items in self._levels:
+            self._launch(self._unplace, (len(rods), worlds), [rods, *inputs], [self._excess, self._added])
+            read = [meets, starts, items, net.blocks, self._added]
+            self._launch(self._pass_on, (len(meets), worlds), read, [self.by_q, self._along])
+        held_mass = [self._solver.held, self.net.moves]
+        read = [self._nodes, self._ahead, self._q, before.q, before.v, *held_mass, islands.rate, islands.turn]
+        read += [islands.todo, net.blocks, self._excess]
+        self._launch(self._turn, (len(self._nodes), worlds), read, [self._by_base, self._by_step])
+        read = [self.by_q, self._along, self._placed, *self._meets, len(self._nodes), self._by_base, self._by_step]
+        read += [before.v, *held_mass, islands.todo, islands.rate, net.blocks]
+        self._launch(self._pull, len(self._q), read, [by_fixed, start.q, start.v, by_rate])
+
+    def _put(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.net.device)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)

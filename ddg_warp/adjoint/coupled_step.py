@@ -1,0 +1,300 @@
+"""Reverse of a step of a net; see `ddg_warp.adjoint.implicit`."""
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.adjoint.contact import ContactAdjoint
+from ddg_warp.adjoint.coupled_assembly import Shares
+from ddg_warp.adjoint.coupled_linear_solve import NetSolve
+from ddg_warp.adjoint.coupled_predictor import NetPredictor
+from ddg_warp.adjoint.drag import NetDragAdjoint
+from ddg_warp.adjoint.follower_loads import Followers
+from ddg_warp.adjoint.supports import Supports
+from ddg_warp.kernels.adjoint import coupled_step, elements
+from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
+from ddg_warp.kernels.forces.drag import block_inertia
+from ddg_warp.model.coupled_model import NetState
+
+
+@dataclass
+class NetKept:
+    """What the reverse of a step reads of it: the state `before`, and the solution of its solve with its lagged data.
+
+    `lagged` are the solutions where friction was taken anew (W N,), in this order; what else is lagged stays. Of an equilibrium with
+    friction `before` is the one that slips count from, and `rubbing` over the increment of the load parameter since then.
+    """
+
+    before: NetState
+    solved: NetState
+    whole: wp.array | None
+    retries: wp.array | None = None
+    time: float = 0.0
+    lagged: list[wp.array] = field(default_factory=list)
+    rubbing: float = 0.0
+
+    @property
+    def frame(self) -> wp.array:
+        """Lagged frames at the solution."""
+        return self.solved.frame
+
+
+@dataclass
+class NetInputs:
+    """Derivatives by what a step of a net read beside its state.
+
+    Attributes:
+        parameters: of every element set (parameters, W E); data, end_data: by its constant data in the solve and at the end of the step
+            (rows, W E).
+        mass: by the masses of the dofs of blocks (W N,); load: by the forces on them, zero at held dofs.
+        held: by where held dofs are at the solution (W N,).
+        drag: by coefficients of drag (rows, W edges that feel it); None without any.
+        rate, damping, gravity: by what all blocks share, the share of each (W N,); elements_rate: by the rate, of every set (W E,), and
+            of friction.
+        touching, radius: by the numbers of contact, as of `ContactAdjoint`; None without.
+    """
+
+    parameters: list[wp.array]
+    data: list[wp.array]
+    end_data: list[wp.array]
+    mass: wp.array
+    load: wp.array
+    held: wp.array
+    rate: wp.array
+    damping: wp.array
+    gravity: wp.array
+    drag: wp.array | None
+    elements_rate: list[wp.array]
+    touching: wp.array | None = None
+    radius: wp.array | None = None
+
+
+class NetAdjoint:
+    """Reverse of the steps of a model's net, and of its equilibria; `gravity` and `axes` as of `ChainAdjoint`.
+
+    Args:
+        scheme, posed: as of `ChainAdjoint`.
+
+    Raises:
+        SceneError: a motion has no gradient, or contact; see `Supports` and `ContactAdjoint`.
+    """
+
+    def __init__(self, model, scheme: str | None, posed: bool = False):
+        net, real = model.net, model.types.real
+        self.model, self.net, self.real, self.device = model, net, real, model.wp_device
+        host, count = net.host, net.worlds * net.blocks
+        self.axes = host.axes
+        midpoint = scheme == "implicit_midpoint"
+        self.supports = Supports(model, net, midpoint) if (scheme or posed) and host.moves else None
+        motion = self.supports.motion if self.supports else None
+        self._midpoint, drag = midpoint, bool(host.drag and scheme)
+        self.followers = Followers(model, net, midpoint) if host.followers and scheme else None
+        self.predictor = NetPredictor.of(model, net, motion, scheme)
+        self._shares = Shares(model)
+        self.drag = NetDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
+        self.contact = ContactAdjoint(net) if host.touching else None
+        self.solve = NetSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
+        self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
+        self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
+        storages = [coupled_storage(part.term, real) for part in net.sets]
+        self._pull = [elements.pull_kernel(storage, 0, real, True, True) for storage in storages]
+        self._strains = [
+            elements.strain_kernel(storage, 0, real, True) if part.term.density.lagged else None
+            for storage, part in zip(storages, net.sets, strict=True)
+        ]
+        self._solution, self._inert, self._start, self._ended = coupled_step.step_kernels(real, midpoint, drag)
+        self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
+        self._rates, self._rubbing = (wp.zeros(net.worlds, dtype=real, device=self.device) for _ in range(2))
+
+        def make(dtype=net.vector):
+            return wp.zeros(count, dtype=dtype, device=self.device)
+
+        def of_sets(rows):
+            return [self._shares.make(rows(part.term), part.elements) for part in net.sets]
+
+        self._by_end, self._by_q, self._w, self._end, self._stays = (make() for _ in range(5))
+        self._by_lagged = make() if self.contact and self.contact.lags > 1 else None
+        self._given_frame = self._shares.make(FRAME, net.edges)
+        # of frames and own lagged rows: of what the step ends in, of its solve, and of where it starts
+        self._by_frame = [self._shares.make(FRAME, net.edges) for _ in range(2)]
+        self._by_own = [self._shares.make_own() for _ in range(3)]
+        self._start_state = net.empty()
+        self._inputs = NetInputs(
+            parameters=of_sets(lambda term: len(term.parameter_names)),
+            data=of_sets(lambda term: term.measure.data_size),
+            end_data=of_sets(lambda term: term.measure.data_size),
+            mass=make(),
+            load=make(),
+            held=self._by_q,
+            rate=make(real),
+            damping=make(real),
+            gravity=make(),
+            drag=self.drag.by_coefficients if drag else None,
+            elements_rate=[wp.zeros(part.elements * net.worlds, dtype=real, device=self.device) for part in net.sets],
+        )
+        if self.contact:
+            self._inputs.touching, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
+            self._inputs.elements_rate.append(self.contact.by_rate)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [*self._pull, *(kernel for kernel in self._strains if kernel)]
+        own += [self._solution, self._inert, self._start, self._ended]
+        parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
+        return own + [kernel for part in parts if part for kernel in part.kernels]
+
+    def suit(self, step, s: float, given: bool = False) -> bool:
+        """As of `ChainAdjoint`, of a `NetStep`."""
+        return self.predictor is not None and self.predictor.suit(step, s)
+
+    def upload(self, t0: float, t1: float) -> None:
+        """As of `ChainAdjoint`."""
+        for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
+            part.upload(t0, t1)
+
+    def lagged(self, before: NetState, states=None) -> wp.array:
+        """As of `ChainAdjoint`."""
+        if self.predictor is None:
+            return before.frame
+        if self.supports:
+            self.supports.follow(*states)
+        self.predictor.find(before)
+        return self.predictor.state.frame
+
+    def keep(self, step, before: NetState) -> NetKept:
+        """What the step that a `NetStep` has just made leaves for its reverse; `before` has to stay as it is."""
+        net, q = self.net, wp.clone(step.newton.q)
+        data = {index: wp.clone(values) for index, values in step._data.items()}
+        solved = replace(before, q=q, data=data)
+        if net.edges:
+            frame, lag = step._lagged
+            solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
+        islands = step.islands
+        lagged = [wp.clone(values) for values in step.newton.contact.solutions] if self.contact else []
+        return NetKept(before, solved, wp.clone(islands.portion), wp.clone(islands.retries), lagged=lagged)
+
+    def pull(
+        self, kept: NetKept, after: NetState, given: NetState, s: float, states=None, factors: bool = False
+    ) -> tuple[NetState, NetInputs]:
+        """As `ChainAdjoint.pull`; `factors`: as of `NetSolve`."""
+        net, solved, before, shares = self.net, kept.solved, kept.before, self._shares
+        rate, last = 1.0 / s, net.blocks - net.host.spins
+        start, inputs, by_end, by_q, w = self._start_state, self._inputs, self._by_end, self._by_q, self._w
+        self._clear()
+        frame, carried = self._given_frame, self._by_frame[0]
+        of_end, own, first = self._by_own
+        wp.copy(frame, given.frame)
+        # strains of the end, which the next step is damped from
+        for i, kernel in enumerate(self._strains):
+            if kernel:
+                read = [net.elements(after, i), given.last[i]]
+                self._over(i, kernel, read, [shares.slots[i], shares.lags[i], inputs.parameters[i]])
+        shares.collect(by_end, frame, inputs.end_data)
+        for part, rows, lag in zip(net.sets, of_end, given.lag, strict=True):
+            if part.term.measure.advance:
+                wp.copy(rows, lag)
+        shares.add_own(of_end)
+        ended, predictor, by_predicted, tangents = solved.q, self.predictor, None, before.q
+        if predictor:
+            self.lagged(before, states)
+            lagged, by_predicted = predictor.state, predictor.by_q
+            by_predicted.zero_()
+            tangents = lagged.q if self._midpoint else tangents
+            solved = replace(solved, frame=lagged.frame, lag=lagged.lag)
+        if self._midpoint:
+            ended = self._end
+            self._launch(self._ended, len(ended), [solved.q, before.q], [ended])
+        shares.uncarry(solved, after, ended, frame, of_end, by_end, inputs.end_data, carried, own)
+        # the solve
+        if self.drag:
+            self.drag.resist(before, tangents, rate)
+        read = [given.q, given.v, by_end, self._inertia, rate, last, net.blocks]
+        self._launch(self._solution, len(by_q), read, [by_q])
+        self._rates.fill_(rate)
+        self._rubbing.fill_(kept.rubbing or rate)
+        rough, ways = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
+        if kept.rubbing:  # normal forces are those of the equilibrium
+            rough, ways = self.contact.matrix(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
+        by_tangents = by_predicted if self._midpoint else start.q
+        for at, q in ways:  # friction lagged there, and the solution
+            damped = replace(solved, q=q, last=before.last)
+            if self.contact:
+                rates = after.rate, before.rate if at is before.q else None
+                self.contact.system.find(at, before.q, q, self._rubbing, rates)
+            self.solve(damped, rate, kept.time, by_q, w, factors, rough)
+            shares.clear()
+            for i, kernel in enumerate(self._pull):
+                written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
+                written += [start.last[i], inputs.elements_rate[i]]
+                self._over(i, kernel, [net.elements(damped, i, rate=self._rates), w], written)
+            shares.collect(by_q, carried, inputs.data)
+            shares.add_own(own)
+            if self.drag:
+                self.drag.pull(before, tangents, q, w, rate, by_q, start, inputs.rate, by_tangents)
+            read = [q, before.q, before.v, w, net.mass, self.gravity, net.host.nodes, last, net.blocks, rate]
+            written = [start.q, start.v, inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity]
+            self._launch(self._inert, len(q), [*read, self._damping], written)
+            if self.contact:
+                by_lagged = next(by for of, by in ((before.q, start.q), (q, by_q), (at, self._by_lagged)) if of is at)
+                self.contact.pull((at, before.q, q), w, self._rubbing, (by_lagged, start.q, by_q))
+                if kept.rubbing:
+                    self.contact.roll(q, before.q, start.q, by_q)
+            if at is not before.q and at is not q:
+                self.solve.chain(self._by_lagged, by_q)
+        if self.solve.held is not None:
+            wp.map(wp.add, by_q, self.solve.held, out=by_q)
+        if self.supports:
+            self.supports.follow(*states)
+            frame, by_frame = (net.frames(array) for array in (solved.frame, carried))
+            held, angle = net.components(by_q), net.angles(by_q)
+            self.supports.pull(net.points(solved.q), frame, held, angle, by_frame)
+        if self.followers:
+            of = net.components(inputs.load), net.angles(inputs.load), net.components(by_predicted)
+            self.followers.pull(net.points(lagged.q), *of)
+        if predictor:
+            if predictor.carries:
+                written = by_predicted, inputs.data, self._by_frame[1], first
+                shares.uncarry(before, lagged, lagged.q, carried, own, *written)
+                carried, own = self._by_frame[1], first
+            predictor.pull(before, by_q, start, inputs.rate)
+        start.frame, start.lag = carried, own
+        if s < np.inf:
+            self.solve.stays(by_q, self._stays)
+        self._launch(
+            self._start,
+            len(by_q),
+            [given.q, given.v, by_end, solved.q, before.q, self._stays, self._inertia, last, net.blocks, rate],
+            [start.q, start.v, inputs.rate],
+        )
+        return start, inputs
+
+    def outgrown(self, q: wp.array) -> bool:
+        """Whether the last `pull`, to a solution q, had more pairs in contact than there was room for, and is to be done again.
+
+        Reads from the device where there is contact.
+        """
+        return self.contact is not None and self.contact.outgrown(q)
+
+    def _clear(self) -> None:
+        """Zero what is added to."""
+        inputs, start = self._inputs, self._start_state
+        own = [array for arrays in self._by_own for array in arrays]
+        for array in (
+            *(self._by_end, start.q, start.v, *start.last, *self._by_frame, *own),
+            *(inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity, *inputs.elements_rate),
+            *(*inputs.parameters, *inputs.data, *inputs.end_data),
+            *([inputs.drag] if self.drag else []),
+            *([self.contact.by_groups, self.contact.by_radius] if self.contact else []),
+            *([self.solve.failed] if self.solve.failed is not None else []),
+        ):
+            array.zero_()
+        self._shares.clear()
+
+    def _over(self, index: int, kernel, inputs: list, outputs: list) -> None:
+        self._launch(kernel, (self.net.worlds, self.net.sets[index].elements), inputs, outputs)
+
+    def _launch(self, kernel, count: int | tuple[int, int], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, count, inputs, outputs, device=self.device)

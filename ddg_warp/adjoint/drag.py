@@ -1,0 +1,174 @@
+"""VJP of drag in the steps of a rod group and of the coupled system; see `kernels.adjoint.drag`."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp import device_arrays
+from ddg_warp.kernels.adjoint.drag import chain_kernels, net_kernels
+from ddg_warp.kernels.core.islands import Islands
+from ddg_warp.kernels.elements import rod_layout
+from ddg_warp.kernels.forces.drag import ROWS, block_inertia
+from ddg_warp.solve.forces.drag import ChainDrag, NetDrag
+from ddg_warp.solve.linear.sparse_system import lists
+
+
+class ChainDragAdjoint:
+    """VJP of drag on a rod group.
+
+    Attributes:
+        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `pull`.
+    """
+
+    def __init__(self, model, group, midpoint: bool):
+        kind, real, device = group.kind, model.types.real, model.wp_device
+        self.model, self.group, self.drag = model, group, ChainDrag(model, group, midpoint)
+        self._edges, self._nodes = chain_kernels(kind, real, midpoint)
+        shape = group.nodes, group.columns
+        self._by_edge, self._by_velocity, self.by_coefficients = (
+            device_arrays.allocate((rows, *shape), real, device) for rows in (kind.dim, kind.dim, ROWS)
+        )
+        self._nowhere = device_arrays.allocate((1, 1, 1), real, device)
+        self._islands = None
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._edges, self._nodes, *self.drag.kernels]
+
+    def resist(self, before, tangents: wp.array, solver, islands) -> None:
+        """Write inertia and drag of a solve from the state `before` to a solver, with the tangents of that solve; launches only."""
+        target = SimpleNamespace(x=tangents, mass=solver.mass, rotary=solver.rotary, target_angle=solver.target_angle)
+        self.drag.resist(before, target, islands)
+
+    def matrix(self, before, tangents: wp.array, rate: float) -> sparse.csc_matrix:
+        """Return the drag matrix of a solve, in the dof order of a `ChainTangent`."""
+        group, kind, real, device = self.group, self.group.kind, self.model.types.real, self.model.wp_device
+        if self._islands is None:
+            shape = group.nodes, group.columns
+            twisted = shape if kind.twist else (1, 1)
+            self._islands = Islands(group.columns, real, device)
+            self._islands.coefficient.fill_(1.0)
+            self._inertia = SimpleNamespace(
+                mass=device_arrays.allocate(shape, rod_layout.inertia_type(kind, real), device)
+            )
+            self._inertia.rotary, self._inertia.target_angle = (
+                device_arrays.allocate(twisted, real, device) for _ in range(2)
+            )
+        self._islands.rate.fill_(rate)
+        self.resist(before, tangents, self._inertia, self._islands)
+        inertia = device_arrays.download(self._inertia.mass).T.ravel()
+        blocks = np.zeros((len(inertia), kind.block, kind.block))
+        blocks[:, : kind.dim, : kind.dim] = inertia["resistance"].reshape(-1, kind.dim, kind.dim)
+        if kind.twist:
+            blocks[:, kind.dim, kind.dim] = inertia["spin"]
+        return sparse.block_diag(blocks, format="csc")
+
+    def pull(
+        self,
+        before,
+        tangents: wp.array,
+        kept,
+        w: wp.array,
+        rate: wp.array,
+        by_fixed,
+        start,
+        by_rate,
+        by_tangents=None,
+    ) -> None:
+        """Add the gradients of drag.
+
+        Args:
+            by_fixed: gradient with respect to fixed dofs, added to.
+            start: gradient with respect to the state before the step, added to.
+            by_rate: gradient with respect to the inverse step, added to.
+            by_tangents: gradient with respect to the tangents, added to; if None these terms are added to the positions of `start`.
+        """
+        group = self.group
+        read = [tangents, before.x, before.v, before.theta, kept.x, kept.theta, group.drag, self.drag.flow, w]
+        read += [group.count, rate]
+        self._launch(self._edges, read, [self._by_edge, self._by_velocity, self.by_coefficients])
+        outputs = [
+            self._nowhere if by_tangents is None else by_tangents,
+            by_fixed,
+            start.x,
+            start.v,
+            start.theta,
+            by_rate,
+        ]
+        self._launch(self._nodes, [*read, group.fixed, self._by_edge, self._by_velocity], outputs)
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.model.wp_device)
+
+
+class NetDragAdjoint:
+    """VJP of drag on the coupled system; further attributes as `ChainDragAdjoint`.
+
+    Args:
+        gather: kernel that assembles contributions of edges to dof blocks.
+
+    Attributes:
+        inertia: inertia and drag of the dof blocks in the current solve (worlds, N), written by `resist`.
+    """
+
+    def __init__(self, model, net, midpoint: bool, gather):
+        real, device, (ends, angles, _) = model.types.real, net.device, net.host.drag
+        self.net, self.drag, self._gather = net, NetDrag(model, midpoint), gather
+        self._edges, self._nodes = net_kernels(real, midpoint)
+        self._ends, self._angles = (
+            wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device) for values in (ends.T, angles)
+        )
+        self._starts, self._items = (
+            wp.array(values.astype(np.int32), dtype=int, device=device) for values in lists(ends.ravel(), net.blocks)
+        )
+        self._edge_count, count = len(ends.T), len(ends.T) * net.worlds
+        self._by_tangent, self._by_velocity = (wp.zeros((2, count), dtype=net.vector, device=device) for _ in range(2))
+        self.by_coefficients = wp.zeros((ROWS, count), dtype=real, device=device)
+        self.inertia = wp.zeros((net.worlds, net.blocks), dtype=block_inertia(real), device=device)
+        self._islands = Islands(net.worlds, real, device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._edges, self._nodes, *self.drag.kernels]
+
+    def resist(self, before, tangents: wp.array, rate: float) -> None:
+        """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""
+        self._islands.rate.fill_(rate)
+        target = SimpleNamespace(q=tangents, outer=self.net.still, mass=self.inertia)
+        self.drag.resist(before, target, self._islands)
+
+    @property
+    def matrix(self) -> sparse.csc_matrix:
+        """Drag matrix of `inertia`, in dof blocks of space components."""
+        return sparse.block_diag(self.inertia.numpy()["resistance"].reshape(-1, 3, 3), format="csc")
+
+    def pull(
+        self,
+        before,
+        tangents: wp.array,
+        q: wp.array,
+        w: wp.array,
+        rate: float,
+        by_fixed,
+        start,
+        by_rate,
+        by_tangents,
+    ):
+        """Add gradients as `ChainDragAdjoint.pull`, for a solve with the solution q; `by_tangents` is required."""
+        net, drag = self.net, self.drag
+        read = [tangents, before.q, before.v, q, self._ends, self._angles, net.drag, drag.flow, w, rate]
+        outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]
+        self._launch(self._edges, self.by_coefficients.shape[1], [*read, net.blocks], outputs)
+        for slots, target in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):
+            self._launch(
+                self._gather, len(q), [self._starts, self._items, self._edge_count, net.blocks, slots], [target]
+            )
+        inputs = [self.inertia, before.q, q, w, rate, net.blocks]
+        self._launch(self._nodes, len(q), inputs, [by_fixed, start.q, by_rate])
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)

@@ -1,0 +1,379 @@
+"""Linear systems of adjoints: the transposed exact Hessian of a solve, without any projection to SPD."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from ddg_warp import device_arrays
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels.adjoint import float32_error, iterative_refinement
+from ddg_warp.kernels.adjoint.coupled_linear_solve import check_kernels
+from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
+from ddg_warp.solve.equilibrium.rod_tangent import ChainTangent
+from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
+from ddg_warp.solve.linear.solver_selection import automatic
+from ddg_warp.solve.linear.sparse_direct import SingularError, regular
+from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
+from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
+
+CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
+PASSES = 2  # ... which limits refinement. Measured: with 3 passes, an error of 1e-2 each, gradients erred by 1e-3
+LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner.
+MISSED = 1e-6  # Largest true relative residual left by conjugate gradients, for rounding.
+SINGULAR = 1e-6  # Accepted relative residual; a singular matrix that was regularised leaves more
+
+
+class HostSolve:
+    """Solver of (H + c M - dL/dq)^T w = g of a subsystem, by sparse factors on the host.
+
+    Attributes:
+        held: load-stiffness term of the gradient by fixed dofs (size,), of the last solution; None without follower loads.
+    """
+
+    def __init__(self, tangent):
+        self.tangent = tangent
+        self.held = None
+
+    def __call__(
+        self, state, rate: float, coefficient: float, factor: float | None, rhs: np.ndarray, more=None, rubbing=None
+    ) -> np.ndarray:
+        """Return w (size,), zero at fixed dofs.
+
+        Args:
+            state: the solution with its lagged frames, in the layout of a state.
+            rate: inverse step of implicit Euler [1/s], used in strain-rate damping; zero for an equilibrium.
+            coefficient: c, zero for an equilibrium [1/s^2].
+            factor: load parameter of an equilibrium, which has load stiffness dL/dq; None in a step, where loads are lagged.
+            rhs: g (size,).
+            more: additional matrix, of drag; None without.
+            rubbing: additional matrix, unsymmetric, of friction in an equilibrium; None without.
+
+        A singular matrix, with zero stiffness along a motion, is accepted if g has no component along the motion.
+
+        Raises:
+            SolverError: g has such a component.
+        """
+        tangent, following = self.tangent, None
+        tangent.rate = wp.full(len(tangent.rate), rate, dtype=tangent.rate.dtype, device=tangent.rate.device)
+        hessian = (
+            tangent.hessian(state) if rubbing is None else tangent.potential_hessian(state) + tangent.matrix(rubbing)
+        )
+        if coefficient == 0.0 and tangent.model.touch is None:
+            self._require_stiff(state, hessian)
+        matrix = hessian + sparse.diags(coefficient * tangent.mass)
+        if more is not None:
+            matrix = matrix + tangent.matrix(more)
+        if factor is not None:
+            spun = self._spun(state, factor, rubbing is not None)
+            following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), spun)
+        free = np.flatnonzero(tangent.free)
+        free_matrix, rhs = (
+            sparse.csc_matrix(matrix if following is None else matrix + following)[free][:, free],
+            rhs[free],
+        )
+        try:
+            symmetric = following is None and rubbing is None
+            solve = regular(free_matrix, tangent.mass[free])[0].solve if symmetric else _transposed(free_matrix)
+            solution = solve(rhs)
+        except (SingularError, RuntimeError) as error:
+            raise self._singular(free) from error
+        missed = np.abs(free_matrix.T @ solution - rhs)
+        if not missed.max(initial=0.0) <= SINGULAR * np.abs(rhs).max(initial=0.0):
+            raise self._singular(free[int(np.argmax(missed))])
+        w = np.zeros(tangent.size)
+        w[free] = solution
+        self.held = None if following is None else np.where(tangent.free, 0.0, -(following.T @ w))
+        return w
+
+    def _require_stiff(self, state, hessian: sparse.csc_matrix) -> None:
+        """Refuse an equilibrium with a neutral rigid-body mode, such as the spin of a rod without torsional support.
+
+        Loads along the mode make the equilibrium jump under any change of parameters, which g does not reveal.
+        """
+        tangent = self.tangent
+        neutral = rigid_modes(tangent, state, hessian)
+        if neutral.shape[1]:
+            mode = neutral[:, 0]
+            spins = np.abs(mode[~tangent.angle]).max(initial=0.0) <= 1e-6 * np.abs(mode).max() / tangent.edge_length()
+            kind = "the spin of" if spins else "a motion of"
+            where = tangent.where(int(np.argmax(np.abs(mode))))
+            raise SolverError(
+                f"no gradient goes through the equilibrium: {kind} {where} is neutral, as nothing holds it, so that it would jump with "
+                f"parameters; {'hold it by scene.fix_twist(...)' if spins else 'hold it'}",
+                outcome="neutral",
+            )
+
+    def _spun(self, state, factor: float, rubs: bool) -> sparse.csc_matrix | None:
+        """Return the stiffness from transport of frames, which the tangent keeps fixed; None if no moment acts on an edge.
+
+        A moment M on the twist angle of an edge e rotates with its frame. The transported frame spins about the tangent t by
+        t . (t x de) / 2 |e| less than a fixed one. This adds the force M [t] de / 2 |e|^2 across the edge, with [t] the matrix of t
+        x. M is the sum of loads, reactions and, if `rubs`, friction; together they balance the elastic moment.
+        """
+        tangent, rows, columns, values = self.tangent, [], [], []
+        q = tangent.dofs(state)
+        moments = np.where(tangent.free & (not rubs), tangent.loads(factor, q), tangent.gradient(state))
+        for body in tangent.bodies():
+            if len(body.angles) and (body.nodes >= 0).all():
+                ends = body.nodes[body.ends]  # (edges, 2, 3)
+                acting = moments[body.angles] * tangent.free[ends].any((1, 2)) != 0.0
+                ends, moment = ends[acting], moments[body.angles][acting]
+                e = q[ends[:, 1]] - q[ends[:, 0]]
+                size = moment / (2.0 * np.linalg.norm(e, axis=1) ** 3)
+                across = size[:, None, None] * np.swapaxes(np.cross(e[:, None], np.eye(3)), 1, 2)
+                sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
+                row, column = np.broadcast_arrays(ends[:, :, None, :, None], ends[:, None, :, None, :])
+                rows.append(row.ravel())
+                columns.append(column.ravel())
+                values.append((sign[None, :, :, None, None] * across[:, None, None]).ravel())
+        if not sum(map(len, values)):
+            return None
+        data, *indices = (np.concatenate(parts) for parts in (values, rows, columns))
+        return sparse.csc_matrix((data, indices), shape=(tangent.size, tangent.size))
+
+    def _singular(self, dof: np.ndarray | int) -> SolverError:
+        where = self.tangent.where(int(np.ravel(dof)[0]))
+        return SolverError(
+            f"no gradient goes through the solution: {where} can move without any stiffness, along what the loss depends on; hold it, "
+            "or stay off limit points and bifurcations",
+            outcome="singular",
+        )
+
+
+def _total(*matrices: sparse.csc_matrix | None) -> sparse.csc_matrix | None:
+    """Return the sum of the matrices that are not None; None if all are."""
+    return sum(m for m in matrices if m is not None) if any(m is not None for m in matrices) else None
+
+
+def _transposed(matrix: sparse.csc_matrix):
+    """Return the solver of a transposed system, for unsymmetric matrices."""
+    factors = splu(matrix)
+    return lambda rhs: factors.solve(rhs, trans="T")
+
+
+class ClosedChains:
+    """Solver of closed rods by conjugate gradients, preconditioned by the opened rods; interface of `CyclicReduction`."""
+
+    def __init__(self, system: PcgNewton):
+        self.system = system
+        _, self._check = check_kernels(system.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        system = self.system
+        return [system._factor, system._start, system._product, system._advance, self._check]
+
+    def solve(self, matrix, right, count, wanted, solution: wp.array, failed: wp.array, again: bool = False) -> None:
+        """Solve as `CyclicReduction.solve`; `failed` marks rods with a residual left."""
+        system = self.system
+        wp.copy(system.islands.wanted, wanted)
+        system.factorise()
+        system.right, system.direction = right, solution
+        system.direct()
+        failed.zero_()
+        read = [system.rho, system.rho_first, MISSED]
+        wp.launch(self._check, system.group.columns, read, [failed], device=system.device)
+
+
+class DirectSolve:
+    """Device solver of H w = g of a rod group.
+
+    Factors come from the sweep, or, in another precision than the state's, from block elimination or cyclic reduction with
+    iterative refinement. Closed rods are solved by conjugate gradients.
+
+    Args:
+        linear: precision of the factors; by default that of the state.
+
+    Attributes:
+        failed: nonzero for rods with an H that is not positive definite (columns,), where w is meaningless.
+        passes: number of solutions summed in iterative refinement; 0 without.
+    """
+
+    def __init__(self, model, group, linear=None):
+        self.group, self.passes = group, 0
+        kind, device, real = group.kind, model.wp_device, model.types.real
+        arguments, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
+        self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
+        if kind.closed:
+            options = NewtonOptions(psd="none", linear_rtol=LINEAR_RTOL)
+            self.system = PcgNewton(model, group, options, linear=real)
+            self.solver, self.failed = ClosedChains(self.system), self.system.islands.bad
+            return
+        few = automatic(group) == "partitioned"
+        if not few and linear is None:
+            self.solver, self.system = None, ChainNewton(*arguments)
+            self._moved = self.system.x, self.system.theta  # arrays that the sweep moves along w
+            self.failed = self.system.islands.status
+            return
+        self.system = AssembledNewton(*arguments, stored=linear)
+        precision_of_factors = linear or real
+        if few:
+            self.solver = CyclicReduction(kind.block, *size, precision_of_factors, device, repeated=linear is not None)
+        else:
+            self.solver = Elimination(kind, *size, precision_of_factors, device)
+        self.failed = self.system.islands.bad
+        if linear is not None:
+            self._product = iterative_refinement.product_kernel(kind, real)
+            self._guess, self._rest, self._add = iterative_refinement.refine_kernels(kind, real, linear)
+            self._elements = device_arrays.allocate((kind.window, *size), real, device)
+            self._right, self._found = self.system.vectors(), self.system.vectors()
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        around = [(self.system._evaluate, 128)]
+        if self.solver is None:
+            return [*around, (self.system._sweep, self.system._threads)]
+        refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
+        return [*around, self.system._assemble, *self.solver.kernels, *refined]
+
+    def __call__(self, solved, last: wp.array, rate: float, coefficient: float, right: wp.array, w: wp.array, resisted):
+        """Write w; launches only. Arguments as of `ChainSolve`, `coefficient` that of inertia [1/s^2]."""
+        system = self.system
+        system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
+        islands = system.islands
+        islands.arrays[0].zero_()
+        islands.coefficient.fill_(coefficient)
+        islands.rate.fill_(rate)
+        islands.unbalanced.fill_(1)  # assemble the matrices of all rods
+        if resisted:
+            resisted[0].resist(*resisted[1:], system, islands)
+        system.evaluate(last)
+        if self.solver is None:
+            islands.stale.zero_()  # keep the frames of the step
+            (system.x, system.theta), system.right, system.direction = self._moved, right, w
+            device_arrays.copy(system.x, solved.x)
+            device_arrays.copy(system.theta, solved.theta)
+            system.eliminate()
+            return
+        system.assemble_blocks()
+        if not self.passes:
+            self._solve(right, w)
+            return
+        nodes, count = w.shape[1:], self.group.count
+        self._launch(self._guess, nodes, [right, system.mass, islands.coefficient], [w])
+        for done in range(self.passes):
+            self._launch(self._product, nodes, [system.factor, system.geometric, w, count], [self._elements])
+            read = [right, w, self._elements, system.mass, system.rotary, islands.coefficient, self.group.fixed, count]
+            self._launch(self._rest, nodes, read, [self._right])
+            self._solve(self._right, self._found, again=done > 0)
+            self._launch(self._add, w.shape, [self._found], [w])
+
+    def _solve(self, right: wp.array, solution: wp.array, again: bool = False) -> None:
+        system = self.system
+        self.solver.solve(system.blocks, right, self.group.count, self._wanted, solution, system.islands.bad, again)
+
+    def _launch(self, kernel, shape: tuple, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
+
+
+class ChainSolve:
+    """Solver of H w = g of a rod group, in the precision of its state; of equilibria on the host.
+
+    Factors have the precision of the model's linear algebra if accurate enough.
+
+    Attributes:
+        tangent: tangent of host solves.
+        held: see `HostSolve`, of the last host solve, in the layout of w.
+        system: the `DirectSolve`.
+        exact: a `DirectSolve` in the precision of the state, selected on the device by the values of parameter tensors; None if
+            parameters are the model's or `system` has that precision.
+        failed: of the last direct solve, see `DirectSolve`.
+    """
+
+    def __init__(self, model, group):
+        self.model, self.group = model, group
+        self.host = HostSolve(ChainTangent(model, group, 0))
+        self.tangent, self.held = self.host.tangent, None
+        self.system, self.exact, self._for = DirectSolve(model, group), None, None
+        self.failed = self.system.failed
+
+    def suit(self, s: float, other_parameters: bool = False) -> bool:
+        """Select precision and refinement passes for steps of s [s], so that the error of w is below `CLOSE`; return True if changed.
+
+        Args:
+            other_parameters: True if parameters may differ from the model's; the device then checks the values.
+        """
+        model, kind = self.model, self.group.kind
+        if model.types.linear is model.types.real:
+            return False
+        changed = False
+        if self._for != (s, model.version):
+            self._for = s, model.version
+            error = 1.0 if kind.drag or kind.closed else float(self.group.float32_errors(s).max())
+            passes = next((n for n in range(1, PASSES + 1) if error**n <= CLOSE), 0)
+            changed = passes != self.system.passes
+            if bool(passes) != bool(self.system.passes):
+                self.system, self.exact = DirectSolve(model, self.group, model.types.linear if passes else None), None
+                self.failed = self.system.failed
+            self.system.passes = passes
+        if other_parameters and self.exact is None and self.system.passes:
+            self._watch()
+            changed = True
+        return changed
+
+    def _watch(self) -> None:
+        group, real, device = self.group, self.model.types.real, self.model.wp_device
+        self.exact = DirectSolve(self.model, group)
+        self.failed = wp.zeros_like(self.system.failed)
+        self._measure, self._judge = float32_error.stiffness_kernels(group.kind, real)
+        self._poor = wp.zeros(1, dtype=int, device=device)
+        self._rate = wp.zeros(group.columns, dtype=real, device=device)
+        parts = -(-group.nodes // float32_error.PART)
+        self._found = wp.zeros((float32_error.ROWS, parts, group.columns), dtype=real, device=device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        watch = [*self.exact.kernels, self._measure, self._judge] if self.exact else []
+        return [*self.system.kernels, *watch]
+
+    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
+        """Write w (block, n, R), zero at fixed dofs, for a right-hand side that is zero there.
+
+        Args:
+            solved: the solution `x`, `theta` and its lagged `frame`.
+            last: strains of the last step.
+            s: length of the implicit Euler step [s]; infinite for an equilibrium with the load parameter `solved.time`.
+            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes of the tangents.
+
+        Raises:
+            SolverError: H is singular (host only; see `failed`).
+        """
+        rate = 1.0 / s
+        coefficient = rate * (rate + self.model.scene.mass_damping)
+        if not rate:
+            more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
+            self._on_host(solved, last, rate, coefficient, right, w, more)
+            return
+        arguments = solved, last, rate, coefficient, right, w, resisted
+        if self.exact is None:
+            self.system(*arguments)
+            return
+        group, device = self.group, self.model.wp_device
+        self._poor.zero_()
+        self._rate.fill_(rate)
+        read = [*group.parameters.arrays, group.mass, group.count]
+        wp.launch(self._measure, self._found.shape[1:], read, [self._found], device=device)
+        read = [self._found, group.length, group.count, self._rate, CLOSE ** (1.0 / self.system.passes)]
+        wp.launch(self._judge, group.columns, read, [self._poor], device=device)
+        wp.capture_if(self._poor, lambda: self._by(self.exact, arguments), lambda: self._by(self.system, arguments))
+
+    def _by(self, direct: DirectSolve, arguments: tuple) -> None:
+        direct(*arguments)
+        wp.copy(self.failed, direct.failed)
+
+    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array, more) -> None:
+        data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)
+        groups = [data if each is self.group else None for each in self.model.groups]
+        factor = None if rate else solved.time
+        b = device_arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
+        solution = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
+        device_arrays.assign(w, self.tangent.blocks(solution).transpose(2, 1, 0))
+        by_fixed = self.host.held
+        self.held = None if by_fixed is None else self.tangent.blocks(by_fixed).transpose(2, 1, 0)

@@ -1,0 +1,281 @@
+"""Reverse of a step of a group of rods on their own; see `ddg_warp.adjoint.implicit`."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import device_arrays
+from ddg_warp.adjoint.drag import ChainDragAdjoint
+from ddg_warp.adjoint.follower_loads import Followers
+from ddg_warp.adjoint.linear_solve import ChainSolve
+from ddg_warp.adjoint.rod_predictor import ChainPredictor
+from ddg_warp.adjoint.supports import Supports
+from ddg_warp.compile.dof_map import FREE
+from ddg_warp.kernels.adjoint import elements, rod_elements
+from ddg_warp.kernels.adjoint import rod_step as step
+from ddg_warp.kernels.elements.rod_layout import rod_storage
+from ddg_warp.model.state import GroupState
+
+
+@dataclass
+class Kept:
+    """What the reverse of a step reads of it.
+
+    Attributes:
+        before: the state that it started from.
+        x, theta: the solution of its solve; frame: the lagged frames at it.
+        whole: of every rod, the part of the step that its last solve was about; retries: how often that was tried again.
+        time: load parameter of an equilibrium.
+    """
+
+    before: GroupState
+    x: wp.array
+    theta: wp.array
+    frame: wp.array
+    whole: wp.array | None
+    retries: wp.array | None = None
+    time: float = 0.0
+
+
+@dataclass
+class ChainInputs:
+    """Derivatives by what a step of a group read beside its state, of every element, node or rod.
+
+    Attributes:
+        parameters: (rows of the parameter table, n, R); mass, rotary: of nodes and edges (n, R).
+        load: by the forces on nodes and the moments on angles (block, n, R); zero at held dofs.
+        held: by where held dofs are at the solution (block, n, R).
+        drag: by coefficients of drag (rows, n, R); None without any.
+        rate, damping, gravity: by what all nodes share, the share of each (n, R); by the rate without what motions, loads and
+            fields do as functions of time.
+    """
+
+    parameters: wp.array
+    mass: wp.array
+    rotary: wp.array
+    load: wp.array
+    held: wp.array
+    rate: wp.array
+    damping: wp.array
+    gravity: wp.array
+    drag: wp.array | None = None
+
+
+class ChainAdjoint:
+    """Reverse of the steps of a group of rods, and of their equilibria.
+
+    Attributes:
+        gravity: of every world in what is pulled (worlds,), by which derivatives by masses go; the scene's at first.
+        axes: components of space that it has.
+
+    Args:
+        scheme: of the steps, None for equilibria.
+        posed: whether equilibria are given poses of grips.
+
+    Attributes:
+        unread: names of the arrays of the state that a step led to which its reverse does not read.
+
+    Raises:
+        SceneError: a motion has no gradient; see `Supports`.
+    """
+
+    def __init__(self, model, group, scheme: str | None, posed: bool = False):
+        self.group, self.model, self.axes = group, model, group.host.axes
+        real, kind, device = model.types.real, group.kind, model.wp_device
+        midpoint = self._midpoint = scheme == "implicit_midpoint"
+        self.device, self.real = device, real
+        self.vector = wp.types.vector(kind.dim, real)
+        self.solve = ChainSolve(model, group)
+        self.supports = Supports(model, group, midpoint) if (scheme or posed) and group.host.moves else None
+        motion = self.supports.motion if self.supports else None
+        self.drag = ChainDragAdjoint(model, group, midpoint) if kind.drag and scheme else None
+        self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
+        self.predictor = ChainPredictor.of(model, group, motion, scheme)
+        terms = range(len(kind.terms))
+        storage, viscous = rod_storage(kind, real), kind.viscous
+        self._pull = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
+        self._strain = [elements.strain_kernel(storage, i, real, False) for i in terms] if viscous else []
+        self._frame = rod_elements.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
+        self._ends, self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
+        self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})
+        self._more_to_start = bool(self.drag or self.predictor)
+        self._solution, self._start = step.step_kernels(kind, real, midpoint, self._more_to_start)
+        self._moved = device_arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
+        self._rate = wp.zeros(group.columns, dtype=real, device=device)
+        self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        self.gravity = wp.array(np.tile(group.gravity_host, (group.worlds, 1)), dtype=self.vector, device=device)
+        twisted = kind.twist
+        self._window, self._lag = self._rows(kind.window), self._rows(13)
+        self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
+        self._by_frame = self._rows(7, twisted and viscous)
+        self._start_state = GroupState(
+            x=self._make(self.vector),
+            v=self._make(self.vector),
+            theta=self._make(needed=twisted),
+            omega=self._make(needed=twisted),
+            frame=self._rows(7, twisted),
+            last=self._rows(kind.strain_rows, viscous),
+            a=self._make(self.vector),
+            alpha=self._make(needed=twisted),
+        )
+        self._inputs = ChainInputs(
+            parameters=self._rows(sum(len(term.parameter_names) for term in kind.terms)),
+            mass=self._make(),
+            rotary=self._make(),
+            load=self._rows(kind.block),
+            held=self._dof,
+            rate=self._make(),
+            damping=self._make(),
+            gravity=self._make(self.vector),
+            drag=self.drag.by_coefficients if self.drag else None,
+        )
+
+    def suit(self, step, s: float, given: bool = False) -> bool:
+        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before.
+
+        Args:
+            given: whether parameters may be others than those of the model.
+        """
+        changed = self.predictor is not None and self.predictor.suit(step, s)
+        return self.solve.suit(s, given) or changed
+
+    def upload(self, t0: float, t1: float) -> None:
+        """What supports, loads that follow and the fluid do between t0 and t1, the step whose reverse follows."""
+        for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
+            part.upload(t0, t1)
+
+    def lagged(self, before: GroupState, states=None) -> wp.array:
+        """The frames that the solve of a step lags as long as it does not renew them; `states` as of `pull`."""
+        if self.predictor is None:
+            return before.frame
+        if self.supports:
+            self.supports.follow(*states)
+        self.predictor.find(before)
+        return self.predictor.frame
+
+    def keep(self, step, before: GroupState) -> Kept:
+        """What the step that a `ChainStep` has just made leaves for its reverse; `before` has to stay as it is."""
+        newton, twist = step.newton, self.group.kind.twist
+        theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
+        islands = step.islands
+        return Kept(before, wp.clone(newton.x), theta, frame, wp.clone(islands.portion), wp.clone(islands.retries))
+
+    def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float, states=None) -> tuple:
+        """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
+        equilibria.
+
+        Args:
+            after: the state that it led to.
+            given: derivatives by that state.
+            s: length of the implicit Euler step that it solved [s].
+            states: those of the model at both ends, where supports move.
+
+        Returns:
+            Derivatives by the start, a `GroupState`, and `ChainInputs`.
+        """
+        group, kind, before = self.group, self.group.kind, kept.before
+        start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
+        for array in (inputs.rate, *((start.x, start.v, start.theta) if self._more_to_start else ())):
+            device_arrays.clear(array)
+        self._rate.fill_(1.0 / s)
+        by_frame, lagged = (
+            given.frame,
+            start.frame,
+        )  # derivatives by frames of the end, and by those that the solve lags
+        predictor, tangents = self.predictor, before.x
+        if predictor:
+            kept = replace(kept, frame=self.lagged(before, states))
+            device_arrays.clear(predictor.by_x)
+            lagged = predictor.by_frame if predictor.carries else lagged
+            tangents = predictor.x if self._midpoint else tangents
+        if kind.viscous:
+            # strains of the end, which the next step is damped from
+            read = [group.element_inputs(after, after.last), device_arrays.columns(given.last)]
+            for kernel in self._strain:
+                self._launch(kernel, read, [*map(device_arrays.columns, (window, lag, inputs.parameters))])
+            if kind.twist:
+                by_frame = self._by_frame
+                device_arrays.copy(by_frame, given.frame)
+                self._launch(self._edges, [lag, group.count], [by_frame])
+        if kind.twist:
+            self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
+        if kind.twist or kind.viscous:
+            self._launch(self._ends, [window, group.count], [self._end])
+        end = [given.x, given.v, given.theta, given.omega, self._end]
+        read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
+        self._launch(self._solution, read, [self._dof, self._right])
+        resisted = self.drag and (self.drag, before, tangents)
+        read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
+        written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
+        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
+        for kernel in self._pull:
+            self._launch(kernel, read, written)
+        self._launch(self._nodes, [window, group.count], [self._dof])
+        if self.solve.held is not None:
+            device_arrays.assign(self._dof, device_arrays.download(self._dof) + self.solve.held)
+        if kind.twist:
+            self._launch(self._edges, [lag, group.count], [lagged])
+        if self.supports and kind.twist:
+            held = self._dof[: kind.dim], self._dof[kind.dim]
+            self.supports.follow(*states)
+            self.supports.pull(kept.x, kept.frame, *held, lagged)
+        if self.drag:
+            by_tangents = predictor.by_x if self._midpoint else None
+            read = before, tangents, kept, inputs.load, self._rate, self._dof, start, inputs.rate
+            self.drag.pull(*read, by_tangents)
+        if self.followers:
+            w = inputs.load[: kind.dim], inputs.load[kind.dim] if kind.twist else None
+            self.followers.pull(predictor.x, *w, predictor.by_x[: kind.dim])
+        if predictor:
+            predictor.pull(before, self._nodes, window, self._dof, start, inputs.rate)
+        self._launch(
+            self._start,
+            [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, inputs.load, self._dof]
+            + [
+                group.mass,
+                group.rotary,
+                group.fixed,
+                self._moved,
+                group.count,
+                self._rate,
+                self._damping,
+                self.gravity,
+                group.world,
+            ],
+            [start.x, start.v, start.theta, start.omega, inputs.mass, inputs.rotary, inputs.rate, inputs.damping]
+            + [inputs.gravity],
+        )
+        return start, inputs
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [*self._pull, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
+        own += [*([self._frame] if self._frame else []), *self.solve.kernels]
+        parts = (self.supports, self.drag, self.followers, self.predictor)
+        return own + [kernel for part in parts if part for kernel in part.kernels]
+
+    def _rows(self, rows: int, needed: bool = True) -> wp.array:
+        shape = (rows, self.group.nodes, self.group.columns) if needed else (1, 1, 1)
+        return device_arrays.allocate(shape, self.real, self.device)
+
+    def _make(self, dtype=None, needed: bool = True) -> wp.array:
+        shape = (self.group.nodes, self.group.columns) if needed else (1, 1)
+        return device_arrays.allocate(shape, dtype or self.real, self.device)
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.device)
+
+
+def _moved(group) -> np.ndarray:
+    """Dofs that motions put in place, as bits of nodes (n, R)."""
+    host, rods = group.host, group.rods
+    moved = np.zeros((group.nodes, rods), np.uint8)
+    for place, *poses in host.moving:
+        for at, d in enumerate(host.axes):
+            if poses[d] > FREE:
+                moved[place // rods, place % rods] |= 1 << at
+    for place in host.turning[:, 0] - host.nodes:
+        moved[place // rods, place % rods] |= 1 << group.kind.dim
+    return moved

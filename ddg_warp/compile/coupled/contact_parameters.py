@@ -1,0 +1,159 @@
+"""Contact of the coupled system: collision bodies and parameters of pairs of groups."""
+
+import numpy as np
+
+from ddg_warp.compile.collision_bodies import ROD, Body, Touching
+from ddg_warp.compile.coupled.system import Net
+from ddg_warp.compile.laws import contact_law
+from ddg_warp.errors import SceneError
+from ddg_warp.scene.contact import Contact, touching_names
+from ddg_warp.scene.obstacles import MESH
+
+HALF = 0.5  # default activation distance over the smallest radius
+
+# Default contact forces that close a fraction of the activation distance. WEIGHTS: nodal weights. BENDING: fraction of EI / r^2, that
+# is, bending to ten radii. STRAIN: strain of a membrane. LIMP: strain of a rod, decisive where bending stiffness is negligible.
+WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
+BEYOND = 100.0  # largest activation distance over the size of the scene
+RESOLVED = 1e-13  # least activation distance over coordinates
+INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap, over nodal mass / dt^2
+
+
+def touching(scene, net: Net) -> Touching | None:
+    """Return the contact of the coupled system, None without."""
+    law = scene.touching
+    if law is None:
+        return None
+    names, bodies, forces = touching_names(scene), [], []
+    for rod in net.rods:
+        batch = rod.piece.batch
+        if batch.name in names:
+            row = rod.rod - batch.first
+            radius = law.radius.get(batch.name)
+            if radius is None:
+                radius = _radius(batch, row, rod.rod)
+            if law.rolling and not rod.edges.size:
+                raise SceneError(
+                    f"contact: rolling, and rod {rod.rod} ('{batch.name}') has no twist, by which it would roll; leave rolling out, or "
+                    "give the rod twist"
+                )
+            angles = rod.edges if law.rolling else rod.edges[:0]
+            bodies.append(
+                Body(rod.nodes, ROD, radius, batch.name, f"rod {rod.rod}", closed=batch.closed, angles=angles)
+            )
+            bending = max(float(np.max(_of_rod(batch, name, row))) for name in ("EI1", "EI2"))
+            elastic = max(BENDING * bending / radius**2, LIMP * float(np.max(_of_rod(batch, "EA", row))))
+            forces.append((net.mass[rod.nodes, 0].max(), elastic))
+    for index, shell in enumerate(net.shells):
+        if (name := shell.surface.name) in names:
+            plate = shell.plate
+            half = law.radius.get(name, 0.5 * float(plate.thickness.max()))
+            cells = shell.nodes[shell.surface.triangles]
+            bodies.append(Body(shell.nodes, MESH, half, name, f"shell {index}", cells, shell=index))
+            membrane = float((plate.membrane_stiffness * np.sqrt(2.0 * plate.area)).max())
+            elastic = max(BENDING * float(plate.bending_stiffness.max()) / half, STRAIN * membrane)
+            forces.append((net.mass[shell.nodes, 0].max(), elastic))
+    gravity, obstacles = float(np.linalg.norm(scene.gravity)), len(scene.obstacles)
+    scale = [max(WEIGHTS * mass * gravity, elastic) for mass, elastic in forces]
+    scale_mass = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
+    scale_mass = np.column_stack([scale_mass, np.full((2, obstacles), np.nan)])
+    for index, (obstacle, nodes, markers) in enumerate(zip(scene.obstacles, net.obstacles, net.markers, strict=True)):
+        shape, name = obstacle.shape, obstacle.name
+        geometry = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
+        bodies.append(Body(*geometry, still=True, markers=markers))
+    result = _numbers(scene, law, bodies, *scale_mass)
+    if law.rolling and not (result.rubs and any(body.angles.size for body in bodies)):
+        lacking = "no rod touches anything" if result.rubs else "there is no friction"
+        raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
+    return result
+
+
+def _radius(batch, row: int, rod: int) -> float:
+    """Return the contact radius of one rod of a batch, the largest of its section [m].
+
+    Raises:
+        SceneError: the section has no positive radius.
+    """
+    radius = batch.section.radius
+    if radius is None or not np.all(np.asarray(radius) > 0.0):
+        raise SceneError(
+            f"contact: rod {rod} ('{batch.name}') touches by a radius, and that of its section is {radius}; give "
+            f"Stiffness(radius=...), positive, or contact(radius={{{batch.name!r}: ...}})"
+        )
+    return float(np.max(_of_rod(batch, "radius", row)))
+
+
+def _of_rod(batch, name: str, row: int) -> np.ndarray:
+    """Return a section property of one rod of a batch."""
+    values = np.asarray(getattr(batch.section, name), float)
+    return values[row] if values.ndim == 2 and len(values) > 1 else values
+
+
+def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: np.ndarray) -> Touching:
+    """Return the contact parameters of pairs of groups.
+
+    Args:
+        scale: force of every body that closes a fraction of the activation distance [N]; mass: heaviest nodal mass [kg].
+    """
+    names, group = np.unique([body.name for body in bodies], return_inverse=True)
+    count, moving = len(names), np.array([not body.still for body in bodies])
+    radius = min(body.radius for body in bodies if not body.still)
+    within = np.full((count, count), HALF * radius if law.range is None else law.range)
+    rough = np.full((count, count, 3), law.friction)
+    force, inertia = (_of_both(values, group, moving) for values in (scale, INERTIA * mass))
+    stiffness = np.full((count, count), np.nan if law.stiffness is None else law.stiffness)
+    ignored, index = [], {name: i for i, name in enumerate(names.tolist())}
+    for between in scene.betweens:
+        g, h = (index[name] for name in between.names)
+        for table, value in ((rough, between.friction), (stiffness, between.stiffness), (within, between.range)):
+            if value is not None:
+                table[g, h] = table[h, g] = value
+        if between.ignore:
+            ignored.append((g, h))
+    _refuse_ranges(scene, within, names)
+    explicit = bool(np.isfinite(stiffness).any())
+    inertia = np.where(np.isnan(stiffness), inertia, 0.0)
+    stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
+    density, keep = contact_law(law, stiffness, within, explicit)
+    multipliers = _by_way(rough)
+    return Touching(
+        law, density, keep, bodies, names.tolist(), group, *multipliers, stiffness, within, inertia, ignored
+    )
+
+
+def _refuse_ranges(scene, within: np.ndarray, names) -> None:
+    """Refuse activation distances (groups, groups) beyond the scene size or below the resolution of coordinates."""
+    points = np.concatenate([o.points.reshape(-1, 3) for o in (*scene.batches, *scene.shells)])
+    size, far = np.ptp(points, axis=0).max(), np.abs(points).max()
+    for g, h in np.argwhere((within > BEYOND * size) | (within < RESOLVED * far))[:1]:
+        wrong = (
+            f"far beyond the size of the scene, {size:.3g} m"
+            if within[g, h] > size
+            else f"lost in positions of {far:.3g} m"
+        )
+        raise SceneError(
+            f"contact: the range between {str(names[g])!r} and {str(names[h])!r} is {within[g, h]:.3g} m, {wrong}; it is by "
+            "default half of the smallest radius or half thickness: give range=..., of about that size"
+        )
+
+
+def _of_both(values: np.ndarray, group: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Return geometric means (groups, groups) of the largest values of moving bodies in two groups.
+
+    An obstacle takes the value of the other group. Two obstacles have zero.
+    """
+    largest = np.full(int(group.max()) + 1, np.nan)
+    for g in np.unique(group[moving]):
+        largest[g] = values[moving & (group == g)].max()
+    largest = np.where(np.isnan(largest)[:, None], largest[None], largest[:, None])
+    return np.nan_to_num(np.sqrt(largest * largest.T))
+
+
+def _by_way(friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest nonzero coefficient of forwards, backwards and across (..., 3), and multiples of it.
+
+    So sticking contacts creep by less than the velocity of the law in every direction.
+    """
+    least = np.where(friction > 0.0, friction, np.inf).min(-1)
+    none = np.isinf(least)
+    return np.where(none, 0.0, least), np.where(none[..., None], 1.0, friction / least[..., None])

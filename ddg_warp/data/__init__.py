@@ -1,0 +1,1 @@
+"""Episodes, data sets, parameter sweeps and recordings for learning."""

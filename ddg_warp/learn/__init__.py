@@ -1,1 +1,0 @@
-"""Gradients of steps and equilibria, the torch interface, data sets and environments."""

@@ -1,0 +1,256 @@
+"""User order of nodes and edges, and maps from there to storage of rod groups and the coupled system."""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import argument_checks
+from ddg_warp.compile import axisymmetric
+from ddg_warp.io.obstacles import Obstacles
+from ddg_warp.io.shapes import Curves, Surfaces
+from ddg_warp.model.rod_group import Group
+from ddg_warp.scene.material import DRAWN
+
+
+class Order:
+    """User order: nodes of rods as added, of meridians, then vertices of shells; edges likewise."""
+
+    def __init__(self, model):
+        self.model = model
+
+    @cached_property
+    def curves(self) -> Curves:
+        """Rods, then meridians of axisymmetric shells with the radius of half the thickness."""
+        batches, shells = self.model.scene.batches, self.model.scene.axisymmetric_shells
+        if not batches and not shells:
+            none = np.zeros(0, int)
+            return Curves(none, none.astype(bool), np.zeros(0), np.zeros(0, object), none)
+        counts = np.concatenate([*(np.full(b.rods, b.nodes) for b in batches), *([len(s.points)] for s in shells)])
+        radius = [np.broadcast_to(_node_radius(b), (b.rods, b.nodes)).ravel() for b in batches]
+        radius += [0.5 * axisymmetric.at_nodes(shell.thickness, len(shell.points)) for shell in shells]
+        single = np.ones(len(shells), int)
+        return Curves(
+            counts=counts,
+            closed=np.concatenate([*(np.full(b.rods, b.closed) for b in batches), single == 0]),
+            radius=np.concatenate(radius),
+            names=np.array([*(b.name for b in batches for _ in range(b.rods)), *(s.name for s in shells)], object),
+            batch=np.repeat(_alike([*batches, *shells]), [*(b.rods for b in batches), *single]),
+        )
+
+    @cached_property
+    def surfaces(self) -> Surfaces | None:
+        """Shells as triangles among the rows of `State.points`; None without."""
+        if not self.model.scene.shells:
+            return None
+        shells, rods = self.model.net.host.shells, int(self.curves.counts.sum())
+        points = np.cumsum([0] + [len(shell.nodes) for shell in shells])
+        triangles = np.cumsum([0] + [len(shell.surface.triangles) for shell in shells])
+        return Surfaces(
+            triangles=np.concatenate(
+                [s.surface.triangles + rods + offset for s, offset in zip(shells, points, strict=False)]
+            ),
+            first=triangles[:-1],
+            names=np.array([shell.name for shell in self.model.scene.shells], dtype=object),
+            thickness=np.concatenate([shell.plate.thickness for shell in shells]),
+        )
+
+    @cached_property
+    def obstacles(self) -> Obstacles | None:
+        """Obstacles as surfaces; None without."""
+        scene = self.model.scene
+        if not scene.obstacles:
+            return None
+        points = [batch.points.reshape(-1, 3) for batch in scene.batches] + [shell.points for shell in scene.shells]
+        return Obstacles.of(scene.obstacles, np.concatenate(points))
+
+    @cached_property
+    def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points` from the coupled system, and the dof blocks that fill them."""
+        if self.model.net is None:
+            return np.zeros(0, int), np.zeros(0, int)
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        host = self.model.net.host
+        rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
+        first = len(start) - 1 - len(host.meridians)
+        rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
+        blocks = [body.nodes for body in (*host.rods, *host.meridians, *host.shells)]
+        vertices = sum(len(shell.nodes) for shell in host.shells)
+        return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
+
+    def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return for the nodes of a rod group: node with ghosts, column, row of `State.points`."""
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        return _user_index(group, group.host.own, start)
+
+    @property
+    def points_count(self) -> int:
+        """Rows of `State.points` in one world."""
+        vertices = 0 if self.model.net is None else sum(len(shell.nodes) for shell in self.model.net.host.shells)
+        return int(self.curves.counts.sum()) + vertices
+
+    @cached_property
+    def edge_starts(self) -> np.ndarray:
+        """Offsets of the edges of every curve (curves + 1,)."""
+        return np.cumsum([0, *(self.curves.counts - np.where(self.curves.closed, 0, 1))])
+
+    @property
+    def edges_count(self) -> int:
+        """Rows of `State.angles` in one world."""
+        return int(self.edge_starts[-1])
+
+    @cached_property
+    def twisted(self) -> np.ndarray:
+        """Mask of the edges that have a twist angle (edges,)."""
+        result = np.zeros(self.edges_count, bool)
+        for group in self.model.groups:
+            if group.kind.twist:
+                result[self.edge_places(group)[2]] = True
+        for rod in self.model.net.host.rods if self.model.net is not None else ():
+            result[self.edge_starts[rod.rod] + np.arange(len(rod.edges))] = True
+        return result
+
+    def elements(self, name: str) -> tuple[int, list[tuple[Group, np.ndarray, np.ndarray]]]:
+        """Return the elements of uncoupled rods that have a parameter "term.parameter".
+
+        Elements are numbered rod by rod, clamped ends included.
+
+        Returns:
+            The number of elements in one world, and (group, mask (n, R), numbers (n, R), 0 outside of the mask) of every group with
+            some.
+        """
+        counts, groups = np.zeros(self.model.scene.rod_count, np.int64), []
+        for group in self.model.groups:
+            if name in group.parameters.values:
+                term = next(term for term in group.kind.terms if name.startswith(f"{term.name}."))
+                missing = 0 if group.kind.closed else term.measure.span
+                inside = np.arange(group.nodes)[:, None] < group.host.count - missing
+                counts[group.host.rods] = inside.sum(0)
+                groups.append((group, inside))
+        first = np.cumsum(counts) - counts
+        numbers_of_groups = [first[group.host.rods] + np.arange(group.nodes)[:, None] for group, _ in groups]
+        return int(counts.sum()), [
+            (*each, np.where(each[1], numbers, 0)) for each, numbers in zip(groups, numbers_of_groups, strict=True)
+        ]
+
+    @property
+    def meridian_rows(self) -> slice:
+        """Rows of `State.points` that are nodes of meridians."""
+        counts, meridians = self.curves.counts, len(self.model.scene.axisymmetric_shells)
+        rods = len(counts) - meridians
+        return slice(int(counts[:rods].sum()), int(counts.sum()))
+
+    def edge(self, row: int) -> tuple[int, int]:
+        """Return edge and curve of a row of `State.angles`."""
+        curve = int(np.searchsorted(self.edge_starts, row, side="right")) - 1
+        return int(row - self.edge_starts[curve]), curve
+
+    def edge_places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return for the edges of a rod group: edge with ghosts, column, row of `State.angles`."""
+        counts = group.host.own - (0 if group.kind.closed else 1)
+        return _user_index(group, counts, self.edge_starts)
+
+    def put_nodes(self, group: Group, values, out: np.ndarray, label: str) -> None:
+        """Write values in user order (P, 3) to (node, column, dim) of a group."""
+        values = self._points(values, label)
+        axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
+        k, column, index = self.places(group)
+        for world in range(self.model.worlds):
+            of_world = values if values.ndim == 2 else values[world]
+            out[k, column + world * group.rods] = of_world[index][:, axes]
+
+    def put_blocks(self, values, blocks: np.ndarray, label: str) -> np.ndarray:
+        """Return `blocks` (worlds N, 3) with values in user order (P, 3) filled in."""
+        values = self._points(values, label)
+        out = blocks.astype(float).reshape(self.model.worlds, -1, 3)
+        rows, indices = self.net_rows
+        out[:, indices] = (values if values.ndim == 3 else values[None])[:, rows]
+        return out.reshape(-1, 3)
+
+    def _points(self, values, label: str) -> np.ndarray:
+        values, count = _numbers(label, values), self.points_count
+        if values.shape not in ((count, 3), (self.model.worlds, count, 3)):
+            raise ValueError(f"{label} have shape {values.shape}; they are ({count}, 3), or one such array a world")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{label}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
+        return values
+
+    def put_edges(self, group: Group, values, out: np.ndarray, label: str = "spins") -> None:
+        values, _ = self.of_edges(values, label)
+        k, column, index = self.edge_places(group)
+        for world in range(self.model.worlds):
+            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+
+    def of_edges(self, values, label: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return checked spins or angles in user order, and the edge offsets of rods."""
+        values, count = _numbers(label, values), self.edges_count
+        if values.shape not in ((count,), (self.model.worlds, count)):
+            raise ValueError(f"{label} have shape {values.shape}; they are ({count},), or one such array a world")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{label}: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
+        return values, self.edge_starts
+
+    def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
+        """Return nodal values in user order from group arrays (node, column, dim) and dof blocks (worlds N, 3)."""
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        out = np.zeros((self.model.worlds, self.points_count, 3))
+        if blocks is not None:
+            rows, indices = self.net_rows
+            out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(
+                self.model.worlds, -1, 3
+            )[:, indices]
+        for group, value in zip(self.model.groups, values, strict=True):
+            axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
+            k, column, index = _user_index(group, group.host.own, start)
+            for world in range(self.model.worlds):
+                out[world][index[:, None], axes] = value[k, column + world * group.rods]
+        return out[0] if self.model.worlds == 1 else out
+
+    def edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
+        """Return edge values in user order from groups (node, column) and coupled rod edges (worlds, edges)."""
+        if not any(group.kind.twist for group in self.model.groups) and net is None:
+            return None
+        out = np.zeros((self.model.worlds, self.edges_count, *([width] if width else [])))
+        for group, value in zip(self.model.groups, values, strict=True):
+            if group.kind.twist:
+                k, column, index = self.edge_places(group)
+                for world in range(self.model.worlds):
+                    out[world][index] = value[k, column + world * group.rods]
+        for rod in self.model.net.host.rods if net is not None else ():
+            rows = self.edge_starts[rod.rod] + np.arange(len(rod.edges))
+            out[:, rows] = net[:, rod.edges - self.model.net.angle_start]
+        return out[0] if self.model.worlds == 1 else out
+
+
+def _numbers(label: str, values) -> np.ndarray:
+    values = argument_checks.array(label, values)
+    argument_checks.sized(label, values, least=0.0)  # decayed velocities may be tiny
+    return values
+
+
+def _node_radius(batch) -> np.ndarray:
+    radius = np.asarray(DRAWN if batch.section.radius is None else batch.section.radius, float)
+    if radius.ndim == 0 or radius.shape[-1] == 1:
+        return radius
+    return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))
+
+
+def _alike(batches) -> list[int]:
+    """Return for each batch the first one with the same name and section; shells of revolution are distinct."""
+    first: dict = {}
+    keys = [(batch.name, _hashable(batch.section)) if hasattr(batch, "section") else id(batch) for batch in batches]
+    return [first.setdefault(key, len(first)) for key in keys]
+
+
+def _hashable(section) -> tuple:
+    """Return the values of a section as a hashable key."""
+    return tuple(
+        np.asarray(value, dtype=object if value is None else float).tobytes() for value in vars(section).values()
+    )
+
+
+def _user_index(group: Group, counts: np.ndarray, start: np.ndarray):
+    """Return for nodes or edges (`counts` a rod): node with ghosts, column, index in user order."""
+    column = np.repeat(np.arange(group.rods), counts)
+    index = np.arange(counts.sum()) - np.repeat(np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
+    return index + group.host.first[column], column, index + start[group.host.rods[column]]

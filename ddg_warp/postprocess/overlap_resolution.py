@@ -1,0 +1,115 @@
+"""Overlap resolution: project a state with overlaps to a minimum gap."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import argument_checks
+from ddg_warp.capture_lock import launches
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.collision.contact.query import closest_kernel
+from ddg_warp.model import rod_shell_coupling
+
+ROUNDS = 1000
+PART = 0.1  # default gap over the smallest activation distance
+BEYOND = 1.02  # gap that pairs are moved to over the required one, for few rounds
+
+
+@launches
+def pushed_apart(model, state, gap: float | None = None):
+    """Return a copy of a state, with nodes moved until no two surfaces are closer than a gap.
+
+    Each round moves close pairs apart along the line between their closest points, by least squares. Fixed dofs stay. Crossing rods
+    pass by each other then; entangled ones stay entangled. Velocities stay, frames are transported. Lengths may change: check the
+    returned distance.
+
+    Args:
+        gap: smallest surface distance [m]; by default a tenth of the smallest activation distance.
+
+    Returns:
+        The state, and the largest displacement of a node [m]; zero if no pair was too close.
+
+    Raises:
+        SceneError: the scene has no contact, or the gap exceeds the activation distance.
+        SolverError: pairs cannot be separated; the message names the closest.
+    """
+    touch = model.touch
+    if touch is None:
+        raise SceneError("pushed_apart: this scene has no contact; add scene.contact()")
+    net, host = model.net, model.net.host
+    least = (
+        PART * float(host.touching.range.min())
+        if gap is None
+        else argument_checks.positive("pushed_apart: gap", gap, "m")
+    )
+    if least > touch.search.reach:
+        raise SceneError(
+            f"pushed_apart: gap is {least:.6g} m; contact is within {touch.search.reach:.6g} m, which it may not exceed"
+        )
+    new = state.copy()
+    start = new.net.q.numpy().reshape(-1, 3).astype(float)
+    x, free = start.copy(), np.tile(~host.fixed.astype(bool), (model.worlds, 1)).astype(float)
+    for _ in range(ROUNDS):
+        new.net.q.assign(x)
+        touch.find(new.net.q)
+        steps, weights, closest = np.zeros_like(x), np.zeros(len(x)), np.inf
+        for pairs in touch.search.lists:
+            closest = min(closest, _part(pairs, new.net.q, free, least, steps, weights))
+        if closest >= least:
+            break
+        x = x + steps / np.maximum(1.0, weights)[:, None]
+    else:
+        gap, pair = touch.closest(new.net.q)
+        raise SolverError(
+            f"pushed_apart: {pair} are still {gap:.3g} m apart, less than {least:.3g} m, after {ROUNDS} rounds; move them apart, free "
+            "what holds them, or give them a smaller radius",
+            outcome="no_room",
+        )
+    moved = float(np.linalg.norm(x - start, axis=1).max(initial=0.0))
+    if moved > 0.0:
+        model.carry_frames(new)
+        rod_shell_coupling.follow(net, new.net, angles=True, rates=False)
+        model.update_strains(new)
+    return new, moved
+
+
+def _part(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray, weight_sums: np.ndarray) -> float:
+    """Add separating displacements of a pair list to `steps` and weights to `weight_sums`; return the smallest gap."""
+    count = int(pairs.count.numpy()[0])
+    if not count:
+        return np.inf
+    real = x.dtype._wp_scalar_type_
+    kinds = x.dtype, wp.vec4i, wp.types.vector(4, real), real
+    closest = [wp.zeros(count, dtype=kind, device=x.device) for kind in kinds]
+    wp.launch(closest_kernel(pairs.kind, real), count, [pairs.pairs, pairs.sides, x], closest, device=x.device)
+    distance, nodes, weights, thickness = (array.numpy() for array in closest)
+    length = np.linalg.norm(distance, axis=1)
+    gap = length - thickness
+    near = np.flatnonzero(gap < least)
+    if len(near):
+        weights, nodes = weights[near], nodes[near]
+        n = _directions(distance[near], length[near], x.numpy()[nodes], pairs.kind.endless)
+        movable = free[nodes] * n[:, None]  # (pairs, nodes, 3), direction on free dofs
+        mobility = (weights**2 * (movable * n[:, None]).sum(2)).sum(1)
+        size = np.where(mobility > 0.0, (BEYOND * least - gap[near]) / np.where(mobility > 0.0, mobility, 1.0), 0.0)
+        np.add.at(steps, nodes, (size[:, None] * weights)[..., None] * movable)
+        np.add.at(weight_sums, nodes, np.abs(weights) * (mobility > 0.0)[:, None])
+    return float(gap.min())
+
+
+def _directions(distance: np.ndarray, length: np.ndarray, corners: np.ndarray, endless: bool) -> np.ndarray:
+    """Return unit vectors (n, 3) of separation.
+
+    Directions are along `distance`, across both sides if closest points coincide, or normals of half-spaces (`endless`).
+    """
+    if endless:
+        distance = np.cross(corners[:, 2] - corners[:, 1], corners[:, 3] - corners[:, 1])
+        return distance / np.linalg.norm(distance, axis=1)[:, None]
+    sides = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 2]
+    size = np.maximum(np.linalg.norm(sides[0], axis=1), np.linalg.norm(sides[1], axis=1))
+    across = np.cross(*sides)
+    flat = np.linalg.norm(across, axis=1) <= 1e-9 * size**2  # parallel: any direction across
+    some = np.eye(3)[np.abs(sides[0]).argmin(1)]
+    across = np.where(flat[:, None], np.cross(np.where(sides[0].any(1)[:, None], sides[0], sides[1]), some), across)
+    meet = length <= 1e-9 * size
+    distance = np.where(meet[:, None], across, distance)
+    return distance / np.linalg.norm(distance, axis=1)[:, None]

@@ -1,0 +1,192 @@
+"""Equilibrium paths of a continuation, with watched displacements and termination criteria."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ddg_warp import argument_checks
+from ddg_warp.errors import SceneError
+
+REGULAR, LIMIT_POINT, BIFURCATION = "regular", "limit point", "bifurcation"
+
+
+@argument_checks.called
+@dataclass(frozen=True)
+class Displacement:
+    """Displacement from rest [m] of a point along an axis, or a weighted sum of several.
+
+    Attributes:
+        terms: (row of `State.points`, axis "x", "y" or "z", weight) of each term.
+    """
+
+    terms: tuple[tuple[int, str, float], ...]
+
+    def __post_init__(self):
+        terms = self.terms if isinstance(self.terms, tuple | list) else [self.terms]
+        if not terms:
+            raise SceneError(
+                "Displacement: there are no terms; give (row of the points, axis, weight) each, one at least"
+            )
+        for term in terms:
+            if not isinstance(term, tuple | list) or len(term) != 3:
+                raise SceneError(
+                    f"Displacement: {argument_checks.shown(term)} is no term; give (row of the points, axis, weight) each"
+                )
+            argument_checks.index("Displacement: point", term[0])
+            argument_checks.choice("Displacement: axis", term[1], ("x", "y", "z"))
+            argument_checks.number("Displacement: weight", term[2])
+
+    @classmethod
+    def of(cls, row: int, axis: str, weight: float = 1.0) -> "Displacement":
+        """Return the displacement of one point; weight -1 reverses the axis."""
+        return cls(((row, axis, weight),))
+
+    def vector(self, tangent) -> np.ndarray:
+        """Return the derivative with respect to all dofs (size,).
+
+        Raises:
+            SceneError: an unknown point or axis.
+        """
+        dofs, result = tangent.point_dofs(), np.zeros(tangent.size)
+        for row, axis, weight in self.terms:
+            if not -len(dofs) <= row < len(dofs) or axis not in ("x", "y", "z"):
+                raise SceneError(
+                    f"displacement of point {row} along {axis!r}: there are {len(dofs)} points, axes x, y and z"
+                )
+            dof = dofs[row, "xyz".index(axis)]
+            if dof < 0:
+                raise SceneError(f"displacement of point {row} along {axis!r}: the scene is planar")
+            result[dof] += weight
+        return tangent.into(result)
+
+
+@dataclass(eq=False)
+class Point:
+    """Equilibrium of a path.
+
+    Attributes:
+        state: the equilibrium, with the load parameter as time.
+        load: load parameter.
+        arclength: arc length from the start, in the metric of the continuation.
+        values: watched displacements by name [m].
+        negative: number of negative eigenvalues of the tangent stiffness (inertia count): 0 for stable equilibria. The zero
+            eigenvalue of a limit point or bifurcation is not counted.
+        kind: "regular", "limit point" (the load is stationary) or "bifurcation" (another path crosses).
+        direction: unit tangent of the path: dofs (size,) and load parameter at the end.
+        mode: critical eigenvector of a bifurcation (size,), of unit length in the metric; else None.
+        iterations: number of Newton iterations.
+        mode_displacements: the mode by node (P, 3), in the order of `State.points`; None without a mode.
+    """
+
+    state: Any
+    load: float
+    arclength: float
+    values: dict[str, float]
+    negative: int
+    kind: str
+    direction: np.ndarray
+    mode: np.ndarray | None = None
+    iterations: int = 0
+    mode_displacements: np.ndarray | None = None
+
+    @property
+    def stable(self) -> bool:
+        """True if the second variation of the potential is positive."""
+        return self.negative == 0
+
+
+@dataclass(eq=False)
+class Path:
+    """Equilibria in order along a path.
+
+    Attributes:
+        points: see `Point`.
+        outcome: why the path ends: "load", "displacement", "limit_points", "steps" or "values".
+    """
+
+    points: list[Point] = field(default_factory=list)
+    outcome: str = ""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def load(self) -> np.ndarray:
+        """Load parameters (points,)."""
+        return np.array([point.load for point in self.points])
+
+    @property
+    def negative(self) -> np.ndarray:
+        """Numbers of negative eigenvalues (points,)."""
+        return np.array([point.negative for point in self.points])
+
+    @property
+    def stable(self) -> np.ndarray:
+        """Stability of each point (points,) bool."""
+        return self.negative == 0
+
+    @property
+    def kinds(self) -> list[str]:
+        """Kind of each point: "regular", "limit point" or "bifurcation"."""
+        return [point.kind for point in self.points]
+
+    @property
+    def arclength(self) -> np.ndarray:
+        """Arc lengths (points,)."""
+        return np.array([point.arclength for point in self.points])
+
+    def values(self, name: str) -> np.ndarray:
+        """Return a watched displacement (points,) [m]; names are the keys of `points[0].values`."""
+        return np.array([point.values[name] for point in self.points])
+
+    def of_kind(self, kind: str) -> list[Point]:
+        """Return the points of a kind: "regular", "limit point" or "bifurcation"."""
+        return [point for point in self.points if point.kind == kind]
+
+    @property
+    def limit_points(self) -> list[Point]:
+        """Points with stationary load."""
+        return self.of_kind(LIMIT_POINT)
+
+    @property
+    def bifurcations(self) -> list[Point]:
+        """Points with a crossing path."""
+        return self.of_kind(BIFURCATION)
+
+
+@argument_checks.called
+@dataclass(frozen=True)
+class Stop:
+    """Termination criteria of a path; the first met counts, and the last point lies exactly on that bound.
+
+    Attributes:
+        steps: accepted steps.
+        load: (lowest, highest) load parameter.
+        displacement: (name of a watched displacement, lowest, highest value [m]).
+        limit_points: number of limit points passed.
+    """
+
+    steps: int = 200
+    load: tuple[float, float] = (-np.inf, np.inf)
+    displacement: tuple[str, float, float] | None = None
+    limit_points: int | None = None
+
+    def __post_init__(self):
+        argument_checks.count("Stop: steps", self.steps)
+        if self.limit_points is not None:
+            argument_checks.count("Stop: limit_points", self.limit_points)
+        bounds = {"load": self.load}
+        if self.displacement is not None:
+            entry = self.displacement
+            if not (isinstance(entry, tuple | list) and len(entry) == 3 and isinstance(entry[0], str)):
+                shown = argument_checks.shown(entry)
+                raise SceneError(
+                    f"Stop: displacement is {shown}; give (name of what is watched, lowest, highest value)"
+                )
+            bounds["displacement"] = entry[1:]
+        for name, bound in bounds.items():
+            limits = argument_checks.floats(bound)
+            if limits.shape != (2,) or not limits[0] < limits[1]:
+                shown = argument_checks.shown(getattr(self, name))
+                raise SceneError(f"Stop: {name} is {shown}; its lowest value comes before a higher one")

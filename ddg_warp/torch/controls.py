@@ -1,0 +1,125 @@
+"""Controls of a step (loads, grip poses, field), and gradients with respect to them."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from ddg_warp.solve.forces.control_loads import LOADS
+from ddg_warp.solve.forces.prescribed_motion import counts_turns, turns_between
+from ddg_warp.torch.state_layout import view
+
+
+class StepControls:
+    """Controls of the steps of an engine."""
+
+    def __init__(self, engine):
+        self.engine, self.model, self.layout = engine, engine.model, engine.layout
+        real = wp.dtype_to_torch(self.model.types.real)
+        self._usual = torch.tensor(np.array(self.model.scene.gravity, float), dtype=real, device=engine.device)
+        self._pulled_by = False  # True if the last backward pass had gravity as a control
+
+    def give(self, controls: dict) -> None:
+        """Write loads and poses to the integrator; masses given as parameters count as loads, since residuals are scaled by loads."""
+        engine, integrator, model = self.engine, self.engine.integrator, self.model
+        loaded = engine.tables.weighs or any(name in controls for name in LOADS)
+        if integrator.given is None and loaded:
+            integrator._control({"gravity": np.array(model.scene.gravity, float)[None]}, 0)
+        if integrator.given is not None:
+            loads = integrator.given
+            loads.any = loaded
+            for name in LOADS:
+                target = view(getattr(loads, name))
+                if name in controls:
+                    value = controls[name]
+                    target.copy_(value - self._usual if name == "gravity" else value)
+                else:
+                    target.zero_()
+        self.give_field(controls)
+        if model.grips:
+            target = view(engine.after.grips.pose)
+            if "poses" in controls:
+                self._refuse_far_turns(controls["poses"])
+                target.copy_(controls["poses"].reshape(-1, 6).T)
+            else:
+                target.copy_(view(engine.before.grips.pose))
+
+    def _refuse_far_turns(self, poses: torch.Tensor) -> None:
+        """Refuse rotation vectors that differ by more than 180 degrees from the start of the step.
+
+        On CUDA without contact they are not read, which would synchronise; such steps end with a non-finite outcome.
+
+        Raises:
+            SolverError: as `turns_between`.
+        """
+        if self.model.wp_device.is_cuda and self.model.touch is None:
+            return
+        ends = poses.detach().cpu().numpy()
+        if counts_turns(ends):
+            begin = view(self.engine.before.grips.pose).T.reshape(ends.shape).detach().cpu().numpy()
+            turns_between(begin, np.where(np.isfinite(ends), ends, begin))
+
+    def give_field(self, controls: dict) -> None:
+        """Write the magnetic field of a step to the integrator."""
+        if not self.model.magnetic:
+            return
+        target = view(self.engine.integrator.field)
+        if "field" in controls:
+            target.copy_(controls["field"].T)
+        else:
+            target.zero_()
+
+    def give_gravity(self, controls: dict, adjoint) -> None:
+        """Write the gravity of a step to the adjoint, which starts with that of the scene."""
+        is_control = "gravity" in controls
+        if is_control or self._pulled_by:
+            gravity = controls.get("gravity", self._usual)
+            for i, part in enumerate(adjoint.parts):
+                view(part.gravity).copy_(gravity.index_select(-1, self._axes(i, part.axes)))
+        self._pulled_by = is_control
+
+    def _axes(self, part: int, axes) -> torch.Tensor:
+        """Return the space components that a subsystem has."""
+        return self.layout.places(("axes", part), lambda: [list(axes)])[0]
+
+    def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
+        """Return the gradient with respect to a control of a step, or of an equilibrium at full load (worlds, ...)."""
+        if name == "poses":
+            return self.engine.by_poses * self.layout.by_world(flags)[:, None, None]
+        result = torch.zeros_like(value)
+        model, worlds = self.model, self.model.worlds
+        if name == "field":
+            for part, data in zip(model.net.sets, inputs[-1].data, strict=True):
+                measure = part.term.measure
+                if measure.field:
+                    first = measure.data_size - measure.field
+                    result += view(data)[first : first + 3].reshape(3, worlds, -1).sum(2).T
+            return result * flags[-1][:, None]
+        for i, group in enumerate(model.groups):
+            gradients = inputs[i]
+            if name == "gravity":
+                by_gravity = view(gradients.gravity) * flags[i][:, None]
+                by_gravity = by_gravity.reshape(group.nodes, worlds, group.rods, -1).sum((0, 2))
+                result.index_add_(1, self._axes(i, group.host.axes), by_gravity)
+                continue
+            w = (view(gradients.load) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
+            if name == "forces":
+                k, column, rows = self.layout.places(("points", i), lambda group=group: model.order.places(group))
+                result[:, rows[:, None], self._axes(i, group.host.axes)] = w[: group.kind.dim, k, :, column].permute(
+                    2, 0, 1
+                )
+            elif group.kind.twist:
+                k, column, rows = self.layout.places(("edges", i), lambda group=group: model.order.edge_places(group))
+                result[:, rows] = w[group.kind.dim, k, :, column].T
+        if model.net is not None:
+            gradients = inputs[-1]
+            if name == "gravity":
+                by_gravity = view(gradients.gravity).reshape(worlds, -1, 3).sum(1)
+                return result + by_gravity * flags[-1][:, None]
+            w = view(gradients.load).reshape(worlds, -1, 3) * flags[-1][:, None, None]
+            if name == "forces":
+                rows, blocks = self.layout.places(("points", "net"), lambda: model.order.net_rows)
+                result[:, rows] = w[:, blocks]
+            else:
+                rows, blocks = self.layout.net_edges()
+                result[:, rows] = w[:, blocks, 0]
+        return result

@@ -1,0 +1,266 @@
+"""Gradient check cases: an object under an analysis, with inputs and a loss; see `ddg_warp.torch.gradient_check`."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import torch
+
+from ddg_warp.errors import SceneError
+from ddg_warp.scene.grip import Grip
+from ddg_warp.torch.gradient_check_scenes import scene_of
+from ddg_warp.torch.named_parameters import MASSES, of_sections
+from ddg_warp.torch.simulator import Simulator, WorldState
+
+WORLDS, DT, STEPS = 2, 0.01, 2
+TIGHT = {"rtol": 1e-13}
+REAL = torch.float64
+
+
+@dataclass
+class Input:
+    """Input of steps, moved along a direction.
+
+    Attributes:
+        name: name of the input.
+        size: size of a change as large as the input itself, for scaling x.
+        loss: x -> the loss with the input moved by x along the direction; x a tensor () or a number.
+        gradient: () -> the derivative at zero; by default by torch.
+    """
+
+    name: str
+    size: float
+    loss: Callable
+    gradient: Callable | None = None
+
+    def found(self) -> float:
+        """Return the derivative at zero; zero if torch finds no dependence."""
+        if self.gradient:
+            return self.gradient()
+        x = torch.zeros((), dtype=REAL, requires_grad=True)
+        loss = self.loss(x)
+        if not loss.requires_grad:
+            return 0.0
+        (derivative,) = torch.autograd.grad(loss, x, allow_unused=True)
+        return 0.0 if derivative is None else float(derivative)
+
+
+class Case:
+    """Object under an analysis, with inputs and a loss.
+
+    Args:
+        name: a key of `OBJECTS`.
+        analysis: one of `ANALYSES`.
+    """
+
+    def __init__(self, name: str, analysis: str, device: str):
+        self.name, self.analysis, self.device = name, analysis, device
+        self.statics = analysis == "statics"
+        self.random = torch.Generator("cpu").manual_seed(5)
+        self.simulator = self.built()
+        self.engine = self.simulator.engine(WORLDS)
+        self.model = self.engine.model
+        contact = self.model.net.host.touching if self.model.net is not None else None
+        self.slides = self.statics and contact is not None and contact.rubs
+        axisymmetric = bool(self.model.scene.axisymmetric_shells)  # gravity is along z
+        flat = axisymmetric or self.model.scene.dimension == 2
+        self.place = self.engine.source[0].device
+        self.axes = self._tensor([1.0, 0.0, 1.0] if flat else [1.0, 1.0, 1.0])
+        self.down = self._tensor([0.0, 0.0, 1.0]) if axisymmetric else self.axes
+        points, edges = self.model.points_count, self.model.order.edges_count
+        shape = (WORLDS, points, 3)
+        self.weights = self._normal(*shape), 0.1 * self._normal(*shape), 0.1 * self._normal(WORLDS, edges)
+        # start poses of equilibria: angles are measured from frames transported to there
+        self.poses = 1e-3 * self._normal(WORLDS, len(self.model.grips), 6)
+        self.posed = {"poses": self.poses} if self.model.grips else {}
+        self.state = self._first()
+
+    def built(self, dt: float = DT, **changes) -> Simulator:
+        """Return a simulator of the scene with changes; see `scene_of`."""
+        model = scene_of(self.name, **changes).build(device=self.device, precision="float64")
+        return Simulator(model, dt, scheme="implicit_euler" if self.statics else self.analysis, **TIGHT)
+
+    def _normal(self, *shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
+
+    def _tensor(self, values) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=REAL, device=self.place)
+
+    def _first(self) -> WorldState:
+        """Return an equilibrium, or a state in motion with random velocities and spins."""
+        with torch.no_grad():
+            if self.slides:  # the equilibrium depends on the load path
+                return self.simulator.initial_state(WORLDS)
+            if self.statics:
+                return self.simulator.equilibrium(None, self.posed, batch=WORLDS, **TIGHT)
+            state = self.simulator.initial_state(WORLDS)
+            for _ in range(3):
+                state = self.simulator.step(state)
+            values = self.engine.layout.put_points(state.values, "v", "v", state.velocities + self._rates())
+            values = self.engine.layout.turn_edges(
+                values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count)
+            )
+        return replace(state, values=tuple(values))
+
+    def _rates(self) -> torch.Tensor:
+        """Return random velocities (worlds, P, 3), within the planes of skew supports."""
+        rates = 0.3 * self._normal(WORLDS, self.model.points_count, 3) * self.axes
+        frames = self.model.net.host.frames if self.model.net is not None else {}
+        for row, block in zip(*self.model.order.net_rows, strict=True) if frames else ():
+            if block in frames:
+                normals = self._tensor(frames[block][self.model.net.host.fixed[block]])
+                rates[:, row] -= rates[:, row] @ normals.T @ normals
+        return rates
+
+    def loss(self, state: WorldState) -> torch.Tensor:
+        """Return the loss of a final state."""
+        terms = [(self.weights[0] * state.positions).sum()]
+        if not self.slides:  # with friction angles depend on the transport of frames
+            terms.append((self.weights[2] * state.angles).sum())
+        return sum(terms) + (0.0 if self.statics else (self.weights[1] * state.velocities).sum())
+
+    def end(self, simulator: Simulator, values=None, parameters=None, controls=None) -> WorldState:
+        """Return the final state for given tensors of the first one."""
+        state = replace(self.state, values=tuple(values or self.state.values), engine=simulator.engine(WORLDS))
+        controls = self.posed | (controls or {})
+        if self.statics:
+            begin = {"start": 0.0, "load_steps": STEPS} if self.slides else {"start": 1.0}
+            return simulator.equilibrium(parameters, controls, state=state, **begin, **TIGHT)
+        *_, state = simulator.rollout(state, parameters, controls, steps=STEPS)
+        return state
+
+    def inputs(self) -> Iterator[Input]:
+        """Yield all inputs of the object."""
+        points, edges = self.model.points_count, self.model.order.edges_count
+        net = self.model.net
+        twisted = any(group.kind.twist for group in self.model.groups) or bool(net is not None and net.edges)
+        gravity = self._tensor(self.model.scene.gravity)
+        place = self._normal(WORLDS, points, 3) * self.axes
+        yield self._state("positions", 0.1, lambda x: self._moved("x", "q", x * place))
+        if twisted:
+            angle = self._normal(WORLDS, edges)
+            yield self._state(
+                "angles", 1.0, lambda x: self.engine.layout.turn_edges(self.state.values, "theta", "q", x * angle)
+            )
+        if not self.statics:
+            rate = self._rates()
+            yield self._state("velocities", 1.0, lambda x: self._moved("v", "v", x * rate))
+            if twisted:
+                spin = self._normal(WORLDS, edges)
+                yield self._state(
+                    "spins", 10.0, lambda x: self.engine.layout.turn_edges(self.state.values, "omega", "v", x * spin)
+                )
+        for name in self.engine.tables.names():
+            yield self._parameter(name)
+        yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
+        if twisted:
+            yield self._control("moments", 1e-4, self._normal(WORLDS, edges))
+        if self.model.grips:
+            yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
+        yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
+        if self.model.magnetic:
+            yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
+        if not self.statics:
+            timed = self._without_step()
+            yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
+            yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})
+        yield self._density()
+
+    def _moved(self, array: str, blocks: str, shift: torch.Tensor) -> list:
+        points = self.engine.layout.points(self.state.values, array, blocks)
+        return self.engine.layout.put_points(self.state.values, array, blocks, points + shift)
+
+    def _state(self, name: str, size: float, values: Callable) -> Input:
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, values(x))))
+
+    def _parameter(self, name: str) -> Input:
+        usual, values = self.engine.tables.value(name), None
+        if name == "contact.range":  # bounded by the search distance
+            usual = 0.9 * usual
+            values = self._begun(name, usual)
+        size = float(usual.abs().max()) or self._size_of_family(name)
+        if self.engine.tables.rule(name)[0] == "not negative":  # differences need smaller values, too
+            usual = torch.where(usual > 0.0, usual, size)
+        direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
+
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, values, {name: usual + x * direction})))
+
+    def _begun(self, name: str, value: torch.Tensor) -> tuple | None:
+        """Return a start equilibrium with another parameter value, since angles depend on the path from the start."""
+        if not self.statics or self.slides:
+            return None
+        with torch.no_grad():
+            return self.end(self.simulator, None, {name: value}).values
+
+    def _size_of_family(self, name: str) -> float:
+        """Return the largest value of a parameter family, such as the components of a metric; 1 if all are zero."""
+        family = name.rstrip("0123456789")
+        alike = [member for member in self.engine.tables.names() if member.rstrip("0123456789") == family]
+        return max(float(self.engine.tables.value(member).abs().max()) for member in alike) or 1.0
+
+    def _control(self, name: str, size: float, direction: torch.Tensor, usual=0.0) -> Input:
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, controls={name: usual + x * direction})))
+
+    def _density(self) -> Input:
+        """Return the input that scales masses and inertia as parameters; differences rebuild the scene."""
+        names = set(self.engine.tables.names())
+
+        def scaled(x: torch.Tensor) -> dict[str, torch.Tensor]:
+            masses = {name: self._tensor(of_sections(self.model, name)) for name in names.intersection(MASSES)}
+            more = {name: self.engine.tables.value(name) + x * base for name, base in masses.items()}
+            inertia = {name: self.engine.tables.value(name) * (1.0 + x) for name in names.intersection(["rod.inertia"])}
+            return more | inertia
+
+        base = Input("density", 1.0, lambda x: self.loss(self.end(self.simulator, None, scaled(x))))
+        return replace(
+            base,
+            loss=lambda x: self.loss(self.end(self.built(density=1.0 + float(x)))),
+            gradient=base.found,
+        )
+
+    def _without_step(self) -> str:
+        """Return the reason why step lengths have no derivative; empty if they have one."""
+        field = self.model.scene.applied_field
+        moved = [motion for motion in self.model.motions if not isinstance(motion, Grip)]
+        parts = [*self.model.groups, *([self.model.net] if self.model.net is not None else [])]
+        loads = any(part.host.timed for part in parts)
+        if moved or loads or (field is not None and (callable(field.value) or callable(field.gradient))):
+            return "the reverse does not differentiate motions, loads and fields that are functions of time"
+        return ""
+
+    def _shared(self, name: str, size: float, changes: Callable, why: str = "") -> Input:
+        """Return an input that is no tensor; differences rebuild the scene. `why` is the reason if there is no derivative."""
+
+        def gradient() -> float:
+            if why:
+                raise SceneError(why)
+            return float(self.reverse()[name])
+
+        return Input(name, size, lambda x: self.loss(self.end(self.built(**changes(x)))), gradient)
+
+    def reverse(self) -> dict[str, float]:
+        """Return derivatives with respect to inputs that are no tensors, from the backward pass of every step."""
+        self.engine.tables.write((), [])  # parameters of the model
+        states, results, sums = [self.state], [], {"time step": 0.0, "mass damping": 0.0}
+        for _ in range(STEPS):
+            states.append(self.simulator.step(states[-1], None, self.posed))
+            results.append([*self.engine.smooth_flags(), states[-1].codes, *self.engine.lagged()])
+        cotangent = self._by_end(states[-1])
+        for before, after, entry in zip(states[-2::-1], states[:0:-1], results[::-1], strict=True):
+            cotangent, read, _ = self.engine.backward(
+                before.time, DT, before.values, after.values, entry, cotangent, self.posed
+            )
+            for each in read:
+                by_rate = sum(entry.numpy().sum() for entry in (each.rate, *getattr(each, "elements_rate", ())))
+                # an implicit step is over dt, the midpoint rule's over half of it
+                sums["time step"] -= by_rate / DT**2 * (2.0 if self.analysis == "implicit_midpoint" else 1.0)
+                sums["mass damping"] += each.damping.numpy().sum()
+        return sums
+
+    def _by_end(self, state: WorldState) -> list[torch.Tensor]:
+        leaves = [value.detach().requires_grad_() for value in state.values]
+        loss = self.loss(replace(state, values=tuple(leaves)))
+        gradients = torch.autograd.grad(loss, leaves, allow_unused=True)
+        return [
+            torch.zeros_like(leaf) if gradient is None else gradient
+            for leaf, gradient in zip(leaves, gradients, strict=True)
+        ]

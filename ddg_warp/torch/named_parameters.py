@@ -1,0 +1,239 @@
+"""Named parameters outside terms: masses, rotary inertia, drag coefficients and contact parameters.
+
+    "rod.mass"       [kg] of the points of all rods, including point masses of `Scene.add_mass`
+    "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
+    "shell.mass"     [kg] of the vertices of all shells, "meridian.mass" of the nodes of all shells of revolution
+    "drag.tangential", "drag.normal" [N s/m^2], "drag.rotational" [N s]
+                     of the edges of rods with viscous drag, per length; rotational drag of those with twist
+    "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
+                     of the edges of rods in a granular medium
+    "drag.first", "drag.last" [N s/m]
+                     of bodies at the first and at the last node of the edges of rods with drag; `Scene.drag(nodes=...)` assigns
+                     the coefficient of a node to the edge that starts there, that of the last node to the last edge
+    "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
+                     between objects of two names, or of one, that may come into contact. Friction exists in scenes with friction;
+                     if anisotropic it is the smallest nonzero coefficient, to which the others keep their ratios
+    "contact.radius" [m] of rods and obstacles that have one, half thicknesses of shells and meshes
+
+`contact_parameters.contact_elements` lists the owners of contact parameters in order. Points and edges are in the order of
+`State.points` and `State.angles`. The mass of several points that are one node of the coupled system is the sum.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddg_warp.kernels.forces import drag
+from ddg_warp.model.masses import point_masses
+from ddg_warp.torch import contact_parameters
+from ddg_warp.torch.parameter_storage import ArrayPlace
+from ddg_warp.torch.state_layout import view
+
+MASSES = ("rod.mass", "shell.mass", "meridian.mass")
+VISCOUS = {"tangential": drag.TANGENTIAL, "normal": drag.NORMAL, "rotational": drag.ROTATIONAL}
+GRANULAR = {
+    "lateral": drag.LATERAL,
+    "friction": drag.FRICTION,
+    "leading": drag.LEADING,
+    "slope": drag.SLOPE,
+    "speed": drag.SPEED,
+}
+BODIES = {"first": drag.FIRST, "last": drag.LAST}
+COEFFICIENTS = {f"drag.{name}": row for name, row in (VISCOUS | GRANULAR | BODIES).items()}
+NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *contact_parameters.NAMES)
+SIGNED, POSITIVE = (
+    ("drag.leading",),
+    ("drag.slope", "drag.speed", "contact.range", "contact.radius"),
+)  # all others must be nonnegative
+
+
+@dataclass
+class _Part:
+    """Storage of a parameter in one subsystem: arguments of `ArrayPlace`, and the user rows of its elements."""
+
+    index: int
+    chain: bool
+    key: object
+    usual: np.ndarray
+    places: np.ndarray
+    rows: np.ndarray
+    brought: np.ndarray
+    look: Callable
+    found: Callable
+    heavy: object = None
+
+
+def elements(model, name: str) -> np.ndarray:
+    """Return the rows of `State.points`, or of `State.angles`, that have a parameter, in ascending order (E,)."""
+    return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
+
+
+def array_places(model, name: str) -> tuple[int, list[ArrayPlace | contact_parameters.ContactPlace]]:
+    """Return the number of elements that have a parameter, and their storage; an empty list if the model has none."""
+    if name in contact_parameters.NAMES:
+        count = len(contact_parameters.contact_elements(model, name))
+        return count, [contact_parameters.ContactPlace(model, name)] if count else []
+    rows = elements(model, name)
+    made = [
+        ArrayPlace(
+            model,
+            part.index,
+            part.chain,
+            part.key,
+            part.usual,
+            part.places,
+            np.searchsorted(rows, part.rows),
+            part.brought,
+            len(rows),
+            part.look,
+            part.found,
+            part.heavy,
+        )
+        for part in _parts(model, name)
+        if len(part.places)
+    ]
+    return len(rows), made
+
+
+def of_sections(model, name: str) -> np.ndarray:
+    """Return the masses (E,) [kg] that sections and thicknesses contribute under a name; they scale with density."""
+    return point_masses(model)[0][_rows(model, name)]
+
+
+def _rows(model, name: str) -> slice:
+    """Return the rows of `State.points` with masses of a name."""
+    rings = model.order.meridian_rows
+    return {"rod.mass": slice(0, rings.start), "meridian.mass": rings, "shell.mass": slice(rings.stop, None)}[name]
+
+
+def rule(name: str, usual: np.ndarray) -> tuple[str, Callable]:
+    """Return the rule for values of a parameter in words, and a function that tests values; `usual` are those of the model."""
+    if name in SIGNED:
+        return "a number", np.isfinite
+    if name in POSITIVE or (name in MASSES and (usual > 0.0).all()):
+        return "positive", lambda values: values > 0.0
+    return "not negative", lambda values: values >= 0.0
+
+
+def _parts(model, name: str) -> Iterator[_Part]:
+    if name in MASSES:
+        return _masses(model, name)
+    return _inertia(model) if name == "rod.inertia" else _drag(model, name)
+
+
+def _masses(model, name: str) -> Iterator[_Part]:
+    order, total = model.order, np.sum(point_masses(model), axis=0)
+    for index, group in enumerate(model.groups if name == "rod.mass" else ()):
+        k, column, rows = order.places(group)
+        yield _Part(
+            index,
+            True,
+            "mass",
+            group.host.mass,
+            k * group.rods + column,
+            rows,
+            total[rows],
+            lambda group=group: view(group.mass),
+            lambda inputs: view(inputs.mass),
+            group,
+        )
+    if model.net is not None:
+        net, (rows, blocks) = model.net, order.net_rows
+        chosen = np.isin(rows, np.arange(order.points_count)[_rows(model, name)])
+        rows, blocks = rows[chosen], blocks[chosen]
+        nodes, shape = net.host.nodes, (net.worlds, net.blocks, 3)
+        yield _Part(
+            -1,
+            False,
+            "mass",
+            net.host.mass[:nodes, 0],
+            blocks,
+            rows,
+            total[rows],
+            lambda: view(net.mass)[:, :nodes],
+            lambda inputs: view(inputs.mass).view(shape)[:, :nodes].sum(-1),
+            net,
+        )
+
+
+def _inertia(model) -> Iterator[_Part]:
+    for index, group in enumerate(model.groups):
+        if group.kind.twist:
+            k, column, rows = model.order.edge_places(group)
+            places = k * group.rods + column
+            yield _Part(
+                index,
+                True,
+                "inertia",
+                group.host.rotary,
+                places,
+                rows,
+                group.host.rotary.ravel()[places],
+                lambda group=group: view(group.rotary),
+                lambda inputs: view(inputs.rotary),
+                group,
+            )
+    if model.net is not None:
+        net, host = model.net, model.net.host
+        first, last, shape = host.nodes, host.nodes + net.edges, (net.worlds, net.blocks, 3)
+        blocks = np.concatenate([np.zeros(0, int), *(rod.edges for rod in host.rods)])
+        rows = [model.order.edge_starts[rod.rod] + np.arange(len(rod.edges)) for rod in host.rods]
+        yield _Part(
+            -1,
+            False,
+            "inertia",
+            host.mass[first:last, 0],
+            blocks - first,
+            np.concatenate([np.zeros(0, int), *rows]),
+            host.mass[blocks, 0],
+            lambda: view(net.mass)[:, first:last, :1],
+            lambda inputs: view(inputs.mass).view(shape)[:, first:last, 0],
+            net,
+        )
+
+
+def _drag(model, name: str) -> Iterator[_Part]:
+    row, granular = COEFFICIENTS[name], name.partition(".")[2] in GRANULAR
+    for index, group in enumerate(model.groups):
+        if group.kind.drag and (group.kind.twist or row != drag.ROTATIONAL):
+            k, column, rows = model.order.edge_places(group)
+            places, usual = k * group.rods + column, group.host.drag[row]
+            chosen = ((group.host.drag[drag.SPEED].ravel()[places] > 0.0) == granular) | (row in BODIES.values())
+            places, rows = places[chosen], rows[chosen]
+            yield _Part(
+                index,
+                True,
+                name,
+                usual,
+                places,
+                rows,
+                usual.ravel()[places],
+                lambda group=group: view(group.drag)[row],
+                lambda inputs: None if inputs.drag is None else view(inputs.drag)[row],
+            )
+    if model.net is not None and model.net.host.drag:
+        net, (_, angles, coefficients) = model.net, model.net.host.drag
+        places, rows, first_edge = [np.zeros(0, int)], [np.zeros(0, int)], 0
+        for rod in net.host.rods:
+            if rod.piece.kind.drag:
+                local_edges = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
+                places.append(first_edge + rod.first + local_edges)
+                rows.append(model.order.edge_starts[rod.rod] + local_edges)
+                first_edge += len(rod.piece.drag[rod.row])
+        places, rows, shape = np.concatenate(places), np.concatenate(rows), (net.worlds, coefficients.shape[1], 1)
+        chosen = ((coefficients[drag.SPEED, places] > 0.0) == granular) | (row in BODIES.values())
+        if row == drag.ROTATIONAL:
+            chosen &= angles[places] >= 0
+        places, rows = places[chosen], rows[chosen]
+        yield _Part(
+            -1,
+            False,
+            name,
+            coefficients[row],
+            places,
+            rows,
+            coefficients[row, places],
+            lambda: view(net.drag)[row].view(shape),
+            lambda inputs: None if inputs.drag is None else view(inputs.drag)[row].view(shape[:2]),
+        )

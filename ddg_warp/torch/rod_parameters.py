@@ -1,0 +1,148 @@
+"""Module of learned rod material and section parameters."""
+
+from math import pi
+
+import numpy as np
+import torch
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.scene.drag import Laws, Viscous
+from ddg_warp.torch import contact_parameters, named_parameters
+from ddg_warp.torch.positive_parameters import asked, parameter_key, usual_values
+
+NAMES = ("stretching", "bending", "twisting", "density", "radius")
+
+
+class RodParameters(torch.nn.Module):
+    """Learned factors of rod stiffnesses, density and radius; calling the module returns input of `Simulator.step`.
+
+    Factors c multiply the values of the built model, are positive and learned as logarithms:
+
+        stretching, bending, twisting   c EA; c EI in both directions; c GJ
+        density                         c rho: masses and rotary inertia; masses of `Scene.add_mass` stay
+        radius                          all lengths of the section: c^2 EA, c^4 EI, c^4 GJ, c^2 of masses, c^4 of rotary inertia,
+            drag
+                                        by the radius in `Viscous`, c of the radius in contact, 1 / c of the curvature at
+                                        which the law of a `Ribbon` changes
+
+    Drag coefficients and contact radii that were set explicitly stay. Rods have no radius to learn if the section is a `Stiffness`,
+    if they have constitutive laws of their own, or if they are magnetised. Rod-shell coupling stays unchanged.
+
+    Args:
+        simulator: the simulator of the rods.
+        batch: number of worlds with factors of their own; by default all worlds use the same.
+        names: the factors to learn, from the list above.
+
+    Raises:
+        SceneError: the model has no rods, or none with such a quantity.
+    """
+
+    def __init__(
+        self, simulator, batch: int | None = None, names: tuple[str, ...] = ("stretching", "bending", "twisting")
+    ):
+        super().__init__()
+        names, batch = asked("RodParameters", simulator, names, batch)
+        model = simulator.model
+        powers = _powers(model)
+        available = [name for name in NAMES if any(name in power for power in powers.values())]
+        for name in names:
+            if name not in available:
+                raise SceneError(f"RodParameters: no rod has {name!r}; there is {', '.join(available) or 'no rod'}")
+        if "radius" in names:
+            _require_sizes(model.scene)
+        made = {"dtype": torch.float64, "device": str(wp.device_to_torch(model.wp_device))}
+        self.logarithms = torch.nn.ParameterDict(
+            {name: torch.nn.Parameter(torch.zeros((batch, 1), **made)) for name in names}
+        )
+        # in a fixed order, by which DistributedDataParallel matches buffers across processes
+        self._powers = {parameter: power for parameter, power in powers.items() if not power.keys().isdisjoint(names)}
+        for parameter in self._powers:
+            self.register_buffer(parameter_key(parameter), usual_values(simulator, parameter))
+        if "rod.mass" in self._powers:
+            self.register_buffer("_sections", torch.tensor(named_parameters.of_sections(model, "rod.mass"), **made))
+        for parameter in ("drag.tangential", "drag.normal", "drag.rotational", contact_parameters.RADIUS):
+            if parameter in self._powers:
+                self.register_buffer(
+                    f"{parameter_key(parameter)}_share", torch.tensor(_share(model, parameter), **made)
+                )
+
+    def forward(self) -> dict[str, torch.Tensor]:
+        """Return parameter values for `Simulator.step`."""
+        result = {}
+        for parameter, powers in self._powers.items():
+            usual, logarithms = getattr(self, parameter_key(parameter)), self.logarithms
+            exponent = sum(power * logarithms[name] for name, power in powers.items() if name in logarithms)
+            if parameter == "rod.mass":
+                result[parameter] = usual + self._sections * torch.expm1(exponent)
+            elif parameter in ("drag.rotational", contact_parameters.RADIUS):  # 4 pi mu a^2, and a
+                result[parameter] = usual * (
+                    1.0 + getattr(self, f"{parameter_key(parameter)}_share") * torch.expm1(exponent)
+                )
+            elif parameter.startswith("drag."):  # k mu / (ln(S / a) + constant)
+                result[parameter] = usual / (
+                    1.0 - usual * getattr(self, f"{parameter_key(parameter)}_share") * exponent
+                )
+            else:
+                result[parameter] = usual * exponent.exp()
+        return result
+
+
+def _powers(model) -> dict[str, dict[str, int]]:
+    """Return {parameter: {factor: power}} for all parameters of a model's rods."""
+    terms = [term for group in model.groups for term in group.kind.terms]
+    net = [part.term for part in (model.net.sets if model.net is not None else ())]
+    terms += [term for term in net if term.name.startswith("rod") or term.name == "rigid_joint"]
+    powers: dict[str, dict[str, int]] = {}
+    for term in dict.fromkeys(terms):
+        for parameter, strain in zip(term.stiffness, term.measure.strains, strict=False):
+            kind = {"stretch": "stretching", "twist": "twisting"}.get(strain.partition(" ")[0], "bending")
+            powers[f"{term.name}.{parameter}"] = {kind: 1, "radius": 2 if kind == "stretching" else 4}
+        if "crossover" in term.parameter_names:
+            powers[f"{term.name}.crossover"] = {"radius": -1}
+    if named_parameters.of_sections(model, "rod.mass").any():
+        powers["rod.mass"] = {"density": 1, "radius": 2}
+        if named_parameters.array_places(model, "rod.inertia")[1]:
+            powers["rod.inertia"] = {"density": 1, "radius": 4}
+    for parameter, power in (("drag.tangential", 1), ("drag.normal", 1), ("drag.rotational", 2)):
+        if named_parameters.array_places(model, parameter)[1] and _share(model, parameter).any():
+            powers[parameter] = {"radius": power}
+    if contact_parameters.sized(model, shells=False):
+        powers[contact_parameters.RADIUS] = {"radius": 1}
+    return powers
+
+
+def _share(model, name: str) -> np.ndarray:
+    """Return the sensitivity of drag coefficients of edges, or contact radii of bodies, to the section radius a.
+
+    Axial and normal drag: d(1 / zeta) / d(-ln a) [m^2 / N s]. Rotational drag, proportional to a^2, and contact radii: 1.
+    Values that were set explicitly: 0.
+    """
+    if name == contact_parameters.RADIUS:
+        return np.isin(
+            np.arange(named_parameters.array_places(model, name)[0]),
+            list(contact_parameters.sized(model, shells=False)),
+        )
+    laws = Laws(model.scene)
+    rods = [model.order.edge(row)[1] for row in named_parameters.elements(model, name)]
+    laws_of_edges = [laws.given[laws.of_rods[rod]] for rod in rods]
+    k = {"drag.tangential": 2.0 * pi, "drag.normal": 4.0 * pi}.get(name)
+    sized = (law for law in laws_of_edges if isinstance(law, Viscous) and law.radius is None)
+    sensitivity = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in sized}
+    return np.array([sensitivity.get(law, 0.0) for law in laws_of_edges])
+
+
+def _require_sizes(scene) -> None:
+    """Refuse rods with stiffnesses or magnetic moments that a radius does not determine."""
+    magnetised = {rod for magnet in scene.magnets for rod in np.ravel(magnet.rods).tolist()}
+    for batch in scene.batches:
+        if not batch.sized:
+            raise SceneError(
+                f"RodParameters: rods '{batch.name}' have no 'radius' that gives their stiffnesses: they are those of a Stiffness, or "
+                "of laws; learn 'stretching', 'bending', 'twisting' and 'density'"
+            )
+        if magnetised.intersection(range(batch.first, batch.first + batch.rods)):
+            raise SceneError(
+                f"RodParameters: rods '{batch.name}' are magnetised, and their 'radius' would change their moments, too; learn "
+                "'stretching', 'bending', 'twisting' and 'density'"
+            )

@@ -1,0 +1,104 @@
+"""WorldState: the states of the worlds of a batch as tensors."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.core import outcome
+from ddg_warp.torch.engine import Engine
+from ddg_warp.torch.state_layout import Layout
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """State of B worlds as tensors in storage layout; properties such as `positions` are in user order.
+
+    Attributes:
+        values: arrays of a `State`, ordered as `Layout.fields`; NaN in failed worlds.
+        time: [s], of all worlds.
+        engine: engine with the layout; None for a copied or loaded state, see `Simulator.world_state`.
+        codes: outcomes of the step to this state (B,), see `kernels.core.outcome`; 0 if good, or without a step.
+        differentiable: bools (B,), True if a gradient goes through all steps to this state, as far as made for gradients. Gradients
+            of other worlds are NaN, unless their cotangent is zero: mask them in a loss, and apply `torch.nan_to_num` to
+            values computed from failed worlds.
+    """
+
+    values: tuple
+    time: float
+    engine: Engine | None
+    codes: torch.Tensor
+    differentiable: torch.Tensor
+
+    @classmethod
+    def begun(cls, values, time: float, engine: Engine) -> "WorldState":
+        """Return a state without a step before."""
+        codes = torch.zeros(engine.model.worlds, dtype=torch.int32, device=engine.device)
+        return cls(tuple(values), time, engine, codes, codes == 0)
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the tensors of the state.
+
+        Raises:
+            SceneError: the state was loaded, and is not bound to a simulator.
+        """
+        if self.engine is None:
+            raise SceneError(
+                "the state was loaded, and belongs to no simulator yet; give it to world_state(...) of one"
+            )
+        return self.engine.layout
+
+    @property
+    @torch.compiler.disable
+    def positions(self) -> torch.Tensor:
+        """Points (B, P, 3) [m], in the order of `State.points`."""
+        return self.layout.points(self.values, "x", "q")
+
+    @property
+    @torch.compiler.disable
+    def velocities(self) -> torch.Tensor:
+        """Velocities of points (B, P, 3) [m/s]."""
+        return self.layout.points(self.values, "v", "v")
+
+    @property
+    @torch.compiler.disable
+    def angles(self) -> torch.Tensor:
+        """Twist angles of edges (B, edges) [rad], zero without twist."""
+        return self.layout.edges(self.values)
+
+    @property
+    def failed(self) -> torch.Tensor:
+        """Mask of worlds that failed in the last step (B,)."""
+        return (self.codes != 0) & (self.codes != outcome.NO_GRADIENT)
+
+    def outcomes(self) -> np.ndarray:
+        """Return outcome names of the last step of every world (B,), as `Integrator.outcomes`. Reads from the device.
+
+        "no_gradient" marks worlds that converged but have no gradient, though gradients were requested.
+        """
+        return outcome_names(self.codes)
+
+    def detach(self) -> "WorldState":
+        """Return the state without gradient history."""
+        values = tuple(value.detach() for value in self.values)
+        return replace(self, values=values, differentiable=torch.ones_like(self.differentiable))
+
+    def __getstate__(self):
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | {"engine": None}
+
+    def __deepcopy__(self, memo):
+        return replace(self.detach(), values=tuple(value.detach().clone() for value in self.values))
+
+
+torch.utils._pytree.register_pytree_node(
+    WorldState,
+    lambda state: ([*state.values, state.codes, state.differentiable], (state.time, state.engine)),
+    lambda values, context: WorldState(tuple(values[:-2]), *context, *values[-2:]),
+)
+
+
+def outcome_names(codes: torch.Tensor) -> np.ndarray:
+    """Return outcome names by code."""
+    return np.array([outcome.NAMES[code or outcome.CONVERGED] for code in codes.tolist()])
