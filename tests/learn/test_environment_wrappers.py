@@ -16,13 +16,17 @@ from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripp
 
 @pytest.mark.parametrize(
     ("module", "package", "extra"),
-    [("gymnasium_env", "gymnasium", "gym"), ("torchrl_env", "torchrl.data", "torchrl"), ("jax", "jax", "jax")],
+    [
+        ("rl.gymnasium_env", "gymnasium", "gym"),
+        ("rl.torchrl_env", "torchrl.data", "torchrl"),
+        ("torch.jax", "jax", "jax"),
+    ],
 )
 def test_what_is_not_installed_is_told_with_its_extra(module, package, extra, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, f"ddg_warp.rl.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, f"ddg_warp.{module}", raising=False)
     with pytest.raises(ModuleNotFoundError, match=rf"pip install 'ddg-warp\[{extra}\]'"):
-        importlib.import_module(f"ddg_warp.rl.{module}")
+        importlib.import_module(f"ddg_warp.{module}")
 
 
 # gymnasium

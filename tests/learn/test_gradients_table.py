@@ -9,11 +9,7 @@ from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CURVE, DT, SCENES
 
 torch = pytest.importorskip("torch")
-from ddg_warp.torch import (  # noqa: E402
-    Simulator,
-    gradient_check,
-    gradient_check_scenes,
-)
+from ddg_warp.torch import Simulator, gradient_check, gradient_check_scenes  # noqa: E402
 
 FAST = (
     ("rod", "statics"),

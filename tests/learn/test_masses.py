@@ -10,12 +10,7 @@ from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
 
 torch = pytest.importorskip("torch")
-from ddg_warp.torch import (  # noqa: E402
-    RodParameters,
-    ShellParameters,
-    Simulator,
-    gradient_check_scenes,
-)
+from ddg_warp.torch import RodParameters, ShellParameters, Simulator, gradient_check_scenes  # noqa: E402
 from tests.learn.test_torch import check, normal  # noqa: E402
 
 SECTIONS = {

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from net_problem import Problem, branches, hinged_grid, ring_and_spokes, sheet
+from coupled_problem import Problem, branches, hinged_grid, ring_and_spokes, sheet
 from test_psd import CONVERGED, errors, helix, order, run
 
 import ddg_warp as ddg

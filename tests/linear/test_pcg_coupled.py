@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from net_problem import Problem, frame_and_sheet, membrane_with_springs
+from coupled_problem import Problem, frame_and_sheet, membrane_with_springs
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from chain_system import system
+from rod_system import system
 
 from ddg_warp import device_arrays
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction

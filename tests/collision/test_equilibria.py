@@ -16,7 +16,7 @@ from ddg_warp.solve.collision import candidate_list
 from ddg_warp.solve.equilibrium import dynamic_relaxation, stability
 from ddg_warp.solve.equilibrium.newton_pcg import NetEquilibrium
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from tests.contact.brute_force import edge_edge
+from tests.collision.brute_force import edge_edge
 from tests.learn.contact_cases import SCENES, scene_of, touching
 from tests.learn.differences import built
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
-from chain_system import system
+from rod_system import system
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.linear.rod_dof_map import place_dofs

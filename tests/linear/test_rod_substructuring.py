@@ -4,7 +4,17 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from net_problem import CABLE, SECTION, Problem, branches, frame_and_sheet, hinged_grid, line, ring_and_spokes, sheet
+from coupled_problem import (
+    CABLE,
+    SECTION,
+    Problem,
+    branches,
+    frame_and_sheet,
+    hinged_grid,
+    line,
+    ring_and_spokes,
+    sheet,
+)
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from brute_force import SIDES, candidate_pairs, near_pairs, scene, upload
 from motion_cases import MARGIN, REACH, Motion, ccd_bodies, tangle
-from test_impact import gaps, random_pairs
+from test_additive_ccd import gaps, random_pairs
 
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
