@@ -23,9 +23,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.run import bench
     from ddg_warp.run.check import Check
     from ddg_warp.run.recorder import Recorder
-    from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
+    from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
     from ddg_warp.scene.drag import Granular, Viscous
-    from ddg_warp.scene.equilibrium_path import Displacement, Stop
+    from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
     from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.law import Law
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
@@ -33,11 +33,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.scene.prescribed_motion import Motion
     from ddg_warp.scene.scene import Scene
     from ddg_warp.solve.equilibrium import continuation, stability, statics
-    from ddg_warp.solve.stepping.adaptive_step import StepControl
+    from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
     from ddg_warp.solve.stepping.integrator import Integrator
 
 __version__ = "0.1.0"
 __all__ = [
+    "AdaptiveStepper",
     "Box",
     "Capsule",
     "Check",
@@ -54,6 +55,7 @@ __all__ = [
     "Mesh",
     "Model",
     "Motion",
+    "PathAnalysis",
     "Plane",
     "Recorder",
     "Rectangle",
@@ -65,10 +67,8 @@ __all__ = [
     "Sphere",
     "State",
     "Statics",
-    "StepControl",
     "Stiffness",
-    "Stop",
-    "Trace",
+    "StopCriterion",
     "Viscous",
     "bench",
     "continuation",
@@ -108,10 +108,10 @@ _HOME = {
     "Sphere": "scene.obstacles",
     "State": "model.state",
     "Statics": "scene.descriptions",
-    "StepControl": "solve.stepping.adaptive_step",
+    "AdaptiveStepper": "solve.stepping.adaptive_step",
     "Stiffness": "scene.material",
-    "Stop": "scene.equilibrium_path",
-    "Trace": "scene.descriptions",
+    "StopCriterion": "scene.equilibrium_path",
+    "PathAnalysis": "scene.descriptions",
     "Viscous": "scene.drag",
 }
 _MODULES = {

@@ -9,7 +9,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.equilibrium_path import Displacement, Stop
+from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
 from ddg_warp.scenes import lee_frame, post_buckling, roll_up
 from ddg_warp.solve.equilibrium import stability
 from ddg_warp.solve.equilibrium.continuation import Continuation
@@ -50,7 +50,7 @@ def test_shallow_truss_snaps_through(device):
     """
     length = 1.1
     continuation, height = truss(device, length)
-    path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 2.3 * height)))
+    path = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, 2.3 * height)))
     z = height - path.values("drop")
     np.testing.assert_allclose(path.load, exact_load(z, length), atol=1e-10)
     assert path.outcome == "displacement"
@@ -73,7 +73,7 @@ def test_shallow_truss_snaps_through(device):
 def test_steep_truss_bifurcates_before_it_snaps(device):
     length = 3.0
     continuation, height = truss(device, length)
-    path = continuation.trace(stop=Stop(displacement=("drop", -1.0, height)))
+    path = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, height)))
     roots = np.sort(np.roots([1.0, -length, 0.0, length]).real)[:0:-1]
     assert roots == pytest.approx([2.532, 1.347], abs=1e-3)
     expected = [("bifurcation", roots[0]), ("limit point", length ** (1.0 / 3.0)), ("bifurcation", roots[1])]
@@ -94,10 +94,10 @@ def test_branch_of_the_truss(device):
     """
     length = 3.0
     continuation, height = truss(device, length)
-    (point,) = continuation.trace(stop=Stop(load=(-1.0, 0.5))).bifurcations
+    (point,) = continuation.trace(stop=StopCriterion(load=(-1.0, 0.5))).bifurcations
     sides = []
     for side in (1, -1):
-        branch = continuation.switch(point, side=side, step=0.01, stop=Stop(steps=25))
+        branch = continuation.switch(point, side=side, step=0.01, stop=StopCriterion(steps=25))
         x, z = branch.values("sway"), height - branch.values("drop")
         forces = np.zeros((len(branch), 2))
         for foot in (-1.0, 1.0):
@@ -139,7 +139,7 @@ def strip(device, n: int, axial: float):
 # Links of length h (1 - P / EA) with springs EI / h between them: P (1 - P / EA) = 4 EI sin(k pi / 2 n)^2 / h^2.
 def test_pinned_column_bifurcates_at_eulers_loads(device):
     n, axial = 12, 5e3
-    path = strip(device, n, axial).trace(stop=Stop(load=(0.0, 45.0)))
+    path = strip(device, n, axial).trace(stop=StopCriterion(load=(0.0, 45.0)))
     assert path.outcome == "load"
     assert path.load[-1] == 45.0
     buckling = 4.0 * n**2 * np.sin(np.array([1.0, 2.0]) * np.pi / (2.0 * n)) ** 2
@@ -160,8 +160,8 @@ def test_branch_follows_the_elastica(device):
     edges, errors = (20, 40, 80), []
     for n in edges:
         continuation = strip(device, n, 1e7)
-        (point,) = continuation.trace(stop=Stop(load=(0.0, 12.0))).bifurcations
-        branch = continuation.switch(point, stop=Stop(displacement=("shortening", -1.0, 0.3)))
+        (point,) = continuation.trace(stop=StopCriterion(load=(0.0, 12.0))).bifurcations
+        branch = continuation.switch(point, stop=StopCriterion(displacement=("shortening", -1.0, 0.3)))
         assert branch.values("shortening")[-1] == pytest.approx(0.3, rel=1e-9)
         assert not branch.negative[1:].any()
         assert not [p for p in branch.points[1:] if p.kind != "regular"]
@@ -194,8 +194,8 @@ def test_closed_branch_passes_both_pitchforks(device, load_scale):
     runs.
     """
     continuation = arch(device, load_scale)
-    first = continuation.trace(stop=Stop(displacement=("drop", -1.0, 0.1))).bifurcations[0]
-    branch = continuation.switch(first, stop=Stop(steps=45))
+    first = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, 0.1))).bifurcations[0]
+    branch = continuation.switch(first, stop=StopCriterion(steps=45))
     events = [point for point in branch.points[1:] if point.kind != "regular"]
     assert {point.kind for point in events} == {"bifurcation"}
     assert len(events) >= 2
@@ -204,17 +204,17 @@ def test_closed_branch_passes_both_pitchforks(device, load_scale):
         assert (point.load == pytest.approx(first.load, rel=1e-4)) == back
     assert np.abs(branch.values("sway")).max() > 0.02
     # switching at the other pitchfork, across the loop, leads to symmetric states
-    symmetric = continuation.switch(events[0], stop=Stop(steps=3))
+    symmetric = continuation.switch(events[0], stop=StopCriterion(steps=3))
     assert np.abs(symmetric.values("sway")[1:]).max() < 1e-3 < np.ptp(symmetric.values("drop"))
 
 
 @pytest.mark.slow
 def test_imperfect_arch_has_a_limit_point_near_the_pitchfork(device):
     """The path passes the pitchfork by limit points instead, without a jump to another path."""
-    path = arch(device, 30.0, 1e-4).trace(stop=Stop(displacement=("drop", -1.0, 0.55)))
+    path = arch(device, 30.0, 1e-4).trace(stop=StopCriterion(displacement=("drop", -1.0, 0.55)))
     assert [point.kind for point in path.points if point.kind != "regular"] == ["limit point"]
     (limit,) = path.limit_points
-    perfect = arch(device, 30.0).trace(stop=Stop(displacement=("drop", -1.0, 0.1))).bifurcations[0]
+    perfect = arch(device, 30.0).trace(stop=StopCriterion(displacement=("drop", -1.0, 0.1))).bifurcations[0]
     assert limit.load < perfect.load
     assert limit.load == pytest.approx(perfect.load, rel=0.02)
     assert np.abs(path.values("sway")).max() > 0.02
@@ -225,7 +225,7 @@ def test_imperfect_arch_has_a_limit_point_near_the_pitchfork(device):
 def test_every_event_is_listed_once(device, load_scale):
     """The steep truss passes six events, by closed form (see above), in any metric."""
     continuation, height = truss(device, 3.0, load_scale=load_scale)
-    path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 2.2 * height)))
+    path = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, 2.2 * height)))
     roots = np.sort(np.roots([1.0, -3.0, 0.0, 3.0]).real)[:0:-1]
     bars = [roots[0], 3.0 ** (1.0 / 3.0), roots[1]]
     kinds = ["bifurcation", "limit point", "bifurcation"]
@@ -255,7 +255,7 @@ def cap(device):
 def test_default_steps_resolve_a_snap(device):
     """The snap is shorter than the first default step: limit loads agree with displacement control."""
     continuation = cap(device)
-    path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 0.042)))
+    path = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, 0.042)))
     assert np.diff(path.values("drop")).max() < 0.01  # a thickness
     assert [point.kind for point in path.points if point.kind != "regular"] == [
         "bifurcation",
@@ -282,7 +282,7 @@ def test_path_under_moving_supports(device):
     model = scene.build(device, "float64")
     continuation = Continuation(model, {"rise": Displacement.of(10, "z")}, floor_factor=1.0)
     start = solve(model, end=0.0)
-    path = continuation.trace(start, stop=Stop(load=(-1.0, 1.0)))
+    path = continuation.trace(start, stop=StopCriterion(load=(-1.0, 1.0)))
     assert path.load[-1] == 1.0
     assert (np.diff(path.load) > 0.0).all()
     for point in path.points[:: max(1, len(path) // 3)]:
@@ -299,7 +299,7 @@ def test_path_under_a_follower_couple(device):
     scene.clamp_end(rod, "first")
     scene.add_couple(rod, -1, (0.0, -0.5 * np.pi, 0.0))
     continuation = Continuation(scene.build(device, "float64"), {"tip": Displacement.of(-1, "z")}, floor_factor=1.0)
-    path = continuation.trace(stop=Stop(load=(-1.0, 1.0)))
+    path = continuation.trace(stop=StopCriterion(load=(-1.0, 1.0)))
     model = roll_up.build(0.25, 12).build(device, "float64")
     state = path.points[-1].state
     stiffness = continuation.tangent.load_stiffness(1.0, continuation.tangent.dofs(state))
@@ -312,7 +312,7 @@ def test_path_under_a_follower_couple(device):
 
 
 def test_path_goes_backwards_and_repeats_bitwise(device):
-    first, again = (truss(device, 1.1)[0].trace(direction=-1, stop=Stop(steps=12)) for _ in range(2))
+    first, again = (truss(device, 1.1)[0].trace(direction=-1, stop=StopCriterion(steps=12)) for _ in range(2))
     assert first.outcome == "steps"
     assert len(first) == 13
     assert (first.load[1:] < 0.0).all()
@@ -326,7 +326,7 @@ def test_stop_by_limit_points_and_the_start_is_kept(device):
     continuation, _ = truss(device, 1.1)
     start = continuation.model.state()
     before = start.snapshot()
-    path = continuation.trace(start, stop=Stop(limit_points=1))
+    path = continuation.trace(start, stop=StopCriterion(limit_points=1))
     assert path.outcome == "limit_points"
     assert path.points[-1].kind == "limit point"
     assert path.points[-1].negative == 0
@@ -357,7 +357,7 @@ def test_failures_are_named(device):
     assert caught.value.outcome == "step_too_small"
     assert len(caught.value.path) == 1
     np.testing.assert_array_equal(caught.value.state.points(), continuation.model.state().points())
-    (point,) = truss(device, 3.0)[0].trace(stop=Stop(load=(-1.0, 0.5))).bifurcations
+    (point,) = truss(device, 3.0)[0].trace(stop=StopCriterion(load=(-1.0, 0.5))).bifurcations
     with pytest.raises(ddg.SolverError, match="no_branch") as caught:
         truss(device, 3.0, max_iterations=1)[0].switch(point, step=1e6)
     assert caught.value.outcome == "no_branch"
@@ -380,9 +380,9 @@ def test_mistakes(device):
     with pytest.raises(ddg.SceneError, match="no displacement 'rise' is watched"):
         continuation.control("rise", [0.1])
     with pytest.raises(ddg.SceneError, match="'rise': it is not watched"):
-        continuation.trace(stop=Stop(displacement=("rise", 0.0, 1.0)))
+        continuation.trace(stop=StopCriterion(displacement=("rise", 0.0, 1.0)))
     with pytest.raises(ValueError, match=r"regular.*bifurcation"):
-        continuation.switch(continuation.trace(stop=Stop(steps=1)).points[0])
+        continuation.switch(continuation.trace(stop=StopCriterion(steps=1)).points[0])
     for row, axis, message in (
         (3, "z", "there are 3 points"),
         (1, "w", "axis is 'w'; it is 'x', 'y' or 'z'"),
@@ -402,7 +402,7 @@ def test_mistakes(device):
 def test_metric_does_not_move_the_path(device):
     for load_scale in (0.03, 3.0):
         continuation, height = truss(device, 1.1, load_scale=load_scale)
-        path = continuation.trace(stop=Stop(displacement=("drop", -1.0, height)))
+        path = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, height)))
         np.testing.assert_allclose(path.load, exact_load(height - path.values("drop"), 1.1), atol=1e-10)
     both = Displacement(((1, "z", -1.0), (1, "x", 2.0)))
     tangent = Tangent(continuation.model)

@@ -8,7 +8,7 @@ import ddg_warp as ddg
 from ddg_warp.compile.coupled.rod_ordering import outwards
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.newton.rod_iterate import RELAG
-from ddg_warp.solve.newton.coupled_newton import NetNewton, NewtonOptions
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton, NewtonOptions
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 WIRE = ddg.Material(young=1e9, poisson=0.5, density=1000.0)
@@ -121,7 +121,7 @@ def test_frame_update_keeps_strains(device, rotation):
     """
     model = tree().build(device, "float64", worlds=2)
     net, state = model.net, model.net.rest()
-    newton = NetNewton(model, NewtonOptions())
+    newton = CoupledNewton(model, NewtonOptions())
     random = np.random.default_rng(3)
     q = np.array(state.q.numpy().reshape(2, -1, 3), float)
     nodes, spins = net.host.nodes, net.host.spins

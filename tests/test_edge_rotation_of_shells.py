@@ -5,7 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.equilibrium_path import Stop
+from ddg_warp.scene.equilibrium_path import StopCriterion
 from ddg_warp.solve.equilibrium.continuation import Continuation
 from ddg_warp.solve.equilibrium.statics import solve
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -227,7 +227,7 @@ def test_reaction_moment_is_the_energy_derivative(device, model):
 def test_continuation_with_a_rotating_clamp(device):
     """Arc length and load steps reach one equilibrium; the rate of the normals enters the tangent of the path."""
     model, _ = twisted(device, 0.4, cells=8, across=2)
-    path = Continuation(model, step=0.05, max_step=0.4).trace(stop=Stop(load=(-1.0, 1.0)))
+    path = Continuation(model, step=0.05, max_step=0.4).trace(stop=StopCriterion(load=(-1.0, 1.0)))
     np.testing.assert_allclose(path.points[-1].state.points(), solve(model).points(), atol=1e-9)
     assert max(point.iterations for point in path.points[1:]) < 7
 

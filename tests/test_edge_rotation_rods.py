@@ -5,7 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.kernels.newton.rod_iterate import PLACE
-from ddg_warp.solve.newton.coupled_newton import NetNewton, NewtonOptions
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton, NewtonOptions
 
 SIZES = (2, 3, 33, 64, 65, 200, 1300)  # around one and two runs of edges; the last size has longer runs
 EDGE = 0.05  # m
@@ -95,7 +95,7 @@ def test_edge_rotation_update_equals_a_walk_along_the_rods(device, anchors, clos
     """One world rotates edges, the other stays; repetition is bitwise equal."""
     scene, random = rods(anchors, closed), np.random.default_rng(4)
     model = scene.build(device, "float64", worlds=2)
-    newton, host = NetNewton(model, NewtonOptions()), model.net.host
+    newton, host = CoupledNewton(model, NewtonOptions()), model.net.host
     base = newton.base.numpy()
     base[:] = model.state().net.q.numpy()
     direction = 0.15 * EDGE * random.normal(size=base.shape)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.model.rebuild import Recipe
+from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.torch.gradient_check_scenes import OBJECTS, scene_of
 
@@ -76,7 +76,7 @@ def same(state, expected) -> None:
 
 def set_back(model, name: str) -> None:
     """Restore all parameters of the scene."""
-    Recipe(built(name, model.device), WORLDS).put(model)
+    ModelBuilder(built(name, model.device), WORLDS).put(model)
 
 
 @EVERY_KIND

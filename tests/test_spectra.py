@@ -11,7 +11,7 @@ from ddg_warp.solve.equilibrium.stability import spectrum
 from ddg_warp.solve.equilibrium.statics import solve
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.linear import eigensolver
-from ddg_warp.solve.linear.eigensolver import Lowest
+from ddg_warp.solve.linear.eigensolver import ShiftInvertLanczos
 from ddg_warp.solve.linear.sparse_direct import Factorisation
 
 SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
@@ -240,7 +240,7 @@ def test_iteration_finds_every_copy(device):
     model = scene.build(device, "float64")
     tangent = Tangent(model)
     matrix = tangent.stiffness(model.state())[tangent.free][:, tangent.free]
-    values, _ = eigensolver.Lowest(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))(25)
+    values, _ = eigensolver.ShiftInvertLanczos(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))(25)
     exact, _ = eigensolver.dense(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))
     np.testing.assert_allclose(values, exact[:25], rtol=1e-8)
     assert np.ptp(values[:11]) < 1e-8 * values[0]
@@ -321,9 +321,9 @@ def test_a_count_that_rounding_makes_too_large_ends_the_search(device, monkeypat
     model = scene.build(device, "float64")
     monkeypatch.setattr(stability, "DENSE", 0)
     exact = spectrum(model, model.state(), 3)
-    searches, inertia, nearest = [], Lowest.inertia, Lowest.nearest
-    monkeypatch.setattr(Lowest, "inertia", lambda self, shift: inertia(self, shift) + 1)
-    monkeypatch.setattr(Lowest, "nearest", lambda self, *args: searches.append(1) or nearest(self, *args))
+    searches, inertia, nearest = [], ShiftInvertLanczos.inertia, ShiftInvertLanczos.nearest
+    monkeypatch.setattr(ShiftInvertLanczos, "inertia", lambda self, shift: inertia(self, shift) + 1)
+    monkeypatch.setattr(ShiftInvertLanczos, "nearest", lambda self, *args: searches.append(1) or nearest(self, *args))
     modes = spectrum(model, model.state(), 3)
     np.testing.assert_allclose(modes.eigenvalues, exact.eigenvalues, rtol=1e-9)
     assert len(searches) < 5

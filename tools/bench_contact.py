@@ -27,14 +27,14 @@ from ddg_warp.kernels.collision.primitives import EDGES, pair_functions, sides_s
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 EDGES_A_ROD, LENGTH, RADIUS, APART = 64, 0.01, 1e-3, 4.2e-3  # [m]
 REACH, MARGIN = 5e-4, 1e-3  # [m]
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 
 
-def strands(edges: int) -> tuple[Shapes, np.ndarray]:
+def strands(edges: int) -> tuple[CollisionMesh, np.ndarray]:
     """Return shapes with about this number of edges, and nodes (n, 3)."""
     rods = max(1, edges // EDGES_A_ROD)
     side, nodes = int(np.ceil(np.sqrt(rods))), EDGES_A_ROD + 1
@@ -43,7 +43,7 @@ def strands(edges: int) -> tuple[Shapes, np.ndarray]:
     phase = rng.uniform(0.0, 2.0 * np.pi, (rods, 2))[rod]
     wave = 0.25 * APART * np.sin(2.0 * np.pi * node / 16.0 + phase.T)
     points = np.column_stack([LENGTH * node, APART * (rod % side) + wave[0], APART * (rod // side) + wave[1]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     for r in range(rods):
         shapes.rod(r * nodes + np.arange(nodes), RADIUS)
     return shapes, points

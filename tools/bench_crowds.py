@@ -9,7 +9,7 @@ runs to its end or for `limit` seconds of wall time. A row covers a sixth of tha
   searches; `dt` is the mean step [s]
 - pairs in contact, the smallest gap so far over the search distance, and `refused`, crossing pairs in rejected steps
 - `rtol`, residual tolerance over the weight of a rod, and `outliers`, the fraction of rods that may exceed it
-- `astray`, the largest local error estimate of `StepControl` [m/s], which halves the steps of some scenes
+- `astray`, the largest local error estimate of `AdaptiveStepper` [m/s], which halves the steps of some scenes
 - `gained`, energy created over energy lost so far, in scenes without driving
 - `search_share`, the fraction of wall time for searches, from one timed separately
 
@@ -36,7 +36,7 @@ LARGE = ("hair_10000", "hair_10000_control", "hair_10000_sag_free")
 RTOL, OTHERWISE = {"noodles": 3e-1, "hair_512": 1e-1} | dict.fromkeys(LARGE, 3e-1), 3e-2
 # 0 otherwise. Measured: position errors are half of the change by half the step.
 OUTLIERS = dict.fromkeys(LARGE, 5e-2)
-# error [m/s] and halvings of `StepControl`; other cases have constant steps
+# error [m/s] and halvings of `AdaptiveStepper`; other cases have constant steps
 CONTROL, ONE_LENGTH = {"noodles": (5e-3, 2)} | dict.fromkeys(LARGE[1:], (5e-3, 3)), (5e-3, 0)
 PARTS = 6  # rows of a case
 CASES = {  # scene, its arguments, longest step [s], duration [s], whether something drives it
@@ -66,7 +66,7 @@ LANDING = {  # arguments of a scene, steps of 1/960 s until landing and for comp
     "noodles": ({"count": 49, "nodes": 241, "bowl": 0.45}, 420, 40, ()),
     "strands": ({"count": 256, "contact": True}, 270, 40, (1e-2, 5e-2, 2e-1)),
 }
-CONTROLS = (  # error and halvings of `StepControl`, rtol, outliers; the first is the reference
+CONTROLS = (  # error and halvings of `AdaptiveStepper`, rtol, outliers; the first is the reference
     ((1e-3, 4), 3e-2, 0.0),
     ((2.5e-3, 4), 3e-1, 5e-2),
     ((5e-3, 3), 3e-1, 5e-2),
@@ -235,7 +235,7 @@ def _tolerances(name: str, device) -> list[dict]:
 
 
 def controls(device) -> list[dict]:
-    """Return rows of cost and error of `StepControl` and tolerances for sag-free hair on a moving head."""
+    """Return rows of cost and error of `AdaptiveStepper` and tolerances for sag-free hair on a moving head."""
     count = 10_000 if device.is_cuda else 512
     model = import_module("ddg_warp.scenes.strands").build(count=count, contact=True, sag_free=True).build(device)
     start = ddg.Integrator(model).step(model.state(), 1e-4)  # compiles everything
@@ -243,7 +243,7 @@ def controls(device) -> list[dict]:
 
 
 def _compared(name: str, model, start, duration: float, settings: list[tuple]) -> list[dict]:
-    """Run from a state by (error and halvings of `StepControl`, rtol, outliers, longest step); compare each with the first."""
+    """Run from a state by (error and halvings of `AdaptiveStepper`, rtol, outliers, longest step); compare each with the first."""
     rows, points = [], None
     for control, rtol, outliers, length in settings:
         integrator, state, astray = ddg.Integrator(model, rtol=rtol, outliers=outliers), start, 0.0

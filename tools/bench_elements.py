@@ -24,8 +24,8 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import device_arrays
-from ddg_warp.adjoint.coupled_step import NetAdjoint
-from ddg_warp.adjoint.rod_step import ChainAdjoint
+from ddg_warp.adjoint.coupled_step import CoupledStepAdjoint
+from ddg_warp.adjoint.rod_step import RodStepAdjoint
 from ddg_warp.run.summary import machine, table, write_table
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
@@ -110,11 +110,11 @@ def registers() -> list[dict]:
         integrator = ddg.Integrator(model)
         if model.net is not None:
             terms, kernels = [part.term for part in model.net.sets], newton_of(integrator)._evaluate
-            reverse = NetAdjoint(model, "implicit_euler")._pull
+            reverse = CoupledStepAdjoint(model, "implicit_euler")._pull
         else:
             (group,) = model.groups
             terms, kernels = group.kind.terms, [newton_of(integrator)._evaluate]
-            reverse = ChainAdjoint(model, group, "implicit_euler")._pull
+            reverse = RodStepAdjoint(model, group, "implicit_euler")._pull
         of_terms = [f" {term.name}" for term in terms]
         named = list(zip(of_terms if len(kernels) == len(terms) > 1 else [""], kernels, strict=True))
         if precision == "float64":

@@ -7,9 +7,9 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import contact_parameters
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
 from ddg_warp.kernels.collision.contact.assembly import sum_kernel
-from ddg_warp.solve.collision.incidence import NodeItems
+from ddg_warp.solve.collision.incidence import Incidence
 from ddg_warp.solve.collision.rolling_rotation import turned_by
-from ddg_warp.solve.equilibrium.friction_jacobian import Rubbing
+from ddg_warp.solve.equilibrium.friction_jacobian import FrictionJacobian
 from ddg_warp.solve.linear.exact_contact import ExactContact
 from ddg_warp.solve.linear.sparse_system import lists
 
@@ -17,7 +17,7 @@ PIECES, LEAST = 256, 64  # largest number of summation chunks of a world, and fe
 
 
 class ContactAdjoint:
-    """VJP of the contact of a `DeviceNet`, friction included; gradients by obstacles are returned by obstacle nodes.
+    """VJP of the contact of a `CoupledModel`, friction included; gradients by obstacles are returned by obstacle nodes.
 
     A step or equilibrium is differentiated as solved exactly. The inputs are:
 
@@ -56,7 +56,7 @@ class ContactAdjoint:
         leads = [friction.directions[0] is not None for friction in terms.frictions]
         self._rolls = [friction.rolls for friction in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
-        self.rubbing, spins = Rubbing(net, self.system), bool(self._spins)
+        self.rubbing, spins = FrictionJacobian(net, self.system), bool(self._spins)
         self._direct = contact_parameters.direction_kernels(real) if any(leads) else ()
         direction_nodes = search.shapes.beside
         self._leads = [
@@ -65,9 +65,9 @@ class ContactAdjoint:
         ]
         self._sides = [contact_parameters.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_parameters.group_kernels(real), contact_parameters.body_kernel(real)
-        self._items, self._add = [NodeItems(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
+        self._items, self._add = [Incidence(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
         rolling = zip(kinds, self._items, self._rolls, strict=True)
-        self._rub_items = [NodeItems(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling]
+        self._rub_items = [Incidence(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling]
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
         self.by_radius = self._zeros(*net.touching["radius"].shape)
         self._things, self._starts, self._spun_things = {}, {}, {}
@@ -152,7 +152,7 @@ class ContactAdjoint:
             self._spins.pull(before, q, self._by_spun, [by_before, by_q, self.by_radius])
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array):
-        """Return the friction matrix as `Rubbing`; a following `pull` has room for all pairs."""
+        """Return the friction matrix as `FrictionJacobian`; a following `pull` has room for all pairs."""
         version, matrix = self.system.search.version, self.rubbing.matrix(q, before, rate)
         if self.system.search.version != version:
             self._reserve()
@@ -170,12 +170,12 @@ class ContactAdjoint:
             ):
                 gradient.assign(gradient.numpy() - (derivative.T @ cotangent).reshape(-1, 3))
 
-    def _add_up(self, items: NodeItems, part, written: wp.array, out: wp.array) -> None:
+    def _add_up(self, items: Incidence, part, written: wp.array, out: wp.array) -> None:
         """Assemble contributions of active pairs, by pair node, to nodes."""
         inputs = [written, part.factor.used, items.places, items.numbers, items.items]
         self._sweep(self._add, len(out), inputs, [out])
 
-    def _sum(self, index: int, items: NodeItems, part) -> None:
+    def _sum(self, index: int, items: Incidence, part) -> None:
         """Sum contact parameter gradients of pairs by group and by primitive."""
         pairs, law = part.found, self.system.terms.law
         pieces, total = self._group
@@ -186,7 +186,7 @@ class ContactAdjoint:
         self._launch(total, self.by_groups.shape[1:], [self._partial, number], [self.by_groups])
         self._to_things(index, items, part, (self._numbers[THICKNESS],) * 2, self._things)
 
-    def _to_things(self, index: int, items: NodeItems, part, values: tuple, out: dict[int, wp.array]) -> None:
+    def _to_things(self, index: int, items: Incidence, part, values: tuple, out: dict[int, wp.array]) -> None:
         """Sum values of pairs, of both sides (capacity,), by primitive, for each primitive size."""
         pairs, (first, second), (first_values, second_values) = part.found, self._sides[index], values
         inputs = [part.count, part.starts, part.partners, first_values]

@@ -5,11 +5,11 @@ import warp as wp
 
 from ddg_warp.kernels.adjoint import coupled_assembly, coupled_step
 from ddg_warp.kernels.elements.coupled_element import FRAME
-from ddg_warp.model.coupled_model import NetState
+from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.solve.linear.sparse_system import lists
 
 
-class Shares:
+class CoupledAssembly:
     """Of all element sets; in memory that stays.
 
     Attributes:
@@ -80,8 +80,8 @@ class Shares:
 
     def uncarry(
         self,
-        before: NetState,
-        after: NetState,
+        before: CoupledState,
+        after: CoupledState,
         q: wp.array,
         frame: wp.array,
         own: list[wp.array],
@@ -90,8 +90,8 @@ class Shares:
         by_frame: wp.array,
         by_own: list[wp.array],
     ) -> None:
-        """Reverse of `DeviceNet.carry`: from derivatives by lagged data of `after`, to those by the data of `before`, by the blocks q
-        and by constant data, which are added.
+        """Reverse of `CoupledModel.carry`: from derivatives by lagged data of `after`, to those by the data of `before`, by the
+        blocks q and by constant data, which are added.
 
         Args:
             frame, own: by the frames, added to, and own lagged rows of `after`.

@@ -10,17 +10,17 @@ from ddg_warp.adjoint.linear_solve import HostSolve
 from ddg_warp.compile.dof_map import FREE
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.coupled_linear_solve import chain_kernel
-from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
+from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
 
 
-class NetSolve:
+class CoupledLinearSolve:
     """Solver of (H + c M - dL/dq)^T w = g, on the device for steps, on the host for equilibria.
 
     Host solves use sparse factors; dL/dq is the load stiffness of equilibria.
 
     Args:
-        drag: `NetDragAdjoint`, None without drag.
+        drag: `CoupledDragAdjoint`, None without drag.
         contact: `ExactContact`, evaluated at the solution of a step; None without contact.
         steps: True for steps.
 
@@ -41,9 +41,9 @@ class NetSolve:
         self._left_out = self.system and self.system.bits(~net.host.fixed | _moved(net.host))
 
     @cached_property
-    def tangent(self) -> NetTangent:
+    def tangent(self) -> CoupledTangent:
         """Tangent of host solves."""
-        return NetTangent(self.model, 0)
+        return CoupledTangent(self.model, 0)
 
     @cached_property
     def _host(self) -> HostSolve:

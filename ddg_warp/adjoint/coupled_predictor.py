@@ -10,13 +10,13 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import coupled_predictor
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.newton import coupled_newton
-from ddg_warp.model.coupled_model import NetState
+from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.solve.linear.sparse_system import lists
-from ddg_warp.solve.newton.edge_rotation import Turns
+from ddg_warp.solve.newton.edge_rotation import EdgeRotations
 
 
-class NetPredictor:
-    """Predictor of the coupled system, with a VJP; see `ChainPredictor`.
+class CoupledPredictor:
+    """Predictor of the coupled system, with a VJP; see `RodPredictor`.
 
     Attributes:
         state: predicted blocks `q` with lagged data.
@@ -59,7 +59,7 @@ class NetPredictor:
         self._solver = self._for = None
 
     @classmethod
-    def of(cls, model, net, motion, scheme: str | None) -> "NetPredictor | None":
+    def of(cls, model, net, motion, scheme: str | None) -> "CoupledPredictor | None":
         """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         midpoint = scheme == "implicit_midpoint"
         needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
@@ -73,7 +73,7 @@ class NetPredictor:
         return kernels_of_predictor + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float) -> bool:
-        """Prepare for solves of a `NetStep` over s [s]; return True if kernels or arrays have changed."""
+        """Prepare for solves of a `CoupledStep` over s [s]; return True if kernels or arrays have changed."""
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
@@ -83,10 +83,10 @@ class NetPredictor:
         self._solver = solver = copy.copy(step.newton)  # with arrays of its own
         solver.q, solver.base, solver.target, solver.islands = self._q, self._base, self._target, self._islands
         solver.direction = wp.zeros_like(solver.direction)
-        solver.turns = Turns(solver) if self._levels else None
+        solver.turns = EdgeRotations(solver) if self._levels else None
         return True
 
-    def find(self, before: NetState) -> None:
+    def find(self, before: CoupledState) -> None:
         """Compute the predictor of a step from the state `before`; launches only."""
         net, solver, islands = self.net, self._solver, self._islands
         islands.todo.zero_()
@@ -102,7 +102,7 @@ class NetPredictor:
             self.state = replace(self.state, frame=self.frame, lag=self._lag)
             net.carry(before, self.state)
 
-    def pull(self, before: NetState, by_fixed: wp.array, start: NetState, by_rate: wp.array) -> None:
+    def pull(self, before: CoupledState, by_fixed: wp.array, start: CoupledState, by_rate: wp.array) -> None:
         """Add the gradient by the state before the step, given `by_q`, which is overwritten.
 
         Args:

@@ -7,28 +7,28 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.adjoint.contact import ContactAdjoint
-from ddg_warp.adjoint.coupled_assembly import Shares
-from ddg_warp.adjoint.coupled_linear_solve import NetSolve
-from ddg_warp.adjoint.coupled_predictor import NetPredictor
-from ddg_warp.adjoint.drag import NetDragAdjoint
+from ddg_warp.adjoint.coupled_assembly import CoupledAssembly
+from ddg_warp.adjoint.coupled_linear_solve import CoupledLinearSolve
+from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
+from ddg_warp.adjoint.drag import CoupledDragAdjoint
 from ddg_warp.adjoint.follower_loads import Followers
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.kernels.adjoint import coupled_step, elements
 from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
 from ddg_warp.kernels.forces.drag import block_inertia
-from ddg_warp.model.coupled_model import NetState
+from ddg_warp.model.coupled_model import CoupledState
 
 
 @dataclass
-class NetKept:
+class CoupledSavedStep:
     """What the reverse of a step reads of it: the state `before`, and the solution of its solve with its lagged data.
 
     `lagged` are the solutions where friction was taken anew (W N,), in this order; what else is lagged stays. Of an equilibrium with
     friction `before` is the one that slips count from, and `rubbing` over the increment of the load parameter since then.
     """
 
-    before: NetState
-    solved: NetState
+    before: CoupledState
+    solved: CoupledState
     whole: wp.array | None
     retries: wp.array | None = None
     time: float = 0.0
@@ -42,7 +42,7 @@ class NetKept:
 
 
 @dataclass
-class NetInputs:
+class CoupledInputs:
     """Derivatives by what a step of a net read beside its state.
 
     Attributes:
@@ -71,11 +71,11 @@ class NetInputs:
     radius: wp.array | None = None
 
 
-class NetAdjoint:
-    """Reverse of the steps of a model's net, and of its equilibria; `gravity` and `axes` as of `ChainAdjoint`.
+class CoupledStepAdjoint:
+    """Reverse of the steps of a model's net, and of its equilibria; `gravity` and `axes` as of `RodStepAdjoint`.
 
     Args:
-        scheme, posed: as of `ChainAdjoint`.
+        scheme, posed: as of `RodStepAdjoint`.
 
     Raises:
         SceneError: a motion has no gradient, or contact; see `Supports` and `ContactAdjoint`.
@@ -91,11 +91,11 @@ class NetAdjoint:
         motion = self.supports.motion if self.supports else None
         self._midpoint, drag = midpoint, bool(host.drag and scheme)
         self.followers = Followers(model, net, midpoint) if host.followers and scheme else None
-        self.predictor = NetPredictor.of(model, net, motion, scheme)
-        self._shares = Shares(model)
-        self.drag = NetDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
+        self.predictor = CoupledPredictor.of(model, net, motion, scheme)
+        self._shares = CoupledAssembly(model)
+        self.drag = CoupledDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
         self.contact = ContactAdjoint(net) if host.touching else None
-        self.solve = NetSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
+        self.solve = CoupledLinearSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
         self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
         storages = [coupled_storage(part.term, real) for part in net.sets]
@@ -121,7 +121,7 @@ class NetAdjoint:
         self._by_frame = [self._shares.make(FRAME, net.edges) for _ in range(2)]
         self._by_own = [self._shares.make_own() for _ in range(3)]
         self._start_state = net.empty()
-        self._inputs = NetInputs(
+        self._inputs = CoupledInputs(
             parameters=of_sets(lambda term: len(term.parameter_names)),
             data=of_sets(lambda term: term.measure.data_size),
             end_data=of_sets(lambda term: term.measure.data_size),
@@ -147,16 +147,16 @@ class NetAdjoint:
         return own + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float, given: bool = False) -> bool:
-        """As of `ChainAdjoint`, of a `NetStep`."""
+        """As of `RodStepAdjoint`, of a `CoupledStep`."""
         return self.predictor is not None and self.predictor.suit(step, s)
 
     def upload(self, t0: float, t1: float) -> None:
-        """As of `ChainAdjoint`."""
+        """As of `RodStepAdjoint`."""
         for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
             part.upload(t0, t1)
 
-    def lagged(self, before: NetState, states=None) -> wp.array:
-        """As of `ChainAdjoint`."""
+    def lagged(self, before: CoupledState, states=None) -> wp.array:
+        """As of `RodStepAdjoint`."""
         if self.predictor is None:
             return before.frame
         if self.supports:
@@ -164,8 +164,8 @@ class NetAdjoint:
         self.predictor.find(before)
         return self.predictor.state.frame
 
-    def keep(self, step, before: NetState) -> NetKept:
-        """What the step that a `NetStep` has just made leaves for its reverse; `before` has to stay as it is."""
+    def keep(self, step, before: CoupledState) -> CoupledSavedStep:
+        """What the step that a `CoupledStep` has just made leaves for its reverse; `before` has to stay as it is."""
         net, q = self.net, wp.clone(step.newton.q)
         data = {index: wp.clone(values) for index, values in step._data.items()}
         solved = replace(before, q=q, data=data)
@@ -174,12 +174,18 @@ class NetAdjoint:
             solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
         islands = step.islands
         lagged = [wp.clone(values) for values in step.newton.contact.solutions] if self.contact else []
-        return NetKept(before, solved, wp.clone(islands.portion), wp.clone(islands.retries), lagged=lagged)
+        return CoupledSavedStep(before, solved, wp.clone(islands.portion), wp.clone(islands.retries), lagged=lagged)
 
     def pull(
-        self, kept: NetKept, after: NetState, given: NetState, s: float, states=None, factors: bool = False
-    ) -> tuple[NetState, NetInputs]:
-        """As `ChainAdjoint.pull`; `factors`: as of `NetSolve`."""
+        self,
+        kept: CoupledSavedStep,
+        after: CoupledState,
+        given: CoupledState,
+        s: float,
+        states=None,
+        factors: bool = False,
+    ) -> tuple[CoupledState, CoupledInputs]:
+        """As `RodStepAdjoint.pull`; `factors`: as of `CoupledLinearSolve`."""
         net, solved, before, shares = self.net, kept.solved, kept.before, self._shares
         rate, last = 1.0 / s, net.blocks - net.host.spins
         start, inputs, by_end, by_q, w = self._start_state, self._inputs, self._by_end, self._by_q, self._w

@@ -11,11 +11,11 @@ from ddg_warp.kernels.adjoint.drag import chain_kernels, net_kernels
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.kernels.forces.drag import ROWS, block_inertia
-from ddg_warp.solve.forces.drag import ChainDrag, NetDrag
+from ddg_warp.solve.forces.drag import ChainDrag, CoupledDrag
 from ddg_warp.solve.linear.sparse_system import lists
 
 
-class ChainDragAdjoint:
+class RodDragAdjoint:
     """VJP of drag on a rod group.
 
     Attributes:
@@ -44,7 +44,7 @@ class ChainDragAdjoint:
         self.drag.resist(before, target, islands)
 
     def matrix(self, before, tangents: wp.array, rate: float) -> sparse.csc_matrix:
-        """Return the drag matrix of a solve, in the dof order of a `ChainTangent`."""
+        """Return the drag matrix of a solve, in the dof order of a `RodTangent`."""
         group, kind, real, device = self.group, self.group.kind, self.model.types.real, self.model.wp_device
         if self._islands is None:
             shape = group.nodes, group.columns
@@ -104,8 +104,8 @@ class ChainDragAdjoint:
         wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.model.wp_device)
 
 
-class NetDragAdjoint:
-    """VJP of drag on the coupled system; further attributes as `ChainDragAdjoint`.
+class CoupledDragAdjoint:
+    """VJP of drag on the coupled system; further attributes as `RodDragAdjoint`.
 
     Args:
         gather: kernel that assembles contributions of edges to dof blocks.
@@ -116,7 +116,7 @@ class NetDragAdjoint:
 
     def __init__(self, model, net, midpoint: bool, gather):
         real, device, (ends, angles, _) = model.types.real, net.device, net.host.drag
-        self.net, self.drag, self._gather = net, NetDrag(model, midpoint), gather
+        self.net, self.drag, self._gather = net, CoupledDrag(model, midpoint), gather
         self._edges, self._nodes = net_kernels(real, midpoint)
         self._ends, self._angles = (
             wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device) for values in (ends.T, angles)
@@ -158,7 +158,7 @@ class NetDragAdjoint:
         by_rate,
         by_tangents,
     ):
-        """Add gradients as `ChainDragAdjoint.pull`, for a solve with the solution q; `by_tangents` is required."""
+        """Add gradients as `RodDragAdjoint.pull`, for a solve with the solution q; `by_tangents` is required."""
         net, drag = self.net, self.drag
         read = [tangents, before.q, before.v, q, self._ends, self._angles, net.drag, drag.flow, w, rate]
         outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]

@@ -12,7 +12,7 @@ class Followers:
     """VJP of the follower loads of a rod group or of the coupled system.
 
     Args:
-        part: `Group` or `DeviceNet`.
+        part: `RodGroup` or `CoupledModel`.
     """
 
     def __init__(self, model, part, midpoint: bool):

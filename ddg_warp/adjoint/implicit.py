@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from ddg_warp.adjoint.coupled_step import NetAdjoint, NetKept
-from ddg_warp.adjoint.rod_step import ChainAdjoint, Kept
+from ddg_warp.adjoint.coupled_step import CoupledSavedStep, CoupledStepAdjoint
+from ddg_warp.adjoint.rod_step import RodStepAdjoint, SavedStep
 from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.controls import Controls, checked
-from ddg_warp.model.coupled_model import NetState
+from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.model.state import State, check_state
 
 
@@ -57,8 +57,8 @@ class Adjoint:
         self.integrator, self.model = integrator, integrator.model
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()
-        self.chains = [ChainAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
-        self.net = NetAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
+        self.chains = [RodStepAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
+        self.net = CoupledStepAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
         self._grips = (
             self.model.empty_state().grips
         )  # gradient with respect to grip poses; see `ddg_warp.torch.grip_poses`
@@ -88,7 +88,8 @@ class Adjoint:
         return kept + ([self.net.keep(integrator._net, state.net)] if self.net else [])
 
     def pull(self, tape: Tape, cotangent: State) -> tuple[State, list]:
-        """Return the VJP of a step: the gradient with respect to its start state, and `ChainInputs` of every rod group and `NetInputs`.
+        """Return the VJP of a step: the gradient with respect to its start state, and `RodInputs` of every rod group and
+        `CoupledInputs`.
 
         Args:
             tape: of the step.
@@ -126,7 +127,7 @@ class Adjoint:
         return changed
 
     def outgrown(self, parts: list) -> bool:
-        """Return True if contact pairs of the last `pull_parts` exceeded the capacity; see `NetAdjoint.outgrown`."""
+        """Return True if contact pairs of the last `pull_parts` exceeded the capacity; see `CoupledStepAdjoint.outgrown`."""
         return self.net is not None and self.net.outgrown(parts[-1].solved.q)
 
     def pull_parts(
@@ -178,8 +179,8 @@ class EquilibriumAdjoint:
 
     def __init__(self, model, posed: bool = False):
         self.model = model
-        self.chains = [ChainAdjoint(model, group, None, posed) for group in model.groups]
-        self.net = NetAdjoint(model, None, posed) if model.net is not None else None
+        self.chains = [RodStepAdjoint(model, group, None, posed) for group in model.groups]
+        self.net = CoupledStepAdjoint(model, None, posed) if model.net is not None else None
         self.by_before = None
 
     @property
@@ -188,7 +189,7 @@ class EquilibriumAdjoint:
         return [*self.chains, *([self.net] if self.net else [])]
 
     def pull(self, state: State, cotangent: State, controls: Controls | None = None) -> list:
-        """Return the gradient with respect to the inputs of the residual: `ChainInputs` of every rod group, `NetInputs`.
+        """Return the gradient with respect to the inputs of the residual: `RodInputs` of every rod group, `CoupledInputs`.
 
         Args:
             state: the equilibrium; its time is the load parameter, which scales gravity and hence the gradients by gravity and
@@ -209,12 +210,12 @@ class EquilibriumAdjoint:
             own.gravity.assign(np.ascontiguousarray(gravity[:, list(own.axes)], float))
             own.upload(state.time, state.time)
         for own, group_state, by_group in zip(self.chains, state.groups, cotangent.groups, strict=True):
-            kept = Kept(group_state, group_state.x, group_state.theta, group_state.frame, None, time=state.time)
+            kept = SavedStep(group_state, group_state.x, group_state.theta, group_state.frame, None, time=state.time)
             inputs += _copied(
                 self.model.empty_state(), [own.pull(kept, group_state, by_group, np.inf, (state, state))[1]]
             )[1]
         if self.net:
-            kept = NetKept(state.net, state.net, None, time=state.time)
+            kept = CoupledSavedStep(state.net, state.net, None, time=state.time)
             if self.rubs:
                 kept = replace(kept, before=self._before(state), rubbing=1.0 / state.sliding.increment)
             asked = kept, state.net, cotangent.net, np.inf, (state, state)
@@ -235,7 +236,7 @@ class EquilibriumAdjoint:
         """True if equilibria have friction."""
         return self.net is not None and self.net.net.host.touching is not None and self.net.net.host.touching.rubs
 
-    def _before(self, state: State) -> NetState:
+    def _before(self, state: State) -> CoupledState:
         """Return the coupled state of the equilibrium before."""
         if state.sliding is None:
             raise SceneError(
@@ -258,7 +259,7 @@ def _cloned(value):
     return None if value is None else wp.clone(value)
 
 
-def _require_minimum(adjoint: ChainAdjoint, part) -> None:
+def _require_minimum(adjoint: RodStepAdjoint, part) -> None:
     """Refuse the backward pass of a step that ended at a saddle point, where the Hessian has negative pivots."""
     saddles = np.flatnonzero(adjoint.solve.failed.numpy())
     if len(saddles):
@@ -268,7 +269,9 @@ def _require_minimum(adjoint: ChainAdjoint, part) -> None:
         )
 
 
-def _require_one_solve(adjoint: ChainAdjoint | NetAdjoint, kept: Kept | NetKept, states: tuple, part) -> None:
+def _require_one_solve(
+    adjoint: RodStepAdjoint | CoupledStepAdjoint, kept: SavedStep | CoupledSavedStep, states: tuple, part
+) -> None:
     """Refuse the backward pass of a step with substeps, with a retry that its predictor depends on, or with updated frames."""
     lagged, solved_frame = adjoint.lagged(kept.before, states), kept.frame
     changed = (lagged.numpy() != solved_frame.numpy()).any(0)

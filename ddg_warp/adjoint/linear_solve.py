@@ -12,11 +12,11 @@ from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint import float32_error, iterative_refinement
 from ddg_warp.kernels.adjoint.coupled_linear_solve import check_kernels
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
-from ddg_warp.solve.equilibrium.rod_tangent import ChainTangent
+from ddg_warp.solve.equilibrium.rod_tangent import RodTangent
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
 from ddg_warp.solve.linear.solver_selection import automatic
 from ddg_warp.solve.linear.sparse_direct import SingularError, regular
-from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
 
@@ -206,7 +206,7 @@ class DirectSolve:
             return
         few = automatic(group) == "partitioned"
         if not few and linear is None:
-            self.solver, self.system = None, ChainNewton(*arguments)
+            self.solver, self.system = None, RodNewton(*arguments)
             self._moved = self.system.x, self.system.theta  # arrays that the sweep moves along w
             self.failed = self.system.islands.status
             return
@@ -233,7 +233,7 @@ class DirectSolve:
         return [*around, self.system._assemble, *self.solver.kernels, *refined]
 
     def __call__(self, solved, last: wp.array, rate: float, coefficient: float, right: wp.array, w: wp.array, resisted):
-        """Write w; launches only. Arguments as of `ChainSolve`, `coefficient` that of inertia [1/s^2]."""
+        """Write w; launches only. Arguments as of `RodLinearSolve`, `coefficient` that of inertia [1/s^2]."""
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
         islands = system.islands
@@ -272,7 +272,7 @@ class DirectSolve:
         wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
 
 
-class ChainSolve:
+class RodLinearSolve:
     """Solver of H w = g of a rod group, in the precision of its state; of equilibria on the host.
 
     Factors have the precision of the model's linear algebra if accurate enough.
@@ -288,7 +288,7 @@ class ChainSolve:
 
     def __init__(self, model, group):
         self.model, self.group = model, group
-        self.host = HostSolve(ChainTangent(model, group, 0))
+        self.host = HostSolve(RodTangent(model, group, 0))
         self.tangent, self.held = self.host.tangent, None
         self.system, self.exact, self._for = DirectSolve(model, group), None, None
         self.failed = self.system.failed
@@ -340,7 +340,7 @@ class ChainSolve:
             solved: the solution `x`, `theta` and its lagged `frame`.
             last: strains of the last step.
             s: length of the implicit Euler step [s]; infinite for an equilibrium with the load parameter `solved.time`.
-            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes of the tangents.
+            resisted: with drag, its `RodDragAdjoint`, the state before the step, and the nodes of the tangents.
 
         Raises:
             SolverError: H is singular (host only; see `failed`).

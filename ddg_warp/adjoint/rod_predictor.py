@@ -11,7 +11,7 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.stepping import rod_step
 
 
-class ChainPredictor:
+class RodPredictor:
     """Predictor of a rod group with a VJP, for whole steps solved at the first attempt.
 
     Args:
@@ -47,7 +47,7 @@ class ChainPredictor:
         self._pull = rod_predictor.predict_kernel(kind, real, midpoint)
 
     @classmethod
-    def of(cls, model, group, motion, scheme: str | None) -> "ChainPredictor | None":
+    def of(cls, model, group, motion, scheme: str | None) -> "RodPredictor | None":
         """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         kind, midpoint = group.kind, scheme == "implicit_midpoint"
         needed = scheme and (group.host.followers or (midpoint and (kind.twist or kind.drag)))
@@ -59,7 +59,7 @@ class ChainPredictor:
         return [self._begin, self._predict, self._pull, *([self._carry] if self._carry else [])]
 
     def suit(self, solved, s: float) -> bool:
-        """Prepare for solves of a `ChainStep` over s [s]; return True if kernels or arrays have changed."""
+        """Prepare for solves of a `RodStep` over s [s]; return True if kernels or arrays have changed."""
         linear = solved.newton.linear
         if self._for != (s, self.model.version):
             self._for = s, self.model.version

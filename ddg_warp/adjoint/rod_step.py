@@ -6,20 +6,20 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.adjoint.drag import ChainDragAdjoint
+from ddg_warp.adjoint.drag import RodDragAdjoint
 from ddg_warp.adjoint.follower_loads import Followers
-from ddg_warp.adjoint.linear_solve import ChainSolve
-from ddg_warp.adjoint.rod_predictor import ChainPredictor
+from ddg_warp.adjoint.linear_solve import RodLinearSolve
+from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.compile.dof_map import FREE
 from ddg_warp.kernels.adjoint import elements, rod_elements
 from ddg_warp.kernels.adjoint import rod_step as step
 from ddg_warp.kernels.elements.rod_layout import rod_storage
-from ddg_warp.model.state import GroupState
+from ddg_warp.model.state import RodGroupState
 
 
 @dataclass
-class Kept:
+class SavedStep:
     """What the reverse of a step reads of it.
 
     Attributes:
@@ -29,7 +29,7 @@ class Kept:
         time: load parameter of an equilibrium.
     """
 
-    before: GroupState
+    before: RodGroupState
     x: wp.array
     theta: wp.array
     frame: wp.array
@@ -39,7 +39,7 @@ class Kept:
 
 
 @dataclass
-class ChainInputs:
+class RodInputs:
     """Derivatives by what a step of a group read beside its state, of every element, node or rod.
 
     Attributes:
@@ -62,7 +62,7 @@ class ChainInputs:
     drag: wp.array | None = None
 
 
-class ChainAdjoint:
+class RodStepAdjoint:
     """Reverse of the steps of a group of rods, and of their equilibria.
 
     Attributes:
@@ -86,12 +86,12 @@ class ChainAdjoint:
         midpoint = self._midpoint = scheme == "implicit_midpoint"
         self.device, self.real = device, real
         self.vector = wp.types.vector(kind.dim, real)
-        self.solve = ChainSolve(model, group)
+        self.solve = RodLinearSolve(model, group)
         self.supports = Supports(model, group, midpoint) if (scheme or posed) and group.host.moves else None
         motion = self.supports.motion if self.supports else None
-        self.drag = ChainDragAdjoint(model, group, midpoint) if kind.drag and scheme else None
+        self.drag = RodDragAdjoint(model, group, midpoint) if kind.drag and scheme else None
         self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
-        self.predictor = ChainPredictor.of(model, group, motion, scheme)
+        self.predictor = RodPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         storage, viscous = rod_storage(kind, real), kind.viscous
         self._pull = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
@@ -109,7 +109,7 @@ class ChainAdjoint:
         self._window, self._lag = self._rows(kind.window), self._rows(13)
         self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
         self._by_frame = self._rows(7, twisted and viscous)
-        self._start_state = GroupState(
+        self._start_state = RodGroupState(
             x=self._make(self.vector),
             v=self._make(self.vector),
             theta=self._make(needed=twisted),
@@ -119,7 +119,7 @@ class ChainAdjoint:
             a=self._make(self.vector),
             alpha=self._make(needed=twisted),
         )
-        self._inputs = ChainInputs(
+        self._inputs = RodInputs(
             parameters=self._rows(sum(len(term.parameter_names) for term in kind.terms)),
             mass=self._make(),
             rotary=self._make(),
@@ -132,7 +132,7 @@ class ChainAdjoint:
         )
 
     def suit(self, step, s: float, given: bool = False) -> bool:
-        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before.
+        """From now on reverse solves of a `RodStep` over s [s] by what suits them; whether that is anything else than before.
 
         Args:
             given: whether parameters may be others than those of the model.
@@ -145,7 +145,7 @@ class ChainAdjoint:
         for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
             part.upload(t0, t1)
 
-    def lagged(self, before: GroupState, states=None) -> wp.array:
+    def lagged(self, before: RodGroupState, states=None) -> wp.array:
         """The frames that the solve of a step lags as long as it does not renew them; `states` as of `pull`."""
         if self.predictor is None:
             return before.frame
@@ -154,14 +154,14 @@ class ChainAdjoint:
         self.predictor.find(before)
         return self.predictor.frame
 
-    def keep(self, step, before: GroupState) -> Kept:
-        """What the step that a `ChainStep` has just made leaves for its reverse; `before` has to stay as it is."""
+    def keep(self, step, before: RodGroupState) -> SavedStep:
+        """What the step that a `RodStep` has just made leaves for its reverse; `before` has to stay as it is."""
         newton, twist = step.newton, self.group.kind.twist
         theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
         islands = step.islands
-        return Kept(before, wp.clone(newton.x), theta, frame, wp.clone(islands.portion), wp.clone(islands.retries))
+        return SavedStep(before, wp.clone(newton.x), theta, frame, wp.clone(islands.portion), wp.clone(islands.retries))
 
-    def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float, states=None) -> tuple:
+    def pull(self, kept: SavedStep, after: RodGroupState, given: RodGroupState, s: float, states=None) -> tuple:
         """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
         equilibria.
 
@@ -172,7 +172,7 @@ class ChainAdjoint:
             states: those of the model at both ends, where supports move.
 
         Returns:
-            Derivatives by the start, a `GroupState`, and `ChainInputs`.
+            Derivatives by the start, a `RodGroupState`, and `RodInputs`.
         """
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag

@@ -6,7 +6,7 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.rod_step import angle_kernel
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.solve.forces.prescribed_element_data import NetMotion
+from ddg_warp.solve.forces.prescribed_element_data import CoupledMotion
 from ddg_warp.solve.forces.prescribed_motion import Motion
 
 
@@ -14,7 +14,7 @@ class Supports:
     """VJP of the supports of a rod group or of the coupled system, with motions by time functions or grips.
 
     Args:
-        part: `Group` or `DeviceNet`.
+        part: `RodGroup` or `CoupledModel`.
 
     Attributes:
         islands: islands at the start of a whole step.
@@ -26,7 +26,7 @@ class Supports:
     def __init__(self, model, part, midpoint: bool):
         self.model, self.part, real = model, part, model.types.real
         host = part.host
-        self.motion = NetMotion(model, midpoint) if part is model.net else Motion(model, part, midpoint)
+        self.motion = CoupledMotion(model, midpoint) if part is model.net else Motion(model, part, midpoint)
         self.islands = Islands(part.columns, real, model.wp_device)
         self.islands.portion.fill_(1.0)
         self._angles = angle_kernel(part.dim, real, midpoint)

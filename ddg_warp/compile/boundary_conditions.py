@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ddg_warp.compile.dof_map import FREE, Held, Storage
+from ddg_warp.compile.dof_map import FREE, DofStorage, Held
 from ddg_warp.compile.loads import Couple
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
@@ -23,14 +23,14 @@ def pose_starts(motions: list) -> np.ndarray:
     return np.cumsum([0, *(motion.count or 1 for motion in motions)])
 
 
-def add_masses(scene, storage: Storage) -> None:
+def add_masses(scene, storage: DofStorage) -> None:
     """Add the point masses of rods."""
     for rods, node, mass in scene.masses:
         _, rows = storage.places.among(rods)
         storage.add_mass(storage.places.node(rows, node), mass)
 
 
-def load_rods(scene, storage: Storage) -> None:
+def load_rods(scene, storage: DofStorage) -> None:
     """Add the loads of rods."""
     places = storage.places
     for load in scene.loads:
@@ -44,7 +44,7 @@ def load_rods(scene, storage: Storage) -> None:
             storage.followers += [Couple(*edge, np.array(load.couple), load.amplitude) for edge in edges]
 
 
-def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
+def hold_rods(scene, storage: DofStorage, claims: "ConstraintRegistry") -> None:
     """Fix the dofs that supports of rods name."""
     places = storage.places
     for support in scene.supports:
@@ -60,14 +60,14 @@ def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
         claims.take(support, np.concatenate([_NONE, *nodes]), nth, owners, np.concatenate([_NONE, *angles]))
 
 
-class Claims:
+class ConstraintRegistry:
     """Assignment of poses to fixed dofs; conflicting poses of a dof are refused.
 
     A component named by a support that its motion never changes counts as fixed at rest. So a motion about y does not conflict with a
     symmetry plane "y". A motion that changes none of the named components claims all of them.
     """
 
-    def __init__(self, scene, storage: Storage):
+    def __init__(self, scene, storage: DofStorage):
         self.storage, self.motions = storage, scene_motions(scene)
         self._duration = getattr(scene.analysis, "duration", None) or 1.0
         starts = pose_starts(self.motions)

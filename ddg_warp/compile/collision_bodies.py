@@ -36,7 +36,7 @@ class Body:
 
 
 @dataclass
-class Touching:
+class ContactParameters:
     """Contact of the coupled system.
 
     Attributes:

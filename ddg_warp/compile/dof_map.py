@@ -15,7 +15,7 @@ FREE = -1  # pose index of a dof without prescribed motion
 
 
 @dataclass(frozen=True)
-class Along:
+class RodIndexMap:
     """Index map along rods: entry k of row r is `start[r] + step * k`, looked up in `table` if given."""
 
     start: np.ndarray
@@ -28,7 +28,7 @@ class Along:
 
 
 @dataclass(frozen=True)
-class RodPlaces:
+class RodDofMap:
     """Dof map of the rods of a storage, one a row.
 
     Attributes:
@@ -44,8 +44,8 @@ class RodPlaces:
     closed: np.ndarray
     twist: np.ndarray
     length: np.ndarray
-    nodes: Along
-    angles: Along
+    nodes: RodIndexMap
+    angles: RodIndexMap
 
     @cached_property
     def _row(self) -> np.ndarray:
@@ -89,7 +89,7 @@ class Held:
 
 
 @dataclass(kw_only=True, eq=False)
-class Storage:
+class DofStorage:
     """Boundary conditions and loads of a rod group or of the coupled system.
 
     Attributes:

@@ -12,7 +12,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.scene.scene import Scene
 
 
-class Ghosts:
+class GhostNodes:
     """Ghost nodes outside the ends of a scene's rods.
 
     Attributes:

@@ -55,7 +55,7 @@ def stiffnesses(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s:
     named stiffness counts as the worst case: infinite in stretch, zero in bending.
 
     Args:
-        kind: `ChainKind` of the rods.
+        kind: `RodKind` of the rods.
         mass: mean nodal mass (R,) [kg]; length: (R,) [m].
         parameters: parameters of all terms, "term.parameter", each broadcastable to (n, R).
     """

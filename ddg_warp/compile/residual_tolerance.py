@@ -38,7 +38,7 @@ class Level:
     body: np.ndarray
 
 
-class Bodies:
+class ToleranceBodies:
     """Bodies of the coupled system, by which residuals are normalised.
 
     Attributes:

@@ -6,11 +6,11 @@ from functools import cached_property
 import numpy as np
 
 from ddg_warp.compile import boundary_conditions
-from ddg_warp.compile.dof_map import Along, RodPlaces, Storage
-from ddg_warp.compile.ghost_nodes import Ghosts
-from ddg_warp.compile.rods import Alike, alike, compress, net_rods, piece_of
+from ddg_warp.compile.dof_map import DofStorage, RodDofMap, RodIndexMap
+from ddg_warp.compile.ghost_nodes import GhostNodes
+from ddg_warp.compile.rods import UniformRods, alike, compress, net_rods, piece_of
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.forces.drag import ROWS as DRAG_ROWS
 from ddg_warp.scene import drag
 from ddg_warp.scene.scene import Scene
@@ -19,7 +19,7 @@ PADDING = 1.25  # longest over shortest rod of a group
 
 
 @dataclass(kw_only=True, eq=False)
-class ChainGroup(Storage):
+class RodGroupData(DofStorage):
     """Rod group on the host: R rods of one kind and similar length, n nodes of the longest.
 
     Node k of rod r has the index k R + r.
@@ -38,7 +38,7 @@ class ChainGroup(Storage):
         parameters: parameters of all terms, "term.parameter", each broadcastable to (n, R).
     """
 
-    kind: ChainKind
+    kind: RodKind
     rods: np.ndarray
     first: np.ndarray
     own: np.ndarray
@@ -70,12 +70,12 @@ class ChainGroup(Storage):
         return self.nodes * (2 if self.kind.twist else 1)
 
     @cached_property
-    def places(self) -> RodPlaces:
+    def places(self) -> RodDofMap:
         rods = len(self.rods)
         closed, twist = np.full(rods, self.kind.closed), np.full(rods, self.kind.twist)
         first = self.first * rods + np.arange(rods)
-        nodes, angles = Along(first, rods), Along(first + self.nodes, rods)
-        return RodPlaces(self.rods, self.own, closed, twist, self.length, nodes, angles)
+        nodes, angles = RodIndexMap(first, rods), RodIndexMap(first + self.nodes, rods)
+        return RodDofMap(self.rods, self.own, closed, twist, self.length, nodes, angles)
 
     def index(self, places: np.ndarray) -> np.ndarray:
         return places % self.nodes
@@ -125,7 +125,7 @@ class ChainGroup(Storage):
         return f"{kind} {k - self.first[column]} of rod {self.rods[column]}"
 
 
-def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[ChainGroup]:
+def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[RodGroupData]:
     """Return the groups of uncoupled rods of a scene, with boundary conditions, masses and loads.
 
     Args:
@@ -138,11 +138,11 @@ def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[Chain
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
-    ghosts, laws = Ghosts(scene), drag.Laws(scene)
+    ghosts, laws = GhostNodes(scene), drag.Laws(scene)
     chosen = ~net_rods(scene) if chosen is None else chosen
     parts = [part for batch in scene.batches for part in alike(scene.dimension, batch, ghosts, laws, chosen)]
     parts.sort(key=lambda part: (*part.kind.key, part.nodes))
-    groups: list[list[Alike]] = []
+    groups: list[list[UniformRods]] = []
     for part in parts:
         last = groups[-1] if groups else None
         if last and last[0].kind == part.kind and part.nodes <= PADDING * last[0].nodes:
@@ -151,7 +151,7 @@ def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[Chain
             groups.append([part])
     chains = [_join(group, ghosts, laws) for group in groups]
     for chain in chains:
-        claims = boundary_conditions.Claims(scene, chain)
+        claims = boundary_conditions.ConstraintRegistry(scene, chain)
         boundary_conditions.hold_rods(scene, chain, claims)
         claims.finish()
         boundary_conditions.add_masses(scene, chain)
@@ -159,7 +159,7 @@ def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[Chain
     return chains
 
 
-def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
+def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodGroupData:
     kind, rods = parts[0].kind, np.concatenate([part.rods for part in parts])
     count = np.concatenate([np.full(len(part.rods), part.nodes) for part in parts])
     n, total = int(count.max()), len(rods)
@@ -181,7 +181,7 @@ def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
     fixed = np.zeros((n, total), np.uint8)
     if kind.twist and not kind.closed:
         fixed[count - 1, np.arange(total)] = 1 << kind.dim  # the last node starts no edge
-    return ChainGroup(
+    return RodGroupData(
         kind=kind,
         rods=rods,
         first=np.concatenate([np.full(len(part.rods), part.ghosts[0]) for part in parts]),

@@ -5,12 +5,12 @@ from itertools import product
 
 import numpy as np
 
-from ddg_warp.compile.ghost_nodes import Ghosts, end_director, ghost_node
+from ddg_warp.compile.ghost_nodes import GhostNodes, end_director, ghost_node
 from ddg_warp.compile.half_cells import HalfCells
 from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import drag
 from ddg_warp.scene.contact import touching_names
@@ -20,13 +20,13 @@ from ddg_warp.scene.validate import check_batch
 
 
 @dataclass(frozen=True)
-class Alike:
+class UniformRods:
     """Rods of one batch with equal ghosts, all with drag or all without."""
 
     batch: RodBatch
     rows: np.ndarray  # of the batch
     ghosts: tuple[int, int]  # at the first and last node, 0 or 1
-    kind: ChainKind
+    kind: RodKind
 
     @property
     def nodes(self) -> int:
@@ -39,19 +39,19 @@ class Alike:
         return self.batch.first + self.rows
 
     @property
-    def runs(self) -> list["Alike"]:
+    def runs(self) -> list["UniformRods"]:
         """Runs of a few rods each, so that intermediate arrays stay in the cache."""
         return [replace(self, rows=rows) for rows in self.batch.runs(self.rows)]
 
 
 @dataclass
-class Piece:
-    """Arrays (R, ...) of a run of rods with equal ghosts, ghosts included; attributes as in `ChainGroup`."""
+class RodArrays:
+    """Arrays (R, ...) of a run of rods with equal ghosts, ghosts included; attributes as in `RodGroupData`."""
 
     batch: RodBatch
     rods: np.ndarray
     ghosts: tuple[int, int]
-    kind: ChainKind
+    kind: RodKind
     x: np.ndarray
     tangent: np.ndarray
     director: np.ndarray
@@ -79,7 +79,9 @@ def net_rods(scene: Scene) -> np.ndarray:
     return chosen
 
 
-def alike(dimension: int, batch: RodBatch, ghosts: Ghosts, laws: drag.Laws, chosen: np.ndarray) -> list[Alike]:
+def alike(
+    dimension: int, batch: RodBatch, ghosts: GhostNodes, laws: drag.Laws, chosen: np.ndarray
+) -> list[UniformRods]:
     """Return the chosen rods (R,) of a batch, grouped by ghosts and drag."""
     check_batch(batch, dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
@@ -90,11 +92,11 @@ def alike(dimension: int, batch: RodBatch, ghosts: Ghosts, laws: drag.Laws, chos
     for *pattern, drags in product((0, 1), (0, 1), (False, True)):
         rows = np.flatnonzero((flags == pattern).all(1) & (dragged == drags) & chosen)
         if rows.size:
-            result.append(Alike(batch, rows, tuple(pattern), _kind(dimension, batch, drags)))
+            result.append(UniformRods(batch, rows, tuple(pattern), _kind(dimension, batch, drags)))
     return result
 
 
-def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
+def _kind(dimension: int, batch: RodBatch, dragged: bool) -> RodKind:
     prefix = "planar" if dimension == 2 else "rod"
     names = [f"{prefix}_stretch"]
     if batch.bend:
@@ -103,10 +105,10 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
     keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
     terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
-    return ChainKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
+    return RodKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
 
 
-def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
+def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArrays:
     """Return the arrays of some rods.
 
     Raises:
@@ -179,7 +181,7 @@ def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
 
         values = _bound(batch, term, inputs, on_edges, None if stretch else cells)
         parameters |= {f"{term.name}.{name}": compress(np.atleast_2d(v)) for name, v in values.items()}
-    return Piece(
+    return RodArrays(
         batch,
         rods,
         part.ghosts,
@@ -217,7 +219,7 @@ def _bound(batch: RodBatch, term: Term, inputs: dict, on_edges, cells: HalfCells
     return bind_law(where, term, law, inputs, along, f"the {batch.rods} rods and {batch.edges} edges")
 
 
-def _bending(section, kind: ChainKind) -> list:
+def _bending(section, kind: RodKind) -> list:
     if kind.twist:
         return [section.EI1, section.EI2, section.GJ]
     return [section.EI1] * (3 if kind.dim == 3 else 1)

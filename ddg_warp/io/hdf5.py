@@ -7,7 +7,7 @@
                   obstacles; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
                   one after the other, up to contacts/ends[f] for frame f
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
-                  any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `Touching`, parameters/NAME,
+                  any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `ContactParameters`, parameters/NAME,
                   attributes/NAME of rods
     /control      options of the run
     /checkpoint   a and b, alternately the state at the last frame, at full precision; the attribute current names the last;

@@ -20,7 +20,7 @@ class Revolution:
         sides: Corners of each ring, three at least.
 
     Attributes:
-        shapes: The surfaces as `Shapes`, for writers.
+        shapes: The surfaces as `CollisionMesh`, for writers.
     """
 
     def __init__(self, curves: Curves, points: np.ndarray, sides: int):

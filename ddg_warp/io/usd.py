@@ -43,7 +43,7 @@ class CurvesWriter:
 
     Args:
         path: The file, .usdc or .usda; an existing one is replaced.
-        curves: Rods without points, such as `model.curves`, or a `CurveSet`; or `Shapes` of rods and surfaces.
+        curves: Rods without points, such as `model.curves`, or a `CurveSet`; or `CollisionMesh` of rods and surfaces.
         fps: Time codes per second.
         colors: RGB of each rod, shape (R, 3), or of each rod point; by default one color a batch.
         color_by: Name of a scalar shown by color instead, and its values at both ends of the scale.

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays as arrays
-from ddg_warp.compile.coupled.system import Net, inert_mass
+from ddg_warp.compile.coupled.system import CoupledSystem, inert_mass
 from ddg_warp.compile.precision import float32_error, stiffnesses
 from ddg_warp.kernels.elements import coupled_element as elements
 from ddg_warp.kernels.elements import coupled_frames as frames
@@ -17,12 +17,12 @@ from ddg_warp.model.rod_elements import RodElements
 
 
 @dataclass
-class NetState:
+class CoupledState:
     """Device arrays of the coupled system with N dof blocks and W worlds.
 
     Attributes:
         q, v: blocks (W N,) of positions [m], twist angles and rotation vectors since the last step [rad], and their rates.
-        a: accelerations of blocks (W N,) for the warm start; see `GroupState` and `kernels.stepping.coupled_warm_start`.
+        a: accelerations of blocks (W N,) for the warm start; see `RodGroupState` and `kernels.stepping.coupled_warm_start`.
         frame: director and tangent of rod edges (6, W edges).
         lag: time-lagged rows of each element set (rows, W E).
         last: strains of each damped set at this state.
@@ -49,8 +49,8 @@ class NetState:
         return named | {f"data_{i}": data for i, data in self.data.items()}
 
 
-class DeviceSet:
-    """Element set on the device, with its parameters as in `Group`.
+class ElementSetArrays:
+    """Element set on the device, with its parameters as in `RodGroup`.
 
     Attributes:
         turning: element, first row of the data and motion (n, 3) of the normals that supports rotate.
@@ -111,8 +111,8 @@ class DeviceSet:
         return self.parameters.set(**changed)
 
 
-class DeviceNet:
-    """Coupled system: a `Net` with all worlds on a device.
+class CoupledModel:
+    """Coupled system: a `CoupledSystem` with all worlds on a device.
 
     Args:
         motions: index of the motion that rotates each support of shells and rings, -1 for none.
@@ -125,13 +125,13 @@ class DeviceNet:
         touching: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).
     """
 
-    def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
+    def __init__(self, host: CoupledSystem, worlds: int, device, real, motions: np.ndarray):
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
         self.vector = wp.types.vector(3, real)
         self.blocks, self.angle_start = host.blocks, host.nodes
         self.dim, self.world_columns, self.columns = 3, 1, worlds
         self.edges = host.rod_edges
-        self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
+        self.sets = [ElementSetArrays(s, worlds, device, real, motions) for s in host.sets]
         self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
         self._stiffnesses = None, None  # key and values
         self._along = {}  # elements of pieces of rods
@@ -160,11 +160,11 @@ class DeviceNet:
         rows_of_sets = [self._zeros(rows, self.worlds * elements if rows else 1) for rows, elements in counts]
         return self._zeros(6, self.worlds * self.edges), rows_of_sets
 
-    def empty(self) -> NetState:
+    def empty(self) -> CoupledState:
         """Allocate a state."""
         blocks = self.worlds * self.blocks
         q, v, a = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(3))
-        state = NetState(q, v, a, *self.lagged())
+        state = CoupledState(q, v, a, *self.lagged())
         for part in self.sets:
             count = self.worlds * part.elements
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
@@ -217,7 +217,7 @@ class DeviceNet:
         """Return rest data of element sets in the magnetic field, by index."""
         return {i: part.own_data() for i, part in enumerate(self.sets) if part.term.measure.field}
 
-    def rest(self) -> NetState:
+    def rest(self) -> CoupledState:
         """Return the rest state."""
         state = self.empty()
         state.q.assign(np.tile(self.host.rest, (self.worlds, 1)))
@@ -263,7 +263,7 @@ class DeviceNet:
         """Return float32 errors of the mixed axial-force formulation for the rods of every world."""
         return self.host.split_errors(self.rod_stiffnesses(s))
 
-    def elements(self, state: NetState, index: int, q=None, rate=None):
+    def elements(self, state: CoupledState, index: int, q=None, rate=None):
         """Return the kernel struct of element set `index` at a state, optionally with other dofs `q` and a rate."""
         part, inputs = self.sets[index], elements.elements_type(self.real)()
         inputs.q, inputs.frame = state.q if q is None else q, state.frame
@@ -274,7 +274,7 @@ class DeviceNet:
         inputs.elements = part.elements
         return inputs
 
-    def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
+    def strains(self, state: CoupledState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
         """Compute strains of an element set (strains, W E), and stresses if `stress` is given."""
         part = self.sets[index]
         wp.launch(
@@ -285,14 +285,14 @@ class DeviceNet:
             device=self.device,
         )
 
-    def update_strains(self, state: NetState) -> None:
+    def update_strains(self, state: CoupledState) -> None:
         """Store the strains of a state for strain-rate damping."""
         for index, part in enumerate(self.sets):
             if part.term.density.lagged:
                 self.strains(state, index, state.last[index])
 
     def carry(
-        self, before: NetState, after: NetState, kept: NetState | None = None, moved: wp.array | None = None
+        self, before: CoupledState, after: CoupledState, kept: CoupledState | None = None, moved: wp.array | None = None
     ) -> None:
         """Update time-lagged data of `after` from `before` at the positions of `after`, and zero joint rotations.
 
@@ -302,7 +302,7 @@ class DeviceNet:
             self._carry(before, after, after.q, kept or before, moved or self.every, 1, 0)
             self.reset_spins(after.q)
 
-    def renew(self, state: NetState, q: wp.array, todo: wp.array) -> None:
+    def renew(self, state: CoupledState, q: wp.array, todo: wp.array) -> None:
         """Update frames and time-lagged data of `state` to iterate q in worlds that `todo` marks; strains stay."""
         self._carry(state, state, q, state, todo, RELAG, 1)
 

@@ -27,6 +27,6 @@ def point_masses(model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def vertex_masses(shell) -> np.ndarray:
-    """Return vertex masses of a `NetShell`, lumped from triangles [kg]."""
+    """Return vertex masses of a `CoupledShell`, lumped from triangles [kg]."""
     corners = shell.surface.triangles.ravel()
     return np.bincount(corners, np.repeat(shell.corner_mass, 3), len(shell.nodes))

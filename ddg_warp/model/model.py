@@ -20,10 +20,10 @@ from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step
 from ddg_warp.model import rod_shell_coupling
 from ddg_warp.model.parameters import valid_numbers
-from ddg_warp.model.rebuild import Recipe
-from ddg_warp.model.rod_group import Group
-from ddg_warp.model.state import GripState, GroupState, State, check_state
-from ddg_warp.model.user_numbering import Order
+from ddg_warp.model.rebuild import ModelBuilder
+from ddg_warp.model.rod_group import RodGroup
+from ddg_warp.model.state import GripState, RodGroupState, State, check_state
+from ddg_warp.model.user_numbering import UserNumbering
 from ddg_warp.scene.grip import Grip
 
 
@@ -64,20 +64,20 @@ class Model:
         self.chains = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.grips = [motion for motion in self.motions if isinstance(motion, Grip)]
-        self.groups = [Group(chain, scene, self.worlds, self.wp_device, self.types.real) for chain in self.chains]
+        self.groups = [RodGroup(chain, scene, self.worlds, self.wp_device, self.types.real) for chain in self.chains]
         self.net = self._build_net() if needs_net(scene) else None
-        self.order = Order(self)
+        self.order = UserNumbering(self)
 
     def _build_net(self):
         from ddg_warp.compile.coupled.builder import compile_net
-        from ddg_warp.model.coupled_model import DeviceNet
+        from ddg_warp.model.coupled_model import CoupledModel
 
         supports = [*self.scene.shell_supports, *self.scene.ring_supports]
         turning = [s.motion is not None and s.motion.turns for s in supports]
         place = {id(motion): i for i, motion in enumerate(self.motions)}
         motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
         net = compile_net(self.scene, along=self.wp_device.is_cpu)
-        return DeviceNet(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
+        return CoupledModel(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
 
     def __repr__(self) -> str:
         scene, net = self.scene, self.net
@@ -93,7 +93,7 @@ class Model:
 
     def __reduce__(self):
         """Have pickle, torch.save and copy.deepcopy rebuild the scene with the current parameters and rest shapes."""
-        return Recipe.build, (Recipe(self, self.worlds),)
+        return ModelBuilder.build, (ModelBuilder(self, self.worlds),)
 
     @property
     def device(self) -> str:
@@ -133,12 +133,12 @@ class Model:
 
     @cached_property
     def touch(self):
-        """Contact queries at given states (`Touch`); None without contact."""
-        from ddg_warp.solve.collision.contact_model import Touch
+        """Contact queries at given states (`ContactModel`); None without contact."""
+        from ddg_warp.solve.collision.contact_model import ContactModel
 
         if self.net is None or self.net.host.touching is None:
             return None
-        return Touch(self.net, self.types.real, self.net.rest().q)
+        return ContactModel(self.net, self.types.real, self.net.rest().q)
 
     @property
     def magnetic(self) -> bool:
@@ -400,7 +400,7 @@ class Model:
         state.time, state.spun = float(snapshot["time"]), "spun" in snapshot
         return state
 
-    def group_state(self, group: Group) -> GroupState:
+    def group_state(self, group: RodGroup) -> RodGroupState:
         """Allocate the state of a rod group."""
         kind, real = group.kind, self.types.real
         vector = wp.types.vector(kind.dim, real)
@@ -409,7 +409,7 @@ class Model:
         def make(shape, dtype, needed=True):
             return device_arrays.allocate(shape if needed else (1,) * len(shape), dtype, self.wp_device)
 
-        return GroupState(
+        return RodGroupState(
             x=make(nodes, vector),
             v=make(nodes, vector),
             theta=make(nodes, real, kind.twist),
@@ -445,7 +445,7 @@ class Model:
         if self.net is not None:
             self.net.update_strains(state.net)
 
-    def strains(self, group: Group, data: GroupState, out: wp.array, stress: wp.array | None = None) -> None:
+    def strains(self, group: RodGroup, data: RodGroupState, out: wp.array, stress: wp.array | None = None) -> None:
         """Launch the strain kernel of a group; write elastic stresses to `stress` if given. Can be captured."""
         wp.launch(
             element_path.strain_kernel(rod_storage(group.kind, self.types.real), self.types.real),

@@ -5,7 +5,7 @@ import numpy as np
 from ddg_warp.errors import SceneError
 
 
-class Recipe:
+class ModelBuilder:
     """Scene, options, parameters and rest shapes of a model, for rebuilding it with `worlds` worlds.
 
     Raises:

@@ -7,8 +7,8 @@ class RodElements:
     """Map from rods of one kind to elements in the element sets of the coupled system.
 
     Args:
-        net: a `DeviceNet`.
-        kind: `ChainKind` of the rods.
+        net: a `CoupledModel`.
+        kind: `RodKind` of the rods.
         rods: the scene's indices (R,).
         nodes: number of nodes of the longest rod, with ghosts.
 

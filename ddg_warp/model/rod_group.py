@@ -7,13 +7,13 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.compile import precision
-from ddg_warp.compile.rod_groups import ChainGroup
+from ddg_warp.compile.rod_groups import RodGroupData
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene import drag
 
 
-class Group:
+class RodGroup:
     """Constant device arrays of one rod group, all worlds side by side (column = world * R + rod).
 
     Attributes:
@@ -21,7 +21,7 @@ class Group:
         weighed: whether `mass` and `rotary` may differ from `host`.
     """
 
-    def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
+    def __init__(self, host: RodGroupData, scene, worlds: int, device, real):
         kind = replace(host.kind, serial=device_arrays.serial(device))
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
@@ -146,19 +146,19 @@ class Group:
         return errors if self.kind.span == 2 and self.kind.edge_strains == self.kind.tensions == 1 else errors + np.inf
 
 
-def _last_anchor(host: ChainGroup) -> np.ndarray:
+def _last_anchor(host: RodGroupData) -> np.ndarray:
     """Return the last node of every rod (R,) that is fixed in all directions, or -1."""
     return np.where(host.anchored, np.arange(host.shape[0])[:, None], -1).max(axis=0)
 
 
-def _constant_loads(host: ChainGroup) -> tuple[np.ndarray, np.ndarray]:
+def _constant_loads(host: RodGroupData) -> tuple[np.ndarray, np.ndarray]:
     """Return constant nodal forces (n, R, dim) [N] and edge moments (n, R) [N m]; moments (1, 1) without twist."""
     load = host.constant_loads()
     force = load[: host.nodes].reshape(*host.shape, 3)[..., :: 2 if host.kind.dim == 2 else 1]
     return force, load[host.nodes :, 0].reshape(host.shape) if host.kind.twist else np.zeros((1, 1))
 
 
-def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:
+def _outer_forces(host: RodGroupData, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:
     """Return the load scale of every rod (R,) [N]: sum of the magnitudes of external forces."""
     forces, rods = np.zeros_like(host.mass), len(host.rods)
     for d, g in enumerate(gravity):
@@ -172,7 +172,7 @@ def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, momen
     return total + changing_forces(host).reshape(-1, rods).sum(0)
 
 
-def changing_forces(host: ChainGroup) -> np.ndarray:
+def changing_forces(host: RodGroupData) -> np.ndarray:
     """Return magnitudes of time-dependent and follower loads by storage index [N].
 
     Time-dependent loads count with their full amplitude, moments over the length of the rod.

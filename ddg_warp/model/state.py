@@ -16,7 +16,7 @@ VELOCITIES = ("v", "omega", "a", "alpha")
 
 
 @dataclass
-class GroupState:
+class RodGroupState:
     """Device arrays of one rod group with n nodes and R rods.
 
     Attributes:
@@ -98,7 +98,7 @@ class State:
             state is later by `lead`.
     """
 
-    def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
+    def __init__(self, model, groups: list[RodGroupState], net=None, time: float = 0.0, grips: GripState | None = None):
         self.stable: bool | np.ndarray | None = None
         self.outcome: str | np.ndarray | None = None
         self.unbalanced: float | np.ndarray | None = None
@@ -152,7 +152,7 @@ class State:
         return groups | {name: part for name, part in single.items() if part is not None}
 
     def arrays(self) -> dict[str, wp.array]:
-        """Return device arrays by "part/name", in storage order; see `GroupState`.
+        """Return device arrays by "part/name", in storage order; see `RodGroupState`.
 
         Other libraries read them without a copy, by DLPack: `torch.from_dlpack(state.arrays()["0/x"])`.
         """

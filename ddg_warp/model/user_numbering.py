@@ -9,11 +9,11 @@ from ddg_warp import argument_checks
 from ddg_warp.compile import axisymmetric
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
-from ddg_warp.model.rod_group import Group
+from ddg_warp.model.rod_group import RodGroup
 from ddg_warp.scene.material import DRAWN
 
 
-class Order:
+class UserNumbering:
     """User order: nodes of rods as added, of meridians, then vertices of shells; edges likewise."""
 
     def __init__(self, model):
@@ -78,7 +78,7 @@ class Order:
         vertices = sum(len(shell.nodes) for shell in host.shells)
         return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
 
-    def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def places(self, group: RodGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for the nodes of a rod group: node with ghosts, column, row of `State.points`."""
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         return _user_index(group, group.host.own, start)
@@ -110,7 +110,7 @@ class Order:
             result[self.edge_starts[rod.rod] + np.arange(len(rod.edges))] = True
         return result
 
-    def elements(self, name: str) -> tuple[int, list[tuple[Group, np.ndarray, np.ndarray]]]:
+    def elements(self, name: str) -> tuple[int, list[tuple[RodGroup, np.ndarray, np.ndarray]]]:
         """Return the elements of uncoupled rods that have a parameter "term.parameter".
 
         Elements are numbered rod by rod, clamped ends included.
@@ -145,12 +145,12 @@ class Order:
         curve = int(np.searchsorted(self.edge_starts, row, side="right")) - 1
         return int(row - self.edge_starts[curve]), curve
 
-    def edge_places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def edge_places(self, group: RodGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for the edges of a rod group: edge with ghosts, column, row of `State.angles`."""
         counts = group.host.own - (0 if group.kind.closed else 1)
         return _user_index(group, counts, self.edge_starts)
 
-    def put_nodes(self, group: Group, values, out: np.ndarray, label: str) -> None:
+    def put_nodes(self, group: RodGroup, values, out: np.ndarray, label: str) -> None:
         """Write values in user order (P, 3) to (node, column, dim) of a group."""
         values = self._points(values, label)
         axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
@@ -175,7 +175,7 @@ class Order:
             raise ValueError(f"{label}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
         return values
 
-    def put_edges(self, group: Group, values, out: np.ndarray, label: str = "spins") -> None:
+    def put_edges(self, group: RodGroup, values, out: np.ndarray, label: str = "spins") -> None:
         values, _ = self.of_edges(values, label)
         k, column, index = self.edge_places(group)
         for world in range(self.model.worlds):
@@ -249,7 +249,7 @@ def _hashable(section) -> tuple:
     )
 
 
-def _user_index(group: Group, counts: np.ndarray, start: np.ndarray):
+def _user_index(group: RodGroup, counts: np.ndarray, start: np.ndarray):
     """Return for nodes or edges (`counts` a rod): node with ghosts, column, index in user order."""
     column = np.repeat(np.arange(group.rods), counts)
     index = np.arange(counts.sum()) - np.repeat(np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)

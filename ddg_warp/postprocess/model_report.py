@@ -9,12 +9,12 @@ from ddg_warp.kernels.terms import ALL, FRICTION, Potential, contact_potential
 from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
-from ddg_warp.solve.linear.rod_substructuring import Chains
+from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.solver_selection import automatic, net_preconditioner
-from ddg_warp.solve.linear.sparse_system import NetSystem
+from ddg_warp.solve.linear.sparse_system import SparseSystem
 from ddg_warp.solve.stepping.decoupled_step import uncoupled
 from ddg_warp.solve.stepping.rod_step import DIRECT
-from ddg_warp.solve.stepping.step_driver import Means, suited
+from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, suited
 
 SOLVERS = {
     "chain": "PCG (closed chains)",
@@ -72,7 +72,7 @@ def step_lines(model, errors_of: Callable) -> list[str]:
     if not isinstance(analysis, Dynamics):
         return []
     errors = errors_of(analysis.dt * (0.5 if analysis.scheme == "implicit_midpoint" else 1.0))
-    means = suited(model.precision, Means(model.types.linear), *(each.max(initial=0.0) for each in errors))
+    means = suited(model.precision, LinearSolverChoice(model.types.linear), *(each.max(initial=0.0) for each in errors))
     taken = ["edges turned, second derivatives"] * means.stiff
     taken += [f"linear algebra in {means}"] * (means.linear is not model.types.linear or means.split)
     return [f"  over steps of {analysis.dt:g} s: {', '.join(taken)}"] if taken else []
@@ -111,8 +111,8 @@ def net_lines(model) -> list[str]:
     """Return lines on dofs, terms and matrix of the coupled system."""
     host, net = model.net.host, model.net
     name, linear = net_preconditioner(net), model.types.linear
-    chains = Chains.of(net, name)
-    table = NetSystem(net, chains and chains.kept)
+    chains = RodSubstructuring.of(net, name)
+    table = SparseSystem(net, chains and chains.kept)
     lines = [
         f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
         f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "

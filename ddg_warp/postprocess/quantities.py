@@ -13,7 +13,7 @@ from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
 from ddg_warp.postprocess import end_moments
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.forces.drag import ChainDrag, NetDrag
+from ddg_warp.solve.forces.drag import ChainDrag, CoupledDrag
 
 TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints
 
@@ -136,7 +136,7 @@ def drag(model, state) -> Drag:
         force = np.zeros((model.worlds, model.net.blocks, 3))
         v = force
         if model.net.host.drag:
-            resisted = NetDrag(model)
+            resisted = CoupledDrag(model)
             v = resisted.rates(state.net, state.lead)
             inertia, u = resisted.at(state.net, state.time)
             force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)

@@ -31,7 +31,7 @@ from ddg_warp.kernels.terms import ALL, REGISTRY, Potential, Term
 from ddg_warp.run.derivative_samples import Sample, rotation
 from ddg_warp.run.derivative_samples_contact import ContactSample, FrictionSample
 from ddg_warp.run.derivative_samples_coupled import Elements
-from ddg_warp.run.derivative_samples_rod import Chain, chain_of
+from ddg_warp.run.derivative_samples_rod import RodSample, chain_of
 
 TRAP = 2.0**-30
 
@@ -123,7 +123,7 @@ def invariance(sample: Sample) -> float:
     return largest(relative(sample.energy(sample.real, **data), before) for data in moved)
 
 
-def rigid(sample: Chain) -> float:
+def rigid(sample: RodSample) -> float:
     sample = sample.isotropic()
     force = sample.scatter(sample.gradient(sample.real))
     adjoint = sample.reverse(0, np.ones(sample.shape))
@@ -195,7 +195,7 @@ def samples_of(
     if isinstance(term, Potential):
         return [(FrictionSample if term.frictional else ContactSample)(term, None, precision, device)]
     if term.measure in {rod_term.measure for rod_term in REGISTRY.values()}:
-        return [Chain(term, chain_of(term, closed), precision, device) for closed in chains]
+        return [RodSample(term, chain_of(term, closed), precision, device) for closed in chains]
     if term.measure.dim != 3:
         raise ValueError(f"{term.name}: of the plane are measures of rods alone; give {term.measure.name} dim = 3")
     return [Elements(term, None, precision, device)]
@@ -206,7 +206,7 @@ def checks_of(sample: Sample) -> list[str]:
     left_out = set(sample.LEFT_OUT)
     if isinstance(sample, Elements) and not sample.measure.packed:
         left_out.add("exact")
-    if isinstance(sample, Chain | Elements) and not sample.term.rest and sample.chain != "open":
+    if isinstance(sample, RodSample | Elements) and not sample.term.rest and sample.chain != "open":
         left_out.add("rest")
     single = sample.precision == "float32"
     return [name for name, check in CHECKS.items() if name not in left_out and not (single and check[2] is None)]

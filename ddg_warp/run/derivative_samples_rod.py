@@ -6,21 +6,21 @@ import warp as wp
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
-from ddg_warp.kernels.elements.rod_layout import ChainKind, rod_elements_type, rod_storage
+from ddg_warp.kernels.elements.rod_layout import RodKind, rod_elements_type, rod_storage
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.terms import REGISTRY, Term
 from ddg_warp.run.derivative_samples import Sample, random_parameters, random_strains
 
 
-def chain_of(term: Term, closed: bool) -> ChainKind:
+def chain_of(term: Term, closed: bool) -> RodKind:
     """Return the kind of rod with a term: bending first, then stretch, both damped or neither."""
     names = ("planar_bend", "planar_stretch") if term.measure.dim == 2 else ("rod_bend_twist", "rod_stretch")
     bending, stretch = (REGISTRY[name].damped(term.density.lagged) for name in names)
     terms = (term, stretch) if term.measure.span == 2 else (bending, term)
-    return ChainKind(term.measure.dim, terms[0].measure.angles > 0, closed, terms)
+    return RodKind(term.measure.dim, terms[0].measure.angles > 0, closed, terms)
 
 
-class Chain(Sample):
+class RodSample(Sample):
     """A term of two rods with 6 and 5 nodes, bent, stretched and twisted, with parameters by element.
 
     Lagged frames differ from the tangents by 25 degrees; the reference twist is up to several revolutions.
@@ -34,7 +34,7 @@ class Chain(Sample):
     shape, LEFT_OUT = (6, 2), frozenset({"energy", "resultant"})
     INPUTS = ("x", "theta", "frame", "last", "rate", "buffer")
 
-    def __init__(self, term: Term, kind: ChainKind, *arguments):
+    def __init__(self, term: Term, kind: RodKind, *arguments):
         self.chain, self.count = "closed" if kind.closed else "open", np.array([6, 5])
         self.index, self.grid, self.column = (
             kind.terms.index(term),
@@ -46,9 +46,9 @@ class Chain(Sample):
         super().__init__(term, kind, *arguments)
 
     @property
-    def parts(self) -> list["Chain"]:
+    def parts(self) -> list["RodSample"]:
         """Samples of both terms of the rods."""
-        return [Chain(term, self.kind, self.precision, self.device, self.data) for term in self.kind.terms]
+        return [RodSample(term, self.kind, self.precision, self.device, self.data) for term in self.kind.terms]
 
     def random_state(self) -> dict[str, np.ndarray]:
         """Return random data; see the class."""

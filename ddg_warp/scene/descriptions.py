@@ -8,7 +8,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.surface import Surface
-from ddg_warp.scene.equilibrium_path import Displacement, Stop
+from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law
 from ddg_warp.scene.material import Material, Stiffness
@@ -57,7 +57,7 @@ class Statics:
 
 @argument_checks.called
 @dataclass(frozen=True)
-class Trace:
+class PathAnalysis:
     """Arc-length continuation of equilibria from load parameter 0, through limit points.
 
     Attributes:
@@ -67,7 +67,7 @@ class Trace:
     """
 
     watch: dict[str, Displacement] = field(default_factory=dict)
-    stop: Stop = field(default_factory=Stop)
+    stop: StopCriterion = field(default_factory=StopCriterion)
     step: float = 0.02
     max_step: float = 0.1
     load_scale: float = 1.0
@@ -75,7 +75,7 @@ class Trace:
     def __post_init__(self):
         for name in ("step", "max_step", "load_scale"):
             argument_checks.positive(f"Trace: {name}", getattr(self, name))
-        if not isinstance(self.stop, Stop):
+        if not isinstance(self.stop, StopCriterion):
             raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
         if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
             raise SceneError(

@@ -157,7 +157,7 @@ class Path:
 
 @argument_checks.called
 @dataclass(frozen=True)
-class Stop:
+class StopCriterion:
     """Termination criteria of a path; the first met counts, and the last point lies exactly on that bound.
 
     Attributes:

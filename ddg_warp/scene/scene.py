@@ -11,7 +11,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
-from ddg_warp.scene.descriptions import Dynamics, Load, RodBatch, Statics, Support, Trace
+from ddg_warp.scene.descriptions import Dynamics, Load, PathAnalysis, RodBatch, Statics, Support
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Stiffness, stiffness_of
@@ -29,7 +29,7 @@ class Scene(Structures):
     Args:
         gravity: acceleration (3,) [m/s^2].
         dimension: 3, or 2 for a scene in a plane y = const: forces, couples, motions and gravity out of the plane are refused.
-        analysis: `Dynamics`, `Statics` or `Trace` of `ddg-warp run`.
+        analysis: `Dynamics`, `Statics` or `PathAnalysis` of `ddg-warp run`.
         mass_damping: mass-proportional damping alpha [1/s].
         flow: uniform velocity (3,) [m/s] of the fluid of `drag`; or a function of time that returns it.
         initial: function of the model that returns the first state of a run; the rest state by default.
@@ -41,7 +41,7 @@ class Scene(Structures):
 
     gravity: tuple = (0.0, 0.0, -9.81)
     dimension: int = 3
-    analysis: Dynamics | Statics | Trace = field(default_factory=Dynamics)
+    analysis: Dynamics | Statics | PathAnalysis = field(default_factory=Dynamics)
     mass_damping: float = 0.0
     flow: tuple | Callable[[float], tuple] = (0.0, 0.0, 0.0)
     initial: Callable | None = None

@@ -10,7 +10,7 @@ from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import polyline
 from ddg_warp.scene import drag
 from ddg_warp.scene.contact import check_contact
-from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
+from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.prescribed_motion import Motion
 
@@ -32,7 +32,7 @@ def check_settings(scene) -> None:
     )
     if not callable(scene.flow):
         argument_checks.vector("flow", scene.flow)
-    if not isinstance(scene.analysis, Dynamics | Statics | Trace):
+    if not isinstance(scene.analysis, Dynamics | Statics | PathAnalysis):
         raise SceneError(f"analysis is {scene.analysis!r}; give Dynamics(...), Statics(...) or Trace(...)")
     if scene.initial is not None and not callable(scene.initial):
         raise SceneError(f"initial is {scene.initial!r}; give a function of the model that returns a state, or None")

@@ -41,10 +41,10 @@ def _round(contact) -> np.ndarray:
     return np.flatnonzero(contact.numbers["radius"] > 0.0)
 
 
-class ContactPlace:
+class ContactParameterView:
     """Storage of a contact parameter in the arrays that collision detection and contact terms of the coupled system read.
 
-    Attributes: see `TermPlace`.
+    Attributes: see `TermParameterView`.
     """
 
     chain = weighs = False

@@ -10,15 +10,15 @@ import torch
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.adjoint.coupled_predictor import NetPredictor
-from ddg_warp.adjoint.coupled_step import NetKept
+from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
+from ddg_warp.adjoint.coupled_step import CoupledSavedStep
 from ddg_warp.adjoint.implicit import Adjoint, EquilibriumAdjoint
-from ddg_warp.adjoint.rod_predictor import ChainPredictor
-from ddg_warp.adjoint.rod_step import Kept
+from ddg_warp.adjoint.rod_predictor import RodPredictor
+from ddg_warp.adjoint.rod_step import SavedStep
 from ddg_warp.capture_lock import alone
 from ddg_warp.kernels.adjoint.rod_step import asked_kernel, flag_kernels, smooth_kernel
 from ddg_warp.model.controls import Controls
-from ddg_warp.model.rebuild import Recipe
+from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.state import Sliding
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.stepping.graph_cache import Graphs
@@ -27,8 +27,8 @@ from ddg_warp.solve.stepping.world_reset import cubed
 from ddg_warp.torch.controls import StepControls
 from ddg_warp.torch.grip_poses import Poses
 from ddg_warp.torch.notice import Notice
-from ddg_warp.torch.parameter_tensors import Tables
-from ddg_warp.torch.state_layout import GRADIENTS, Layout, copies, tensors, view
+from ddg_warp.torch.parameter_tensors import ParameterTensors
+from ddg_warp.torch.state_layout import GRADIENTS, StateLayout, copies, tensors, view
 
 FOREVER = 2**62  # steps between host checks of outcomes, as worlds carry flags
 LOAD = "load_steps", "start", "end"  # options of the load path of an equilibrium
@@ -53,7 +53,7 @@ class Engine:
     """
 
     def __init__(self, source, worlds: int, scheme: str, options: dict):
-        recipe = Recipe(source, worlds)
+        recipe = ModelBuilder(source, worlds)
         self.model = model = recipe.build()
         self._version = recipe.version
         self.device = str(wp.device_to_torch(model.wp_device))
@@ -64,7 +64,7 @@ class Engine:
         self.adjoint = self.poses = self.by_poses = self.by_equilibrium = None
         self._equilibria = {}  # adjoints of equilibria, by True if grip poses are inputs
         self._solver = None  # options and solver of equilibria
-        self.layout, self.tables = Layout(model), Tables(model)
+        self.layout, self.tables = StateLayout(model), ParameterTensors(model)
         self.fields = self.layout.fields
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
@@ -84,7 +84,7 @@ class Engine:
         if self._version != source.version:
             with self.turn():
                 self.tables.restore()
-                recipe = Recipe(source, self.model.worlds)
+                recipe = ModelBuilder(source, self.model.worlds)
                 recipe.put(self.model)
                 self._version = recipe.version
 
@@ -126,7 +126,7 @@ class Engine:
 
     @property
     def solutions(self) -> list[wp.array]:
-        """Solutions of the friction iterations of the coupled system, see `NetContact`."""
+        """Solutions of the friction iterations of the coupled system, see `NewtonContact`."""
         net = self.integrator._net
         return net.newton.contact.solutions if net is not None and net.newton.contact else []
 
@@ -156,7 +156,7 @@ class Engine:
         key, net = id(part), part is self.integrator._net
         if key not in self._flagged:  # keyed by live steppers; a rebuilt one has another id
             islands, real, device = part.islands, self.model.types.real, self.model.wp_device
-            choice = (NetPredictor, part.net) if net else (ChainPredictor, part.group)
+            choice = (CoupledPredictor, part.net) if net else (RodPredictor, part.group)
             predictor = choice[0].of(self.model, choice[1], part.motion, self.integrator.scheme)
             if net:
                 frames = (part._lagged[0], self.before.net.frame) if part.net.edges else ()
@@ -278,7 +278,7 @@ class Engine:
             # same layout as states, so that a graph can copy it
             solved = (self.model.empty_state() if self.midpoint else self.after).groups
             self._parts = [
-                Kept(before, solution.x, solution.theta, before.frame, None)
+                SavedStep(before, solution.x, solution.theta, before.frame, None)
                 for solution, before in zip(solved, self.before.groups, strict=True)
             ]
             if adjoint.net:
@@ -286,7 +286,9 @@ class Engine:
                 if self.midpoint:
                     data = {index: wp.clone(values) for index, values in data.items()}
                 solved = replace(before, q=wp.clone(before.q), data=data)
-                self._net = NetKept(before, solved, None, lagged=[wp.clone(values) for values in self.solutions])
+                self._net = CoupledSavedStep(
+                    before, solved, None, lagged=[wp.clone(values) for values in self.solutions]
+                )
                 self._turned = wp.clone(before.q)  # scratch
             self.adjoint = adjoint
             self._make_flags()
@@ -318,7 +320,7 @@ class Engine:
         device_arrays.load_kernels(kernels, self.model.wp_device)
         self.integrator._worlds.load_modules()
 
-    def _net_kept(self, start: float, dt: float) -> NetKept:
+    def _net_kept(self, start: float, dt: float) -> CoupledSavedStep:
         """Return the saved step of the coupled system.
 
         Joint rotations are the rates of the step times its length, since these dofs are zero at the start of each step.

@@ -27,7 +27,7 @@ import numpy as np
 from ddg_warp.kernels.forces import drag
 from ddg_warp.model.masses import point_masses
 from ddg_warp.torch import contact_parameters
-from ddg_warp.torch.parameter_storage import ArrayPlace
+from ddg_warp.torch.parameter_storage import ArrayParameterView
 from ddg_warp.torch.state_layout import view
 
 MASSES = ("rod.mass", "shell.mass", "meridian.mass")
@@ -50,7 +50,7 @@ SIGNED, POSITIVE = (
 
 @dataclass
 class _Part:
-    """Storage of a parameter in one subsystem: arguments of `ArrayPlace`, and the user rows of its elements."""
+    """Storage of a parameter in one subsystem: arguments of `ArrayParameterView`, and the user rows of its elements."""
 
     index: int
     chain: bool
@@ -69,14 +69,14 @@ def elements(model, name: str) -> np.ndarray:
     return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
 
 
-def array_places(model, name: str) -> tuple[int, list[ArrayPlace | contact_parameters.ContactPlace]]:
+def array_places(model, name: str) -> tuple[int, list[ArrayParameterView | contact_parameters.ContactParameterView]]:
     """Return the number of elements that have a parameter, and their storage; an empty list if the model has none."""
     if name in contact_parameters.NAMES:
         count = len(contact_parameters.contact_elements(model, name))
-        return count, [contact_parameters.ContactPlace(model, name)] if count else []
+        return count, [contact_parameters.ContactParameterView(model, name)] if count else []
     rows = elements(model, name)
     made = [
-        ArrayPlace(
+        ArrayParameterView(
             model,
             part.index,
             part.chain,

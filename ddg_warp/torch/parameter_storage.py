@@ -9,7 +9,7 @@ from ddg_warp.torch.state_layout import view
 LEAST = 1e-9  # relative remainder after subtraction of written contributions; less is rounding
 
 
-class TermPlace:
+class TermParameterView:
     """Storage of a term's parameter in the table of a rod group or element set.
 
     Attributes:
@@ -109,10 +109,10 @@ def meeting(places: np.ndarray, elements: np.ndarray, size: int, count: int) -> 
     return rows
 
 
-class ArrayPlace:
+class ArrayParameterView:
     """Storage of a parameter in an array with values per world, each the sum over the elements that meet there.
 
-    Attributes: see `TermPlace`.
+    Attributes: see `TermParameterView`.
 
     Args:
         key: key of the array within its subsystem.
@@ -121,7 +121,7 @@ class ArrayPlace:
         brought: contribution of each.
         look: () -> a tensor view of the array, (n, W R) or (W, E, equal components).
         gradient: inputs of the subsystem -> gradient by the array, None if nothing depends on it.
-        heavy: the `Group` or `DeviceNet` with these masses; None for other parameters.
+        heavy: the `RodGroup` or `CoupledModel` with these masses; None for other parameters.
     """
 
     def __init__(self, model, index, chain, key, usual, places, elements, brought, count, look, gradient, heavy=None):

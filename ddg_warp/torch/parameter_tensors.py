@@ -8,10 +8,10 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.torch import named_parameters
-from ddg_warp.torch.parameter_storage import ArrayPlace, TermPlace
+from ddg_warp.torch.parameter_storage import ArrayParameterView, TermParameterView
 
 
-class Tables:
+class ParameterTensors:
     """Parameters of a model: names and values, writes of tensors to storage, and gradients.
 
     Attributes:
@@ -23,7 +23,7 @@ class Tables:
         self._found, self._written, self._rules, self._full = {}, {}, {}, {}
         self.invalid = torch.zeros(model.worlds, dtype=torch.int32, device=self.device)
 
-    def of(self, name: str) -> tuple[int, list[TermPlace | ArrayPlace]]:
+    def of(self, name: str) -> tuple[int, list[TermParameterView | ArrayParameterView]]:
         """Return the number of elements with a parameter, and its storage.
 
         Elements of "term.parameter" are counted rod by rod, clamped ends included, then through the element sets of the coupled
@@ -45,13 +45,15 @@ class Tables:
             self._found[name] = storage
         return self._found[name]
 
-    def _of_terms(self, name: str) -> tuple[int, list[TermPlace]]:
+    def _of_terms(self, name: str) -> tuple[int, list[TermParameterView]]:
         model, name_parts = self.model, name.rpartition(".")
         start, groups = model.order.elements(name)
-        storage = [TermPlace(model, model.groups.index(g), True, name, rows, inside) for g, inside, rows in groups]
+        storage = [
+            TermParameterView(model, model.groups.index(g), True, name, rows, inside) for g, inside, rows in groups
+        ]
         for i, part in enumerate(model.net.sets if model.net is not None else ()):
             if part.term.name == name_parts[0] and name_parts[2] in part.parameters.values:
-                storage.append(TermPlace(model, i, False, name, start + np.arange(part.elements), None))
+                storage.append(TermParameterView(model, i, False, name, start + np.arange(part.elements), None))
                 start += part.elements
         return start, storage
 

@@ -308,7 +308,7 @@ class Simulator(torch.nn.Module):
         return self.engine(worlds).tables.value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
-        """Return parameters as `Tables.full`; only plain numbers are checked, since tensors may still be in computation."""
+        """Return parameters as `ParameterTensors.full`; only plain numbers are checked, since tensors may still be in computation."""
         result = []
         for name, values in _named("parameters", "term.parameter", parameters).items():
             engine.tables.of(name)  # refuses unknown names

@@ -57,7 +57,7 @@ def along(values: torch.Tensor, field: Field, like: torch.Tensor) -> torch.Tenso
     return values if like.ndim == field.axis + 1 else values[:, None]
 
 
-class Layout:
+class StateLayout:
     """Layout of the states of a model: points and edges, in user order, in tensors.
 
     Attributes:

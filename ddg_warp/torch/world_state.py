@@ -8,7 +8,7 @@ import torch
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.torch.engine import Engine
-from ddg_warp.torch.state_layout import Layout
+from ddg_warp.torch.state_layout import StateLayout
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class WorldState:
     """State of B worlds as tensors in storage layout; properties such as `positions` are in user order.
 
     Attributes:
-        values: arrays of a `State`, ordered as `Layout.fields`; NaN in failed worlds.
+        values: arrays of a `State`, ordered as `StateLayout.fields`; NaN in failed worlds.
         time: [s], of all worlds.
         engine: engine with the layout; None for a copied or loaded state, see `Simulator.world_state`.
         codes: outcomes of the step to this state (B,), see `kernels.core.outcome`; 0 if good, or without a step.
@@ -38,7 +38,7 @@ class WorldState:
         return cls(tuple(values), time, engine, codes, codes == 0)
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> StateLayout:
         """Layout of the tensors of the state.
 
         Raises:

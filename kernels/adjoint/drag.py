@@ -10,7 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.dof_map import row_functions
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, block_inertia, edge_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
@@ -34,7 +34,7 @@ def resisted_function(dim: int, real):
 
 
 @cache
-def chain_kernels(kind: ChainKind, real, midpoint: bool):
+def chain_kernels(kind: RodKind, real, midpoint: bool):
     """Build the kernels of uncoupled rods.
 
     `edges`: write gradients by edge vectors of `tangents`, by mean velocities of edges and by coefficients.

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 
 PART = 8  # nodes of a segment, one thread each
 STIFFEST, SOFTEST, MASS = range(
@@ -20,7 +20,7 @@ ROWS = 3
 
 
 @cache
-def stiffness_kernels(kind: ChainKind, real):
+def stiffness_kernels(kind: RodKind, real):
     """Build the kernels of the estimate.
 
     `measure`: write stiffnesses and mass of every segment of every rod.

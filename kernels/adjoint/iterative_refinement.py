@@ -11,11 +11,11 @@ import warp as wp
 
 from ddg_warp.kernels.adjoint.rod_elements import gathered_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, displaced_function
+from ddg_warp.kernels.elements.rod_layout import RodKind, displaced_function
 
 
 @cache
-def product_kernel(kind: ChainKind, real):
+def product_kernel(kind: RodKind, real):
     """product(...): H v of every element, as its window, from the factors and geometric stiffnesses that `evaluate_kernel` wrote."""
     W = wp.types.vector(kind.window, real)
     displaced = displaced_function(kind, real)
@@ -75,7 +75,7 @@ def product_kernel(kind: ChainKind, real):
 
 
 @cache
-def refine_kernels(kind: ChainKind, real, linear):
+def refine_kernels(kind: RodKind, real, linear):
     """guess(...): w of inertia alone; rest(...): the right-hand side that w leaves, from the products of elements; add(...): a solution
     to w.
     """

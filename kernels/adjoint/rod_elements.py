@@ -10,13 +10,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 from ddg_warp.kernels.elements.variation import carried_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
 
 @cache
-def put_function(kind: ChainKind, real, first: bool):
+def put_function(kind: RodKind, real, first: bool):
     """put(out, k, r, f): what an element brings to its window; the `first` that does writes it."""
     W = wp.types.vector(kind.window, real)
 
@@ -32,7 +32,7 @@ def put_function(kind: ChainKind, real, first: bool):
 
 
 @cache
-def frame_kernel(kind: ChainKind, real, unit: bool = True, first: bool = True):
+def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
     """pull(...): the reverse of `step.finish_frames_kernel`, or, not `unit`, of `search.relag`. Writes derivatives by frames; those by
     windows, of which the first edge alone counts, where it is the `first` to do so, else adds.
 
@@ -76,7 +76,7 @@ def frame_kernel(kind: ChainKind, real, unit: bool = True, first: bool = True):
 
 
 @cache
-def gathered_function(kind: ChainKind, real):
+def gathered_function(kind: RodKind, real):
     """gathered(windows, k, n, r): what windows bring to the dofs of node k of a rod of n nodes."""
     dim, twist, closed, window = kind.dim, kind.twist, kind.closed, kind.window
     B = wp.types.vector(kind.block, real)
@@ -106,7 +106,7 @@ def gathered_function(kind: ChainKind, real):
 
 
 @cache
-def gather_kernels(kind: ChainKind, real):
+def gather_kernels(kind: RodKind, real):
     """end(...) writes what windows bring to the dofs of a node, nodes(...) adds it; edges(...) adds what lagged data of vertices bring
     to frames of edges.
     """

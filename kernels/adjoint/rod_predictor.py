@@ -8,13 +8,13 @@ from ddg_warp.kernels.adjoint.edge_rotation import excess_function, unplace_func
 from ddg_warp.kernels.core.dof_map import row_functions
 from ddg_warp.kernels.core.islands import BENT, RATE, TURN
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 from ddg_warp.kernels.newton.edge_rotation import loose_function
 from ddg_warp.kernels.stepping.rod_step import predicted_function
 
 
 @cache
-def predict_kernel(kind: ChainKind, real, midpoint: bool):
+def predict_kernel(kind: RodKind, real, midpoint: bool):
     """Build the kernel of predictors of `step.begin_kernel` and `step.predict_kernel`, one thread a rod.
 
     `pull`: add gradients by fixed dofs, by positions and velocities at the start, and by the rate.

@@ -12,13 +12,13 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.dof_map import column_of, point_functions
 from ddg_warp.kernels.core.islands import PORTION, RETRIES, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.elements.variation import angle_function
 from ddg_warp.kernels.forces.prescribed_motion import functions, reached_function
 
 
 @cache
-def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
+def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
     """Build the kernels of the end update and of inertia.
 
     `solution`: write gradients by the dofs of the solve, given gradients by the end of the step.

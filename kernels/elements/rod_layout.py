@@ -20,7 +20,7 @@ from ddg_warp.kernels.terms import Term
 
 
 @dataclass(frozen=True)
-class ChainKind:
+class RodKind:
     """What a group of rods has: decides every array and kernel of the group."""
 
     dim: int
@@ -109,7 +109,7 @@ class ChainKind:
         return result
 
 
-def inertia_type(kind: ChainKind, real):
+def inertia_type(kind: RodKind, real):
     """What a node has of inertia: its mass [kg]; with drag, a `drag_structure`."""
     return drag_structure(kind.dim, real) if kind.drag else real
 
@@ -134,7 +134,7 @@ def drag_structure(dim: int, real):
 
 
 @cache
-def gather_functions(kind: ChainKind, real):
+def gather_functions(kind: RodKind, real):
     """Device functions that read the window, its lagged data and one parameter."""
     V = wp.types.vector(kind.dim, real)
     W = wp.types.vector(kind.window, real)
@@ -189,7 +189,7 @@ def gather_functions(kind: ChainKind, real):
 
 
 @cache
-def displaced_function(kind: ChainKind, real):
+def displaced_function(kind: RodKind, real):
     """Build `displaced(v, k, count, whole, r)`: return the window of a displacement [component of a node][node][rod]."""
     W = wp.types.vector(kind.window, real)
     along_node, *_ = gather_functions(kind, real)
@@ -235,7 +235,7 @@ def rod_elements_type(dim: int, real):
 
 
 @cache
-def _term_access(kind: ChainKind, index: int, real) -> TermAccess:
+def _term_access(kind: RodKind, index: int, real) -> TermAccess:
     """Return the access of term `index` to the window, and to its rows among those of all terms."""
     term, measure = kind.terms[index], kind.terms[index].measure
     Q, S, _, _ = measure.types(real)
@@ -270,7 +270,7 @@ def _term_access(kind: ChainKind, index: int, real) -> TermAccess:
 
 
 @cache
-def rod_storage(kind: ChainKind, real, linear=None) -> ElementStorage:
+def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
     """Return the storage of uncoupled rods: an island is a rod, and all terms share one window."""
     Inputs, missing, closed, serial = (
         rod_elements_type(kind.dim, real),

@@ -96,7 +96,8 @@ def share_kernel(real):
 
     `share`: raise body loads to at least the mean of their connected component.
 
-    As `Bodies.loads` and `Allowed.assign`: a world without any load has the scale 0 and loads 1, others the scale 1.
+    As `ToleranceBodies.loads` and `ResidualTolerances.assign`: a world without any load has the scale 0 and loads 1, others the
+        scale 1.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

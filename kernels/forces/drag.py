@@ -23,7 +23,7 @@ import warp as wp
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
 # Rows of coefficients of an edge. SLOPE is tan(gamma); SPEED is zero except in granular media. FIRST and LAST are force over velocity
@@ -60,7 +60,7 @@ def edge_function(dim: int, real):
 
 
 @cache
-def chain_kernels(kind: ChainKind, real):
+def chain_kernels(kind: RodKind, real):
     """Build the kernels of drag on uncoupled rods.
 
     `resist`: write inertia and drag of every node at the start of a solve.

@@ -9,13 +9,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 
 SWEEPS = 12  # of Jacobi's method; 8 x 8 matrices take 5 or 6
 
 
 @cache
-def project_kernel(kind: ChainKind, real, linear):
+def project_kernel(kind: RodKind, real, linear):
     """Build the kernel of projected Newton.
 
     `project`: raise G of all windows of active rods until F^T F + G is positive semidefinite.
@@ -138,7 +138,7 @@ def project_kernel(kind: ChainKind, real, linear):
 
 
 @cache
-def block_functions(kind: ChainKind, linear):
+def block_functions(kind: RodKind, linear):
     """Return the device functions `aa`, `ab`, `ac`, `bb`, `bc`, `cc` (G, k, r): blocks of nodes a, b, c of element k.
 
     Edges are differences of nodes: H_ab = sum over edges with their signs. The twist angles of edges e and f are dofs of a and b.

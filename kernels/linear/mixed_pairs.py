@@ -19,14 +19,14 @@ import warp as wp
 
 from ddg_warp.kernels.core.islands import CARRIED, WANTED
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.linear import mixed_axial_force
 
 TENSIONS = 2  # rows of a node for tensions
 
 
 @cache
-def pair_kernel(kind: ChainKind, linear):
+def pair_kernel(kind: RodKind, linear):
     """Build the kernel that assembles pairs.
 
     `pair`: write the system of wanted rods as a level of `cyclic_reduction.level_rows`, one thread a row of a pair.
@@ -122,7 +122,7 @@ def pair_kernel(kind: ChainKind, linear):
 
 
 @cache
-def unpair_kernel(kind: ChainKind, real, linear):
+def unpair_kernel(kind: RodKind, real, linear):
     """Build the kernel that extracts directions.
 
     `unpair`: write the directions of nodes and the lengthening of edges of wanted rods.

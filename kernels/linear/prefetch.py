@@ -4,11 +4,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 
 
 @cache
-def read_functions(kind: ChainKind, linear, rows: int, prefetch: bool):
+def read_functions(kind: RodKind, linear, rows: int, prefetch: bool):
     """Return the device functions `rows_of`, `entry`, `part`, `with_angle` and `positions`.
 
     `rows_of(F, k, r)`: all rows of the elements that start at node k if `prefetch`, else nothing.

@@ -128,9 +128,9 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
 
 @cache
 def layout_type():
-    """Return the struct `Layout`: dof maps of path nodes (see `ChainPlan`) and positions of diagonal blocks of H.
+    """Return the struct `StateLayout`: dof maps of path nodes (see `SubstructuringPlan`) and positions of diagonal blocks of H.
 
-    `idle`: see `Chains`.
+    `idle`: see `RodSubstructuring`.
     """
 
     @wp.struct

@@ -11,7 +11,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.islands import CLAMPED, COEFFICIENT, ITERATION, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.linear import block_ldlt, geometric_stiffness
 from ddg_warp.kernels.newton.line_search import rests_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
@@ -58,7 +58,7 @@ def block_functions(nb: int, linear):
 
 
 @cache
-def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, stored=None):
+def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, stored=None):
     """Build the kernel of assembly.
 
     `assemble`: write the blocks of H of every rod that has not converged.
@@ -216,7 +216,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
 
 
 @cache
-def product_function(kind: ChainKind, linear):
+def product_function(kind: RodKind, linear):
     """Return the device function `times(blocks, v, k, n, r)`: row k of H v."""
     nb2, span, closed = kind.block**2, kind.span, kind.closed
     load, _, vector, _ = block_functions(kind.block, linear)
@@ -303,7 +303,7 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
 
 
 @cache
-def factor_kernel(kind: ChainKind, linear):
+def factor_kernel(kind: RodKind, linear):
     """Build the kernel of factorisation.
 
     `factorise`: write the block LDL^T of H without its periodic blocks; see `factor_function`.
@@ -459,7 +459,7 @@ def substitute_all_function(nb: int, span: int, linear, sides: int):
 
 
 @cache
-def direct_kernel(kind: ChainKind, linear):
+def direct_kernel(kind: RodKind, linear):
     """Build the kernel of the direct solve.
 
     `direct`: compute the search direction of every wanted rod from the factors.

@@ -23,7 +23,7 @@ from ddg_warp.kernels.core.islands import (
     patience_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.linear import block_ldlt
 from ddg_warp.kernels.linear.rod_matrix import block_functions, product_function, substitute_function
 from ddg_warp.kernels.newton.rod_iterate import search_functions
@@ -32,7 +32,7 @@ PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
 
 
 @cache
-def solver_kernels(kind: ChainKind, linear, preconditioner: str):
+def solver_kernels(kind: RodKind, linear, preconditioner: str):
     """Build the kernels of conjugate gradients with one preconditioner.
 
     `start`: set solution, residual and first search direction.
@@ -228,7 +228,7 @@ def repeat_kernel(real, fails: bool, exact: bool = True):
 
 
 @cache
-def take_kernel(kind: ChainKind, real, linear):
+def take_kernel(kind: RodKind, real, linear):
     """Build the kernel that takes a direction.
 
     `take`: cap the rotation, move, and store the predicted decrease r . d.

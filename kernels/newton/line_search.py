@@ -35,7 +35,7 @@ from ddg_warp.kernels.core.islands import (
     WANTED,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, search_functions, shorter_function
 
 STOP, DIRECT = 0, 3  # actions in addition to `PLACE` and `RELAG`: none, and compute a direction
@@ -165,7 +165,7 @@ def judge_functions(twist: bool, real, driven: bool = False):
 
 
 @cache
-def judge_kernel(kind: ChainKind, real, linear):
+def judge_kernel(kind: RodKind, real, linear):
     """Build the kernel of the line search.
 
     `judge`: sum over a rod's nodes, decide, and write a shortened step or updated frames, one thread a rod.

@@ -25,13 +25,13 @@ from ddg_warp.kernels.core.islands import (
     patience_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.newton.line_search import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.newton.rod_iterate import PLACE, STRAIGHT
 
 
 @cache
-def sum_kernels(kind: ChainKind, real, linear):
+def sum_kernels(kind: RodKind, real, linear):
     """Build the kernels of partial sums over ranges of nodes.
 
     `weigh`: sum energy changes, rounding and residuals.
@@ -106,7 +106,7 @@ def sum_kernels(kind: ChainKind, real, linear):
 
 
 @cache
-def decide_kernels(kind: ChainKind, real, linear, exact: bool):
+def decide_kernels(kind: RodKind, real, linear, exact: bool):
     """Build the kernels of decisions from partial sums.
 
     `judge`: test the iterate of a rod.

@@ -7,14 +7,14 @@ import warp as wp
 from ddg_warp.kernels.core.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements import parallel_transport
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 from ddg_warp.kernels.newton.edge_rotation import FURTHER, edge_functions, place_function
 
 PLACE, RELAG, STRAIGHT = 1, 2, 4  # actions on an iterate: edge-rotation update, frame update, straight update
 
 
 @cache
-def move_functions(kind: ChainKind, real, linear, split: bool = False):
+def move_functions(kind: RodKind, real, linear, split: bool = False):
     """Return the device functions `step_of`, `excess`, `put_at` and `carry` of one node or edge.
 
     `step_of`: step of a node.
@@ -110,7 +110,7 @@ def shorter_function(real):
 
 
 @cache
-def search_functions(kind: ChainKind, real, linear, split: bool = False):
+def search_functions(kind: RodKind, real, linear, split: bool = False):
     """Return the device functions `place`, `turn_angles`, `relag` and `shorter` of a line search on a rod.
 
     `place`: take an edge-rotation update.
@@ -218,7 +218,7 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
 
 
 @cache
-def adjust_kernel(kind: ChainKind, real, linear, split: bool = False):
+def adjust_kernel(kind: RodKind, real, linear, split: bool = False):
     """Build the kernel that completes a sweep for few rods.
 
     `adjust`: write a shortened or far-rotating step, or update the frames of its iterate.

@@ -11,14 +11,14 @@ import warp as wp
 from ddg_warp.kernels.core.islands import ANGLE_CHANGE, BENT, CAUTIOUS, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements import parallel_transport
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.newton.edge_rotation import onward_function
 from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, move_functions
 from ddg_warp.kernels.stepping.rod_step import predicted_function
 
 
 @cache
-def move_kernels(kind: ChainKind, real, linear, split: bool = False):
+def move_kernels(kind: RodKind, real, linear, split: bool = False):
     """Build the kernels of an edge-rotation update or a frame update.
 
     `turn`: compute the excess of rotated edges, or their frames, into a second array as neighbours read the old frames.
@@ -189,7 +189,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
 
 
 @cache
-def predict_kernels(kind: ChainKind, real, linear):
+def predict_kernels(kind: RodKind, real, linear):
     """Build the kernels of the predictor.
 
     `aim`: set the velocity step of rods with rotated edges as direction.

@@ -38,7 +38,7 @@ from ddg_warp.kernels.core.islands import (
     patience_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import ChainKind, inertia_type
+from ddg_warp.kernels.elements.rod_layout import RodKind, inertia_type
 from ddg_warp.kernels.linear import block_ldlt, geometric_stiffness, mixed_axial_force
 from ddg_warp.kernels.linear.prefetch import keep_functions, read_functions
 from ddg_warp.kernels.linear.rod_matrix import block_functions
@@ -47,9 +47,7 @@ from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, search_functions
 
 
 @cache
-def sweep_kernel(
-    kind: ChainKind, real, linear, exact_from: int | None = None, fails: bool = False, split: bool = False
-):
+def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fails: bool = False, split: bool = False):
     """Build the kernel of one Newton iteration for one kind of rod.
 
     `sweep`: eliminate, test the iterate, and shorten the step or take the next one.

@@ -27,12 +27,12 @@ from ddg_warp.kernels.core.islands import (
     UNBALANCED,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.newton.line_search import ROUNDED, SETTLED
 
 
 @cache
-def node_functions(kind: ChainKind, real):
+def node_functions(kind: RodKind, real):
     """Return the device functions `force`, `previous`, `balance` and `edge_force` of a node.
 
     `force(g, row, k, r)`: three rows of the gradient.
@@ -121,7 +121,7 @@ def node_functions(kind: ChainKind, real):
 
 
 @cache
-def check_kernel(kind: ChainKind, real, linear):
+def check_kernel(kind: RodKind, real, linear):
     """Build the kernel of the residual and of the convergence test.
 
     `check`: write residual and energy change at every node, and set `unbalanced` of rods with a residual above tolerance and floor.

@@ -15,7 +15,7 @@ from ddg_warp.kernels.collision.contact.statistics import LAST, PARTS
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import CAUTIOUS, ITERATION, LOST, MOVED, PORTION, PROGRESS, RETRIES, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, share_function, until_function
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.stepping.rod_step import start_function
 
 # whether the world is stepped so; worst outcome, most iterations and lost pivots of rods, and whether the step is still to be done
@@ -25,8 +25,8 @@ NODE, ANGLE, VERTEX, EDGE = 0, 2, 4, 6  # first of two rows of the dof map
 
 
 @cache
-def rod_kernels(kind: ChainKind, real):
-    """Build the kernels that copy rods between the coupled storage and a rod group; columns as in `Group`.
+def rod_kernels(kind: RodKind, real):
+    """Build the kernels that copy rods between the coupled storage and a rod group; columns as in `RodGroup`.
 
     `gather`: copy rods of tried worlds to the rod group, and start their step.
     `put`: copy positions back, and collect outcomes per world.

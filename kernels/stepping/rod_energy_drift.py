@@ -16,7 +16,7 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import PROGRESS, RATE, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_function
-from ddg_warp.kernels.elements.rod_layout import ChainKind, inertia_type, rod_storage
+from ddg_warp.kernels.elements.rod_layout import RodKind, inertia_type, rod_storage
 from ddg_warp.kernels.terms import Term
 
 DRIFT, ROUNDING, HELD, DISSIPATED = range(4)  # rows of a balance
@@ -100,7 +100,7 @@ def rows_function(storage: ElementStorage, index: int, real):
 
 
 @cache
-def chain_kernel(kind: ChainKind, real, linear):
+def chain_kernel(kind: RodKind, real, linear):
     """Build the kernel of the rows of a step of every rod, summed over ranges.
 
     Range i holds the nodes i, i + ranges, ...; see `kernels.newton.line_search_parallel`.

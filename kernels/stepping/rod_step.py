@@ -39,14 +39,14 @@ from ddg_warp.kernels.core.islands import (
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements import parallel_transport
-from ddg_warp.kernels.elements.rod_layout import ChainKind, gather_functions
+from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 from ddg_warp.kernels.newton.edge_rotation import ON, onward_function
 from ddg_warp.kernels.newton.rod_iterate import search_functions
 from ddg_warp.kernels.stepping.rod_warm_start import told_function
 
 
 @cache
-def begin_kernel(kind: ChainKind, real, midpoint: bool):
+def begin_kernel(kind: RodKind, real, midpoint: bool):
     """Build the kernel of predictors.
 
     `begin`: write predictor, target of inertia and lagged frames, and restart the solve of every rod that still has to move.
@@ -140,7 +140,7 @@ def predicted_function(dim: int, real):
 
 
 @cache
-def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
+def predict_kernel(kind: RodKind, real, linear, midpoint: bool):
     """Build the kernel of predictors with edge rotations.
 
     `predict`: write the predictor of rods whose edges rotate far, by edge rotations along the velocity instead of stretch.
@@ -218,7 +218,7 @@ def start_kernel(real):
 
 
 @cache
-def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
+def finish_nodes_kernel(kind: RodKind, real, midpoint: bool):
     """Build the kernel of the end update.
 
     `finish`: write positions, twist angles, velocities and accelerations at the end of the substep of rods that converged.
@@ -299,7 +299,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
 
 
 @cache
-def finish_frames_kernel(kind: ChainKind, real):
+def finish_frames_kernel(kind: RodKind, real):
     """Build the kernel of frames at the end of a step.
 
     `finish`: transport reference frames to the tangents of the new state, orthonormalise, and write reference twists.

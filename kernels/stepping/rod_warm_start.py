@@ -12,7 +12,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.islands import BENT, CAUTIOUS, ITERATION, LOAD_SCALE, PROGRESS, RATE
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
-from ddg_warp.kernels.elements.rod_layout import ChainKind
+from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.newton.edge_rotation import FURTHER, loose_function
 from ddg_warp.kernels.newton.rod_iterate import search_functions
 
@@ -56,7 +56,7 @@ def told_function(real, midpoint: bool, crowd: bool = False):
 
 
 @cache
-def foresee_kernel(kind: ChainKind, real, linear):
+def foresee_kernel(kind: RodKind, real, linear):
     """Build the kernel of the warm start.
 
     `foresee`: store the predictor of every rod that still has to move, and add extrapolated accelerations.
@@ -105,7 +105,7 @@ def foresee_kernel(kind: ChainKind, real, linear):
 
 
 @cache
-def further_kernel(kind: ChainKind, real, linear):
+def further_kernel(kind: RodKind, real, linear):
     """Build the kernel of the warm start after predictors with rotated edges.
 
     `further`: extrapolate the last edge rotations and stretches.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from convergence import order
 
-from ddg_warp.scene.equilibrium_path import Stop
+from ddg_warp.scene.equilibrium_path import StopCriterion
 from ddg_warp.scenes import deep_arch, lee_frame, right_angle_frame
 from ddg_warp.solve.equilibrium.continuation import Continuation
 
@@ -107,7 +107,7 @@ def test_postbuckling_branches_are_stable_and_symmetric(device):
     (point,) = path.bifurcations
     sides = []
     for side in (1, -1):
-        branch = continuation.switch(point, side=side, stop=Stop(steps=6))
+        branch = continuation.switch(point, side=side, stop=StopCriterion(steps=6))
         assert not branch.negative[1:].any()  # stable
         sides.append(branch)
     left, right = (branch.values("deflection") for branch in sides)

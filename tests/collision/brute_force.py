@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.solve.collision.collision_mesh import BALLS, Shapes
+from ddg_warp.solve.collision.collision_mesh import BALLS, CollisionMesh
 
 SIDES = ((2, 2), (1, 3))  # numbers of nodes of the two primitives of a pair, without balls
 
@@ -29,11 +29,13 @@ def soup(rng, triangles: int, spread: float, size: float) -> np.ndarray:
     return (rng.uniform(0.0, spread, (triangles, 1, 3)) + rng.uniform(-size, size, (triangles, 3, 3))).reshape(-1, 3)
 
 
-def scene(seed: int, spread: float, rods: int = 50, nodes: int = 21, triangles: int = 500) -> tuple[Shapes, np.ndarray]:
+def scene(
+    seed: int, spread: float, rods: int = 50, nodes: int = 21, triangles: int = 500
+) -> tuple[CollisionMesh, np.ndarray]:
     """Return rods of 1,000 edges in all and 500 triangles of five shells, and the points."""
     rng = np.random.default_rng(seed)
     points = np.concatenate([curves(rng, rods, nodes, spread, 0.05), soup(rng, triangles, spread, 0.04)])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     for r in range(rods):
         shapes.rod(r * nodes + np.arange(nodes), 0.003 + 0.001 * (r % 3), closed=r % 5 == 4)
     loose = rods * nodes + np.arange(3 * triangles).reshape(-1, 3)
@@ -81,7 +83,7 @@ def point_triangle(p, a, b, c) -> np.ndarray:
     return np.where(inside, np.abs(height), best)
 
 
-def admissible_pairs(shapes: Shapes, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+def admissible_pairs(shapes: CollisionMesh, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (n,), (n,) of pairs of primitives that are not excluded, by numbers of nodes."""
     nodes_a, _, owner_a, span_a = shapes.things(first)
     nodes_b, _, owner_b, _ = shapes.things(second)
@@ -102,7 +104,7 @@ def admissible_pairs(shapes: Shapes, first: int, second: int) -> tuple[np.ndarra
     return np.nonzero(fits)
 
 
-def distances(shapes: Shapes, x: np.ndarray, first: int, second: int, i, j) -> tuple[np.ndarray, np.ndarray]:
+def distances(shapes: CollisionMesh, x: np.ndarray, first: int, second: int, i, j) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances and thicknesses (n,) of pairs."""
     nodes_a, radius_a, *_ = shapes.things(first)
     nodes_b, radius_b, *_ = shapes.things(second)
@@ -112,7 +114,7 @@ def distances(shapes: Shapes, x: np.ndarray, first: int, second: int, i, j) -> t
     return (edge_edge if first == 2 else point_triangle)(*corners), radius_a[i] + radius_b[j]
 
 
-def near_pairs(shapes: Shapes, x: np.ndarray, first: int, second: int, reach: float) -> set[tuple[int, int]]:
+def near_pairs(shapes: CollisionMesh, x: np.ndarray, first: int, second: int, reach: float) -> set[tuple[int, int]]:
     """Return the pairs with a gap of at most `reach`."""
     i, j = admissible_pairs(shapes, first, second)
     balls = []

@@ -5,12 +5,12 @@ import warp as wp
 from brute_force import SIDES, near_pairs, scene, upload
 
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 REACH, MARGIN = 0.004, 0.01
 
 
-def tangle(seed: int, spread: float = 0.6) -> tuple[Shapes, np.ndarray]:
+def tangle(seed: int, spread: float = 0.6) -> tuple[CollisionMesh, np.ndarray]:
     """Return a scene without overlaps: overlapping objects ignore each other."""
     shapes, points = scene(seed, spread, rods=30, triangles=60)
     for first, second in SIDES:
@@ -21,7 +21,7 @@ def tangle(seed: int, spread: float = 0.6) -> tuple[Shapes, np.ndarray]:
     return shapes, points
 
 
-def ccd_bodies(shapes: Shapes, kind: str) -> tuple[np.ndarray, int]:
+def ccd_bodies(shapes: CollisionMesh, kind: str) -> tuple[np.ndarray, int]:
     """Return the CCD body of each node (nodes,), and the number of bodies."""
     n = len(shapes.points)
     if kind == "node":
@@ -40,7 +40,7 @@ class Motion:
 
     def __init__(
         self,
-        shapes: Shapes,
+        shapes: CollisionMesh,
         points: np.ndarray,
         device,
         kind: str = "object",

@@ -6,8 +6,8 @@ from brute_force import admissible_pairs, edge_edge, point_edge, point_triangle,
 
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 REACH, MARGIN = 0.004, 0.004
 LAWS = {
@@ -22,7 +22,7 @@ def upload(x: np.ndarray, device, dtype=wp.vec3d) -> wp.array:
 
 def bundle(
     rods: int = 3, edges: int = 4, jitter: float = 2e-5, seed: int = 1, rolls: bool = False
-) -> tuple[Shapes, np.ndarray]:
+) -> tuple[CollisionMesh, np.ndarray]:
     """Return rods side by side over a strip of triangles, parallel to 1 in 500.
 
     Mollifiers are between 0 and 1. With `rolls` all rods but the last have twist angles, stored at the end.
@@ -33,7 +33,7 @@ def bundle(
     i, j = np.meshgrid(np.arange(4), np.arange(3), indexing="ij")
     strip = np.stack([0.02 + 0.05 * i, -0.005 + 0.01 * j, np.full(i.shape, -0.0056)], 2).reshape(-1, 3)
     rest = np.concatenate([sides, strip, np.zeros(((rods - 1) * edges * rolls, 3))])
-    shapes = Shapes(rest)
+    shapes = CollisionMesh(rest)
     for r in range(rods):
         angles = len(sides) + len(strip) + r * edges + np.arange(edges) if rolls and r < rods - 1 else None
         shapes.rod(r * (edges + 1) + np.arange(edges + 1), 0.003, angles=angles)
@@ -52,18 +52,18 @@ CASES = {
 
 
 def terms(
-    shapes: Shapes, x: np.ndarray, device, law: str = "penalty", worlds: int = 1, **options
-) -> tuple[PairTerms, wp.array]:
+    shapes: CollisionMesh, x: np.ndarray, device, law: str = "penalty", worlds: int = 1, **options
+) -> tuple[ContactPotential, wp.array]:
     """Return contact terms evaluated at x, and x on the device."""
     density, parameters = LAWS[law]
     positions = upload(x, device)
     search = BroadPhase(shapes, positions, worlds, reach=REACH, margin=MARGIN)
-    result = PairTerms(search, density, **{**parameters, **options})
+    result = ContactPotential(search, density, **{**parameters, **options})
     result.evaluate(positions)
     return result, positions
 
 
-def move(result: PairTerms, positions: wp.array, x: np.ndarray) -> None:
+def move(result: ContactPotential, positions: wp.array, x: np.ndarray) -> None:
     """Evaluate the terms at x."""
     positions.assign(x)
     result.search.update(positions)
@@ -72,13 +72,13 @@ def move(result: PairTerms, positions: wp.array, x: np.ndarray) -> None:
     result.evaluate(positions)
 
 
-def state(result: PairTerms) -> list[np.ndarray]:
+def state(result: ContactPotential) -> list[np.ndarray]:
     """Return copies of energies, forces and blocks."""
     result.join()
     return [array.numpy().copy() for array in (result.energy, result.forces, result.diagonal, result.between)]
 
 
-def hessian_product(result: PairTerms, v: np.ndarray, positions=None, wanted=None) -> np.ndarray:
+def hessian_product(result: ContactPotential, v: np.ndarray, positions=None, wanted=None) -> np.ndarray:
     """Return H v, of the exact Hessian where `positions` are given.
 
     Worlds flagged in `wanted` add the geometric stiffness to the Gauss-Newton matrix instead.
@@ -91,7 +91,7 @@ def hessian_product(result: PairTerms, v: np.ndarray, positions=None, wanted=Non
     return out.numpy().copy()
 
 
-def assembled_hessian(result: PairTerms, n: int, positions=None) -> np.ndarray:
+def assembled_hessian(result: ContactPotential, n: int, positions=None) -> np.ndarray:
     """Return H (n, 3, n, 3), one column per product."""
     unit = np.eye(3 * n).reshape(3 * n, n, 3)
     return np.stack([hessian_product(result, v, positions) for v in unit], -1).reshape(n, 3, n, 3)
@@ -123,7 +123,7 @@ def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
     return np.where(gap < within, value, 0.0)
 
 
-def end_distances(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
+def end_distances(shapes: CollisionMesh, rest: np.ndarray, x: np.ndarray, i, j):
     """Return distances and weights (2, 3, n) of the ends of edges i from edges j and both nodes of these."""
     nodes, _, owner, span = shapes.things(2)
     key = owner[:, None] * len(rest) + nodes
@@ -134,7 +134,7 @@ def end_distances(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
     return d, np.stack([0.5 * weights * (span[j, 3] >= 0.0)] * 2)
 
 
-def brute_force_energy(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) -> float:
+def brute_force_energy(shapes: CollisionMesh, x: np.ndarray, law: str, v: np.ndarray | None = None) -> float:
     """Return the contact energy of all pairs [J]; with v, v . H v of the Gauss-Newton matrix.
 
     The latter is psi'' times the squared change of distances along v.

@@ -6,14 +6,14 @@ import pytest
 from brute_force import upload
 
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 REACH, MARGIN = 0.004, 0.01
 FRAMES = 2001
 SIDES = {"edges": (2, 2), "point and triangle": (1, 3)}
 
 
-def random_pairs(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, np.ndarray]:
+def random_pairs(name: str, seed: int, count: int) -> tuple[CollisionMesh, np.ndarray, np.ndarray]:
     """Return one pair in each of `count` worlds, random in position and motion.
 
     A point is the end of an edge that is itself in no pair.
@@ -21,7 +21,7 @@ def random_pairs(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, 
     rng = np.random.default_rng(seed)
     nodes = 4 if name == "edges" else 5
     x, move = rng.normal(size=(2, count, nodes, 3))
-    shapes = Shapes(np.random.default_rng(0).normal(size=(nodes, 3)))
+    shapes = CollisionMesh(np.random.default_rng(0).normal(size=(nodes, 3)))
     shapes.rod([0, 1], 0.05)
     if name == "edges":
         shapes.rod([2, 3], 0.1)
@@ -32,7 +32,7 @@ def random_pairs(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, 
     return shapes, x, move
 
 
-def gaps(shapes: Shapes, name: str, x: np.ndarray) -> np.ndarray:
+def gaps(shapes: CollisionMesh, name: str, x: np.ndarray) -> np.ndarray:
     """Return the gaps (pairs, worlds) of all pairs at x (worlds, nodes, 3)."""
     result = []
     for side in [SIDES["edges"]] + [SIDES["point and triangle"]] * (name != "edges"):
@@ -71,7 +71,7 @@ def test_head_on_impact_matches_its_closed_form(device):
     """Crossed edges at distance 1 with radii 0.1 approach by 2: contact is at 0.4, and a tenth of the gap of 0.8 is left at 0.36."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 1.0, 1.0]])
     move = np.array([[0.0, 0.0, 1.0]] * 2 + [[0.0, 0.0, -1.0]] * 2)
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.1)
     shapes.rod([2, 3], 0.1)
     x = upload(points, device)
@@ -99,7 +99,7 @@ def test_crossings_are_counted_exactly(device, offset):
     lower = np.stack(np.broadcast_arrays(ends, offsets[:, None], 0.0), axis=-1).reshape(-1, 3)
     upper = np.stack(np.broadcast_arrays(offsets[:, None], ends, 0.3), axis=-1).reshape(-1, 3)
     points = np.concatenate([lower, upper]) + offset
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     for k in range(16):
         shapes.rod([2 * k, 2 * k + 1], 0.01)
     x = upload(points, device)
@@ -124,7 +124,7 @@ def test_crossings_are_counted_exactly(device, offset):
 def test_close_sliding_is_no_crossing(device, distance):
     """A rod slides by ten thousand times the distance from another, across or along. Rods at no distance meet."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.5, -1.0, distance], [-0.5, 1.0, distance]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 1e-5)
     shapes.rod([2, 3], 1e-5)
     x = upload(points, device)
@@ -137,7 +137,7 @@ def test_close_sliding_is_no_crossing(device, distance):
 def test_crossings_are_found_without_a_new_search(device):
     """A rod falls past another, within half of the margin and farther, without a new search."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 3e-3], [0.0, 1.0, 3e-3]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 1e-4)
     shapes.rod([2, 3], 1e-4)
     x = upload(points, device)
@@ -155,7 +155,7 @@ def test_crossings_equal_roots_of_signed_volumes(device):
     rng = np.random.default_rng(3)
     n = 2000
     x, move = rng.normal(size=(2, n, 4, 3))
-    shapes = Shapes(x[0])
+    shapes = CollisionMesh(x[0])
     shapes.rod([0, 1], 0.01)
     shapes.rod([2, 3], 0.01)
     search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), n, reach=REACH, margin=MARGIN)

@@ -10,7 +10,7 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.solve.collision import bvh
 from ddg_warp.solve.collision.broad_phase import BroadPhase
 from ddg_warp.solve.collision.candidate_list import RunningSums
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 REACH, MARGIN = 0.004, 0.01
 
@@ -52,7 +52,7 @@ def test_edges_within_the_exclusion_distance_form_no_pairs(device, closed, exclu
     angle = 2.0 * np.pi * np.arange(n) / n
     radius = 0.05 / np.sin(np.pi / n)
     points = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod(np.arange(n), 0.01, closed=closed, apart=exclusion)
     (candidates,) = candidate_pairs(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
     i, j = np.triu_indices(n if closed else n - 1, 1)
@@ -100,7 +100,7 @@ def test_coincident_and_parallel_edges_are_found(device):
         [[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]], (20, 1)
     )
     points = np.concatenate([stacked, parallel])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     for k in range(80):
         shapes.rod([2 * k, 2 * k + 1], 0.003)
     search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
@@ -153,7 +153,7 @@ def test_candidates_are_valid_for_half_the_margin(device, excess):
     gap = REACH + 1.002 * MARGIN
     distance = 0.02 + gap
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, -0.5, distance], [0.5, 0.5, distance]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.01)
     shapes.rod([2, 3], 0.01)
     search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
@@ -172,7 +172,7 @@ def test_candidates_are_valid_for_half_the_margin(device, excess):
 def test_dofs_of_no_primitive_trigger_no_search(device):
     """Dof blocks without a position, such as twist angles of edges, may have any value."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.01)
     search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
     for node, more in ((2, 0), (5, 0), (1, 1), (4, 1)):
@@ -256,7 +256,7 @@ def test_boxes_contain_their_primitives(device, offset):
     for size in shapes.sizes:
         nodes, radius, *_ = shapes.things(size)
         radii = wp.array([shapes.radii], dtype=wp.float64, device=device)
-        primitives = bvh.Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
+        primitives = bvh.Primitives(shapes, size, 1, wp.float64, wp.get_device(device), radii)
         primitives.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
         reach = (radius + 0.002)[:, None]
         below = points[nodes].min(1) - reach - primitives.lower.numpy().astype(float)
@@ -288,7 +288,7 @@ def test_order_of_objects_is_irrelevant(device):
     triangles = 252 + np.arange(90).reshape(-1, 3)
 
     def pairs_of(order) -> set:
-        shapes = Shapes(points)
+        shapes = CollisionMesh(points)
         for k in order:
             if k == 12:
                 shapes.shell(triangles, 0.004)
@@ -358,4 +358,4 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
 )
 def test_invalid_shapes_are_refused_by_name(describe, message):
     with pytest.raises(SceneError, match=message):
-        describe(Shapes(POINTS))
+        describe(CollisionMesh(POINTS))

@@ -8,7 +8,7 @@ from motion_cases import MARGIN, REACH, Motion, tangle
 
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import AHEAD
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 
 def random_offsets(rng, count: int, most: float) -> np.ndarray:
@@ -17,7 +17,7 @@ def random_offsets(rng, count: int, most: float) -> np.ndarray:
     return most * direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def search_motion(shapes: Shapes, x: wp.array, move: wp.array, together: int = 0) -> BroadPhase:
+def search_motion(shapes: CollisionMesh, x: wp.array, move: wp.array, together: int = 0) -> BroadPhase:
     """Return a search for a motion, with room for all pairs."""
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
     flag = wp.full(1, together, dtype=int, device=x.device)
@@ -92,7 +92,7 @@ def test_candidates_are_complete_within_half_the_margin_of_the_motion(device):
 def test_search_starts_beyond_half_the_margin_off_the_motion(device, excess, fraction, off, argument):
     """A node is aside of the middle of a motion, or off an end to any outward side."""
     points = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.01)
     move = np.array([[5.0 * MARGIN, 0.0, 0.0]] * 2)
     search = search_motion(shapes, upload(points, device), upload(move, device))
@@ -133,7 +133,7 @@ def test_moving_half_spaces_find_distant_points(device, angle):
     _, points = scene(27, 3.0, rods=60, nodes=11, triangles=1)
     points = points[:660] * [1.0, 1.0, 0.1]
     frame = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    shapes = Shapes(np.concatenate([points, frame]))
+    shapes = CollisionMesh(np.concatenate([points, frame]))
     for r in range(60):
         shapes.rod(11 * r + np.arange(11), 0.004)
     shapes.plane([660, 661, 662])

@@ -11,7 +11,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.equilibrium_path import Displacement, Stop
+from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
 from ddg_warp.solve.equilibrium.continuation import Continuation
 
 LENGTH = 1.1  # m, of the bars of the truss
@@ -61,7 +61,7 @@ def test_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     """The load falls until bars and ball are in contact, then grows with the force of the ball. The way back is the same."""
     stop = -0.1
     follower = truss(device, law, stop, reach, stiffness)
-    path = follower.trace(stop=Stop(load=(-1.0, 0.3)))
+    path = follower.trace(stop=StopCriterion(load=(-1.0, 0.3)))
     assert path.outcome == "load"
     for point in path.points:
         ball_force = upward_force(follower.model, point.state)
@@ -73,7 +73,7 @@ def test_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     assert HEIGHT - path.values("drop")[-1] == pytest.approx(stop, abs=reach)
     assert set(path.negative[path.arclength > corner.arclength]) == {0}
     assert set(path.negative[(path.arclength > first.arclength) & (path.arclength < corner.arclength)]) == {1}
-    back = follower.trace(path.points[-1].state, start=0.3, direction=-1, stop=Stop(load=(-0.1, 1.0)))
+    back = follower.trace(path.points[-1].state, start=0.3, direction=-1, stop=StopCriterion(load=(-0.1, 1.0)))
     assert [point.load for point in back.limit_points] == pytest.approx([corner.load, first.load], abs=1e-5)
     assert truss_load(HEIGHT - back.values("drop")[-1]) == pytest.approx(-0.1, rel=1e-9)
 
@@ -85,7 +85,7 @@ def test_truss_on_a_ball_bifurcates_sideways(device, law):
     The bars have the lateral stiffness 2 (EA / l0 cos^2 + N / l sin^2), with axial force N = EA (l / l0 - 1) and slope z over 1.
     """
     follower = truss(device, law, -0.5, 1e-3, 1e2)
-    (event,) = follower.trace(stop=Stop(load=(-1.0, 0.6))).bifurcations
+    (event,) = follower.trace(stop=StopCriterion(load=(-1.0, 0.6))).bifurcations
     z = HEIGHT - event.values["drop"]
     length = np.hypot(1.0, z)
     sideways = 2.0 * (1.0 / LENGTH + (length / LENGTH - 1.0) / length * z**2) / length**2
@@ -124,9 +124,9 @@ def test_buckled_column_between_walls_matches_its_closed_form(device, law):
     until w'' vanishes in the middle, too, at t = pi. Finite slopes cause an error of (h / L)^2, n edges one of 1 / n^2.
     """
     follower = column(device, law, 40)
-    (buckles,) = follower.trace(stop=Stop(load=(-1.0, 12.0))).bifurcations
+    (buckles,) = follower.trace(stop=StopCriterion(load=(-1.0, 12.0))).bifurcations
     assert buckles.load == pytest.approx(np.pi**2, rel=1e-3)
-    path = follower.switch(buckles, stop=Stop(load=(0.0, 0.9 * 4.0 * np.pi**2)))
+    path = follower.switch(buckles, stop=StopCriterion(load=(0.0, 0.9 * 4.0 * np.pi**2)))
     assert path.outcome == "load"
     assert path.stable.all()
     pressed = [point for point in path.points if point.load > 11.0]
@@ -237,7 +237,7 @@ def scene_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
 def test_paths_end_at_the_states_of_load_steps(device, name, law):
     """Weight and obstacle motions follow the load parameter: end states and reactions are the same."""
     model = scene_of(name, law).build(device, "float64")
-    path = Continuation(model).trace(stop=Stop(load=(-1.0, 1.0)))
+    path = Continuation(model).trace(stop=StopCriterion(load=(-1.0, 1.0)))
     end, stepped = path.points[-1].state, statics.solve(model, load_steps=4)
     assert path.points[-1].load == 1.0
     assert path.stable.all()

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.solve.stepping.decoupled_step import Alone
+from ddg_warp.solve.stepping.decoupled_step import DecoupledStep
 
 RADIUS, DT = 2e-3, 1 / 240
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5, viscosity=1e-3)
@@ -362,7 +362,7 @@ def test_decoupling_is_not_built_where_it_does_not_apply(device, scene, options,
     def refuse(*_):
         raise AssertionError("made")
 
-    monkeypatch.setattr(Alone, "__init__", refuse)
+    monkeypatch.setattr(DecoupledStep, "__init__", refuse)
     run(device, scene(), 2, **options)
 
 

@@ -8,7 +8,7 @@ from pair_cases import CASES, assembled_hessian, assert_repeatable, hessian_prod
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 FACTORS = np.array([1.0, 1.7, 2.5])  # forwards, backwards and across, over MU
 RADIUS, RANGE = 5e-3, 1e-4
@@ -77,12 +77,12 @@ def test_float32_factors_keep_forces_and_products(device, case):
     assert np.abs(hessian_product(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
 
 
-def rod_on_triangle(tilt: float) -> tuple[Shapes, np.ndarray]:
+def rod_on_triangle(tilt: float) -> tuple[CollisionMesh, np.ndarray]:
     """Return a rod in contact with a triangle at one edge, along x but for the `tilt` [rad]."""
     s = np.array([0.0, 0.05, 0.1])
     rod = np.stack([0.05 + s * np.cos(tilt), 0.05 + 0.0 * s, 0.0065 + s * np.sin(tilt)], 1)
     x = np.concatenate([[[-1.0, -1.0, 0.0], [2.0, -1.0, 0.0], [-1.0, 2.0, 0.0]], rod])
-    shapes = Shapes(x)
+    shapes = CollisionMesh(x)
     shapes.shell(np.array([[0, 1, 2]]), 0.004)
     shapes.rod([3, 4, 5], 0.003)
     return shapes, x

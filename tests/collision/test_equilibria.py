@@ -14,7 +14,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.scenes import crossed_beams
 from ddg_warp.solve.collision import candidate_list
 from ddg_warp.solve.equilibrium import dynamic_relaxation, stability
-from ddg_warp.solve.equilibrium.newton_pcg import NetEquilibrium
+from ddg_warp.solve.equilibrium.newton_pcg import CoupledEquilibrium
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from tests.collision.brute_force import edge_edge
 from tests.learn.contact_cases import SCENES, scene_of, touching
@@ -399,7 +399,7 @@ def test_unsupported_rod_is_reported_adrift(device):
 def test_host_finishes_unconverged_device_solves(monkeypatch, outcome):
     """The device stops near the end, where rounding may keep it from converging: the host finds the same equilibrium."""
     model = beam_under_a_ball(16, "barrier", 0.5, True).build("cpu", precision="float64")
-    finished, solve = statics.solve(model), NetEquilibrium.solve
+    finished, solve = statics.solve(model), CoupledEquilibrium.solve
 
     def unfinished(self, state, load_factor, before, increment):
         solution = solve(self, state, load_factor, before, increment)
@@ -407,7 +407,7 @@ def test_host_finishes_unconverged_device_solves(monkeypatch, outcome):
         self.tangent.assign(solution, moved - 1e-9 * self.tangent.free * np.cos(np.arange(len(moved))))
         raise SolverError("not finished", state=solution, outcome=outcome)
 
-    monkeypatch.setattr(NetEquilibrium, "solve", unfinished)
+    monkeypatch.setattr(CoupledEquilibrium, "solve", unfinished)
     state = statics.solve(model)
     assert state.stable
     np.testing.assert_allclose(state.points(), finished.points(), rtol=0.0, atol=1e-13)

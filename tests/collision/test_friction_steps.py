@@ -22,7 +22,7 @@ from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.densities.contact import smooth_penalty
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 
 @each_case
@@ -156,7 +156,7 @@ def test_float32_positions(device, case):
     whole, _, x, after = friction_terms(case, device, slip=1e-3, velocity=1.0)
     positions = upload(x, device, wp.vec3f)
     search = BroadPhase(CASES[case]()[0], positions, reach=REACH, margin=MARGIN)
-    single = PairTerms(search, smooth_penalty, **LAWS["penalty"][1], friction=MU, velocity=1.0)
+    single = ContactPotential(search, smooth_penalty, **LAWS["penalty"][1], friction=MU, velocity=1.0)
     single.lag(positions)
     single.law.stiffness.zero_()
     positions.assign(after)

@@ -9,18 +9,18 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.collision.contact.incidence import list_kernels
 from ddg_warp.kernels.collision.primitives import EDGES, POINT_TRIANGLE, Kind
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 MU, RATE, SIDE = 0.4, 100.0, 50
 
 
-def star() -> tuple[Shapes, np.ndarray]:
+def star() -> tuple[CollisionMesh, np.ndarray]:
     """Return 2,500 short rods that lie on one triangle with both points, some along a side."""
     x, y = np.meshgrid(0.02 + 0.03 * np.arange(SIDE), 0.02 + 0.03 * np.arange(SIDE))
     first = np.stack([x, y, np.full_like(x, 0.0058)], -1).reshape(-1, 3)
     corners = [[-1.0, 0.018, 0.0], [5.0, 0.018, 0.0], [-1.0, 5.0, 0.0]]
     points = np.concatenate([corners, np.stack([first, first + [0.01, 0.004, 0.0003]], 1).reshape(-1, 3)])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.shell(np.array([[0, 1, 2]]), 0.004)
     for rod in range(len(first)):
         shapes.rod([3 + 2 * rod, 4 + 2 * rod], 0.003)

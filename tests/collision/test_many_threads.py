@@ -41,7 +41,7 @@ def test_walk_order_follows_a_morton_curve(device):
     """Keys of three times ten bits increase, world by world; boxes outside the bounds are clamped to the sides."""
     rng, count = np.random.default_rng(2), 200
     for worlds in (1, 3):
-        boxes = bvh.Boxes(count, worlds, wp.get_device(device))
+        boxes = bvh.Aabbs(count, worlds, wp.get_device(device))
         order = bvh.WalkOrder(boxes)
         for away in (0.0, 5.0):  # the second time some boxes have left the bounds, which stay
             lower = rng.uniform(size=(worlds * count, 3))

@@ -9,7 +9,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY
 from ddg_warp.scenes import overhand_knot
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.newton.contact_newton import NetContact
+from ddg_warp.solve.newton.contact_newton import NewtonContact
 
 
 def test_steps_cut_by_ccd_converge(device):
@@ -43,7 +43,7 @@ def test_whole_step_completes_the_prescribed_motion(device, monkeypatch):
     scene.clamp(drawn, edges=[0], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -0.1 * np.pi * t)))
     scene.contact(range=1e-3, friction=0.0)
     model = scene.build(device=device, precision="mixed")
-    records, hold, place = [], NetContact.hold, NetContact.place
+    records, hold, place = [], NewtonContact.hold, NewtonContact.place
 
     def record(contact):
         islands = contact.newton.islands
@@ -53,8 +53,8 @@ def test_whole_step_completes_the_prescribed_motion(device, monkeypatch):
     def watched(method):
         return lambda contact: (method(contact), record(contact))
 
-    monkeypatch.setattr(NetContact, "place", watched(place))
-    monkeypatch.setattr(NetContact, "hold", watched(hold))
+    monkeypatch.setattr(NewtonContact, "place", watched(place))
+    monkeypatch.setattr(NewtonContact, "hold", watched(hold))
     step_without_capture(ddg.Integrator(model, rtol=1e-3), model.state(), 1 / 240)
     predictor, *steps = records
     assert predictor[0] < 1.0 and predictor[2] == ON_THE_WAY

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from pair_cases import LAWS, move, psi, terms
 
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 RADIUS, GAP = 0.003, 0.001
 each_law = pytest.mark.parametrize("law", LAWS)
 
 
-def two_rods(first: np.ndarray, second: np.ndarray) -> tuple[Shapes, np.ndarray]:
+def two_rods(first: np.ndarray, second: np.ndarray) -> tuple[CollisionMesh, np.ndarray]:
     points = np.concatenate([first, second])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod(np.arange(len(first)), RADIUS)
     shapes.rod(len(first) + np.arange(len(second)), RADIUS)
     return shapes, points
@@ -124,7 +124,7 @@ def test_closed_rods_may_begin_at_any_node(device, law, first):
     angle = 2.0 * np.pi * np.arange(n) / n
     ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
     points = np.concatenate([ring, ring + [0.0, 0.0, height(law)]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod(np.roll(np.arange(n), first), RADIUS, closed=True)
     shapes.rod(n + np.arange(n), RADIUS, closed=True)
     result, _ = terms(shapes, points, device, law)

@@ -15,7 +15,7 @@ from friction_cases import (
 )
 from pair_cases import LAWS, assembled_hessian, bundle, central, hessian_product, psi, state, terms, used_pairs
 
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 
 def friction_ratios(pair_list) -> np.ndarray:
@@ -74,19 +74,19 @@ def test_blocks_and_stiffness_equal_the_matrix(device, form):
         assert along < 1e-3 * largest if rate is None else along > 1e-2 * largest
 
 
-def crossing() -> tuple[Shapes, np.ndarray]:
+def crossing() -> tuple[CollisionMesh, np.ndarray]:
     """Return two rods that cross."""
     x = np.array([[-0.03, 0.0, 0.0], [0.07, 0.0, 0.0], [0.01, -0.05, 0.0068], [0.01, 0.05, 0.0068]])
-    shapes = Shapes(x)
+    shapes = CollisionMesh(x)
     shapes.rod([0, 1], 0.003)
     shapes.rod([2, 3], 0.003)
     return shapes, x
 
 
-def landing() -> tuple[Shapes, np.ndarray]:
+def landing() -> tuple[CollisionMesh, np.ndarray]:
     """Return a rod that stands on a triangle with one end."""
     x = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.1, 0.08, 0.0058], [0.1, 0.08, 0.1]])
-    shapes = Shapes(x)
+    shapes = CollisionMesh(x)
     shapes.shell(np.array([[0, 1, 2]]), 0.004)
     shapes.rod([3, 4], 0.003)
     return shapes, x

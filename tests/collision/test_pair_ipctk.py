@@ -9,8 +9,8 @@ from test_distance import KINDS, closest_points, configurations
 
 from ddg_warp.kernels.densities.contact import log_barrier
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 ipctk = pytest.importorskip("ipctk")
 COUNT, RANGE, STIFFNESS = 1000, 0.4, 50.0
@@ -38,14 +38,16 @@ def test_distances_equal_the_toolkit(device, name, case):
     )
 
 
-def scene(stencil: str) -> Shapes:
+def scene(stencil: str) -> CollisionMesh:
     """Return two rods of an edge, or a triangle and a rod with a point near the triangle, at rest."""
     if stencil == "edge_edge":
-        shapes = Shapes(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 1.0]]))
+        shapes = CollisionMesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 1.0]]))
         shapes.rod([0, 1], 0.1)
         shapes.rod([2, 3], 0.1)
         return shapes
-    shapes = Shapes(np.array([[0.3, 0.3, 0.1], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.3, 0.3, 9.0]]))
+    shapes = CollisionMesh(
+        np.array([[0.3, 0.3, 0.1], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.3, 0.3, 9.0]])
+    )
     shapes.shell(np.array([[1, 2, 3]]), 0.2)
     shapes.rod([0, 4], 0.1)
     return shapes
@@ -74,11 +76,11 @@ def positions(stencil: str, inside: bool) -> np.ndarray:
     return x[keep & inner if inside else keep][:COUNT]
 
 
-def terms(stencil: str, x: np.ndarray, device, **options) -> tuple[PairTerms, wp.array]:
+def terms(stencil: str, x: np.ndarray, device, **options) -> tuple[ContactPotential, wp.array]:
     """Return the terms of this kind of pair alone, and positions on the device."""
     points = upload(x.reshape(-1, 3), device)
     search = BroadPhase(scene(stencil), points, len(x), reach=RANGE, margin=0.1)
-    result = PairTerms(search, log_barrier, stiffness=STIFFNESS, range=RANGE, thickness=0.0, **options)
+    result = ContactPotential(search, log_barrier, stiffness=STIFFNESS, range=RANGE, thickness=0.0, **options)
     result.lists, result.frictions = result.lists[-1:], result.frictions[-1:]
     return result, points
 
@@ -113,7 +115,7 @@ def toolkit_friction(stencil: str, corners, move, rate: float) -> tuple[np.ndarr
     return bound * f0 / rate, bound * force_over_speed * J.T @ u, bound * rate * J.T @ bend @ J
 
 
-def assert_agreement(result: PairTerms, points, wanted: list, products: tuple) -> None:
+def assert_agreement(result: ContactPotential, points, wanted: list, products: tuple) -> None:
     """Assert that energies, forces and products of each world agree.
 
     For None in `products` the product is of the matrix, for positions of the exact Hessian.

@@ -24,8 +24,8 @@ from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.densities.contact import smooth_penalty
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 each_case = pytest.mark.parametrize("case", CASES)
 each_law = pytest.mark.parametrize("law", LAWS)
@@ -178,7 +178,7 @@ def test_the_order_of_objects_does_not_matter(device):
     shapes, x = bundle()
     rods, edges = 3, 4
     n = len(x)
-    backwards = Shapes(shapes.points[::-1])
+    backwards = CollisionMesh(shapes.points[::-1])
     triangles = n - 1 - shapes.things(3)[0]
     backwards.shell(triangles[::-1, [1, 2, 0]], 0.004)
     for r in reversed(range(rods)):
@@ -268,7 +268,7 @@ def test_float32_positions(device, case):
     shapes, x = CASES[case]()
     points = upload(x, device, wp.vec3f)
     search = BroadPhase(shapes, points, reach=REACH, margin=MARGIN)
-    result = PairTerms(search, smooth_penalty, **LAWS["penalty"][1])
+    result = ContactPotential(search, smooth_penalty, **LAWS["penalty"][1])
     result.evaluate(points)
     assert result.energy.numpy()[0] == pytest.approx(
         brute_force_energy(shapes, x.astype(np.float32).astype(float), "penalty"), rel=1e-4
@@ -302,4 +302,4 @@ def test_invalid_parameters_are_refused_by_name(device, options, message):
     shapes, x = bundle()
     search = BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN)
     with pytest.raises(SceneError, match=message):
-        PairTerms(search, smooth_penalty, **{"stiffness": 1.0, "range": REACH, **options})
+        ContactPotential(search, smooth_penalty, **{"stiffness": 1.0, "range": REACH, **options})

@@ -12,7 +12,7 @@ from ddg_warp.kernels.core.islands import DROWNED, STATUS, UNBALANCED
 from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.run.simulate import simulate
 from ddg_warp.solve.linear.pcg import SPARE
-from ddg_warp.solve.newton.coupled_newton import LOOSEST, NetNewton
+from ddg_warp.solve.newton.coupled_newton import LOOSEST, CoupledNewton
 
 RADIUS, DT, RTOL = 2e-3, 1 / 240, 1e-4
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -69,7 +69,7 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
     model = scene.build(device=device)
     tolerance = 3e-2
     integrator = ddg.Integrator(model, rtol=tolerance, outliers=0.2)
-    records, take = [], NetNewton.take
+    records, take = [], CoupledNewton.take
 
     def record(newton):
         take(newton)
@@ -80,7 +80,7 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
             reduced, limit = float(newton.forcing.numpy()[0]), float(newton.limit.numpy()[0])
             records.append((int(newton.outliers.number.numpy()[0]), reduced, limit))
 
-    monkeypatch.setattr(NetNewton, "take", record)
+    monkeypatch.setattr(CoupledNewton, "take", record)
     step_without_capture(integrator, model.state(velocities=velocities), DT)
     assert records
     for number, reduced, limit in records:

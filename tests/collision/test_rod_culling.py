@@ -9,14 +9,14 @@ from brute_force import curves, near_pairs, upload
 
 from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, STEPS
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
-from ddg_warp.solve.collision.rod_culling import Runs
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from ddg_warp.solve.collision.rod_culling import RodCulling
 
 REACH, MARGIN, RADIUS = 0.002, 0.004, 0.003
 
 
-def rods(points: np.ndarray, nodes: int) -> Shapes:
-    shapes = Shapes(points)
+def rods(points: np.ndarray, nodes: int) -> CollisionMesh:
+    shapes = CollisionMesh(points)
     for r in range(len(points) // nodes):
         shapes.rod(r * nodes + np.arange(nodes), RADIUS)
     return shapes
@@ -25,13 +25,13 @@ def rods(points: np.ndarray, nodes: int) -> Shapes:
 class Culling:
     """Rod culling of some worlds: a call with the ends of a motion returns the doubt of each world."""
 
-    def __init__(self, shapes: Shapes, points: np.ndarray, device, worlds: int = 1, dtype=wp.vec3d):
+    def __init__(self, shapes: CollisionMesh, points: np.ndarray, device, worlds: int = 1, dtype=wp.vec3d):
         self.device, self.worlds, self.dtype = device, worlds, dtype
         self.search = BroadPhase(shapes, self._upload(points), worlds, reach=REACH, margin=MARGIN)
-        self.runs = Runs(self.search)
+        self.runs = RodCulling(self.search)
 
     def __call__(self, x: np.ndarray, y: np.ndarray | None = None, tried=1) -> np.ndarray:
-        """Advance by a step as `Alone` does: test by the existing bounds, and by new ones where these leave doubt."""
+        """Advance by a step as `DecoupledStep` does: test by the existing bounds, and by new ones where these leave doubt."""
         self.looked = 0
         x, y = self._upload(x), self._upload(x if y is None else y)
         tried = wp.array(np.resize(tried, self.worlds).astype(np.int32), device=self.device)
@@ -49,7 +49,7 @@ class Culling:
         return upload(points, self.device, self.dtype)
 
 
-def within_reach(shapes: Shapes, x: np.ndarray, y: np.ndarray) -> bool:
+def within_reach(shapes: CollisionMesh, x: np.ndarray, y: np.ndarray) -> bool:
     """Return True if any pair is within reach at one of five positions along the motion."""
     return any(near_pairs(shapes, x + fraction * (y - x), 2, 2, REACH) for fraction in np.linspace(0.0, 1.0, 5))
 

@@ -8,11 +8,11 @@ from motion_cases import MARGIN, REACH, Motion
 from pair_cases import LAWS, central, psi
 
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import BALLS, Shapes
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.collision_mesh import BALLS, CollisionMesh
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 
-def rods_shell_and_balls(seed: int) -> tuple[Shapes, np.ndarray]:
+def rods_shell_and_balls(seed: int) -> tuple[CollisionMesh, np.ndarray]:
     """Return rods, a shell and thirty balls, ten of which ignore a rod."""
     shapes, points = scene(seed, 0.3, rods=30, triangles=30)
     rng = np.random.default_rng(seed)
@@ -49,7 +49,7 @@ def test_balls_pair_with_edges_of_rods(device):
 def test_rod_stops_at_a_ball(device):
     """The rod keeps between 1 % and 15 % of the gap; a rod that passes by is not stopped."""
     points = np.array([[-1.0, 0.1, 1.0], [1.0, 0.1, 1.0], [1.2, 0.0, 0.0], [2.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.1)
     shapes.rod([2, 3], 0.1)
     shapes.ball(4, 0.5, still=True, name="head")
@@ -83,7 +83,7 @@ def test_obstacles_form_no_pairs_with_each_other(device):
         assert (d - thickness <= REACH + MARGIN).sum() <= len(candidates)
 
 
-def rods_on_balls() -> tuple[Shapes, np.ndarray]:
+def rods_on_balls() -> tuple[CollisionMesh, np.ndarray]:
     """Return ten rods almost in contact with two balls each: one inside an edge, one next to an end."""
     rng = np.random.default_rng(1)
     _, points = scene(2, 5.0, rods=10, triangles=1)
@@ -92,7 +92,7 @@ def rods_on_balls() -> tuple[Shapes, np.ndarray]:
     across /= np.linalg.norm(across, axis=1)[:, None]
     inside = 0.6 * lines[:, 7] + 0.4 * lines[:, 8] + 0.0241 * across
     ends = lines[:, 0] + 0.0241 * across
-    shapes = Shapes(np.concatenate([points[:210], inside, ends]))
+    shapes = CollisionMesh(np.concatenate([points[:210], inside, ends]))
     for r in range(10):
         shapes.rod(21 * r + np.arange(21), 0.004)
     for k in range(20):
@@ -106,7 +106,7 @@ def test_energies_forces_and_products_of_ball_pairs(device):
     density, parameters = LAWS["penalty"]
     positions = upload(x, device)
     search = BroadPhase(shapes, positions, reach=REACH, margin=MARGIN)
-    terms = PairTerms(search, density, **parameters)
+    terms = ContactPotential(search, density, **parameters)
 
     def energy(y: np.ndarray) -> float:
         i, j = admissible_pairs(shapes, 2, BALLS)

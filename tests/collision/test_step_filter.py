@@ -12,7 +12,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.additive_ccd import NEAR, REST
 from ddg_warp.kernels.collision.ccd.step_fractions import ROUNDS
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 
 def allowed_closing(gap: float) -> float:
@@ -20,7 +20,7 @@ def allowed_closing(gap: float) -> float:
     return gap - max(REST * gap, NEAR * min(gap, REACH))
 
 
-def random_displacements(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
+def random_displacements(shapes: CollisionMesh, rng, size: float, kind: str) -> np.ndarray:
     """Return random displacements of nodes, or of objects with a tenth of node motion added."""
     move = rng.normal(size=shapes.points.shape)
     if kind != "node":
@@ -116,7 +116,7 @@ def test_one_tight_pair_limits_no_other_body(device):
     y = spacing * np.arange(n)
     points = np.array([[[-0.01, offset, 0.0], [0.01, offset, 0.0]] for offset in y]).reshape(-1, 3)
     points = np.concatenate([points, [[0.0, -0.5 * spacing, -0.03], [0.0, 1.5 * spacing, -0.03]]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     for k in range(n + 1):
         shapes.rod([2 * k, 2 * k + 1], 0.005, still=k == n)
     motion = Motion(shapes, points, device)
@@ -140,7 +140,7 @@ def test_falling_layers_stop_one_after_another(device, layers):
         [(ends[:, [1, 0, 2]] if k % 2 else ends) + [0.0, 0.0, spacing * (k + 1)] for k in range(layers)]
     )
     points = np.concatenate([points, [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
-    shapes = Shapes(points)
+    shapes = CollisionMesh(points)
     for k in range(layers):
         shapes.rod([2 * k, 2 * k + 1], 0.004)
     shapes.shell([[2 * layers, 2 * layers + 1, 2 * layers + 2]], 1e-3, still=True)
@@ -245,7 +245,7 @@ def test_smallest_gaps(device):
     points = []
     for k, g in enumerate(gap):
         points += [[0, 10 * k, 0], [1, 10 * k, 0], [0, 10 * k, 0.02 + g], [1, 10 * k, 0.02 + g]]
-    shapes = Shapes(np.array(points, float))
+    shapes = CollisionMesh(np.array(points, float))
     for k in range(6):
         shapes.rod([2 * k, 2 * k + 1], 0.01)
     x = upload(np.concatenate([shapes.points, 2.0 * shapes.points]), device)

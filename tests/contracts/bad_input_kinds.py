@@ -24,7 +24,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.model import rest_shapes
 from ddg_warp.postprocess import fields, quantities, sag_free
 from ddg_warp.solve.equilibrium import continuation, stability, statics
-from ddg_warp.solve.stepping.adaptive_step import StepControl
+from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
 
 NUMBERS = [b"0.3", "0.3", True, 1j, [[1.0], [2.0, 3.0]], {"a": 1.0}, 10**400]  # which are none
 GRAD = torch.ones(3, dtype=torch.float64, requires_grad=True)
@@ -44,7 +44,7 @@ each("kinds: numbers", "friction", NUMBERS, lambda v: rods().contact(friction=v)
 each("kinds: numbers", "range", NUMBERS, lambda v: rods().contact(range=v), "contact: range", "positive")
 each("kinds: numbers", "tangential drag", NUMBERS, lambda v: rods().drag(0, tangential=v, normal=1.0), "drag: tangential")
 each("kinds: numbers", "dt", NUMBERS, lambda v: integrator().step(model().state(), v), "dt", "positive")
-each("kinds: numbers", "error", NUMBERS, lambda v: StepControl(integrator(), v), "StepControl: error", "positive")
+each("kinds: numbers", "error", NUMBERS, lambda v: AdaptiveStepper(integrator(), v), "StepControl: error", "positive")
 each("kinds: numbers", "thickness", NUMBERS, lambda v: sheet(thickness=v), "shell 'sheet': thickness")
 each("kinds: numbers", "stiffness of a law", NUMBERS, lambda v: ddg.Law(None, stiffness=[1.0, v]), "Law: stiffness")
 each("kinds: numbers", "EA", NUMBERS, lambda v: built(rods(section=ddg.Stiffness(v))), "EA")

@@ -21,7 +21,7 @@ from bad_inputs import (
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium import continuation, stability, statics
-from ddg_warp.solve.stepping.adaptive_step import StepControl
+from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
 
 FAR, NEAR = [1e300, 1e200, -1e100], [1e-300, 1e-200, -1e-100]
 LARGE, SMALL = [1e300, 1e100, 10**400], [1e-300, 1e-100]
@@ -93,8 +93,8 @@ sizes("sizes: steps", "rtol", lambda v: ddg.Integrator(model(), rtol=v), words=(
 sizes("sizes: steps", "linear_rtol", lambda v: ddg.Integrator(model(), linear_rtol=v), words=("linear_rtol", *OUTSIDE))
 sizes("sizes: steps", "max_iterations", lambda v: ddg.Integrator(model(), max_iterations=v), (2**31, 10**30),
       ("max_iterations", "at most"))
-sizes("sizes: steps", "halvings", lambda v: StepControl(integrator(), 1e-3, v), (2000, 41, 10**30), ("halvings", "at most 40"))
-sizes("sizes: steps", "error", lambda v: StepControl(integrator(), v), (*LARGE[:2], *SMALL), ("StepControl: error", *OUTSIDE))
+sizes("sizes: steps", "halvings", lambda v: AdaptiveStepper(integrator(), 1e-3, v), (2000, 41, 10**30), ("halvings", "at most 40"))
+sizes("sizes: steps", "error", lambda v: AdaptiveStepper(integrator(), v), (*LARGE[:2], *SMALL), ("StepControl: error", *OUTSIDE))
 
 # --- equilibria ---
 sizes("sizes: equilibria", "end", lambda v: statics.solve(model(), end=v), (1e300, 1e-300), ("statics: end", *OUTSIDE))

@@ -11,7 +11,7 @@ from ddg_warp.solve.equilibrium import continuation, stability, statics
 from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions
 from ddg_warp.solve.equilibrium.statics import StaticsOptions
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
-from ddg_warp.solve.stepping.adaptive_step import StepControl
+from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
 
 
 @cache
@@ -114,13 +114,17 @@ CALLS["Controls"] = Call(ddg.Controls, observe_controls, {}, {
 def observe_adaptive_steps(**named) -> list:
     """Observe adaptive steps."""
     made = model("falling")
-    steps = StepControl(ddg.Integrator(made), **named)
+    steps = AdaptiveStepper(ddg.Integrator(made), **named)
     state = steps.advance(made.state(), 0.1)
     return [*observe_state(state), sorted(steps.lengths.items()), steps.estimate]
 
 
-CALLS["StepControl"] = Call(
-    StepControl, observe_adaptive_steps, {"error": 0.2, "halvings": 3}, {"error": 10.0, "halvings": 2}, ("integrator",)
+CALLS["AdaptiveStepper"] = Call(
+    AdaptiveStepper,
+    observe_adaptive_steps,
+    {"error": 0.2, "halvings": 3},
+    {"error": 10.0, "halvings": 2},
+    ("integrator",),
 )
 
 

@@ -10,7 +10,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
-from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
 
 KINDS = {
     "full": {},
@@ -51,7 +51,7 @@ class Problem:
         (self.group,) = self.model.groups
         self.kind, self.device = self.group.kind, device
         self.count = np.tile(self.group.host.count, 2)
-        newton = self.newton = ChainNewton(self.model, self.group, NewtonOptions(**options))
+        newton = self.newton = RodNewton(self.model, self.group, NewtonOptions(**options))
         state = self.model.state().groups[0]
         x = device_arrays.download(state.x)
         device_arrays.assign(newton.x, x + noise * random.normal(size=x.shape))

@@ -5,7 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import device_arrays
-from ddg_warp.adjoint.coupled_linear_solve import NetSolve
+from ddg_warp.adjoint.coupled_linear_solve import CoupledLinearSolve
 from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.contact import FRICTION, RANGE, STIFFNESS
@@ -115,13 +115,13 @@ def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):
         _, gradient, inputs, _ = differentiated(name, "barrier", 1, SLIDING, lags=lags, **RUBBING)
         return gradient.net.q.numpy(), by_number(inputs, "stiffness")
 
-    whole, chain = found(), NetSolve.chain
+    whole, chain = found(), CoupledLinearSolve.chain
 
     def broken(own, by_lagged, by_q):
         by_lagged.zero_()
         chain(own, by_lagged, by_q)
 
-    monkeypatch.setattr(NetSolve, "chain", broken)
+    monkeypatch.setattr(CoupledLinearSolve, "chain", broken)
     for right, wrong in zip(whole, found(), strict=True):
         assert np.abs(right - wrong).max() > 0.1 * np.abs(right).max()
 
@@ -208,13 +208,13 @@ def test_what_is_not_solved_has_no_gradient(lags, monkeypatch):
     model = built(scene_of("crossing rods", lags=lags, **RUBBING))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)
-    system, missed, chain = adjoint.net.solve.system, ExactSystem.missed, NetSolve.chain
+    system, missed, chain = adjoint.net.solve.system, ExactSystem.missed, CoupledLinearSolve.chain
 
     def go_on(*given):
         system.missed = missed
         chain(*given)
 
-    monkeypatch.setattr(NetSolve, "chain", go_on)
+    monkeypatch.setattr(CoupledLinearSolve, "chain", go_on)
     system.missed = 0.0  # which no solution leaves
     with pytest.raises(
         SolverError, match=r"contact: conjugate gradients have not solved .* no gradient goes through it"

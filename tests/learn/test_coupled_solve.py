@@ -11,9 +11,9 @@ import ddg_warp as ddg
 from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.adjoint.linear_solve import HostSolve
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
+from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
-from ddg_warp.solve.linear.pcg import ConjugateGradients
+from ddg_warp.solve.linear.pcg import PCG
 from ddg_warp.torch import Simulator
 from tests.learn import differences
 from tests.learn.differences import TIGHT, built, cotangent, directions, entries, lively
@@ -71,7 +71,7 @@ def by_both(model, state, rate: float, **attributes):
         setattr(system.krylov, name, value)
     rates = wp.full(model.worlds, rate, dtype=net.real, device=net.device)
     system.solve(state.net, coefficient, rates, wp.array(right, dtype=net.vector, device=net.device), found)
-    tangent = NetTangent(model, 0)
+    tangent = CoupledTangent(model, 0)
     solve = HostSolve(tangent)
     wanted = solve(SimpleNamespace(net=state.net), rate, coefficient, None, tangent.into(right.ravel()))
     return system, found.numpy(), tangent.back(wanted).reshape(-1, 3), tangent
@@ -169,13 +169,13 @@ def test_gradients_are_those_of_factors(name, scheme):
 @pytest.fixture
 def hasty(monkeypatch):
     """Conjugate gradients that end with their first iteration."""
-    once = ConjugateGradients.__init__
+    once = PCG.__init__
 
     def cut(self, newton, multilevel, indefinite=False, **options):
         once(self, newton, multilevel, indefinite, **options)
         self._limit = 1 if indefinite else self._limit
 
-    monkeypatch.setattr(ConjugateGradients, "__init__", cut)
+    monkeypatch.setattr(PCG, "__init__", cut)
 
 
 def test_what_does_not_converge_takes_factors(hasty):

@@ -6,7 +6,7 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 SECTION = ddg.Stiffness(EA=300.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
@@ -119,7 +119,7 @@ class Problem:
         free = np.tile(~net.host.fixed, (2, 1))
         q[:] = q * stretch + noise * random.normal(size=q.shape) * free
         self.state.net.q.assign(q)
-        newton = self.newton = NetNewton(self.model, NewtonOptions(psd=psd), preconditioner)
+        newton = self.newton = CoupledNewton(self.model, NewtonOptions(psd=psd), preconditioner)
         wp.copy(newton.q, self.state.net.q)
         wp.copy(newton.base, self.state.net.q)
         newton.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)

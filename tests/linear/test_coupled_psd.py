@@ -6,7 +6,7 @@ from coupled_problem import Problem, branches, hinged_grid, ring_and_spokes, she
 from test_psd import CONVERGED, errors, helix, order, run
 
 import ddg_warp as ddg
-from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 LATE = 5  # an iteration at which "progressive" takes the exact matrix
@@ -62,7 +62,11 @@ def deflected_cut_helix(device, psd: str):
     section = ddg.Stiffness(EA=5.0, EI1=0.05, EI2=0.03, GJ=0.04, mass_per_length=0.1, rotary_inertia=1e-3)
     whole.add_rod(points, section=section, natural="shape")
     model = coupled_copy(whole, 6).build(device, "float64")
-    newton, state, host = NetNewton(model, NewtonOptions(psd=psd, rtol=1e-13), "chain"), model.state(), model.net.host
+    newton, state, host = (
+        CoupledNewton(model, NewtonOptions(psd=psd, rtol=1e-13), "chain"),
+        model.state(),
+        model.net.host,
+    )
     q = state.net.q.numpy()
     target = q.copy()
     s = np.concatenate([s[:7], s[7:]])
@@ -138,6 +142,6 @@ def test_default_mode_follows_natural_curvature(device):
     """Rounding of a straight, inclined rod is no natural curvature; systems without rods have no second derivatives to add."""
     cases = ((branches(), "gauss_newton"), (coupled_copy(helix(), 20), "progressive"), (sheet("hinge"), "gauss_newton"))
     for scene, expected in cases:
-        assert NetNewton(scene.build(device, "float64"), NewtonOptions()).psd == expected
-    newton = NetNewton(sheet("hinge").build(device, "float64"), NewtonOptions(psd="progressive"))
+        assert CoupledNewton(scene.build(device, "float64"), NewtonOptions()).psd == expected
+    newton = CoupledNewton(sheet("hinge").build(device, "float64"), NewtonOptions(psd="progressive"))
     assert set(newton.exact_from) == {None}

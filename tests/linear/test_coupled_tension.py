@@ -8,7 +8,7 @@ from test_tension import advance
 import ddg_warp as ddg
 from ddg_warp import device_arrays
 from ddg_warp.scenes import hair
-from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 
 HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
@@ -36,10 +36,10 @@ def rods_with_fixed_joints(axial: float = 1e4, twist: bool = True) -> ddg.Scene:
 
 def first_direction(
     scene: ddg.Scene, device, linear, carried: float | None, noise: float = 1e-3
-) -> tuple[NetNewton, np.ndarray]:
+) -> tuple[CoupledNewton, np.ndarray]:
     """Return a solver of two worlds at iterates off rest by `noise` [m], and the first direction (worlds, blocks, 3)."""
     random, model = np.random.default_rng(3), scene.build(device, "float64", worlds=2)
-    newton = NetNewton(model, NewtonOptions(psd="gauss_newton"), "chain", linear, split=carried is not None)
+    newton = CoupledNewton(model, NewtonOptions(psd="gauss_newton"), "chain", linear, split=carried is not None)
     state, islands = model.state().net, newton.islands
     q = state.q.numpy()
     free = np.tile(~model.net.host.fixed, (2, 1))

@@ -11,7 +11,7 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.solve.linear import solver_selection
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
-from ddg_warp.solve.newton.rod_newton_parallel import PartitionedNewton
+from ddg_warp.solve.newton.rod_newton_parallel import RodNewtonParallel
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 EVERY_KIND = pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
     random = np.random.default_rng(11)
     model = scene_of(name, **options).build(device, precision, worlds=2)
     for group, state in zip(model.groups, model.state().groups, strict=True):
-        newton = PartitionedNewton(model, group, NewtonOptions())
+        newton = RodNewtonParallel(model, group, NewtonOptions())
         x = device_arrays.download(state.x)
         for array in (newton.x, newton.target):
             device_arrays.assign(array, x + noise * random.normal(size=x.shape))
@@ -345,7 +345,7 @@ def test_auto_reduces_few_long_open_rods(device):
     expected = "cyclic reduction" if model.wp_device.is_cuda else "chain sweep"
     assert expected in model.report()
     solver = ddg.Integrator(model)._chains[0].newton
-    assert isinstance(solver, PartitionedNewton) == model.wp_device.is_cuda
+    assert isinstance(solver, RodNewtonParallel) == model.wp_device.is_cuda
 
 
 def test_closed_rods_are_refused(device):

@@ -9,7 +9,7 @@ import ddg_warp as ddg
 from ddg_warp import device_arrays
 from ddg_warp.kernels.core import outcome
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
 from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
 
 CONVERGED = {"converged", "converged_to_rounding"}
@@ -120,7 +120,7 @@ def order(sizes: list[float]) -> float:
     return (c - b) / (b - a)
 
 
-@pytest.mark.parametrize("solver", [ChainNewton, PcgNewton])
+@pytest.mark.parametrize("solver", [RodNewton, PcgNewton])
 @pytest.mark.parametrize("psd", ["progressive", pytest.param("none", marks=pytest.mark.slow)])
 def test_exact_newton_converges_quadratically(device, solver, psd):
     sizes, plain = (

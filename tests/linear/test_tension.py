@@ -9,7 +9,7 @@ from ddg_warp import device_arrays
 from ddg_warp.scenes import hair as curled
 from ddg_warp.solve.linear import solver_selection
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
-from ddg_warp.solve.newton.rod_newton_parallel import PartitionedNewton
+from ddg_warp.solve.newton.rod_newton_parallel import RodNewtonParallel
 from ddg_warp.solve.stepping.rod_step import DIRECT
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}}
@@ -134,7 +134,7 @@ def test_float32_error_is_independent_of_axial_stiffness(device, solver):
     assert errors[False][-1] > 1e2 * errors[True][-1]
 
 
-def mixed_wavy_rod(nodes: int, axial: float, device) -> PartitionedNewton:
+def mixed_wavy_rod(nodes: int, axial: float, device) -> RodNewtonParallel:
     """Return a mixed solver by cyclic reduction after one iteration, of a wavy rod of 1 m fixed at ends and inner nodes."""
     along = np.linspace(0.0, 1.0, nodes)
     points = np.stack([along, 0.05 * np.sin(20.0 * along), 0.05 * np.cos(14.0 * along)], axis=1)
@@ -146,7 +146,7 @@ def mixed_wavy_rod(nodes: int, axial: float, device) -> PartitionedNewton:
     scene.fix(rod, [72], components="y")
     model = scene.build(device, "mixed")
     group, state = model.groups[0], model.state().groups[0]
-    newton = PartitionedNewton(model, group, NewtonOptions(), split=True)
+    newton = RodNewtonParallel(model, group, NewtonOptions(), split=True)
     for array in (newton.x, newton.target):
         wp.copy(array, state.x)
     wp.copy(newton.frame, state.frame)
@@ -158,7 +158,7 @@ def mixed_wavy_rod(nodes: int, axial: float, device) -> PartitionedNewton:
     return newton
 
 
-def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
+def dense(newton: RodNewtonParallel) -> tuple[np.ndarray, np.ndarray]:
     """Solve [H r^T, r -s] in float64 from the same blocks, rows and slacks; return (nodes, dofs) and lengthenings."""
     kind, n = newton.group.kind, newton.group.nodes
     nb = kind.block

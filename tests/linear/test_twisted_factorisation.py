@@ -9,7 +9,7 @@ from rod_system import system
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.linear.rod_dof_map import place_dofs
-from ddg_warp.solve.linear.twisted_factorisation import BothEnds
+from ddg_warp.solve.linear.twisted_factorisation import TwistedFactorisation
 
 COUNTS = (1, 2, 3, 4, 5, 6, 17, 32, 33)
 LONGEST, WIDTH = max(COUNTS), len(COUNTS)
@@ -64,7 +64,7 @@ def test_solutions_match_dense_solves(device, twist, span, in_place):
         wp.array(COUNTS, dtype=int, device=device),
         wp.array(np.arange(columns) % WIDTH == inactive, dtype=int, device=device),
     )
-    both = BothEnds(SimpleNamespace(twist=twist, span=span, block=nb), columns, wp.float64, device, 32)
+    both = TwistedFactorisation(SimpleNamespace(twist=twist, span=span, block=nb), columns, wp.float64, device, 32)
     rows = np.concatenate([np.tile(bands, (1, 1, worlds)), np.zeros((nb, LONGEST, columns))])
     factors = device_arrays.upload(rows, wp.float64, device)
     matrix = factors if in_place else device_arrays.upload(rows[:-nb], wp.float64, device)
@@ -106,7 +106,7 @@ def test_negative_pivots_are_counted(device, node):
     bands[: nb**2 : nb + 1] = 1.0
     bands[nb + 1, node] = -1.0
     factors = device_arrays.upload(bands, wp.float64, device)
-    both = BothEnds(SimpleNamespace(twist=False, span=2, block=nb), 1, wp.float64, device, 32)
+    both = TwistedFactorisation(SimpleNamespace(twist=False, span=2, block=nb), 1, wp.float64, device, 32)
     count, inactive = wp.full(1, n, dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
     lost = wp.zeros(1, dtype=int, device=device)
     both.factorise(factors, count, inactive, wp.full(1, 1, dtype=int, device=device), factors, lost)

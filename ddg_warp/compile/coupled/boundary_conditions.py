@@ -3,15 +3,15 @@
 import numpy as np
 
 from ddg_warp.compile import axisymmetric, boundary_conditions
-from ddg_warp.compile.boundary_conditions import Claims
+from ddg_warp.compile.boundary_conditions import ConstraintRegistry
 from ddg_warp.compile.coupled.skew_supports import frames_of_planes
-from ddg_warp.compile.coupled.system import Net
+from ddg_warp.compile.coupled.system import CoupledSystem
 from ddg_warp.compile.loads import EdgeCouple, Pressure
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.fundamental_forms import FREE as FREE_EDGE
 
 
-def add_masses(scene, net: Net) -> None:
+def add_masses(scene, net: CoupledSystem) -> None:
     """Lump masses and rotary inertia at the dofs."""
     lumps = [(rod.all_nodes, rod.piece.mass[rod.row]) for rod in net.rods]
     for shell in net.shells:
@@ -27,9 +27,9 @@ def add_masses(scene, net: Net) -> None:
     boundary_conditions.add_masses(scene, net)
 
 
-def hold(scene, net: Net) -> None:
+def hold(scene, net: CoupledSystem) -> None:
     """Fix dofs; record the dofs and the motion of each support."""
-    claims = Claims(scene, net)
+    claims = ConstraintRegistry(scene, net)
     boundary_conditions.hold_rods(scene, net, claims)
     normals: dict[int, list] = {}
     for support in scene.shell_supports:
@@ -50,7 +50,7 @@ def hold(scene, net: Net) -> None:
     frames_of_planes(net, normals)
 
 
-def load(scene, net: Net) -> None:
+def load(scene, net: CoupledSystem) -> None:
     """Add the loads of rods, shells and rings."""
     boundary_conditions.load_rods(scene, net)
     for description in scene.shell_loads:
@@ -71,7 +71,7 @@ def load(scene, net: Net) -> None:
         _press(net, axisymmetric.BandPressure(ends, description.pressure, description.amplitude), description.dead)
 
 
-def _press(net: Net, pressure, dead: bool) -> None:
+def _press(net: CoupledSystem, pressure, dead: bool) -> None:
     """Add a pressure as a follower load, or as a dead load with the forces at rest."""
     if dead:
         forces = pressure.forces(net.rest[pressure.places])

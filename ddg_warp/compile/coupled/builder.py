@@ -11,9 +11,9 @@ from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.coupled import boundary_conditions, element_sets
 from ddg_warp.compile.coupled.contact_parameters import touching
-from ddg_warp.compile.coupled.system import Net, NetRod, NetShell
-from ddg_warp.compile.ghost_nodes import Ghosts
-from ddg_warp.compile.rods import Piece, alike, net_rods, piece_of
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledShell, CoupledSystem
+from ddg_warp.compile.ghost_nodes import GhostNodes
+from ddg_warp.compile.rods import RodArrays, alike, net_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import Surface
@@ -21,7 +21,7 @@ from ddg_warp.scene import drag
 from ddg_warp.scene.shells_and_joints import COINCIDE
 
 
-def compile_net(scene, along: bool = False) -> Net | None:
+def compile_net(scene, along: bool = False) -> CoupledSystem | None:
     """Return the coupled system of a scene, None without one.
 
     Args:
@@ -36,7 +36,7 @@ def compile_net(scene, along: bool = False) -> Net | None:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
-    builder, ghosts, laws = _Builder(scene, along), Ghosts(scene), drag.Laws(scene)
+    builder, ghosts, laws = _Builder(scene, along), GhostNodes(scene), drag.Laws(scene)
     for batch in scene.batches:
         if chosen[batch.first : batch.first + batch.rods].any():
             if scene.dimension == 2:
@@ -73,7 +73,7 @@ class _Builder:
         self.scene, self.along = scene, along
         self.points: list[np.ndarray] = []
         self.count = 0
-        self.rods: dict[int, NetRod] = {}
+        self.rods: dict[int, CoupledRod] = {}
         self.shells: list[tuple] = []
         self.meridians: list[np.ndarray] = []
         self.obstacles: list[np.ndarray] = []
@@ -84,7 +84,7 @@ class _Builder:
         self.stiffness: list[np.ndarray] = []
         self.ends: list[np.ndarray] = []
 
-    def add_rods(self, piece: Piece) -> None:
+    def add_rods(self, piece: RodArrays) -> None:
         """Number the nodes and twist angles of rods."""
         (rods, n, _), closed, (before, after) = piece.x.shape, piece.kind.closed, piece.ghosts
         order = "C" if self.along else "F"
@@ -107,7 +107,7 @@ class _Builder:
         rod_nodes, rod_edges = nodes[:, before : n - after], angles[:, before : edges - after]
         for row, rod in enumerate(piece.rods.tolist()):
             all_dofs = nodes[row], angles[row]
-            self.rods[rod] = NetRod(rod, rod_nodes[row], rod_edges[row], before, piece, row, *all_dofs)
+            self.rods[rod] = CoupledRod(rod, rod_nodes[row], rod_edges[row], before, piece, row, *all_dofs)
 
     def add_shell(self, shell) -> None:
         """Number the vertices of a shell."""
@@ -129,7 +129,7 @@ class _Builder:
         self.count += len(points)
         return np.arange(self.count - len(points), self.count)
 
-    def finish(self) -> Net:
+    def finish(self) -> CoupledSystem:
         """Merge joined nodes, number dof blocks and return the coupled system."""
         scene, points = self.scene, np.concatenate(self.points)
         merged = self._merge(points)
@@ -162,12 +162,12 @@ class _Builder:
             except SceneError as error:
                 raise SceneError(f"shell '{shell.name}': {error}") from None
             third = plate.area * plate.thickness * material.density / 3.0
-            shells.append(NetShell(surface, merged[numbers], angle, kinds, supports, plate, third))
+            shells.append(CoupledShell(surface, merged[numbers], angle, kinds, supports, plate, third))
         angles = self.rod_edges + mesh_edges
         spins = sum(joint.rigid for joint in scene.joints)
         rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
         blocks = nodes + angles + spins
-        net = Net(
+        net = CoupledSystem(
             rest=np.concatenate([rest_nodes, np.zeros((blocks - nodes, 3))]),
             nodes=nodes,
             angles=angles,

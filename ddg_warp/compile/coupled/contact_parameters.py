@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ddg_warp.compile.collision_bodies import ROD, Body, Touching
-from ddg_warp.compile.coupled.system import Net
+from ddg_warp.compile.collision_bodies import ROD, Body, ContactParameters
+from ddg_warp.compile.coupled.system import CoupledSystem
 from ddg_warp.compile.laws import contact_law
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.contact import Contact, touching_names
@@ -19,7 +19,7 @@ RESOLVED = 1e-13  # least activation distance over coordinates
 INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap, over nodal mass / dt^2
 
 
-def touching(scene, net: Net) -> Touching | None:
+def touching(scene, net: CoupledSystem) -> ContactParameters | None:
     """Return the contact of the coupled system, None without."""
     law = scene.touching
     if law is None:
@@ -89,7 +89,7 @@ def _of_rod(batch, name: str, row: int) -> np.ndarray:
     return values[row] if values.ndim == 2 and len(values) > 1 else values
 
 
-def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: np.ndarray) -> Touching:
+def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: np.ndarray) -> ContactParameters:
     """Return the contact parameters of pairs of groups.
 
     Args:
@@ -116,7 +116,7 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
     density, keep = contact_law(law, stiffness, within, explicit)
     multipliers = _by_way(rough)
-    return Touching(
+    return ContactParameters(
         law, density, keep, bodies, names.tolist(), group, *multipliers, stiffness, within, inertia, ignored
     )
 

@@ -9,16 +9,16 @@ import numpy as np
 from ddg_warp.compile import axisymmetric, shells
 from ddg_warp.compile.coupled.magnets import magnet_sets
 from ddg_warp.compile.coupled.rod_shell_coupling import glue_sets
-from ddg_warp.compile.coupled.system import Net, NetRod, NetSet
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledSystem, NetSet
 from ddg_warp.compile.element_set import ElementSet
 from ddg_warp.compile.laws import bind_law, check_laws
-from ddg_warp.compile.rods import Piece
+from ddg_warp.compile.rods import RodArrays
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import fundamental_forms, polyline
 from ddg_warp.kernels.terms import JOINTS, term_key
 
 
-def element_sets(scene, net: Net, along: bool) -> list[NetSet]:
+def element_sets(scene, net: CoupledSystem, along: bool) -> list[NetSet]:
     """Return element sets by term, numbered `along` rods or not (`compile_net`); fix dofs without elements."""
     joints = _joint_places(scene, net)
     rods = [*_rod_sets(net, joints, along), *_joint_sets(net, joints), *glue_sets(scene, net)]
@@ -26,7 +26,7 @@ def element_sets(scene, net: Net, along: bool) -> list[NetSet]:
     return _gather_sets([*rods, *magnets, *_shell_sets(net, scene), *_meridian_sets(net, scene)])
 
 
-def _joint_places(scene, net: Net) -> list[tuple[int, int, list, Mapping]]:
+def _joint_places(scene, net: CoupledSystem) -> list[tuple[int, int, list, Mapping]]:
     """Return (node, rotation block, edges, laws) of each rigid joint, edges as (rod, edge with ghosts, sign)."""
     by_rod = {rod.rod: rod for rod in net.rods}
     result = []
@@ -53,10 +53,10 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list, Mapping]]:
     return result
 
 
-def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
+def _rod_sets(net: CoupledSystem, joints, along: bool) -> list[NetSet]:
     """Return stretch and bending of rods in the order of nodes, except vertices at rigid joints."""
     skipped = np.array([rod.rod * net.nodes + node for node, _, members, _ in joints for rod, _, _ in members], int)
-    alike: dict[int, list[NetRod]] = {}
+    alike: dict[int, list[CoupledRod]] = {}
     for rod in net.rods:
         alike.setdefault(id(rod.piece), []).append(rod)
     sets = []
@@ -94,7 +94,7 @@ def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
     return _gather_sets(sets)
 
 
-def _joint_sets(net: Net, joints) -> list[NetSet]:
+def _joint_sets(net: CoupledSystem, joints) -> list[NetSet]:
     """Return bending and twist of the half cells between rigid joints and adjacent edges.
 
     A joint clamps each rod by the rod's frame at the node: between adjacent edges, or extrapolated at an end.
@@ -109,7 +109,7 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
     return [_half_cells(net, edges, by_angle, law) for (by_angle, _), (law, edges) in kinds]
 
 
-def _half_cells(net: Net, members: list, by_angle: bool, law) -> NetSet:
+def _half_cells(net: CoupledSystem, members: list, by_angle: bool, law) -> NetSet:
     """Return the half cells of rods with one curvature measure and one law, None for the quadratic one."""
     term = JOINTS[term_key("rigid_joint", by_angle)].of({} if law is None else {"rigid_joint": law})
     node, spin, rods, k, sign = zip(*members, strict=True)
@@ -153,7 +153,7 @@ def _spread(count: int, family: str, value) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, float), (count,))
 
 
-def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
+def _natural_at(piece: RodArrays, row: int, node: int) -> np.ndarray:
     """Return natural curvatures and twist of a rod at a node, at an end of the adjacent vertex [1/m]."""
     for term in piece.kind.terms:
         if term.measure.angles:
@@ -166,7 +166,7 @@ def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
     raise AssertionError("a rod of a rigid joint has a bending term")
 
 
-def _shell_sets(net: Net, scene) -> list[NetSet]:
+def _shell_sets(net: CoupledSystem, scene) -> list[NetSet]:
     sets, count = [], Counter()
     for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
         models = description.bending, description.membrane
@@ -185,7 +185,7 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     return sets
 
 
-def _meridian_sets(net: Net, scene) -> list[NetSet]:
+def _meridian_sets(net: CoupledSystem, scene) -> list[NetSet]:
     none = np.zeros(0, int)
     sets = []
     for index, shell in enumerate(net.meridians):

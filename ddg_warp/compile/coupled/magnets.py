@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp.compile.coupled.system import Net, NetRod, NetSet
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledSystem, NetSet
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import MAGNETS
 from ddg_warp.scene.descriptions import Dynamics
@@ -21,7 +21,7 @@ class _Magnets:
         direction, size: unit vector (3, E) in the material frame and size (E,) [A/m] of the magnetisation.
     """
 
-    rod: NetRod
+    rod: CoupledRod
     k: np.ndarray
     ends: np.ndarray
     volume: np.ndarray
@@ -42,7 +42,7 @@ class _Magnets:
         return np.array([np.full(len(self.k), self.rod.rod), self.k + self.rod.first])
 
 
-def magnet_sets(scene, net: Net) -> list[NetSet]:
+def magnet_sets(scene, net: CoupledSystem) -> list[NetSet]:
     """Return the elements of magnetised edges in the applied field, and of dipole pairs."""
     magnets = [edges for rod in net.rods if len((edges := _magnets(scene, net, rod)).k)]
     sets = _pairs(scene, net, magnets) if scene.dipoles else []
@@ -59,7 +59,7 @@ def magnet_sets(scene, net: Net) -> list[NetSet]:
     return sets
 
 
-def _magnets(scene, net: Net, rod: NetRod) -> _Magnets:
+def _magnets(scene, net: CoupledSystem, rod: CoupledRod) -> _Magnets:
     batch = rod.piece.batch
     total = np.zeros((batch.edges, 3))
     for magnet in scene.magnets:
@@ -73,7 +73,7 @@ def _magnets(scene, net: Net, rod: NetRod) -> _Magnets:
     return _Magnets(rod, k, ends, area * length, (total[k] / size[k, None]).T, size[k])
 
 
-def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
+def _pairs(scene, net: CoupledSystem, magnets: list[_Magnets]) -> list[NetSet]:
     """Return the elements of all listed pairs of magnetised edges."""
     from scipy.spatial import cKDTree
 

@@ -23,7 +23,7 @@ class Pieces:
 
 
 @dataclass(frozen=True)
-class Outwards:
+class RodOrder:
     """Breadth-first order of R rods with P path nodes, ghosts included.
 
     Attributes:
@@ -84,7 +84,7 @@ class Outwards:
         return Pieces(np.append(starts, len(self.nodes)), piece_of_node, rod, first)
 
 
-def outwards(rods: list[np.ndarray], fixed: np.ndarray) -> Outwards:
+def outwards(rods: list[np.ndarray], fixed: np.ndarray) -> RodOrder:
     """Return the order of rods, given as lists of dof blocks; `fixed` (N,) bool.
 
     Each rod meets an anchor if one is reachable. The first rod of a connected component without anchors comes first.
@@ -109,7 +109,7 @@ def outwards(rods: list[np.ndarray], fixed: np.ndarray) -> Outwards:
         reached[blocks[chosen]] = True
         levels.append(np.flatnonzero(ready))
         left = left[~chosen]
-    return Outwards(nodes, start, anchored, levels)
+    return RodOrder(nodes, start, anchored, levels)
 
 
 def _first_connected(nodes: np.ndarray, rod: np.ndarray, blocks: int, rods: int) -> np.ndarray:

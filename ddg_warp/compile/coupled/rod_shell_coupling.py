@@ -13,7 +13,7 @@ m. The series keeps the coupling no stiffer than needed if one side is much soft
 import numpy as np
 
 from ddg_warp.compile import shells
-from ddg_warp.compile.coupled.system import Net, NetRod, NetSet, NetShell
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledShell, CoupledSystem, NetSet
 from ddg_warp.geometry import polyline
 from ddg_warp.geometry.fundamental_forms import SYMMETRY
 from ddg_warp.kernels.terms import GLUE as TERM
@@ -22,7 +22,7 @@ GLUE = 10.0
 """Coupling stiffness over the stiffness of a rod edge and its adjacent triangles in series."""
 
 
-def glue_sets(scene, net: Net) -> list[NetSet]:
+def glue_sets(scene, net: CoupledSystem) -> list[NetSet]:
     """Return the rod-shell coupling elements; fix twist angles of edges on a symmetry plane."""
     rods, sets = {rod.rod: rod for rod in net.rods}, []
     for (index, shell_index), vertices in _attached(scene, rods).items():
@@ -37,7 +37,7 @@ def glue_sets(scene, net: Net) -> list[NetSet]:
     return sets
 
 
-def _attached(scene, rods: dict[int, NetRod]) -> dict[tuple[int, int], np.ndarray]:
+def _attached(scene, rods: dict[int, CoupledRod]) -> dict[tuple[int, int], np.ndarray]:
     """Return, by (rod with angles, shell), the attached vertex of each node of the rod, -1 without."""
     result = {}
     for link in scene.attachments:
@@ -48,7 +48,7 @@ def _attached(scene, rods: dict[int, NetRod]) -> dict[tuple[int, int], np.ndarra
     return result
 
 
-def _shared_edges(rod: NetRod, shell: NetShell, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shared_edges(rod: CoupledRod, shell: CoupledShell, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rod edges without ghosts that are mesh edges, and the mesh edges."""
     count = len(rod.edges)
     mesh_edges = shell.surface.find_edges(vertices[:count], np.roll(vertices, -1)[:count])
@@ -56,7 +56,7 @@ def _shared_edges(rod: NetRod, shell: NetShell, vertices: np.ndarray) -> tuple[n
     return edges, mesh_edges[edges]
 
 
-def _elements(net: Net, rod: NetRod, edges, shell: NetShell, mesh_edges, bending: str) -> NetSet:
+def _elements(net: CoupledSystem, rod: CoupledRod, edges, shell: CoupledShell, mesh_edges, bending: str) -> NetSet:
     surface, piece = shell.surface, rod.piece
     ends = np.stack([rod.nodes[edges], np.roll(rod.nodes, -1)[edges]])
     corners = surface.edge_opposite[mesh_edges].T
@@ -83,7 +83,7 @@ def _elements(net: Net, rod: NetRod, edges, shell: NetShell, mesh_edges, bending
     return NetSet(TERM, np.stack([*ends, *opposite, *angles]), angle, data, law, owner)
 
 
-def _bending(shell: NetShell, mesh_edges, heights) -> np.ndarray:
+def _bending(shell: CoupledShell, mesh_edges, heights) -> np.ndarray:
     """Return the sum of D / h over the triangles adjacent to mesh edges [N]."""
     sides = shell.surface.edge_triangles[mesh_edges].T
     return np.where(sides < 0, 0.0, shell.plate.bending_stiffness[sides] / heights).sum(0)

@@ -1,8 +1,8 @@
 """Skew supports: nodal frames of nodes on planes across no coordinate axis.
 
 A symmetry plane fixes the displacement along its normal. If that is no coordinate axis, the node gets an orthonormal frame with the
-fixed directions first, and `Net.fixed` refers to components in this frame. Positions stay in space: host and device rotate forces and
-tangents into the nodal frames, and search directions back.
+fixed directions first, and `CoupledSystem.fixed` refers to components in this frame. Positions stay in space: host and device
+    rotate forces and tangents into the nodal frames, and search directions back.
 """
 
 import numpy as np

@@ -11,27 +11,27 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.collision_bodies import Touching
-from ddg_warp.compile.coupled.rod_ordering import Outwards, outwards
-from ddg_warp.compile.dof_map import Along, RodPlaces, Storage
+from ddg_warp.compile.collision_bodies import ContactParameters
+from ddg_warp.compile.coupled.rod_ordering import RodOrder, outwards
+from ddg_warp.compile.dof_map import DofStorage, RodDofMap, RodIndexMap
 from ddg_warp.compile.loads import accumulate
 from ddg_warp.compile.precision import float32_error, largest_carried, stiffnesses
-from ddg_warp.compile.residual_tolerance import Bodies
-from ddg_warp.compile.rods import Piece
+from ddg_warp.compile.residual_tolerance import ToleranceBodies
+from ddg_warp.compile.rods import RodArrays
 from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene import drag
 
 
 @dataclass
-class NetRod:
+class CoupledRod:
     """Rod of the coupled system: dof blocks of nodes and of twist angles (empty without twist), ghosts excluded."""
 
     rod: int
     nodes: np.ndarray
     edges: np.ndarray
     first: int  # number of ghosts before the first node
-    piece: Piece
+    piece: RodArrays
     row: int  # row in the piece
     all_nodes: np.ndarray  # with ghosts
     all_edges: np.ndarray
@@ -44,7 +44,7 @@ class NetRod:
 
 
 @dataclass
-class NetShell:
+class CoupledShell:
     """Shell of the coupled system: dof blocks of vertices and of mesh-edge angles (-1 without)."""
 
     surface: Surface
@@ -83,7 +83,7 @@ class NetSet:
 
 
 @dataclass(kw_only=True, eq=False)
-class Net(Storage):
+class CoupledSystem(DofStorage):
     """Coupled system of a scene on the host: N dof blocks of three components.
 
     Attributes:
@@ -105,8 +105,8 @@ class Net(Storage):
     nodes: int
     angles: int
     spins: int
-    rods: list[NetRod]
-    shells: list[NetShell]
+    rods: list[CoupledRod]
+    shells: list[CoupledShell]
     sets: list[NetSet]
     ends: np.ndarray
     frame: np.ndarray
@@ -116,7 +116,7 @@ class Net(Storage):
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     obstacles: list[np.ndarray] = field(default_factory=list)
     markers: list[np.ndarray] = field(default_factory=list)
-    touching: Touching | None = None
+    touching: ContactParameters | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -145,15 +145,15 @@ class Net(Storage):
         return self.fixed[nodes]
 
     @cached_property
-    def places(self) -> RodPlaces:
+    def places(self) -> RodDofMap:
         def each(value):
             return np.array([value(rod) for rod in self.rods], int)
 
         def along(lists):
             starts = np.cumsum([0, *map(len, lists)])[:-1] + each(lambda rod: rod.first)
-            return Along(starts, table=np.concatenate([np.zeros(0, int), *lists]))
+            return RodIndexMap(starts, table=np.concatenate([np.zeros(0, int), *lists]))
 
-        return RodPlaces(
+        return RodDofMap(
             rods=each(lambda rod: rod.rod),
             own=each(lambda rod: len(rod.nodes)),
             closed=each(lambda rod: rod.piece.kind.closed) > 0,
@@ -198,7 +198,7 @@ class Net(Storage):
         return tuple(np.concatenate(parts, -1) for parts in zip(*pieces, strict=True)) if pieces else None
 
     @cached_property
-    def outwards(self) -> Outwards:
+    def outwards(self) -> RodOrder:
         """Order of rods for edge-rotation updates."""
         anchors = self.fixed.all(1)
         for shell in (*self.shells, *self.meridians):
@@ -206,9 +206,9 @@ class Net(Storage):
         return outwards([rod.all_nodes for rod in self.rods], anchors)
 
     @cached_property
-    def bodies(self) -> Bodies:
+    def bodies(self) -> ToleranceBodies:
         """Bodies of the residual tolerance."""
-        return Bodies(self)
+        return ToleranceBodies(self)
 
     @cached_property
     def edges(self) -> np.ndarray:

@@ -12,10 +12,10 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
 from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
-from ddg_warp.solve.collision.bvh import Things
-from ddg_warp.solve.collision.candidate_list import PairList
-from ddg_warp.solve.collision.collision_mesh import BALLS, PLANES, Shapes
-from ddg_warp.solve.collision.step_filter import MotionFilter
+from ddg_warp.solve.collision.bvh import Primitives
+from ddg_warp.solve.collision.candidate_list import CandidateList
+from ddg_warp.solve.collision.collision_mesh import BALLS, PLANES, CollisionMesh
+from ddg_warp.solve.collision.step_filter import StepFilter
 
 SLACK = 1e-3  # relative excess of the skin margin in searches, for rounding
 NONE = np.iinfo(np.int64).max
@@ -42,11 +42,11 @@ class BroadPhase:
         radius: radius of every object in every world (worlds, objects) [m], in place of the radii of `shapes`.
 
     Attributes:
-        lists: a `PairList` for each kind of pairs in the mesh.
+        lists: a `CandidateList` for each kind of pairs in the mesh.
         overflow: (1,), nonzero after a capacity overflow, also in `impact` and `crossings`. Then call `fit`, and redo all that used
             the pairs.
         `searches`: (1,) number of searches.
-        `looks`: (1,) counter of `Runs`.
+        `looks`: (1,) counter of `RodCulling`.
         `sought`: both, as of the last `fit` or `check`.
         `more`, `more_read`: (MORE,) counters of other objects, and the values of the last `fit` or `check`.
         `gap`, `time`, `crossed`: [m], step fraction, count of each world; see `measure`, `impact` and `crossings`.
@@ -60,7 +60,7 @@ class BroadPhase:
 
     def __init__(
         self,
-        shapes: Shapes,
+        shapes: CollisionMesh,
         x: wp.array,
         worlds: int = 1,
         *,
@@ -81,7 +81,7 @@ class BroadPhase:
         self.real = real
         if radius is None:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
-        primitives = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
+        primitives = {size: Primitives(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(primitives.values())
         self._still, self._move, self._way = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
         self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # motion of the last search
@@ -107,7 +107,7 @@ class BroadPhase:
         several_worlds = worlds > 1
         sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
         self.lists = [
-            PairList(kind, primitives[first], primitives[second], shapes, several_worlds, real, self.overflow)
+            CandidateList(kind, primitives[first], primitives[second], shapes, several_worlds, real, self.overflow)
             for kind, first, second in sides
             if second in primitives
         ]
@@ -121,7 +121,7 @@ class BroadPhase:
         self.time = wp.zeros(worlds, dtype=real, device=self.device)
         self.crossed = wp.zeros(worlds, dtype=int, device=self.device)
         self._firsts = [wp.zeros(1, dtype=wp.int64, device=self.device) for _ in self.lists]
-        self._filter = MotionFilter(self.lists, nodes, worlds, real, self.device)
+        self._filter = StepFilter(self.lists, nodes, worlds, real, self.device)
         self.version = 0
         self.search(x)
         self.fit(x)
@@ -181,7 +181,7 @@ class BroadPhase:
         for primitives in self._walked:
             primitives.leaves.renew()
 
-        def find(pairs: PairList) -> None:
+        def find(pairs: CandidateList) -> None:
             pairs.meet()
             pairs.judge(x, move, together, self.reach, self._around)
 
@@ -224,8 +224,8 @@ class BroadPhase:
 
         Args:
             x: positions of the search.
-            shorten: called if the pairs are too many to store, see `PairList.crowded`; True means that motions will be shorter, and
-                lists stay.
+            shorten: called if the pairs are too many to store, see `CandidateList.crowded`; True means that motions will be
+                shorter, and lists stay.
 
         Raises:
             SolverError: names a node whose position is not finite; or there are more pairs than can be counted.
@@ -311,7 +311,7 @@ class BroadPhase:
                 return self.describe(pairs, *divmod(key, pairs.second.all))
         return ""
 
-    def describe(self, pairs: PairList, i: int, j: int) -> str:
+    def describe(self, pairs: CandidateList, i: int, j: int) -> str:
         """Return the names of a pair for messages."""
         world, k = divmod(i, pairs.first.count)
         first, second = (

@@ -16,7 +16,7 @@ BUNDLE = 1, 4
 WALKERS = 1, 2  # sizes of primitives that query BVHs: points and edges
 
 
-class Boxes:
+class Aabbs:
     """AABBs of primitives, `count` in each of some worlds; `tree` exists once built.
 
     Args:
@@ -57,7 +57,7 @@ class WalkOrder:
         numbers: box indices (2 all,), of which the first half is valid.
     """
 
-    def __init__(self, boxes: Boxes):
+    def __init__(self, boxes: Aabbs):
         self._boxes = boxes
         self._keys, self.numbers = (wp.zeros(2 * boxes.all, dtype=int, device=boxes.device) for _ in range(2))
         # of 30 bits, which with the world number have to be 31
@@ -76,7 +76,7 @@ class WalkOrder:
         wp.utils.radix_sort_pairs(self._keys, self.numbers, boxes.all)
 
 
-class Things:
+class Primitives:
     """Points, edges, triangles, balls or planes of `shapes`, with AABBs and BVH leaves.
 
     Args:
@@ -111,7 +111,7 @@ class Things:
         self.bundle = int(np.diff(starts).max(initial=1))
         self._single = self.bundle == 1
         corners = (self.lower, self.upper) if self._single else None
-        self.leaves = Boxes(len(starts) - 1, worlds, device, corners)
+        self.leaves = Aabbs(len(starts) - 1, worlds, device, corners)
         self.walked = size != 1  # points query other BVHs and are not queried
         self.order = WalkOrder(self.leaves) if size in WALKERS and not device_arrays.serial(device) else None
         self._enclose = box_kernel(nodes.shape[1], size == PLANES, real)
@@ -119,7 +119,7 @@ class Things:
         self.kernels += [encode] if self.order else []
 
     def build(self) -> None:
-        """Rebuild the BVH of leaves, if any, as `Boxes.build`, and the order of queries."""
+        """Rebuild the BVH of leaves, if any, as `Aabbs.build`, and the order of queries."""
         if self.walked:
             self.leaves.build()
         if self.order:

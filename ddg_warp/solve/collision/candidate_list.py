@@ -5,14 +5,14 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.collision.broad_phase.aabb import Trees
+from ddg_warp.kernels.collision.broad_phase.aabb import BvhPair
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import gap_kernel
 from ddg_warp.kernels.collision.broad_phase.candidates import MOST, candidate_kernels, meet_kernel
 from ddg_warp.kernels.collision.ccd.additive_ccd import passing_kernel
 from ddg_warp.kernels.collision.primitives import Kind, sides_struct
 from ddg_warp.kernels.core import prefix_sum
-from ddg_warp.solve.collision.bvh import Things
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.bvh import Primitives
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 # Lists of overlapping leaves, each for LEAST leaves or more. Measured: 64 lists of 310,000 leaves are equally full within 8 %.
 PARTS, LEAST = 64, 1024
@@ -53,7 +53,7 @@ class RunningSums:
         wp.launch_tiled(kernel, dim=tiles, inputs=inputs, outputs=outputs, block_dim=prefix_sum.THREADS, device=device)
 
 
-class PairList:
+class CandidateList:
     """Candidates of one kind: distance at most both radii and a search distance, or possibly so during a motion.
 
     Attributes:
@@ -66,7 +66,14 @@ class PairList:
     """
 
     def __init__(
-        self, kind: Kind, first: Things, second: Things, shapes: Shapes, grouped: bool, real, overflow: wp.array
+        self,
+        kind: Kind,
+        first: Primitives,
+        second: Primitives,
+        shapes: CollisionMesh,
+        grouped: bool,
+        real,
+        overflow: wp.array,
     ):
         self.kind, self.first, self.second = kind, first, second
         self.overflow, self.device = overflow, first.device
@@ -76,7 +83,7 @@ class PairList:
         self.sides.ignored = wp.array(shapes.ignored, dtype=wp.int64, device=self.device)
         obstacle = [number in shapes.obstacle for number in range(len(shapes.names))]
         self.sides.obstacle = wp.array(obstacle, dtype=wp.uint8, device=self.device)
-        self.trees = Trees()
+        self.trees = BvhPair()
         self.trees.lower, self.trees.upper, self.trees.bundles = first.lower, first.upper, first.bundles
         self.trees.second_lower, self.trees.second_upper, self.trees.leaves = second.lower, second.upper, second.bundles
         self.trees.bundle_lower, self.trees.bundle_upper = first.leaves.lower, first.leaves.upper

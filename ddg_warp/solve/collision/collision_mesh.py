@@ -9,7 +9,7 @@ BALLS, PLANES = 0, -1  # sizes of primitives that are balls and half-spaces, whi
 FLAT = 1e-12  # area over squared longest edge below which a triangle is degenerate
 
 
-class Shapes:
+class CollisionMesh:
     """Collision mesh: rods, shells, balls and half-spaces over the nodes of one world, numbered as added.
 
     Objects that are `still` (obstacles, fixed or moved from outside) form no pair with each other, nor with themselves.

@@ -6,13 +6,13 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.collision.contact import assembly
-from ddg_warp.solve.collision.candidate_list import PairList
-from ddg_warp.solve.collision.incidence import NodeItems
+from ddg_warp.solve.collision.candidate_list import CandidateList
+from ddg_warp.solve.collision.incidence import Incidence
 
 MOST = 2**31 // assembly.ITEMS  # largest number of pairs with countable items
 
 
-class PairElements:
+class CollisionSet:
     """Elements on collision pairs, with a factor of `rows` rows each. A subclass selects and evaluates the pairs.
 
     Args:
@@ -24,18 +24,18 @@ class PairElements:
         `factor`: see `assembly.factor_struct`.
         `energy`, `gradient`: of each pair (capacity,) [J]; by local node or angle (`SLOTS` or `ITEMS`, capacity) [N, N m].
         `placed`, `idle`: see `assembly.set_struct`.
-        `pairs`, `count`, `starts`, `partners`: as of `PairList`.
-        `mollified`: near-parallel edges (`Mollified`) with exact Hessians; None without.
-        `numbers`, `places`, `items`, `ranks`, `angle_ranks`: as of `NodeItems`, whose lists the subclass builds.
+        `pairs`, `count`, `starts`, `partners`: as of `CandidateList`.
+        `mollified`: near-parallel edges (`NearParallelEdges`) with exact Hessians; None without.
+        `numbers`, `places`, `items`, `ranks`, `angle_ranks`: as of `Incidence`, whose lists the subclass builds.
     """
 
     mollified = None
 
     def __init__(
-        self, candidates: PairList, rows: int, nodes: int, real, linear, silent: wp.array, rolls: bool = False
+        self, candidates: CandidateList, rows: int, nodes: int, real, linear, silent: wp.array, rolls: bool = False
     ):
         self.found, self.device, self.rows, self.real, self.linear = candidates, candidates.device, rows, real, linear
-        self.rolls, self._items = rolls, NodeItems(candidates.kind, nodes, silent, rolls)
+        self.rolls, self._items = rolls, Incidence(candidates.kind, nodes, silent, rolls)
         self.numbers, self.places = self._items.numbers, self._items.places
         self.factor = assembly.factor_struct(linear)()
         self.count = wp.zeros(1, dtype=int, device=self.device)

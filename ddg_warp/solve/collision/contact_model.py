@@ -6,19 +6,19 @@ import warp as wp
 from ddg_warp.kernels.collision.contact.query import look_kernel
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.collision_mesh import Shapes
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 MARGIN = 1.0  # margin of searches over a typical radius
 SLIDING = 0.999  # friction of sliding contacts over mu N
 
 
-class Touch:
-    """Contact of a `DeviceNet`, searched first at blocks x (W N,), with the contact parameters on the device.
+class ContactModel:
+    """Contact of a `CoupledModel`, searched first at blocks x (W N,), with the contact parameters on the device.
 
     Args:
         silent: nodes without forces.
-        margin: margin of searches, by default the margin of steps; exact: see `PairTerms`.
+        margin: margin of searches, by default the margin of steps; exact: see `ContactPotential`.
 
     Attributes:
         shapes: collision primitives. search: candidates. terms: energy of active pairs.
@@ -40,7 +40,7 @@ class Touch:
         margin = margin or MARGIN * max(touching.size, touching.reach)
         radius = net.touching["radius"]
         self.search = BroadPhase(self.shapes, x, net.worlds, reach=touching.reach, margin=margin, radius=radius)
-        self.terms = PairTerms(
+        self.terms = ContactPotential(
             self.search,
             touching.density,
             stiffness=touching.stiffness,
@@ -106,7 +106,8 @@ class Touch:
         """Return candidates at blocks x, after `at`, with friction for velocities v if given.
 
         Returns:
-            world: (n,). sizes: node counts of both primitives (n, 2), see `Shapes.things`. `things`: their indices in a world (n, 2).
+            world: (n,). sizes: node counts of both primitives (n, 2), see `CollisionMesh.things`. `things`: their indices in a
+                world (n, 2).
             gap: (n,) [m]. point: midpoint of the closest points (n, 3) [m]. force, friction: on the first primitive (n, 3) [N].
         """
         rubs = [None] * len(self.terms.lists)
@@ -157,7 +158,7 @@ class Touch:
 
 
 def _of_first(part, pairs) -> np.ndarray:
-    """Return forces of `PairElements` on the first primitives of candidates (count, 3) [N], zero if `part` is None."""
+    """Return forces of `CollisionSet` on the first primitives of candidates (count, 3) [N], zero if `part` is None."""
     count = int(pairs.count.numpy()[0])
     forces, active = np.zeros((count, 3)), 0 if part is None else int(part.count.numpy()[0])
     if active:
@@ -170,9 +171,9 @@ def _of_first(part, pairs) -> np.ndarray:
     return forces
 
 
-def shapes_of(host) -> Shapes:
+def shapes_of(host) -> CollisionMesh:
     """Return the collision primitives of the coupled system."""
-    touching, shapes = host.touching, Shapes(host.rest)
+    touching, shapes = host.touching, CollisionMesh(host.rest)
     for body in touching.bodies:
         options = {"name": body.label, "still": body.still}
         if body.kind == PLANE:

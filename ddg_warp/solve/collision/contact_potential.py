@@ -14,15 +14,15 @@ from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.collision.broad_phase import BroadPhase
-from ddg_warp.solve.collision.contact_set import ContactElements
-from ddg_warp.solve.collision.friction_set import FrictionElements
+from ddg_warp.solve.collision.contact_set import ContactSet
+from ddg_warp.solve.collision.friction_set import FrictionSet
 from ddg_warp.solve.collision.hessian_product import PairProduct
 from ddg_warp.solve.collision.parameter_tables import at_own_rate, law_tables, table
-from ddg_warp.solve.collision.surface_rotation import Spins
-from ddg_warp.solve.collision.world_sums import Totals
+from ddg_warp.solve.collision.surface_rotation import RotatingSurfaces
+from ddg_warp.solve.collision.world_sums import WorldSums
 
 
-class PairTerms:
+class ContactPotential:
     """Contact of all pairs of a `BroadPhase`, with one law, parameters by pairs of groups of objects, and friction.
 
     Friction acts on the pairs that are active when `lag` is called, at the start of a step, with their normal forces. Searches
@@ -53,7 +53,7 @@ class PairTerms:
 
     Attributes:
         energy: (worlds,) [J], of contact and the potential of friction; forces: (worlds times nodes,) [N].
-        gap: (worlds,) smallest gap of all candidates [m], at most the reach of the search; touching, dissipated: see `Totals`.
+        gap: (worlds,) smallest gap of all candidates [m], at most the reach of the search; touching, dissipated: see `WorldSums`.
         diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m].
         between: (worlds times edges,) blocks between the first and the second node of edges, in the order of `shapes.things(2)`. A
             pair contributes the 6 x 6 block of each of its edges to both, positive semi-definite. See `join`.
@@ -116,11 +116,9 @@ class PairTerms:
         silenced = np.zeros(len(search.shapes.points), np.uint8)
         silenced[[] if silent is None else silent] = 1
         silenced = wp.array(silenced, dtype=wp.uint8, device=self.device)
-        self.lists = [
-            ContactElements(pairs, law, nodes, self.real, self.linear, silenced, exact) for pairs in search.lists
-        ]
+        self.lists = [ContactSet(pairs, law, nodes, self.real, self.linear, silenced, exact) for pairs in search.lists]
         self._version, self._lagged = search.version, -1
-        self.spins = Spins(search)
+        self.spins = RotatingSurfaces(search)
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
@@ -133,7 +131,7 @@ class PairTerms:
         self._angles = wp.array(angles if self.rolls else angles[:0], dtype=int, device=self.device)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
-        self._totals = totals = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
+        self._totals = totals = WorldSums(self.lists, self.frictions, search.worlds, self.real, self.device)
         self.energy, self.touching, self.dissipated = totals.energy, totals.touching, totals.dissipated
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
@@ -197,7 +195,7 @@ class PairTerms:
             self.lag_law = self._law_before
         law = self.lag_law
 
-        def lag(part: ContactElements, friction: FrictionElements) -> None:
+        def lag(part: ContactSet, friction: FrictionSet) -> None:
             part.write(x, law, self.gap)
             friction.lag(law, x, again, self.more)
 
@@ -309,7 +307,7 @@ class PairTerms:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
 
-    def _with_friction(self, rubs: bool, multipliers, law: str, velocity: float, silent) -> list[FrictionElements]:
+    def _with_friction(self, rubs: bool, multipliers, law: str, velocity: float, silent) -> list[FrictionSet]:
         """Return the friction of each list, none without friction."""
         if law not in FRICTION_LAWS:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION_LAWS)}")
@@ -327,7 +325,7 @@ class PairTerms:
             ]
         )
         return [
-            FrictionElements(
+            FrictionSet(
                 part,
                 FRICTION_LAWS[law],
                 float(velocity),

@@ -12,13 +12,13 @@ from ddg_warp.kernels.collision.contact.pair_evaluation import evaluate_kernels,
 from ddg_warp.kernels.collision.contact.potential import rows_of
 from ddg_warp.kernels.collision.primitives import EDGES
 from ddg_warp.kernels.densities import Density
-from ddg_warp.solve.collision.candidate_list import PairList, RunningSums
-from ddg_warp.solve.collision.collision_set import PairElements
-from ddg_warp.solve.collision.parallel_edges import Mollified, Unkept
+from ddg_warp.solve.collision.candidate_list import CandidateList, RunningSums
+from ddg_warp.solve.collision.collision_set import CollisionSet
+from ddg_warp.solve.collision.parallel_edges import NearParallelEdges, RecomputedHessians
 
 
-class ContactElements(PairElements):
-    """Active contact pairs of one list; see `PairTerms` and, for arguments, `PairElements`.
+class ContactSet(CollisionSet):
+    """Active contact pairs of one list; see `ContactPotential` and, for arguments, `CollisionSet`.
 
     Attributes:
         density: contact potential.
@@ -26,7 +26,7 @@ class ContactElements(PairElements):
 
     def __init__(
         self,
-        candidates: PairList,
+        candidates: CandidateList,
         law: Density,
         nodes: int,
         real,
@@ -42,7 +42,7 @@ class ContactElements(PairElements):
         self._exact = exact_product_kernel(kind, law, real, linear)
         self.kernels += [self._sieve, self._evaluate, self._exact]
         self.kernels += [] if serial else [self._pack]
-        self.mollified = (Unkept if exact else Mollified)(self, law) if kind == EDGES else None
+        self.mollified = (RecomputedHessians if exact else NearParallelEdges)(self, law) if kind == EDGES else None
         self.reserve()
 
     def reserve(self) -> None:

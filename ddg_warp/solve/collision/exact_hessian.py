@@ -12,7 +12,7 @@ COLUMNS = 3 * SLOTS
 
 
 def hessian(terms, x: wp.array) -> sparse.csc_matrix:
-    """Return the Hessian of the contact energy of `PairTerms` at x (W N,), as evaluated last (3 W N, 3 W N) [N/m].
+    """Return the Hessian of the contact energy of `ContactPotential` at x (W N,), as evaluated last (3 W N, 3 W N) [N/m].
 
     Without friction. Reads from the device.
     """
@@ -25,7 +25,7 @@ def hessian(terms, x: wp.array) -> sparse.csc_matrix:
 
 
 def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, columns and values of the Hessians of all active pairs of `ContactElements`."""
+    """Return rows, columns and values of the Hessians of all active pairs of `ContactSet`."""
     number = int(elements.count.numpy()[0])
     if not number:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)

@@ -7,17 +7,17 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import ANGLES
 from ddg_warp.kernels.collision.friction.potential import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
-from ddg_warp.solve.collision.collision_mesh import Shapes
-from ddg_warp.solve.collision.collision_set import PairElements
-from ddg_warp.solve.collision.contact_set import ContactElements
-from ddg_warp.solve.collision.surface_rotation import Spins
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from ddg_warp.solve.collision.collision_set import CollisionSet
+from ddg_warp.solve.collision.contact_set import ContactSet
+from ddg_warp.solve.collision.surface_rotation import RotatingSurfaces
 
 
-class FrictionElements(PairElements):
-    """Friction of the pairs of one list, with lists of their own, which later searches leave alone; see `PairTerms`.
+class FrictionSet(CollisionSet):
+    """Friction of the pairs of one list, with lists of their own, which later searches leave alone; see `ContactPotential`.
 
     Args:
-        contact: contact of the same pairs; nodes, silent: as of `PairElements`.
+        contact: contact of the same pairs; nodes, silent: as of `CollisionSet`.
         velocity: stick threshold [m/s].
         coefficients: by groups, coefficients over `friction` forwards, backwards and across (groups, groups, 3), see `lag_kernel`.
             None: isotropic friction.
@@ -30,12 +30,12 @@ class FrictionElements(PairElements):
 
     def __init__(
         self,
-        contact: ContactElements,
+        contact: ContactSet,
         density: Density,
         velocity: float,
         coefficients: np.ndarray | None,
-        shapes: Shapes,
-        spins: Spins,
+        shapes: CollisionMesh,
+        spins: RotatingSurfaces,
         nodes: int,
         real,
         linear,
@@ -62,7 +62,7 @@ class FrictionElements(PairElements):
         self.reserve()
 
     def reserve(self) -> None:
-        """Make room as `PairElements.reserve`; lagged data is lost."""
+        """Make room as `CollisionSet.reserve`; lagged data is lost."""
         super().reserve()
         for name in self._kept:
             getattr(self, name).zero_()

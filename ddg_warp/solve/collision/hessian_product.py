@@ -7,7 +7,7 @@ from ddg_warp.kernels.collision.contact.assembly import set_struct
 from ddg_warp.kernels.collision.contact.geometric_stiffness import KINDS
 from ddg_warp.kernels.collision.contact.hessian_product import product_kernels
 from ddg_warp.kernels.collision.primitives import EDGES
-from ddg_warp.solve.collision.contact_set import ContactElements
+from ddg_warp.solve.collision.contact_set import ContactSet
 
 
 class PairProduct:
@@ -76,7 +76,7 @@ class PairProduct:
             setattr(struct, name, getattr(pair_set, name))
         for name in ("marks", "starts", "columns") if pair_set.mollified and pair_set.mollified.keeps else ():
             setattr(struct, name, getattr(pair_set.mollified, name))
-        struct.kind = KINDS.index(kind) if isinstance(pair_set, ContactElements) else -1
+        struct.kind = KINDS.index(kind) if isinstance(pair_set, ContactSet) else -1
         struct.edges = (kind.first == 2) + (kind == EDGES)
         struct.rows, struct.things = pair_set.rows, pair_set.found.first.count
         return struct

@@ -9,7 +9,7 @@ from ddg_warp.kernels.collision.primitives import Kind
 from ddg_warp.solve.collision.candidate_list import RunningSums
 
 
-class NodeItems:
+class Incidence:
     """Incidence lists of the nodes in pairs of one kind.
 
     Args:

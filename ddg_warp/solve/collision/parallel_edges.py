@@ -17,8 +17,8 @@ MOST = (
 )  # largest number of threads that differentiate: with one for each column of the capacity, most would do nothing
 
 
-class Mollified:
-    """Exact Hessians of near-parallel edge pairs among `ContactElements`, stored.
+class NearParallelEdges:
+    """Exact Hessians of near-parallel edge pairs among `ContactSet`, stored.
 
     Attributes:
         keeps: True: `PairProduct` multiplies the Hessians with all others.
@@ -35,7 +35,7 @@ class Mollified:
         self._number = wp.zeros(1, dtype=int, device=elements.device)
 
     def reserve(self) -> None:
-        """Make room for as many pairs as `PairElements`."""
+        """Make room for as many pairs as `CollisionSet`."""
         elements, capacity = self._of, self._of.found.capacity
         room = max(LEAST, capacity // ROOM)
         self.marks = wp.zeros(capacity, dtype=int, device=elements.device)
@@ -61,7 +61,7 @@ class Mollified:
         device_arrays.take_turns(kernel, count, inputs, outputs, self._of.device)
 
 
-class Unkept:
+class RecomputedHessians:
     """Exact Hessians of near-parallel edge pairs in every world, recomputed in every product."""
 
     keeps = False

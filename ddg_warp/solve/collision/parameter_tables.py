@@ -5,7 +5,7 @@ import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.contact.pair_evaluation import law_struct
-from ddg_warp.solve.collision.collision_mesh import Shapes
+from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 ROUNDING = 1e-6  # relative excess of an activation distance over the search distance; below the margin of searches
 
@@ -14,12 +14,12 @@ def law_tables(search, parameters: dict, groups, shared: dict[str, wp.array]) ->
     """Return the `law_struct` of a `BroadPhase`, equal in all worlds, and True with friction.
 
     Args:
-        parameters: "stiffness", "range", "thickness", "friction" and "inertia", as of `PairTerms`.
+        parameters: "stiffness", "range", "thickness", "friction" and "inertia", as of `ContactPotential`.
         groups: group of each object, None for one.
         shared: arrays (worlds, groups, groups) used in place of new ones.
 
     Raises:
-        SceneError: see `PairTerms`.
+        SceneError: see `ContactPotential`.
     """
     shapes, real, device = search.shapes, search.real, search.device
     objects = len(shapes.names)
@@ -78,7 +78,7 @@ def _within_reach(search, within: np.ndarray, thickness: np.ndarray, groups: np.
                 )
 
 
-def _edges(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
+def _edges(shapes: CollisionMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return squared rest lengths of edges (n,), and (n, 2): for both nodes 1/2 inside a rod, 0 at rod ends, -1 for shells."""
     nodes, _, owner, span = shapes.things(2)
     ends = shapes.points[nodes]

@@ -6,7 +6,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, DOUBT, KNOWN, run_kernels
-from ddg_warp.solve.collision.bvh import Boxes
+from ddg_warp.solve.collision.bvh import Aabbs
 
 EDGES = 64  # largest number of edges of a run
 LONGER = 1e-5  # relative margin of arc lengths, above the rounding of float32
@@ -14,7 +14,7 @@ SLACK = 1e-3  # relative margin of the search distance
 FIRST = 4  # motions that the first bounds cover
 
 
-class Runs:
+class RodCulling:
     """Bounds of runs of edges, for rods and capsules; valid until a node leaves them, after any motion or time.
 
     Args:
@@ -44,7 +44,7 @@ class Runs:
         self._runs, self._run_of, self._ahead = (
             wp.array(values, dtype=int, device=device) for values in (runs, run_of, first_partners)
         )
-        self._boxes = Boxes(len(runs), worlds, device)
+        self._boxes = Aabbs(len(runs), worlds, device)
         nodes = shapes.points[shapes.things(2)[0]]  # rest positions, for a first BVH
         for corner, bound, ends in (
             (self._boxes.lower, np.minimum, nodes.min(1)),
@@ -70,7 +70,7 @@ class Runs:
         self.kernels = [self._common, *made]
 
     def build(self) -> None:
-        """Rebuild the BVH of bounds, as `Boxes.build`."""
+        """Rebuild the BVH of bounds, as `Aabbs.build`."""
         self._boxes.build()
 
     def hold(self, x: wp.array, y: wp.array, tried: wp.array) -> None:

@@ -3,17 +3,17 @@
 import warp as wp
 
 from ddg_warp.kernels.collision.contact.statistics import LAST, PARTS, SUM, take_kernel
-from ddg_warp.solve.collision.contact_potential import PairTerms
+from ddg_warp.solve.collision.contact_potential import ContactPotential
 
 
-class Tally:
+class ContactStatistics:
     """Counts of active pairs, and friction work, over all steps. Reads nothing back and can be captured.
 
     Attributes:
         counts: of each world (3, worlds), see `kernels.collision.contact.statistics`; work: friction work (worlds,) [J].
     """
 
-    def __init__(self, terms: PairTerms):
+    def __init__(self, terms: ContactPotential):
         self.terms, self.device = terms, terms.device
         self._worlds = terms.search.worlds
         self.counts = wp.zeros((3, self._worlds), dtype=wp.int64, device=self.device)

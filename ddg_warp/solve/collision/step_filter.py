@@ -9,7 +9,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.step_fractions import limit_kernels, share_kernels
 
 
-class MotionFilter:
+class StepFilter:
     """CCD step fractions for the pairs of some lists; see `BroadPhase.filter`.
 
     Args:

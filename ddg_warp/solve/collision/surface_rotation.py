@@ -6,7 +6,7 @@ import warp as wp
 from ddg_warp.kernels.collision.friction.surface_rotation import MARKERS, spin_kernels
 
 
-class Spins:
+class RotatingSurfaces:
     """Rotating surfaces of a `BroadPhase`, if any.
 
     Attributes:
@@ -38,7 +38,7 @@ class Spins:
         self._launch(self._pull, [start, x, cotangent], outputs)
 
     def forces(self, x: wp.array, frictions: list) -> np.ndarray:
-        """Return nodal forces (W N, 3) [N] at x with the torques of `FrictionElements`, as evaluated last. Reads from the device."""
+        """Return nodal forces (W N, 3) [N] at x with the torques of `FrictionSet`, as evaluated last. Reads from the device."""
         out = np.zeros((len(x), 3))
         if not self.any:
             return out

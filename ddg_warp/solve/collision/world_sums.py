@@ -7,7 +7,7 @@ from ddg_warp.kernels.collision.contact.world_sums import ROWS, total_kernels, w
 from ddg_warp.solve.linear.sparse_system import Sums
 
 
-class Totals:
+class WorldSums:
     """Sums over the results of contact and friction sets; call `fit` after the sets have grown.
 
     Attributes:

@@ -23,7 +23,7 @@ from ddg_warp import argument_checks
 from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.state import State, check_state
-from ddg_warp.scene.equilibrium_path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
+from ddg_warp.scene.equilibrium_path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, StopCriterion
 from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions, Corrector, Failed
 
 FORK = 1e-2  # Relative work of the load along the path below which a stationary load is no limit point.
@@ -67,7 +67,7 @@ class Continuation:
         *,
         start: float = 0.0,
         direction: int = 1,
-        stop: Stop | None = None,
+        stop: StopCriterion | None = None,
     ) -> Path:
         """Follow the path by arc length.
 
@@ -96,18 +96,18 @@ class Continuation:
             check_state("continuation", self.model, state)
         return self.corrector.start(state or self.model.state(), argument_checks.number("continuation: start", start))
 
-    def _stop(self, stop: Stop | None) -> Stop:
+    def _stop(self, stop: StopCriterion | None) -> StopCriterion:
         """Return the checked end of a path."""
-        if stop is not None and not isinstance(stop, Stop):
+        if stop is not None and not isinstance(stop, StopCriterion):
             raise SceneError(f"stop is {argument_checks.shown(stop)}; give Stop(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
             raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
-        return stop or Stop()
+        return stop or StopCriterion()
 
     def statistics(self, points: Sequence[Point]) -> dict:
         """Return contact statistics under "contact", of these points and all earlier points.
 
-        See `NetEquilibrium.contact_statistics`.
+        See `CoupledEquilibrium.contact_statistics`.
         """
         for point in points if isinstance(points, Sequence) else [points]:
             if not isinstance(point, Point):
@@ -117,7 +117,9 @@ class Continuation:
             self.corrector.equilibrium.count(point.state, 0.0)
         return self.corrector.equilibrium.statistics()
 
-    def switch(self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: Stop | None = None) -> Path:
+    def switch(
+        self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: StopCriterion | None = None
+    ) -> Path:
         """Switch branches at a bifurcation along the critical mode, and follow the other path.
 
         Args:
@@ -227,7 +229,7 @@ class Continuation:
         if self.corrector.norm(gap) > CONTROLLED * max(map(self.corrector.norm, ends)):
             raise Failed("leap")
 
-    def _follow(self, path: Path, stop: Stop) -> Path:
+    def _follow(self, path: Path, stop: StopCriterion) -> Path:
         """Append points to a path until a stop."""
         options, step = self.options, self.options.step
         current = path.points[-1]
@@ -250,7 +252,7 @@ class Continuation:
         self._warn_of_rest(path, stop)
         return path
 
-    def _warn_of_rest(self, path: Path, stop: Stop) -> None:
+    def _warn_of_rest(self, path: Path, stop: StopCriterion) -> None:
         """Warn of a path that used all steps before any bound, with the fraction reached."""
         bounded = [("load", path.load, stop.load)]
         if stop.displacement is not None:
@@ -269,7 +271,7 @@ class Continuation:
                 stacklevel=5,
             )
 
-    def _next(self, path: Path, step: float, stop: Stop) -> tuple[Point, list[Point], str, float]:
+    def _next(self, path: Path, step: float, stop: StopCriterion) -> tuple[Point, list[Point], str, float]:
         """Return (next point, events before it, bound of `stop` reached or "", step length)."""
         current, options = path.points[-1], self.options
         failed: object = f"rotation_cap, a step of {step:.2g} turns edges by all that it allows"
@@ -293,7 +295,7 @@ class Continuation:
             events = [replace(last, kind=LIMIT_POINT, negative=min(current.negative, following.negative))]
         return following, events, "", following.arclength - current.arclength
 
-    def _bound(self, first: Point, second: Point, stop: Stop):
+    def _bound(self, first: Point, second: Point, stop: StopCriterion):
         """Return the bound between two points as (name, functional, value); None without."""
         for value in stop.load:
             if (first.load - value) * (second.load - value) < 0.0 or second.load == value:

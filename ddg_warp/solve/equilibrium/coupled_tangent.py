@@ -14,12 +14,12 @@ from ddg_warp.model import validate
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.collision import exact_hessian
 from ddg_warp.solve.equilibrium.rigid_modes import Body
-from ddg_warp.solve.equilibrium.tangent_part import Part
-from ddg_warp.solve.forces.prescribed_element_data import NetMotion
+from ddg_warp.solve.equilibrium.tangent_part import TangentBlock
+from ddg_warp.solve.forces.prescribed_element_data import CoupledMotion
 from ddg_warp.solve.linear.skew_supports import HostPlanes
 
 
-class NetTangent(Part):
+class CoupledTangent(TangentBlock):
     """The part of the net. See `Tangent` for the methods."""
 
     def __init__(self, model, offset: int):
@@ -176,8 +176,8 @@ class NetTangent(Part):
         return self.into(moved)
 
     @cached_property
-    def _motion(self) -> NetMotion:
-        return NetMotion(self.model)
+    def _motion(self) -> CoupledMotion:
+        return CoupledMotion(self.model)
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""

@@ -11,7 +11,7 @@ from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.collision.rolling_rotation import turned_by
 
 
-class Rubbing:
+class FrictionJacobian:
     """Derivatives of friction, whose pairs are those of an `ExactContact`.
 
     Attributes:

@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ddg_warp.model.state import State
-from ddg_warp.solve.equilibrium.friction_jacobian import Rubbing
+from ddg_warp.solve.equilibrium.friction_jacobian import FrictionJacobian
 from ddg_warp.solve.linear.exact_contact import ExactContact
 
 STEPS, HALVINGS = 30, 3
@@ -17,7 +17,7 @@ SPIN = 1e-10  # relative shift of the diagonal: twist angles of straight free ro
 FAR = 0.25  # activation distances: largest displacement of a step
 
 
-class Polish:
+class FrictionNewton:
     """Newton's method for balance with friction by normal forces and tangents of the state itself.
 
     Lagged normal forces converge linearly at best, slowly where many contacts are about to slide. This takes a few steps; from far
@@ -91,7 +91,7 @@ class Polish:
     def _matrix(self, state: State, load_factor: float) -> sparse.csc_matrix:
         net, tangent_block, sliding = self.model.net, self.tangent.parts[-1], state.sliding
         if self._rubbing is None:
-            self._rubbing = Rubbing(net, ExactContact(net))
+            self._rubbing = FrictionJacobian(net, ExactContact(net))
         rate = wp.full(net.worlds, 1.0 / sliding.increment, dtype=net.real, device=net.device)
         rubbing = self._rubbing.matrix(state.net.q, sliding.begun(state.net.q), rate)
         matrix = tangent_block.potential_hessian(state) + tangent_block.matrix(rubbing)

@@ -76,8 +76,8 @@ class Step:
     noise: np.ndarray
 
 
-class Descent:
-    """Direct equilibrium search of an `Equilibrium`, with CCD step fractions by `NetEquilibrium.share` in contact."""
+class DirectNewton:
+    """Direct equilibrium search of an `Equilibrium`, with CCD step fractions by `CoupledEquilibrium.share` in contact."""
 
     def __init__(self, owner):
         self.owner, self.tangent, self.options = owner, owner.tangent, owner.options
@@ -151,14 +151,14 @@ class Descent:
 
 
 class Search:
-    """Search of a `Descent`: current iterate and status of every island.
+    """Search of a `DirectNewton`: current iterate and status of every island.
 
     Attributes:
         here: current iterate; region: `TrustRegion`.
         done: converged islands (islands,); small: islands converged to the tolerance itself.
     """
 
-    def __init__(self, descent: Descent, state: State, load_factor: float):
+    def __init__(self, descent: DirectNewton, state: State, load_factor: float):
         self.descent, self.owner, self.at = descent, descent.owner, load_factor
         self.tangent, self.residuals = descent.tangent, descent.owner.residuals
         self.restart(descent.iterate(state, load_factor))

@@ -28,10 +28,10 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.state import Sliding, State
 from ddg_warp.solve.collision.support_arcs import Arcs
-from ddg_warp.solve.equilibrium.friction_newton import Polish
+from ddg_warp.solve.equilibrium.friction_newton import FrictionNewton
 from ddg_warp.solve.forces.loads import StaticLoads
 from ddg_warp.solve.linear.solver_selection import large_static, net_preconditioner
-from ddg_warp.solve.newton.coupled_newton import NetNewton
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping.graph_cache import Graphs
 
@@ -50,8 +50,8 @@ SETTLED = 1e-4  # settled: residual over the sum of loads
 UNSETTLED = "unsettled"  # outcome: no balance with the friction of the state
 
 
-class StaticNewton(NetNewton):
-    """`NetNewton` without inertia, in the precision of the state: no mass bounds the condition number."""
+class StaticNewton(CoupledNewton):
+    """`CoupledNewton` without inertia, in the precision of the state: no mass bounds the condition number."""
 
     banded = False  # products with fixed dofs are needed, too
 
@@ -176,7 +176,7 @@ class StaticNewton(NetNewton):
         self._whole = False
 
 
-class Relaxation:
+class AitkenRelaxation:
     """Aitken relaxation of a fixed point, at most 1, with bounded growth (Irons and Tuck, Int. J. Numer. Meth. Eng. 1, 1969, 275).
 
     A body that only friction supports has no stiffness while all its contacts slide, under normal forces that are not yet consistent.
@@ -203,7 +203,7 @@ class Relaxation:
         return self._part
 
 
-class NetEquilibrium:
+class CoupledEquilibrium:
     """Equilibria of a model with a coupled system alone, for `Equilibrium`, whose tangent and load scale it uses.
 
     Attributes:
@@ -234,7 +234,7 @@ class NetEquilibrium:
         self.wary = True
         self.polish = None
         if self.newton.rubs and not large_static(model):
-            self.polish = Polish(model, owner.residuals, self.share, self.newton.contact.search.reach)
+            self.polish = FrictionNewton(model, owner.residuals, self.share, self.newton.contact.search.reach)
         self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
@@ -253,7 +253,7 @@ class NetEquilibrium:
             self._friction_work += increment * float(touch.terms.dissipated.numpy().sum())
 
     def contact_statistics(self) -> dict:
-        """Return statistics of the counted equilibria, as `NetContact.statistics`.
+        """Return statistics of the counted equilibria, as `NewtonContact.statistics`.
 
         Without interpenetrations: iterates do not lead to an equilibrium along a straight motion.
         """
@@ -325,7 +325,7 @@ class NetEquilibrium:
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
         repeats = self.net.edges or self.model.motions  # test the result with its own frames and support forces
         start = self.tangent.dofs(state)
-        relaxation, settled = Relaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
+        relaxation, settled = AitkenRelaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
         if rubs:
             loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(load_factor, start)).reshape(
                 self.net.worlds, -1

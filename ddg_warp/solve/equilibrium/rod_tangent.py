@@ -17,11 +17,11 @@ from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.solve.equilibrium.rigid_modes import Body
-from ddg_warp.solve.equilibrium.tangent_part import Part
+from ddg_warp.solve.equilibrium.tangent_part import TangentBlock
 from ddg_warp.solve.forces.prescribed_motion import Motion
 
 
-class ChainTangent(Part):
+class RodTangent(TangentBlock):
     """The part of one group of rods; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
 
     def __init__(self, model, group, offset: int):

@@ -16,7 +16,7 @@ from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.linear.eigensolver import Lowest, LowestFactors, dense
+from ddg_warp.solve.linear.eigensolver import LowestFactors, ShiftInvertLanczos, dense
 from ddg_warp.solve.linear.sparse_direct import Factorisation, SingularError, pinned, regular
 
 NEGATIVE = 64.0  # curvature over the sum of magnitudes of its terms that may be zero, in rounding units
@@ -106,7 +106,7 @@ def spectrum(
     elif kept <= DENSE:
         values, modes = dense(matrix, weights, zero_modes)
     else:
-        values, modes = Lowest(matrix, weights, zero_modes)(elastic_count)
+        values, modes = ShiftInvertLanczos(matrix, weights, zero_modes)(elastic_count)
     if (np.abs(values.imag) <= 1e-9 * np.abs(values)).all():
         values, modes = values.real, modes.real
     negative = int((values.real < 0.0).sum())
@@ -195,9 +195,11 @@ def of_islands(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> IslandS
 
 def _lowest_mode(matrix: sparse.csc_matrix, weights: np.ndarray, zero_modes: np.ndarray) -> np.ndarray:
     """Return the lowest eigenvector without rigid modes; the largest entry is positive, for reproducibility."""
-    mode = (dense(matrix, weights, zero_modes) if len(weights) <= DENSE else Lowest(matrix, weights, zero_modes)(1))[1][
-        :, 0
-    ]
+    mode = (
+        dense(matrix, weights, zero_modes)
+        if len(weights) <= DENSE
+        else ShiftInvertLanczos(matrix, weights, zero_modes)(1)
+    )[1][:, 0]
     return mode * np.sign(mode[np.argmax(np.abs(mode))])
 
 

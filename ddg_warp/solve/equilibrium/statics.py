@@ -30,8 +30,8 @@ from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve.equilibrium import mixed_newton, remedies, stability
-from ddg_warp.solve.equilibrium.newton_direct import Descent
-from ddg_warp.solve.equilibrium.newton_pcg import UNSETTLED, NetEquilibrium
+from ddg_warp.solve.equilibrium.newton_direct import DirectNewton
+from ddg_warp.solve.equilibrium.newton_pcg import UNSETTLED, CoupledEquilibrium
 from ddg_warp.solve.equilibrium.residuals import Residuals
 from ddg_warp.solve.equilibrium.rest_path import RestPath
 from ddg_warp.solve.equilibrium.support_checks import require_supports
@@ -160,11 +160,11 @@ class Equilibrium:
         lost_in_rounding(model)
         scene_validate.warn_of_massless(model)
         self._descends = self._solver() == "direct"
-        self.net = None if self._descends and not model.touch else NetEquilibrium(self)
+        self.net = None if self._descends and not model.touch else CoupledEquilibrium(self)
         self._rubs = model.touch is not None and model.net.host.touching.rubs
         self.factors = self._descends or (model.touch is not None and not self._rubs and not large_static(model))
         self.mixed = self.tangent.shells_alone and self.net is None
-        self.descent = Descent(self)
+        self.descent = DirectNewton(self)
         self.iterations = 0
         self.outcome, self.stiffness = "", None
 
@@ -225,7 +225,7 @@ class Equilibrium:
             )
         inputs = checked(controls, self.model, "statics")
         if self.net and self.net.newton.outdated:
-            self.net = NetEquilibrium(self)
+            self.net = CoupledEquilibrium(self)
         self.check_apart(state)
         self.tangent.give(inputs)
         self.tangent.poses = poses_between(state, inputs["poses"], start, end) if "poses" in inputs else None
@@ -324,7 +324,7 @@ class Equilibrium:
     def statistics(self) -> dict:
         """Return contact statistics of the counted equilibria under "contact"; `load` counts.
 
-        See `NetEquilibrium.contact_statistics`.
+        See `CoupledEquilibrium.contact_statistics`.
         """
         return {"contact": self.net.contact_statistics()} if self.model.touch else {}
 

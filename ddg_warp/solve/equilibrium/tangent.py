@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from ddg_warp.capture_lock import launches
-from ddg_warp.solve.equilibrium.rod_tangent import ChainTangent
+from ddg_warp.solve.equilibrium.rod_tangent import RodTangent
 
 
 @launches
@@ -29,12 +29,12 @@ class Tangent:
         self.model, self.poses = model, None
         self.parts, offset = [], 0
         for group in model.groups:
-            self.parts.append(ChainTangent(model, group, offset))
+            self.parts.append(RodTangent(model, group, offset))
             offset += self.parts[-1].size
         if model.net is not None:
-            from ddg_warp.solve.equilibrium.coupled_tangent import NetTangent
+            from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 
-            self.parts.append(NetTangent(model, offset))
+            self.parts.append(CoupledTangent(model, offset))
             offset += self.parts[-1].size
         self.size = offset
         self.free, self.angle = (

@@ -9,18 +9,18 @@ from ddg_warp.compile.dof_map import gathered
 from ddg_warp.solve.forces.control_loads import loaded_rows
 
 
-class Part:
+class TangentBlock:
     """Tangent block of a model, with dofs numbered world by world. See `Tangent` for the methods.
 
     Attributes:
-        host: `Storage` of the block.
+        host: `DofStorage` of the block.
         offset, size: range of dofs among all.
         islands: number of islands, with contiguous dofs of equal number; body_count: number of bodies.
         block: dofs of a node, positions first.
         given: control loads on the dofs of every world, in space, at full load (worlds, n) [N, N m].
 
     Args:
-        part: `Group` or `DeviceNet`.
+        part: `RodGroup` or `CoupledModel`.
     """
 
     def __init__(self, model, part, offset: int, size: int):

@@ -48,7 +48,7 @@ class ControlledLoads(Loads):
 
     Args:
         control_loads: control loads of a step.
-        scale: computes load scales from absolute loads on all dof blocks (worlds, blocks); see `ChainScale`.
+        scale: computes load scales from absolute loads on all dof blocks (worlds, blocks); see `RodScale`.
     """
 
     def __init__(self, model, part, midpoint: bool, control_loads: Given, scale):
@@ -133,7 +133,7 @@ class _Scale:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
 
 
-class ChainScale(_Scale):
+class RodScale(_Scale):
     """Load scales of uncoupled rods; `load` is the load scale of each rod [N]."""
 
     def __init__(self, model, part):
@@ -151,11 +151,11 @@ class ChainScale(_Scale):
         return arm, rod_group.changing_forces(host)
 
 
-class NetScale(_Scale):
+class CoupledScale(_Scale):
     """Residual limits of dof blocks and clusters of the coupled system; see `compile.residual_tolerance`.
 
     Args:
-        solver: the `NetNewton` whose `allowed` and `outer` are written.
+        solver: the `CoupledNewton` whose `allowed` and `outer` are written.
     """
 
     def __init__(self, model, part, solver):

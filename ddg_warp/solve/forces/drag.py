@@ -14,7 +14,7 @@ from ddg_warp.solve.linear.sparse_system import lists
 
 
 class Drag:
-    """Drag on a `Group` or `DeviceNet`."""
+    """Drag on a `RodGroup` or `CoupledModel`."""
 
     def __init__(self, model, part, kernels: tuple, midpoint: bool):
         self.model, self.part, self.midpoint = model, part, midpoint
@@ -100,7 +100,7 @@ class ChainDrag(Drag):
         return v, omega
 
 
-class NetDrag(Drag):
+class CoupledDrag(Drag):
     """Drag on the coupled rods in a flowing fluid."""
 
     def __init__(self, model, midpoint: bool = False):

@@ -11,7 +11,7 @@ class Loads:
     """Loads in time and follower loads of a rod group or of the coupled system.
 
     Args:
-        part: `Group` or `DeviceNet`.
+        part: `RodGroup` or `CoupledModel`.
         midpoint: True if the scheme evaluates forces at the middle of a step.
     """
 

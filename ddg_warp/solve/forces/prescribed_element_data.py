@@ -5,11 +5,11 @@ import warp as wp
 from ddg_warp.compile.boundary_conditions import pose_starts
 from ddg_warp.kernels.forces.prescribed_element_data import field_kernel, normal_kernels
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
-from ddg_warp.model.coupled_model import NetState
+from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.solve.forces.prescribed_motion import Motion
 
 
-class NetMotion(Motion):
+class CoupledMotion(Motion):
     """Prescribed motion of supports, and of the normals at clamped mesh edges.
 
     Attributes:
@@ -41,14 +41,14 @@ class NetMotion(Motion):
             inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, net.sets[index].elements]
             self._launch(self._normals, where, inputs, [self.data[index]])
 
-    def turn(self, islands, before: NetState, after: NetState) -> None:
+    def turn(self, islands, before: CoupledState, after: CoupledState) -> None:
         """Rotate the normals in the end state of a substep, in worlds that accepted one."""
         for index, (where, rest) in self.normals.items():
             inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, self.part.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
 
 
-class NetField:
+class CoupledField:
     """Magnetic field in the data of magnetised edges, at the time of the balance and at the end of a step.
 
     Args:
@@ -79,7 +79,7 @@ class NetField:
         for index, data in self.data.items():
             self._launch(index, self._now, self.net.every, data, data)
 
-    def finish(self, moved: wp.array, before: NetState, after: NetState) -> None:
+    def finish(self, moved: wp.array, before: CoupledState, after: CoupledState) -> None:
         """Set the field at the end of the step, in worlds that `moved`."""
         for index in self.data:
             self._launch(index, self._end, moved, before.data[index], after.data[index])

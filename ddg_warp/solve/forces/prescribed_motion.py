@@ -103,7 +103,7 @@ class Motion:
     Poses at both ends of a step come from the host, poses of grips from the states. The device interpolates per island.
 
     Args:
-        part: `Group` or `DeviceNet`.
+        part: `RodGroup` or `CoupledModel`.
 
     Attributes:
         pose: see `kernels.forces.prescribed_motion`; with grips per world, `stride` rows apart.

@@ -25,7 +25,9 @@ class ContactBands:
         )
 
     def __call__(self, terms, flags: wp.array) -> None:
-        """Write the sum of the bands and the blocks that `PairTerms.join` has assembled, in worlds whose flags want a direction."""
+        """Write the sum of the bands and the blocks that `ContactPotential.join` has assembled, in worlds whose flags want a
+        direction.
+        """
         chains = self.chains
         inputs = [chains.bands, chains.layout, self._ahead, self._edges, flags, chains.net.blocks]
         inputs += [terms.diagonal, terms.between, self._turning, *terms.turned]

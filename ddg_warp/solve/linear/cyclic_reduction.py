@@ -157,7 +157,7 @@ class Elimination:
     """Block LDL^T sweep with one thread a rod, for many rods; interface of `CyclicReduction`.
 
     Args:
-        kind: `ChainKind` of the rods; columns: number of rods in all worlds.
+        kind: `RodKind` of the rods; columns: number of rods in all worlds.
     """
 
     def __init__(self, kind, nodes: int, columns: int, linear, device):

@@ -77,7 +77,7 @@ class Shifted:
         return 0 if under is None else max(0, under - (between + 1)), bound
 
 
-class Lowest(Shifted):
+class ShiftInvertLanczos(Shifted):
     """Lowest eigenpairs of a symmetric stiffness K (n, n) in the metric of masses (n,), some possibly zero.
 
     Args:
@@ -219,7 +219,7 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
 
 
 def dense(matrix: sparse.csc_matrix, mass: np.ndarray, zero_modes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all eigenpairs of a small matrix, as by `Lowest`."""
+    """Return all eigenpairs of a small matrix, as by `ShiftInvertLanczos`."""
     massive, slaves = np.flatnonzero(mass > 0.0), np.flatnonzero(mass <= 0.0)
     root, matrix = np.sqrt(mass[massive]), sparse.csc_matrix(matrix)
     condensed = matrix[massive][:, massive].toarray()

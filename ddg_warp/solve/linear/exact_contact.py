@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from ddg_warp.solve.collision.contact_model import Touch
+from ddg_warp.solve.collision.contact_model import ContactModel
 from ddg_warp.solve.linear.contact_bands import ContactBands
 
 MARGIN = 1e-3  # of the search distance: skin margin; the query is a single position
 
 
 class ExactContact:
-    """Contact of a `DeviceNet`, with candidates found again at the friction lag and at the solution: steps keep none.
+    """Contact of a `CoupledModel`, with candidates found again at the friction lag and at the solution: steps keep none.
 
     Attributes:
         `touch`: search, pairs and their terms, friction lag.
@@ -19,7 +19,7 @@ class ExactContact:
     def __init__(self, net):
         self.net, contact = net, net.host.touching
         obstacle_nodes = net.host.of_obstacles  # their rows of H do not count
-        self.touch = Touch(net, wp.float64, net.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True)
+        self.touch = ContactModel(net, wp.float64, net.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True)
         self.search, self.terms = self.touch.search, self.touch.terms
         self.diagonal = self.terms.diagonal
         self._q = self._bands = None

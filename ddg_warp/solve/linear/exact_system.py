@@ -9,18 +9,18 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.linear.exact_hessian import COUNT, FIRST, SIGN, exact_kernels
-from ddg_warp.model.coupled_model import NetState
-from ddg_warp.solve.linear.pcg import ConjugateGradients
-from ddg_warp.solve.linear.rod_substructuring import Chains
-from ddg_warp.solve.linear.skew_supports import DevicePlanes
+from ddg_warp.model.coupled_model import CoupledState
+from ddg_warp.solve.linear.pcg import PCG
+from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
+from ddg_warp.solve.linear.skew_supports import SkewSupports
 from ddg_warp.solve.linear.solver_selection import net_preconditioner
-from ddg_warp.solve.linear.sparse_system import NetSystem
+from ddg_warp.solve.linear.sparse_system import SparseSystem
 
 
 class ExactSystem:
     """(H + c M) w = g on the free dofs of every world, with the exact Hessian H at the solution of a step.
 
-    The solve is that of a direction of `NetNewton`, whose names it has for what `ConjugateGradients` reads, with all of H in one place,
+    The solve is that of a direction of `CoupledNewton`, whose names it has for what `PCG` reads, with all of H in one place,
     in float64 whatever the precision of the model, and to a tolerance of its own. H is symmetric, as drag is and loads do not follow
     within a step, but may be indefinite, at a saddle. The host reads nothing.
 
@@ -52,9 +52,9 @@ class ExactSystem:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         preconditioner = net_preconditioner(net)
-        self.chains = Chains.of(net, preconditioner, banded=False)
-        self.system = NetSystem(net)
-        self.planes = DevicePlanes(net, self.system, real, self.linear) if host.frames else None
+        self.chains = RodSubstructuring.of(net, preconditioner, banded=False)
+        self.system = SparseSystem(net)
+        self.planes = SkewSupports(net, self.system, real, self.linear) if host.frames else None
         self.fixed = self.bits(host.fixed)
         self.barred = wp.array(np.tile(self.fixed.numpy(), worlds), dtype=wp.uint8, device=device)
         self.mass = net.mass if inertia is None else inertia
@@ -79,7 +79,7 @@ class ExactSystem:
         self._written = [hessians[: n * size**2].reshape((n, size, size)) for n, size in zip(count, sizes, strict=True)]
         self._no_stress = make((0, 0), real)
         self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in net.sets]
-        self.krylov = ConjugateGradients(self, preconditioner.endswith("multilevel"), indefinite=True)
+        self.krylov = PCG(self, preconditioner.endswith("multilevel"), indefinite=True)
 
     def bits(self, dofs: np.ndarray) -> wp.array:
         """Dofs (blocks, 3) bool as bits of blocks."""
@@ -92,7 +92,7 @@ class ExactSystem:
         own = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
         return [*own, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
-    def solve(self, state: NetState, coefficient: float, rate: wp.array, right: wp.array, w: wp.array) -> None:
+    def solve(self, state: CoupledState, coefficient: float, rate: wp.array, right: wp.array, w: wp.array) -> None:
         """Write w (W N,), zero at held dofs; what g (W N,) has there is left out. Launches alone.
 
         Args:
@@ -120,7 +120,7 @@ class ExactSystem:
         self._launch(self._keep, self.all, [left_out, self.net.blocks], [self.right])
         self._give(self.right, out)
 
-    def assemble(self, state: NetState, rate: wp.array) -> None:
+    def assemble(self, state: CoupledState, rate: wp.array) -> None:
         """H of all worlds."""
         table, flags = self.system, self.islands.arrays[0]
         every = device_arrays.takers(self.matrix.shape[1], self.device)

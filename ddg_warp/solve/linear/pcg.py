@@ -30,11 +30,11 @@ def natural_scale(net) -> float:
     return 2.0 ** round(-0.5 * math.log2(largest)) if largest > 0.0 else 1.0
 
 
-class ConjugateGradients:
+class PCG:
     """Preconditioned conjugate gradients for H d = r, to the forcing term `forcing` in the preconditioner norm.
 
     Args:
-        newton: a `NetNewton`, or an object with the same names, whose matrix, residual, direction and substructuring are used.
+        newton: a `CoupledNewton`, or an object with the same names, whose matrix, residual, direction and substructuring are used.
         multilevel: True to add BPX multilevel corrections, or to use these alone; see `kernels.linear.multilevel`.
         scale: power of two by which residuals and directions are scaled, against underflow and overflow of products; see
             `natural_scale`.
@@ -169,8 +169,8 @@ class ConjugateGradients:
         wp.launch(kernel, self.newton.all, inputs, outputs, device=self.newton.device)
 
 
-class Directions(ConjugateGradients):
-    """Directions of a `NetNewton` to the accuracy of `forcing` and `goal`; `scale` as of `ConjugateGradients`."""
+class NewtonPCG(PCG):
+    """Directions of a `CoupledNewton` to the accuracy of `forcing` and `goal`; `scale` as of `PCG`."""
 
     def __init__(self, newton, multilevel: bool):
         self.scale = natural_scale(newton.net)
@@ -206,7 +206,7 @@ class Directions(ConjugateGradients):
         )
 
     def compare(self) -> None:
-        """Write ratios of `NetNewton.allowed` for linear residuals, in worlds with a finished solve."""
+        """Write ratios of `CoupledNewton.allowed` for linear residuals, in worlds with a finished solve."""
         newton, allowed = self.newton, self.newton.allowed
         inputs = [self.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks, self._unit]
         self._launch(self._compare, inputs, [self.z, allowed.ratio])  # worlds that continue overwrite z

@@ -15,22 +15,22 @@ from ddg_warp.kernels.linear.sliced_ell import SETS
 from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type, place_kernel
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction
 from ddg_warp.solve.linear.solver_selection import long_and_few
-from ddg_warp.solve.linear.substructuring_plan import ChainPlan
-from ddg_warp.solve.linear.twisted_factorisation import BothEnds
+from ddg_warp.solve.linear.substructuring_plan import SubstructuringPlan
+from ddg_warp.solve.linear.twisted_factorisation import TwistedFactorisation
 
 SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
 
 
-class Chains:
+class RodSubstructuring:
     """The rods of a net as chains between their joints, and the preconditioner they make.
 
     Args:
-        net: its `DeviceNet`.
-        banded: whether blocks of H between their places are kept here, in bands, and not among the positions of a `NetSystem`.
+        net: its `CoupledModel`.
+        banded: whether blocks of H between their places are kept here, in bands, and not among the positions of a `SparseSystem`.
         split: whether tensions of edges are unknowns, see `kernels.linear.mixed_axial_force`; where `splits` says that they can be.
 
     Attributes:
-        idle: chains of all worlds (columns,) that take no part in a direction are not zero, see `Resting`; zero without it.
+        idle: chains of all worlds (columns,) that take no part in a direction are not zero, see `SleepingIslands`; zero without it.
         exact: whether the preconditioner is the inverse of H, so that a direction takes no conjugate gradients; see `bind`.
         longer (2, longest, columns): if `split`, slack and lengthening of the edges behind places by the last direction.
 
@@ -42,14 +42,14 @@ class Chains:
         if not net.host.rods:
             raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
         self.net, self.device, self.split = net, net.device, split
-        self.plan = ChainPlan(net.host, split)
+        self.plan = SubstructuringPlan(net.host, split)
         self.along = [i for i, part in enumerate(net.sets) if part.host.along]
         self.banded = banded and len(self.along) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
         self._contact = net.host.touching is not None
 
     @classmethod
-    def of(cls, net, preconditioner: str, banded: bool = True, split: bool = False) -> "Chains | None":
+    def of(cls, net, preconditioner: str, banded: bool = True, split: bool = False) -> "RodSubstructuring | None":
         """The chains of a preconditioner, in bands where these serve it; None of one without chains."""
         if preconditioner not in ("chain", "chain_multilevel"):
             return None
@@ -69,7 +69,7 @@ class Chains:
     def bind(
         self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
     ) -> None:
-        """Take the `NetSystem` of the net, without what bands keep, and what the elements of all sets write; see `Assembly`.
+        """Take the `SparseSystem` of the net, without what bands keep, and what the elements of all sets write; see `MatrixAssembly`.
 
         With `reuse` one matrix serves several directions. In contact there is more to H than is here, which goes into `eliminated`
         before `prepare`.
@@ -148,7 +148,7 @@ class Chains:
         if serial and not (self.joints or self.reduction):
             self._walk_places = rod_substructuring.walk_places_kernel(plan.twist, plan.span, linear, self.split)
         if not (serial or self.joints or self.reduction or self.split):
-            self._both = BothEnds(plan, self.columns, linear, device, SERIAL)
+            self._both = TwistedFactorisation(plan, self.columns, linear, device, SERIAL)
         if self.split:
             self.longer = device_arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = rod_bands.lengthen_kernel(terms, real, linear)

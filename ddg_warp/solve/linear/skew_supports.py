@@ -31,8 +31,8 @@ class HostPlanes:
         return (self._turn @ values @ self._turn.T).tocsc()
 
 
-class DevicePlanes:
-    """Nodal frames on the device, for the linear algebra of `NetNewton`."""
+class SkewSupports:
+    """Nodal frames on the device, for the linear algebra of `CoupledNewton`."""
 
     def __init__(self, net, table, real, linear):
         host, device = net.host, net.device

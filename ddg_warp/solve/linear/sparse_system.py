@@ -10,11 +10,11 @@ from ddg_warp.kernels.linear.sliced_ell import SLICE
 from ddg_warp.kernels.residual.coupled_residual import ITEM
 
 
-class NetSystem:
+class SparseSystem:
     """Sparsity and incidence lists of the coupled system, common to all worlds.
 
     Args:
-        `net`: `DeviceNet`.
+        `net`: `CoupledModel`.
         kept: blocks (N,) bool whose couplings along rods are stored in bands, see `kernels.linear.rod_bands`. Entries of fixed blocks
             then are left out. None stores all entries here.
 
@@ -129,7 +129,7 @@ class Sums:
             wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=coupled_pcg.THREADS, device=self.device)
 
 
-class Assembly:
+class MatrixAssembly:
     """Assembly of H from element contributions, `sliced_ell.SETS` element sets a launch.
 
     Args:
@@ -142,7 +142,7 @@ class Assembly:
     def __init__(
         self,
         net,
-        table: NetSystem,
+        table: SparseSystem,
         written: list[dict],
         real,
         linear,

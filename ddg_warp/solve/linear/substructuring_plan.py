@@ -7,7 +7,7 @@ from ddg_warp.kernels.linear.rod_dof_map import place_dofs
 from ddg_warp.solve.linear.sparse_system import lists
 
 
-class ChainPlan:
+class SubstructuringPlan:
     """Rod paths, joints and their couplings on the host.
 
     Path node k of a rod has node k and the twist angle of the edge after it. Joints take out the nodes where rods meet, the rotations
@@ -78,7 +78,7 @@ class ChainPlan:
         return self.complete and not len(self.of_places[1])
 
     def bind(self, host, rows: np.ndarray, columns: np.ndarray, kept: np.ndarray | None) -> None:
-        """Find all positions in H, given its rows and columns; see `Chains.kept`."""
+        """Find all positions in H, given its rows and columns; see `RodSubstructuring.kept`."""
         if any(element_set.term.measure.apart for element_set in host.sets):
             nodes = [
                 element_set.slots.astype(np.int64) for element_set in host.sets if not element_set.term.measure.apart

@@ -6,7 +6,7 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import twisted_factorisation
 
 
-class BothEnds:
+class TwistedFactorisation:
     """Factors of rod paths of a plan without joints or mixed axial-force formulation, and solves.
 
     Args:
@@ -34,7 +34,8 @@ class BothEnds:
         """Write the solution z of the blocks at path nodes, and r . z; `values` are scratch.
 
         Args:
-            inputs: residual of blocks, arrays `places`, `held`, `count`, `idle` of `Chains`, `wanted` (1) of worlds, blocks of a world.
+            inputs: residual of blocks, arrays `places`, `held`, `count`, `idle` of `RodSubstructuring`, `wanted` (1) of worlds,
+                blocks of a world.
         """
         self._launch(self._inward, 2 * self._columns, [factors, *inputs], [values, self._taken])
         self._launch(self._outward, 2 * self._columns, [factors, *inputs, self._taken], [values, z, dots])

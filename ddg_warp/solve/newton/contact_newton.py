@@ -16,8 +16,8 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.newton import contact_newton as kernels
 from ddg_warp.scene.obstacles import Obstacle
 from ddg_warp.solve.collision.ccd_bodies import number_bodies, number_units
-from ddg_warp.solve.collision.contact_model import Touch
-from ddg_warp.solve.collision.statistics import Tally
+from ddg_warp.solve.collision.contact_model import ContactModel
+from ddg_warp.solve.collision.statistics import ContactStatistics
 from ddg_warp.solve.linear.contact_bands import ContactBands
 from ddg_warp.solve.linear.sparse_system import Sums
 from ddg_warp.solve.newton.rod_newton import EARLY
@@ -32,8 +32,8 @@ LEAST = 1e-3  # of the activation distance: gap that counts as minimum gap reach
 ROUNDING = 16.0  # ulps within which supports count as arrived
 
 
-class NetContact:
-    """Contact of a `NetNewton`.
+class NewtonContact:
+    """Contact of a `CoupledNewton`.
 
     Attributes:
         search, terms: candidates; contact potential and friction of active pairs.
@@ -62,7 +62,7 @@ class NetContact:
             )
         newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
         # forces on obstacles are post-processing of states
-        self.touch = Touch(net, linear, newton.q, host.of_obstacles)
+        self.touch = ContactModel(net, linear, newton.q, host.of_obstacles)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
         self.rubs, self.rate = host.touching.rubs, newton.islands.rate
         worlds, updates = net.worlds, self.touch.law.lags - 1 if self.rubs else 0
@@ -82,7 +82,7 @@ class NetContact:
         self._longest, self.farthest = make(worlds, real), math.inf
         self._braced = make(worlds, int)
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
-        self.tally = Tally(self.terms)
+        self.tally = ContactStatistics(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
         self.bodies = number_bodies(host)
         unit, self._units = number_units(*self.bodies, host, model.motions)
@@ -154,7 +154,7 @@ class NetContact:
         """Update the friction lag (normal forces, tangents) at positions x, which belong to the motion that was limited last.
 
         Slips restart, unless the update is made `again` within a step. At the start of a step, `rate` is the previous step's; see
-        `PairTerms.lag`.
+        `ContactPotential.lag`.
         """
         if self.rubs:
             self.terms.lag(x, again, rate)
@@ -316,7 +316,7 @@ class NetContact:
         """Return the statistics of all steps so far, by name.
 
         Counts of searches, refused interpenetrations and present candidates. Smallest gap [m], infinite beyond the activation
-        distance. Entries of `Tally.statistics`.
+        distance. Entries of `ContactStatistics.statistics`.
         """
         least = self.least.numpy()[0]
         return {
@@ -326,7 +326,7 @@ class NetContact:
             "candidates": sum(int(pairs.count.numpy()[0]) for pairs in self.search.lists),
         } | self.tally.statistics()
 
-    def go_on(self, previous: "NetContact") -> None:
+    def go_on(self, previous: "NewtonContact") -> None:
         """Continue the counts of a previous object."""
         for count, previous_count in zip(self._counts, previous._counts, strict=True):
             wp.copy(count, previous_count)

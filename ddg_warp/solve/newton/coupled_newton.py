@@ -16,18 +16,18 @@ from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.linear import rod_pcg
 from ddg_warp.kernels.linear.rod_dof_map import splits
 from ddg_warp.kernels.newton import coupled_newton
-from ddg_warp.solve.linear.pcg import SPARE, Directions, natural_scale
-from ddg_warp.solve.linear.rod_substructuring import Chains
-from ddg_warp.solve.linear.skew_supports import DevicePlanes
-from ddg_warp.solve.linear.sparse_system import Assembly, NetSystem, Sums
-from ddg_warp.solve.newton.contact_newton import NetContact
-from ddg_warp.solve.newton.edge_rotation import Turns
-from ddg_warp.solve.newton.frozen_hessian import Frozen
-from ddg_warp.solve.newton.relaxed_convergence import Outliers
-from ddg_warp.solve.newton.residual import Balance
-from ddg_warp.solve.newton.residual_tolerance import Allowed
+from ddg_warp.solve.linear.pcg import SPARE, NewtonPCG, natural_scale
+from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
+from ddg_warp.solve.linear.skew_supports import SkewSupports
+from ddg_warp.solve.linear.sparse_system import MatrixAssembly, SparseSystem, Sums
+from ddg_warp.solve.newton.contact_newton import NewtonContact
+from ddg_warp.solve.newton.edge_rotation import EdgeRotations
+from ddg_warp.solve.newton.frozen_hessian import FrozenHessian
+from ddg_warp.solve.newton.relaxed_convergence import RelaxedConvergence
+from ddg_warp.solve.newton.residual import ResidualAssembler
+from ddg_warp.solve.newton.residual_tolerance import ResidualTolerances
 from ddg_warp.solve.newton.rod_newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
-from ddg_warp.solve.newton.sleeping_islands import Resting
+from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 STRAIGHT = 1e-9  # turn between edges of a rod at rest that may be rounding [rad]
@@ -35,8 +35,8 @@ RESCALED = 2.0**12  # change of the natural scale that conjugate gradients take 
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
 
-class NetNewton:
-    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `ChainNewton`.
+class CoupledNewton:
+    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `RodNewton`.
 
     Args:
         preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
@@ -44,7 +44,7 @@ class NetNewton:
         linear: scalar type of the linear algebra; that of the model by default.
         drag: whether a block has more than a mass; see `kernels.forces.drag`.
         reuse: whether the matrix of a step's first iterate serves the whole step.
-        split: whether edges may be stiffer than the matrix carries, where that can be; see `Chains.splits`.
+        split: whether edges may be stiffer than the matrix carries, where that can be; see `RodSubstructuring.splits`.
 
     Attributes:
         barred: (W N,) bits of dofs that a direction leaves where they are: held ones and, in contact, those of what rests.
@@ -74,8 +74,8 @@ class NetNewton:
         serial = device_arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
-        self.chains = Chains.of(net, preconditioner, self.banded, split)
-        self.system = NetSystem(net, self.chains and self.chains.kept)
+        self.chains = RodSubstructuring.of(net, preconditioner, self.banded, split)
+        self.system = SparseSystem(net, self.chains and self.chains.kept)
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -89,7 +89,7 @@ class NetNewton:
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
         self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
-        self.planes = DevicePlanes(net, self.system, self.real, self.linear) if host.frames else None
+        self.planes = SkewSupports(net, self.system, self.real, self.linear) if host.frames else None
         self.barred = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
         if self.planes:
             bits[list(host.frames)] = 0
@@ -107,11 +107,11 @@ class NetNewton:
         self.goal.fill_(math.inf)
         self.forcing = make(worlds, self.linear)
         self.pcg_work = make(1, wp.int64)
-        self.frozen = Frozen(self.islands) if reuse else None
+        self.frozen = FrozenHessian(self.islands) if reuse else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         if self.psd == "none":
             self._require_exact()
-        self.contact = NetContact(self, model) if host.touching else None
+        self.contact = NewtonContact(self, model) if host.touching else None
         exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in net.sets]
         self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
         banded = self.chains is not None and self.chains.banded
@@ -149,21 +149,21 @@ class NetNewton:
         repeats = not reuse and (fails or curved or self._direct)
         self._repeat = rod_pcg.repeat_kernel(self.real, fails, curved) if repeats else None
         self.negative = make(worlds, int)
-        self._assembly = Assembly(
+        self._assembly = MatrixAssembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
-        self.turns = Turns(self) if host.rods else None
+        self.turns = EdgeRotations(self) if host.rods else None
         most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
         self._judge, self._measure, self._rotate, self._take, self._move = coupled_newton.search_kernels(
             self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None, most > 0
         )
-        self.allowed = Allowed(net, self.real, self.linear)
+        self.allowed = ResidualTolerances(net, self.real, self.linear)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
-        self.resting = Resting(self, *self.contact.bodies) if self.contact else None
-        self.outliers = Outliers(self, most) if most else None
+        self.resting = SleepingIslands(self, *self.contact.bodies) if self.contact else None
+        self.outliers = RelaxedConvergence(self, most) if most else None
         self.here = self.contact.bound if self.contact else self.q
-        self._balance = Balance(self, drag)
+        self._balance = ResidualAssembler(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
         self._multilevel = preconditioner in ("multilevel", "chain_multilevel")
 
@@ -177,7 +177,7 @@ class NetNewton:
                 )
 
     def automatic_psd(self) -> str:
-        """The mode that suits the rods; see `ChainNewton.automatic_psd`. Curvature that is rounding counts as none.
+        """The mode that suits the rods; see `RodNewton.automatic_psd`. Curvature that is rounding counts as none.
 
         What touches turns about what it touches, and bends: without second derivatives the last digits take tens of iterations.
         """
@@ -191,7 +191,7 @@ class NetNewton:
 
     @property
     def outdated(self) -> bool:
-        """As of `ChainNewton`; or stretching is stiffer or softer by so much that conjugate gradients need another scale."""
+        """As of `RodNewton`; or stretching is stiffer or softer by so much that conjugate gradients need another scale."""
         if self.options.psd == "auto" and self.psd != self.automatic_psd():
             return True
         return not 1.0 / RESCALED < natural_scale(self.net) / self.krylov.scale < RESCALED
@@ -355,12 +355,12 @@ class NetNewton:
             wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
     @cached_property
-    def krylov(self) -> Directions:
+    def krylov(self) -> NewtonPCG:
         """What finds directions where elimination is not exact."""
-        return Directions(self, self._multilevel)
+        return NewtonPCG(self, self._multilevel)
 
     @property
-    def anew(self) -> Islands | Frozen:
+    def anew(self) -> Islands | FrozenHessian:
         """Those whose matrix is new."""
         return self.frozen or self.islands
 

@@ -10,8 +10,8 @@ from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
 BLOCK = 32  # threads a block for pieces of rods: few, since their reads are far apart
 
 
-class Turns:
-    """Edge-rotation update of a `NetNewton`: position rods from their supports outwards, in rod order."""
+class EdgeRotations:
+    """Edge-rotation update of a `CoupledNewton`: position rods from their supports outwards, in rod order."""
 
     def __init__(self, newton):
         self.newton, self.net = newton, newton.net
@@ -87,7 +87,7 @@ class Turns:
         """Position rod nodes by edge rotation, after the straight update.
 
         `mode`: how a predictor continues, see `kernels.newton.edge_rotation`; None for a Newton step. `base`, `positions`: as
-            `base`, `now` of `PartitionedNewton.move`.
+            `base`, `now` of `RodNewtonParallel.move`.
         """
         newton, net = self.newton, self.net
         device, worlds, todo = net.device, net.worlds, newton.islands.todo

@@ -6,7 +6,7 @@ from ddg_warp.kernels.core.islands import WANTED, Islands
 from ddg_warp.kernels.newton.coupled_newton import freeze_kernel
 
 
-class Frozen:
+class FrozenHessian:
     """Frozen Hessian of modified Newton: new for the first direction of a solve, reused afterwards.
 
     Compression is dropped, since the matrix has to be definite for all iterates.

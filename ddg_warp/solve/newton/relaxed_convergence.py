@@ -13,11 +13,11 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.relaxed_convergence import outlier_kernels
 
 
-class Outliers:
-    """Relaxed convergence of a `NetNewton` in contact; launches alone.
+class RelaxedConvergence:
+    """Relaxed convergence of a `CoupledNewton` in contact; launches alone.
 
     Args:
-        newton: with its `Resting`, which numbers the bodies.
+        newton: with its `SleepingIslands`, which numbers the bodies.
         most: unconverged bodies that a world may have.
 
     Attributes:

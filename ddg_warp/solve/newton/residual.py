@@ -8,11 +8,11 @@ from ddg_warp.kernels.newton.line_search import SETTLED
 from ddg_warp.kernels.residual import coupled_residual
 
 
-class Balance:
+class ResidualAssembler:
     """Residuals of all blocks, the change of the energy, and the worlds that have not converged.
 
     Args:
-        newton: the `NetNewton` whose iterate, loads and results are used; drag: True if blocks have more than a mass.
+        newton: the `CoupledNewton` whose iterate, loads and results are used; drag: True if blocks have more than a mass.
     """
 
     def __init__(self, newton, drag: bool):

@@ -7,7 +7,7 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.residual import residual_sums
 
 
-class Allowed:
+class ResidualTolerances:
     """Tolerances of block residuals and of cluster sums, at rtol and load scale 1.
 
     Attributes:

@@ -71,7 +71,7 @@ class NewtonOptions:
             raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")
 
 
-class ChainNewton:
+class RodNewton:
     """Newton on one group of uncoupled open rods by the chain sweep. Owns what is needed while a solve runs.
 
     Args:

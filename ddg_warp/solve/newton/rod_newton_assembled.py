@@ -4,11 +4,11 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import rod_matrix
-from ddg_warp.solve.newton.rod_newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
 
 
-class AssembledNewton(ChainNewton):
-    """As `ChainNewton`, with the matrix of every node in memory; see `kernels.linear.rod_matrix`.
+class AssembledNewton(RodNewton):
+    """As `RodNewton`, with the matrix of every node in memory; see `kernels.linear.rod_matrix`.
 
     Args:
         stored: scalar type of the blocks, where it is another one than that of the elements.

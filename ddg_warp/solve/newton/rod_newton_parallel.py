@@ -14,8 +14,8 @@ from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
 
-class PartitionedNewton(AssembledNewton):
-    """As `ChainNewton`, without a loop of one thread over the nodes of a rod, for open rods.
+class RodNewtonParallel(AssembledNewton):
+    """As `RodNewton`, without a loop of one thread over the nodes of a rod, for open rods.
 
     An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
     """
@@ -71,7 +71,7 @@ class PartitionedNewton(AssembledNewton):
             self.move()
 
     def go_further(self, before, predicted: wp.array) -> None:
-        """As of `ChainNewton`."""
+        """As of `RodNewton`."""
         wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
         self.move(FURTHER, base=predicted, now=before.x)
 

@@ -11,7 +11,7 @@ from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
 
 class PcgNewton(AssembledNewton):
-    """As `ChainNewton`, with the system assembled in blocks and solved by conjugate gradients.
+    """As `RodNewton`, with the system assembled in blocks and solved by conjugate gradients.
 
     Args:
         preconditioner: "jacobi", "block_jacobi", or "chain" (block LDL^T of the open part of the chain: exact for an open rod,
@@ -155,7 +155,7 @@ class PcgNewton(AssembledNewton):
         return int(np.asarray(self.pcg_work.numpy())[0])
 
 
-class ProjectiveNewton(PcgNewton):
+class RodModifiedNewton(PcgNewton):
     """Newton with the matrix frozen: that of a step's first iterate is projected, factorised once and used for the whole step.
 
     An iteration costs a gradient and a substitution instead of a sweep, and converges linearly: it pays where the matrix hardly

@@ -20,15 +20,15 @@ from ddg_warp.kernels.newton.sleeping_islands import resting_kernels
 REST = 0.1
 
 
-class Resting:
-    """Sleeping islands of a `NetNewton` in contact; writes `NetNewton.barred` and `Chains.idle`.
+class SleepingIslands:
+    """Sleeping islands of a `CoupledNewton` in contact; writes `CoupledNewton.barred` and `RodSubstructuring.idle`.
 
     Args:
         newton: with its contact and residual tolerances made.
         body: body (rod, shell, or several joined) of each block (blocks,), -1 for none; bodies: largest possible number of bodies.
 
     Attributes:
-        owner: body of every ratio of `NetNewton.allowed`, -1 for none.
+        owner: body of every ratio of `CoupledNewton.allowed`, -1 for none.
     """
 
     def __init__(self, newton, body: np.ndarray, bodies: int):

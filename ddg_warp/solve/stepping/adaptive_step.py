@@ -23,7 +23,7 @@ ROOM = 0.8  # fraction of the tolerance that permits doubling the step
 @argument_checks.sealed
 @stays_here
 @launches
-class StepControl:
+class AdaptiveStepper:
     """Time-step controller for implicit Euler: halve or double steps by a local error estimate.
 
         steps = StepControl(Integrator(model), error=5e-3)
@@ -95,8 +95,8 @@ class StepControl:
     def _between(self, state: State, controls: Controls | None, start: Controls | None) -> Callable:
         """Return the controls of a step as a function of the end fraction of dt."""
         model = self.model
-        check_state("StepControl.advance", model, state)
-        end, begin = (checked(values, model, "StepControl.advance") for values in (controls, start))
+        check_state("AdaptiveStepper.advance", model, state)
+        end, begin = (checked(values, model, "AdaptiveStepper.advance") for values in (controls, start))
         if "poses" in begin:
             raise SceneError("StepControl.advance: poses begin where the state has them; leave them out of start")
         usual = {"gravity": np.array(model.scene.gravity, float)[None]}

@@ -12,20 +12,20 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import coupled_frames, element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.newton import coupled_newton
-from ddg_warp.model.coupled_model import NetState
+from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.scene import drag
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.forces.control_loads import ControlledLoads, NetScale
-from ddg_warp.solve.forces.drag import NetDrag
+from ddg_warp.solve.forces.control_loads import ControlledLoads, CoupledScale
+from ddg_warp.solve.forces.drag import CoupledDrag
 from ddg_warp.solve.forces.loads import Loads
-from ddg_warp.solve.forces.prescribed_element_data import NetField, NetMotion
+from ddg_warp.solve.forces.prescribed_element_data import CoupledField, CoupledMotion
 from ddg_warp.solve.linear.solver_selection import net_preconditioner
-from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS, NetNewton
-from ddg_warp.solve.stepping.decoupled_step import Alone, rods_of, suits, uncoupled
-from ddg_warp.solve.stepping.energy_drift import NetEnergy
-from ddg_warp.solve.stepping.step_driver import USUAL, PartStep
-from ddg_warp.solve.stepping.warm_start import Foresight
+from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS, CoupledNewton
+from ddg_warp.solve.stepping.decoupled_step import DecoupledStep, rods_of, suits, uncoupled
+from ddg_warp.solve.stepping.energy_drift import CoupledEnergy
+from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
+from ddg_warp.solve.stepping.warm_start import WarmStart
 
 RUNS, TREES = 1, 2  # what is made anew before some steps
 # Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
@@ -33,8 +33,8 @@ RUNS, TREES = 1, 2  # what is made anew before some steps
 RENEWAL = 8
 
 
-class NetStep(PartStep):
-    """Steps a model's net in all worlds, each an island. Arguments as of `ChainStep`."""
+class CoupledStep(StepDriver):
+    """Steps a model's net in all worlds, each an island. Arguments as of `RodStep`."""
 
     def __init__(self, integrator, model, means=USUAL, counts_of=None):
         self.net = model.net
@@ -60,7 +60,7 @@ class NetStep(PartStep):
         reuse = integrator.solver == "projective"
         if options.psd == "auto" and means.stiff and not reuse:
             options = replace(options, psd="progressive")
-        solver = NetNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse, means.split)
+        solver = CoupledNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse, means.split)
         super().__init__(integrator, model, solver, means, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
@@ -72,7 +72,7 @@ class NetStep(PartStep):
             self.tally = own
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
-        self._foresight = Foresight(solver)
+        self._foresight = WarmStart(solver)
         self._begin, self._finish = coupled_newton.step_kernels(
             real, self.midpoint, device_arrays.serial(model.wp_device), solver.contact is not None
         )
@@ -82,16 +82,16 @@ class NetStep(PartStep):
             )
         self._lagged = model.net.lagged() if model.net.edges else None
         self._take = coupled_frames.take_kernel(real)
-        self.drag = NetDrag(model, self.midpoint) if host.drag else None
-        self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
-        self.motion = NetMotion(model, self.midpoint) if host.moves else None
+        self.drag = CoupledDrag(model, self.midpoint) if host.drag else None
+        self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
+        self.motion = CoupledMotion(model, self.midpoint) if host.moves else None
         if (given := integrator.given) is not None:
-            scale = NetScale(model, self.net, solver)
+            scale = CoupledScale(model, self.net, solver)
             self.loads = ControlledLoads(model, self.net, self.midpoint, given, scale)
         elif host.timed or host.followers:
             self.loads = Loads(model, self.net, self.midpoint)
         self.arcs = self._resolve_arcs()
-        self.field = NetField(model, self.midpoint, integrator.field)
+        self.field = CoupledField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
         self.alone, self._groups = None, counts_of and counts_of._groups
         # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
@@ -165,7 +165,7 @@ class NetStep(PartStep):
         wp.capture_while(self.remaining, lambda: self._try(after, after))
 
     def prescribe(self, t0: float, t1: float) -> None:
-        """As of `PartStep`."""
+        """As of `StepDriver`."""
         super().prescribe(t0, t1)
         for chain in self._rods:
             chain.prescribe(t0, t1)
@@ -185,7 +185,7 @@ class NetStep(PartStep):
         self.islands.substep.assign(0.5**levels)
 
     def load_modules(self) -> None:
-        """As of `PartStep`."""
+        """As of `StepDriver`."""
         super().load_modules()
         if self.alone is None:
             return
@@ -203,14 +203,14 @@ class NetStep(PartStep):
     def adapt(self, s: float, anew: bool = False) -> bool:
         """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before.
 
-        `anew` as of `PartStep.suited`.
+        `anew` as of `StepDriver.suited`.
         """
         before = self.alone
         if not (uncoupled(self.model) and suits(self.integrator)):
             self.alone = None
         elif self.alone is None:
             self._groups = self._groups or rods_of(self.model)
-            self.alone = Alone(self, self._groups)
+            self.alone = DecoupledStep(self, self._groups)
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s, anew))
 
     def outgrown(self, before) -> bool:
@@ -225,7 +225,7 @@ class NetStep(PartStep):
         return True
 
     def _counted(self) -> np.ndarray:
-        """As of `PartStep`; where there is contact as `outgrown` has read it."""
+        """As of `StepDriver`; where there is contact as `outgrown` has read it."""
         contact = self.newton.contact
         return contact.search.more_read[: len(self.tally)] if contact else super()._counted()
 
@@ -292,7 +292,7 @@ class NetStep(PartStep):
         if not self.net.edges:
             return replace(before, data=self._data)
         frame, lag = self._lagged
-        start = NetState(self.newton.q, before.v, before.a, frame, lag, before.last, self._data)
+        start = CoupledState(self.newton.q, before.v, before.a, frame, lag, before.last, self._data)
         if self.midpoint:
             self.net.carry(before, start, kept=start, moved=self.islands.moved)
             return start
@@ -315,7 +315,7 @@ class NetStep(PartStep):
 
     @property
     def stiffness_version(self) -> int:
-        """As of `PartStep`."""
+        """As of `StepDriver`."""
         return self.net.version
 
     def float32_errors(self, s: float) -> np.ndarray:
@@ -330,13 +330,13 @@ class NetStep(PartStep):
         return self.net.split_errors(s).max(initial=0.0, keepdims=True)
 
     def limit(self, s: float) -> None:
-        """As of `PartStep`."""
+        """As of `StepDriver`."""
         super().limit(s)
         for chain in self._rods:
             chain.limit(s)
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
-        """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
+        """As of `StepDriver`; and what float32 matrices carry, of the rod that is the softest."""
         found = super()._find_limits(s)
         if any(self.newton.split):
             softest = self.net.rod_stiffnesses(s)[2].min()
@@ -352,7 +352,7 @@ class NetStep(PartStep):
         return []
 
     def failure(self, state, island: int) -> tuple[str, str]:
-        """As of `PartStep`."""
+        """As of `StepDriver`."""
         if int(self.islands.reason.numpy()[island]) == outcome.TURNED_TOO_FAR:
             return outcome.NAMES[outcome.TURNED_TOO_FAR], self.arcs.failure(island)
         return super().failure(state, island)

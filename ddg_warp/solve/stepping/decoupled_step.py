@@ -13,18 +13,18 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.compile.rod_groups import ChainGroup, compile_chains
+from ddg_warp.compile.rod_groups import RodGroupData, compile_chains
 from ddg_warp.compile.rods import net_rods
 from ddg_warp.kernels.collision.broad_phase.rod_culling import KNOWN
 from ddg_warp.kernels.stepping import decoupled_rods as kernels
 from ddg_warp.model.rod_elements import RodElements
-from ddg_warp.model.rod_group import Group
-from ddg_warp.solve.collision.rod_culling import Runs
-from ddg_warp.solve.stepping.rod_step import ChainStep
+from ddg_warp.model.rod_group import RodGroup
+from ddg_warp.solve.collision.rod_culling import RodCulling
+from ddg_warp.solve.stepping.rod_step import RodStep
 
 
-class Alone:
-    """Rods of a `NetStep` as uncoupled rod groups, whose states are scratch.
+class DecoupledStep:
+    """Rods of a `CoupledStep` as uncoupled rod groups, whose states are scratch.
 
     Attributes:
         `chains`: steps of the rod groups.
@@ -32,7 +32,7 @@ class Alone:
         left: worlds of the last step that the coupled solver takes (worlds,).
     """
 
-    def __init__(self, step, groups: list[Group]):
+    def __init__(self, step, groups: list[RodGroup]):
         self.step_of, self.model, self.net = step, step.model, step.net
         real, device, worlds = self.model.types.real, self.model.wp_device, self.net.worlds
         self.chains = [self._chain(group) for group in groups]
@@ -40,7 +40,7 @@ class Alone:
         self._places = [Places(self.net, group) for group in groups]
         self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
         self._search = step.newton.contact.search
-        self.runs = Runs(self._search) if len(self._search.lists) == 1 else None
+        self.runs = RodCulling(self._search) if len(self._search.lists) == 1 else None
         # without culling all worlds are in doubt
         self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
         self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
@@ -52,8 +52,8 @@ class Alone:
         self._obstacles = wp.array(obstacles, dtype=int, device=device)
         self._mixed = not all(places.whole for places in self._places)
 
-    def _chain(self, group: Group, **options) -> ChainStep:
-        chain = ChainStep(self.step_of.integrator, self.model, group, **options)
+    def _chain(self, group: RodGroup, **options) -> RodStep:
+        chain = RodStep(self.step_of.integrator, self.model, group, **options)
         if chain.motion:
             chain.motion.go_by(self.step_of.motion)
         return chain
@@ -73,7 +73,7 @@ class Alone:
         return loaded + ([self._stay, self._follow] if len(self._obstacles) else [])
 
     def adapt(self, s: float, parameters_changed: bool = False) -> bool:
-        """Update parameters and solver selection for a step of s [s], as `NetStep.adapt`; return True if graphs are outdated."""
+        """Update parameters and solver selection for a step of s [s], as `CoupledStep.adapt`; return True if graphs are outdated."""
         changed = any([places.take_parameters() for places in self._places])
         for i, chain in enumerate(self.chains):
             if (means := chain.suited(s, parameters_changed)) != chain.means or (
@@ -218,7 +218,7 @@ class Places:
         whole: True if the coupled system lags the same strains of these rods as the group.
     """
 
-    def __init__(self, net, group: Group):
+    def __init__(self, net, group: RodGroup):
         host, kind = net.host, group.kind
         self._group, self._taken = group, {}
         by_rod = {rod.rod: rod for rod in host.rods}
@@ -260,11 +260,11 @@ def suits(integrator) -> bool:
     return usual and integrator.given is None and not integrator.whole
 
 
-def rods_of(model) -> list[Group]:
+def rods_of(model) -> list[RodGroup]:
     """Return the rods of the coupled system as uncoupled rod groups."""
     real, device = model.types.real, model.wp_device
-    chains: list[ChainGroup] = compile_chains(model.scene, net_rods(model.scene))
-    return [Group(chain, model.scene, model.worlds, device, real) for chain in chains]
+    chains: list[RodGroupData] = compile_chains(model.scene, net_rods(model.scene))
+    return [RodGroup(chain, model.scene, model.worlds, device, real) for chain in chains]
 
 
 def _evenly(indices: np.ndarray) -> tuple[int, int]:

@@ -42,7 +42,7 @@ class _Energy:
     """Discrete energy balance of the steps of a stepper; see `kernels.stepping.rod_energy_drift`.
 
     Args:
-        step: `ChainStep` or `NetStep`.
+        step: `RodStep` or `CoupledStep`.
         count: number of rods in all worlds, or of worlds; rows: number of partial sums of each.
         kept: energy balance of the replaced stepper.
 
@@ -84,7 +84,7 @@ class _Energy:
         )
 
 
-class ChainEnergy(_Energy):
+class RodEnergy(_Energy):
     """Energy balance of a rod group."""
 
     def __init__(self, step, kept=None):
@@ -128,7 +128,7 @@ class ChainEnergy(_Energy):
         self._enter()
 
 
-class NetEnergy(_Energy):
+class CoupledEnergy(_Energy):
     """Energy balance of the coupled system."""
 
     def __init__(self, step, kept=None):

@@ -18,12 +18,12 @@ from ddg_warp.solve.forces.gyroscopic import Gyroscope
 from ddg_warp.solve.forces.prescribed_motion import counts_turns, turns_between
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping import energy_drift
-from ddg_warp.solve.stepping.coupled_step import NetStep
+from ddg_warp.solve.stepping.coupled_step import CoupledStep
 from ddg_warp.solve.stepping.graph_cache import Graphs
-from ddg_warp.solve.stepping.local_error import Changes
-from ddg_warp.solve.stepping.rod_step import NET_ONLY, ChainStep
-from ddg_warp.solve.stepping.state_buffers import Buffer
-from ddg_warp.solve.stepping.world_reset import Worlds, outcomes
+from ddg_warp.solve.stepping.local_error import VelocityChange
+from ddg_warp.solve.stepping.rod_step import NET_ONLY, RodStep
+from ddg_warp.solve.stepping.state_buffers import StateBuffer
+from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
@@ -124,16 +124,16 @@ class Integrator:
         if model.magnetic:
             self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
         with memory.named("Integrator", model.wp_device):
-            self._chains = [ChainStep(self, model, group) for group in model.groups]
-            self._net = NetStep(self, model) if model.net is not None else None
-            self._worlds, self._first = Worlds(model), (None, None)
-            self._buffers = [Buffer(model), Buffer(model)]
+            self._chains = [RodStep(self, model, group) for group in model.groups]
+            self._net = CoupledStep(self, model) if model.net is not None else None
+            self._worlds, self._first = WorldReset(model), (None, None)
+            self._buffers = [StateBuffer(model), StateBuffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
-        self._changes: Changes | None = None
+        self._changes: VelocityChange | None = None
         self._gyroscope: Gyroscope | None = None  # made on first use
         self._spinning = False  # True if the current step has gyroscopic couples
         self._doubted = False  # True once the rounding warning is issued
@@ -311,7 +311,7 @@ class Integrator:
         """Return counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
 
         "energy", if watched, has the energy drift, the work of damping [J] and the largest relative drift since the last state from
-        outside; see `energy_bound`. For "contact" see `NetContact.statistics`.
+        outside; see `energy_bound`. For "contact" see `NewtonContact.statistics`.
         """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
@@ -356,9 +356,9 @@ class Integrator:
 
     def _remake(self) -> None:
         """Rebuild all steppers, keeping counters."""
-        self._chains = [ChainStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
+        self._chains = [RodStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
         if self._net is not None:
-            self._net = NetStep(self, self.model, self._net.means, counts_of=self._net)
+            self._net = CoupledStep(self, self.model, self._net.means, counts_of=self._net)
         self._graphs.clear()
 
     @property
@@ -387,14 +387,14 @@ class Integrator:
         self._version, self._longest = self.model.version, dt
 
     def _adapt(self, s: float, changed: bool = False) -> None:
-        """Select the solver for steps of s [s] and, unless parameters have `changed`, for earlier ones; see `Means`."""
+        """Select the solver for steps of s [s] and, unless parameters have `changed`, for earlier ones; see `LinearSolverChoice`."""
         for i, chain in enumerate(self._chains):
             if (means := chain.suited(s, changed)) != chain.means or (changed and chain.newton.outdated):
-                self._chains[i] = ChainStep(self, self.model, chain.group, means, counts_of=chain)
+                self._chains[i] = RodStep(self, self.model, chain.group, means, counts_of=chain)
                 self._graphs.clear()
         net = self._net
         if net is not None and ((means := net.suited(s, changed)) != net.means or (changed and net.newton.outdated)):
-            self._net = NetStep(self, self.model, means, counts_of=self._net)
+            self._net = CoupledStep(self, self.model, means, counts_of=self._net)
             self._graphs.clear()
         if self._net is not None and self._net.adapt(s, changed):
             self._graphs.clear()
@@ -418,10 +418,10 @@ class Integrator:
         if self._net is not None and self._net.adapt(self._longest):
             self._graphs.clear()
 
-    def watch_changes(self) -> Changes:
+    def watch_changes(self) -> VelocityChange:
         """Return the sums of velocity changes of steps, evaluated from the next step on."""
         if self._changes is None:
-            self._changes = Changes(self.model)
+            self._changes = VelocityChange(self.model)
             self._graphs.clear()
         return self._changes
 

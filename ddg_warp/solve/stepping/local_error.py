@@ -9,7 +9,7 @@ from ddg_warp.model.state import State
 from ddg_warp.solve.linear.sparse_system import Sums
 
 
-class Changes:
+class VelocityChange:
     """Velocity changes of all masses of a model: rod groups, and nodes of the coupled system."""
 
     def __init__(self, model):

@@ -13,27 +13,27 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step, rod_warm_start
-from ddg_warp.solve.forces.control_loads import ChainScale, ControlledLoads
+from ddg_warp.solve.forces.control_loads import ControlledLoads, RodScale
 from ddg_warp.solve.forces.drag import ChainDrag
 from ddg_warp.solve.forces.loads import Loads
 from ddg_warp.solve.forces.prescribed_motion import Motion
 from ddg_warp.solve.linear.solver_selection import automatic
-from ddg_warp.solve.newton.rod_newton import ChainNewton
-from ddg_warp.solve.newton.rod_newton_parallel import PartitionedNewton
-from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton, ProjectiveNewton
+from ddg_warp.solve.newton.rod_newton import RodNewton
+from ddg_warp.solve.newton.rod_newton_parallel import RodNewtonParallel
+from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton, RodModifiedNewton
 from ddg_warp.solve.stepping import energy_drift
-from ddg_warp.solve.stepping.step_driver import USUAL, PartStep
+from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 
-DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
+DIRECT = {"sweep": RodNewton, "partitioned": RodNewtonParallel}  # solvers of open rods by their name
 NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
 
 
-class ChainStep(PartStep):
+class RodStep(StepDriver):
     """Steps the rods of a group in all worlds, each an island.
 
     Args:
-        means: what solves take; see `Means`. The psd mode "auto" takes second derivatives of stiff rods.
-        counts_of: the step that this one replaces; see `PartStep`.
+        means: what solves take; see `LinearSolverChoice`. The psd mode "auto" takes second derivatives of stiff rods.
+        counts_of: the step that this one replaces; see `StepDriver`.
     """
 
     def __init__(self, integrator, model, group, means=USUAL, counts_of=None):
@@ -49,13 +49,11 @@ class ChainStep(PartStep):
         self.outer = group.outer
         if (given := integrator.given) is not None:
             self.newton.take_loads()
-            scale = ChainScale(model, group)
+            scale = RodScale(model, group)
             self.outer, self.loads = scale.load, ControlledLoads(model, group, self.midpoint, given, scale)
         elif group.host.timed or group.host.followers:
             self.loads = Loads(model, group, self.midpoint)
-        self.energy = (
-            energy_drift.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
-        )
+        self.energy = energy_drift.RodEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
         self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
 
@@ -140,7 +138,7 @@ class ChainStep(PartStep):
 
     @property
     def stiffness_version(self) -> int:
-        """As of `PartStep`."""
+        """As of `StepDriver`."""
         return self.group.parameters.version
 
     def float32_errors(self, s: float) -> np.ndarray:
@@ -152,7 +150,7 @@ class ChainStep(PartStep):
         return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
-        """As of `PartStep`; and what float32 matrices carry."""
+        """As of `StepDriver`; and what float32 matrices carry."""
         return super()._find_limits(s) | {"carried": largest_carried(self.group.stiffnesses(s)[2])}
 
     def who(self, column: int) -> str:
@@ -183,7 +181,7 @@ class ChainStep(PartStep):
         return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
 
 
-def _newton(model, group, integrator, means) -> ChainNewton:
+def _newton(model, group, integrator, means) -> RodNewton:
     """The solver of a group that the integrator's `linear` asks for."""
     linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
     options = integrator.options
@@ -192,7 +190,7 @@ def _newton(model, group, integrator, means) -> ChainNewton:
     given = (model, group, options)
     last = (means.linear, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
-        return ProjectiveNewton(*given, *last)
+        return RodModifiedNewton(*given, *last)
     if linear in tuple(DIRECT) and group.kind.closed:
         raise SceneError(
             f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp.model.state import State
 
 
-class Buffer:
+class StateBuffer:
     """State memory at a fixed address, and the `State` that users get of it.
 
     Before the memory is overwritten, `vacate` counts references to this state. A state that the caller keeps receives a copy, while the

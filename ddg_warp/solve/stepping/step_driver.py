@@ -20,7 +20,7 @@ KEPT = 16  # number of step lengths with cached limits
 FOLDED = 1e-5  # angle to opposite edges [rad] that messages call folded
 
 
-class Means(NamedTuple):
+class LinearSolverChoice(NamedTuple):
     """Solver selection of a stepper.
 
     Attributes:
@@ -37,19 +37,19 @@ class Means(NamedTuple):
         return self.linear.__name__ + self.split * " with tensions"
 
 
-USUAL = Means()
+USUAL = LinearSolverChoice()
 
 
-def suited(precision: str, before: Means, errors: float, split_errors: float) -> Means:
+def suited(precision: str, before: LinearSolverChoice, errors: float, split_errors: float) -> LinearSolverChoice:
     """Return the solver selection for float32 errors without and with the mixed formulation, and for `before`."""
     linear, was_stiff, split = before
     if precision == "mixed" and errors > FLOAT32_LIMIT:
         split = linear is wp.float32 and bool(split_errors <= FLOAT32_LIMIT)
         linear = wp.float32 if split else wp.float64
-    return Means(linear, was_stiff or bool(stiff(errors)), split)
+    return LinearSolverChoice(linear, was_stiff or bool(stiff(errors)), split)
 
 
-class PartStep:
+class StepDriver:
     """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.rod_step`.
 
     Subclasses define the attempt (`attempt`) and its kernels (`own_kernels`). For a failed island they return its name (`who`), its
@@ -70,7 +70,7 @@ class PartStep:
 
     energy = motion = loads = field = drag = None
 
-    def __init__(self, integrator, model, newton, means: Means, counts_of: "PartStep | None" = None):
+    def __init__(self, integrator, model, newton, means: LinearSolverChoice, counts_of: "StepDriver | None" = None):
         self.means = means._replace(linear=newton.linear)
         self.integrator, self.model, self.newton = integrator, model, newton
         real, device = model.types.real, model.wp_device
@@ -100,7 +100,7 @@ class PartStep:
         """Number of islands in a world."""
         return len(self.islands) // self.model.worlds
 
-    def suited(self, s: float, parameters_changed: bool = False) -> Means:
+    def suited(self, s: float, parameters_changed: bool = False) -> LinearSolverChoice:
         """Return the solver selection for solves over s [s] and, unless `parameters_changed`, for earlier ones."""
         means = USUAL._replace(linear=self.model.types.linear) if parameters_changed else self.means
         return suited(self.model.precision, means, self.float32_errors(s).max(), self.split_errors(s).max())
@@ -227,7 +227,7 @@ class PartStep:
 
         Args:
             first: number of ghosts before the first node.
-            kind: `ChainKind` of the rod; suffix: suffix of edge names in the message.
+            kind: `RodKind` of the rod; suffix: suffix of edge names in the message.
         """
         edges = polyline.edge_vectors(x[None].astype(float), kind.closed)
         lengths = np.linalg.norm(edges, axis=-1)

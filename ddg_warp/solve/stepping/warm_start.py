@@ -7,8 +7,8 @@ from ddg_warp.kernels.stepping import coupled_warm_start
 from ddg_warp.solve.linear.sparse_system import Sums
 
 
-class Foresight:
-    """Warm start of the solves of a `NetNewton`.
+class WarmStart:
+    """Warm start of the solves of a `CoupledNewton`.
 
     Attributes:
         predicted: blocks (W N,) of the predictor; trust: trusted fraction of the correction, of every world.

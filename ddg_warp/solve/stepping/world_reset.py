@@ -21,7 +21,7 @@ def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
     return np.array([outcome.NAMES[code or outcome.CONVERGED] for code in codes])
 
 
-class Worlds:
+class WorldReset:
     """Failure handling of the worlds of an integrator.
 
     A failed world is inactive: it keeps the state before the step until reset. In watched worlds (`watch`) the state becomes NaN

@@ -14,7 +14,7 @@ LEAST = float(np.finfo(np.float32).tiny)  # so that zero is rounded outwards, to
 
 
 @wp.struct
-class Trees:
+class BvhPair:
     """AABBs of two sides in all worlds, and the BVH of the second side.
 
     `lower`, `upper`: AABBs of first primitives; `second_lower`, `second_upper`: AABBs of second primitives.

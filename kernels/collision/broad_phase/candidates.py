@@ -46,7 +46,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.broad_phase.aabb import Trees, overlap
+from ddg_warp.kernels.collision.broad_phase.aabb import BvhPair, overlap
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function, relative_function
 from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
@@ -109,7 +109,7 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
                 leaf_pairs[segment * room + first + n] = both
 
     @wp.func
-    def finds(trees: Trees, i: int, j: int):
+    def finds(trees: BvhPair, i: int, j: int):
         """Return True if leaf i lists the pair with leaf j; ties go to the first leaf."""
         if wp.static(alike):
             first = trees.bundle_lower[j][wp.static(AXIS)] < trees.bundle_lower[i][wp.static(AXIS)]
@@ -117,7 +117,7 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
         return True
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def meet(trees: Trees, num_met: wp.array(dtype=int), leaf_pairs: wp.array(dtype=wp.vec2i)):
+    def meet(trees: BvhPair, num_met: wp.array(dtype=int), leaf_pairs: wp.array(dtype=wp.vec2i)):
         """Append pairs while there is room, and count all; one thread per leaf of a world."""
         segment = wp.tid() / wp.static(WARP) % num_met.shape[0]
         i = wp.tid()
@@ -160,7 +160,7 @@ def asked_functions(kind: Kind, real, single: bool):
     _, may_touch, *_ = pair_functions(kind, real)
 
     @wp.func
-    def ranges_of(trees: Trees, both: wp.vec2i):
+    def ranges_of(trees: BvhPair, both: wp.vec2i):
         w = both[0] / (trees.bundles.shape[0] - 1)
         first, second = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
         if wp.static(single):
@@ -168,7 +168,7 @@ def asked_functions(kind: Kind, real, single: bool):
         return w, trees.bundles[first], trees.bundles[first + 1], trees.leaves[second], trees.leaves[second + 1]
 
     @wp.func
-    def reaches(sides: Sides, trees: Trees, bundle: int, l: int, w: int):
+    def reaches(sides: Sides, trees: BvhPair, bundle: int, l: int, w: int):
         if wp.static(single):
             return True
         j = l + w * sides.counts[1]
@@ -176,7 +176,7 @@ def asked_functions(kind: Kind, real, single: bool):
         return overlap(trees.bundle_lower[bundle], trees.bundle_upper[bundle], lower, upper)
 
     @wp.func
-    def asked(sides: Sides, trees: Trees, k: int, l: int, w: int):
+    def asked(sides: Sides, trees: BvhPair, k: int, l: int, w: int):
         if wp.static(single):
             return may_touch(sides, k, l)
         i, j = k + w * sides.counts[0], l + w * sides.counts[1]
@@ -231,7 +231,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
     def judge(
         threads: int,
         sides: Sides,
-        trees: Trees,
+        trees: BvhPair,
         wide: wp.vec2i,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),

@@ -10,7 +10,7 @@ rod needs some tests per edge, growing with the logarithm of their number. `SPAR
 while no edge differs by more from its last value, the rod need not be tested again.
 
 Pairs that these bounds do not exclude may be near: a search decides. Rows of the status array
-`Runs.known` (rows, worlds) are named here.
+`RodCulling.known` (rows, worlds) are named here.
 """
 
 from functools import cache

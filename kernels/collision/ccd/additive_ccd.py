@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.broad_phase.aabb import Trees
+from ddg_warp.kernels.collision.broad_phase.aabb import BvhPair
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function, relative_function
 from ddg_warp.kernels.collision.broad_phase.candidates import asked_functions, note_needed, turns
 from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct, things_function
@@ -103,7 +103,7 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
     def impacts(
         threads: int,
         sides: Sides,
-        trees: Trees,
+        trees: BvhPair,
         num_met: wp.array(dtype=int),
         leaf_pairs: wp.array(dtype=wp.vec2i),
         x: wp.array(dtype=X),

@@ -12,7 +12,7 @@ ROWS = 3
 
 @cache
 def written_struct(real):
-    """List of pairs with energies, by first primitives, `things` in a world; see `PairList`.
+    """List of pairs with energies, by first primitives, `things` in a world; see `CandidateList`.
 
     `used`: not zero for active pairs; `work`: work of friction, empty for contact.
     """

@@ -180,7 +180,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
     multipliers: by groups, coefficients forwards, backwards and across over `friction`. Directed friction reads all three.
     spinning (objects,): blocks of the markers of an object, negative without. It is read if objects spin.
     more (worlds,): addition to normal forces [N].
-    first_angles, second_angles (primitives,): see `Shapes.angles`; read if rods roll, like x and rod_nodes.
+    first_angles, second_angles (primitives,): see `CollisionMesh.angles`; read if rods roll, like x and rod_nodes.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(SLOTS, real), lay_functions(real, linear)
