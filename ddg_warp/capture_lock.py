@@ -106,8 +106,8 @@ def _cuda() -> bool:
     return wp.is_cuda_available()
 
 
-_turns = _Turns()
-launching, capturing = _turns.launching, _turns.capturing
+_serialise = _Turns()
+launching, capturing = _serialise.launching, _serialise.capturing
 
 
 def launches(target):
@@ -137,7 +137,7 @@ def _acquired(owner) -> threading.RLock:
     """Acquire and return the lock of an object."""
     lock = lock_of(owner)
     if not lock.acquire(blocking=False):
-        _turns.await_lock(lock)
+        _serialise.await_lock(lock)
     return lock
 
 
@@ -182,7 +182,7 @@ def stays_here(cls):
 
 
 def _release(self) -> None:
-    if _turns.shared:
+    if _serialise.shared:
         with launching():
             vars(self).clear()
 
@@ -190,7 +190,7 @@ def _release(self) -> None:
 def _within(section, function):
     @wraps(function)
     def entered(*args, **kwargs):
-        if section is launching and _turns.inside:  # already in a section; entering again would cost more
+        if section is launching and _serialise.inside:  # already in a section; entering again would cost more
             return function(*args, **kwargs)
         with section():
             return function(*args, **kwargs)

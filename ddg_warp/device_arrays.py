@@ -108,7 +108,7 @@ def take_turns(kernel, count: int, inputs: list, outputs: list, device) -> None:
 
 
 def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS, worlds: int = 1) -> None:
-    """Launch a kernel over `count` items, or as many in every world; see `kernels.core.launch.share_function`."""
+    """Launch a kernel over `count` items, or as many in every world; see `kernels.core.launch.items_function`."""
     wp.launch(kernel, worlds * takers(count, device), inputs, outputs, device=device, block_dim=threads)
 
 

@@ -71,7 +71,7 @@ def _between(a, b, c, d) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return r + s[:, None] * u - t[:, None] * v, s, t
 
 
-def pushed_apart(points: np.ndarray, apart: float, held: int = 0, rounds: int = 400) -> np.ndarray:
+def resolve_overlaps(points: np.ndarray, apart: float, held: int = 0, rounds: int = 400) -> np.ndarray:
     """Move nodes of rods (rods, nodes, 3) until edges of two rods are `apart` [m] apart; the first `held` nodes are fixed.
 
     Edges that are too close move by equal amounts along the line between closest points, so that crossing rods separate.

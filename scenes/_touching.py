@@ -46,7 +46,7 @@ def mass(model) -> float:
 def momentum(model, state) -> np.ndarray:
     """Return the momentum (3,) of all rods and shells [N s]."""
     each = _masses(model)
-    return each @ state.net.v.numpy()[: len(each)].astype(float)
+    return each @ state.coupled.v.numpy()[: len(each)].astype(float)
 
 
 def weight(model) -> float:
@@ -104,7 +104,7 @@ def colors(model) -> np.ndarray:
 
 def _masses(model) -> np.ndarray:
     """Return masses of the nodes of the coupled system [kg], without obstacle nodes."""
-    host = model.net.host
+    host = model.coupled.host
     first = min((int(nodes.min()) for nodes in host.obstacles), default=host.nodes)
     return host.mass[:first, 0]
 

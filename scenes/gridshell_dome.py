@@ -87,7 +87,7 @@ def check(result) -> list[ddg.Check]:
     ribs, nodes = len(model.curves.counts) // 2, int(model.curves.counts[0])
     segments = (nodes - 1) // (ribs + 1)
     rise, rigid = float(model.scene.batches[ribs // 2].points[0, nodes // 2, 2]), model.scene.joints[0].rigid
-    host, load = model.net.host, -model.scene.loads[0].force[2]
+    host, load = model.coupled.host, -model.scene.loads[0].force[2]
     outer = float(host.mass[: host.nodes, 2].sum()) * GRAVITY + load
     lift = sum(reaction.force[2] for reaction in model.reactions(state))
     drop = result.series["crown"][0] - result.series["crown"][-1]

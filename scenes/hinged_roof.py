@@ -50,7 +50,7 @@ def observe(model, state) -> dict[str, float]:
     """Return the drop of the crown [mm] and the reaction there for the whole roof [N]."""
     from ddg_warp.solve.equilibrium.tangent import Tangent
 
-    crown = model.net.host.shells[0].nodes[0]
+    crown = model.coupled.host.shells[0].nodes[0]
     force = -4.0 * Tangent(model).gradient(state)[3 * crown]
     return {"drop": -_sze.displacement(model, state, 0, 0), "force": float(force)}
 

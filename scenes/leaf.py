@@ -66,7 +66,7 @@ def edge(state) -> np.ndarray:
 
 def strains(state) -> tuple[float, float]:
     """Return the strain of the free edge against the initial length: actual, and in the rest metric."""
-    shell = state.model.net.host.shells[0]
+    shell = state.model.coupled.host.shells[0]
     sides = np.flatnonzero((shell.surface.points[shell.surface.edges, 1] > WIDTH - 1e-9).all(1))
     triangle, corner = np.nonzero(np.isin(shell.surface.triangle_edges, sides))
     rest = np.sqrt(shell.plate.lengths_squared[triangle, corner]).sum()

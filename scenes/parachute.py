@@ -92,7 +92,7 @@ def check(result) -> list[ddg.Check]:
 def descent(result, names) -> list[ddg.Check]:
     """Return the checks of a steady canopy."""
     model, state = result.model, result.state
-    host, last = model.net.host, {name: values[-1] for name, values in result.series.items()}
+    host, last = model.coupled.host, {name: values[-1] for name, values in result.series.items()}
     total = float(host.mass[: host.nodes, 2].sum())
     carried = model.scene.masses[0][2] + 0.5 * 0.02 * sum(_last_edges(model))
     effective = GRAVITY - DAMPING * last["payload"]

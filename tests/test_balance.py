@@ -38,7 +38,7 @@ def test_reactions_carry_the_loads(device, name):
     state = solver.load(model.state(), scene.analysis.load_steps)
     tangent = solver.tangent
     loads = np.where(tangent.angle, 0.0, tangent.loads(1.0, tangent.dofs(state)))
-    if model.net is None:
+    if model.coupled is None:
         loads = tangent.at_points(loads).reshape(-1, 3)
     else:  # joined rods have common nodes, of which `at_points` has one a rod
         assert not model.groups

@@ -77,7 +77,7 @@ def test_reactions_carry_the_weight(device):
     scene.attach(rod, [0], 0, [tip])
     model = scene.build(device, "float64")
     state = solve(model)
-    host = model.net.host
+    host = model.coupled.host
     weight = host.mass[: host.nodes] * np.array([0.0, 0.0, -0.02])
     (reaction,) = model.reactions(state)
     np.testing.assert_allclose(reaction.force, -weight.sum(0), atol=1e-7 * np.abs(weight).sum())

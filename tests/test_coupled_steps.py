@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.compile.coupled.rod_ordering import outwards
+from ddg_warp.compile.coupled.rod_ordering import rod_order
 from ddg_warp.geometry import meshes
-from ddg_warp.kernels.newton.rod_iterate import RELAG
+from ddg_warp.kernels.newton.rod_iterate import UPDATE_FRAMES
 from ddg_warp.solve.newton.coupled_newton import CoupledNewton, NewtonOptions
 
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
@@ -59,11 +59,11 @@ def advance(scene, device, dt, count, velocities=None, **options):
 def test_joined_rods_rotate_edges_as_uncoupled_rods(device, radius, material, points, dt, count):
     """Long steps of stiff, thin rods: equal motion in about as many iterations, without retries."""
     natural = "straight" if points is None else "shape"
-    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+    (uncoupled, uncoupled_counts), (is_coupled, coupled_counts) = (
         advance(cantilever(is_coupled, radius, material, natural, points), device, dt, count)
         for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-7)
+    np.testing.assert_allclose(is_coupled[:32], uncoupled, atol=1e-7)
     assert np.abs(uncoupled - cantilever(False, radius, material, natural, points).batches[0].points[0]).max() > 0.1
     assert uncoupled_counts["retries"] == coupled_counts["retries"] == 0
     assert coupled_counts["newton_iterations"]["mean"] < 1.25 * uncoupled_counts["newton_iterations"]["mean"]
@@ -71,7 +71,7 @@ def test_joined_rods_rotate_edges_as_uncoupled_rods(device, radius, material, po
 
 def test_joined_rods_converge_as_uncoupled_rods(device):
     """Exact elimination gives the same iterates up to rounding, whatever else the island contains."""
-    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+    (uncoupled, uncoupled_counts), (is_coupled, coupled_counts) = (
         advance(cantilever(is_coupled, 2e-3, RUBBER), device, 1.0 / 60.0, 20, rtol=1e-8) for is_coupled in (False, True)
     )
     # the stub adds a little weight to the load scale of the island: one step in twenty may end one iteration sooner
@@ -81,7 +81,7 @@ def test_joined_rods_converge_as_uncoupled_rods(device):
         <= uncoupled_counts["newton_iterations"]["mean"]
     )
     assert 0 <= uncoupled_counts["newton_iterations"]["max"] - coupled_counts["newton_iterations"]["max"] <= 1
-    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-11)
+    np.testing.assert_allclose(is_coupled[:32], uncoupled, atol=1e-11)
 
 
 def whip(joined: bool) -> ddg.Scene:
@@ -92,10 +92,10 @@ def test_predictors_rotate_edges(device):
     """A rod that swings by 0.4 rad a step is predicted unstretched: the coupled system takes hardly more iterations."""
     rates = np.zeros((35, 3))
     rates[:32, 2] = 40.0 * np.linspace(0.0, 1.0, 32)
-    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+    (uncoupled, uncoupled_counts), (is_coupled, coupled_counts) = (
         advance(whip(is_coupled), device, 0.01, 3, rates[: 35 if is_coupled else 32]) for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-6)
+    np.testing.assert_allclose(is_coupled[:32], uncoupled, atol=1e-6)
     assert coupled_counts["newton_iterations"]["mean"] <= 1.25 * uncoupled_counts["newton_iterations"]["mean"]
 
 
@@ -120,11 +120,11 @@ def test_frame_update_keeps_strains(device, rotation):
     Lagged tangents then equal tangents of the iterate, up to rounding.
     """
     model = tree().build(device, "float64", worlds=2)
-    net, state = model.net, model.net.rest()
+    coupled, state = model.coupled, model.coupled.rest()
     newton = CoupledNewton(model, NewtonOptions())
     random = np.random.default_rng(3)
     q = np.array(state.q.numpy().reshape(2, -1, 3), float)
-    nodes, spins = net.host.nodes, net.host.spins
+    nodes, spins = coupled.host.nodes, coupled.host.spins
     # rotated about an axis by an angle that grows along x, with random twist angles and joint rotations
     angle = rotation * q[:, :nodes, :1]
     y, z = q[:, :nodes, 1:2] + 0.2, q[:, :nodes, 2:3]
@@ -137,24 +137,26 @@ def test_frame_update_keeps_strains(device, rotation):
 
     def energies():
         strains = []
-        for i, element_set in enumerate(net.sets):
+        for i, element_set in enumerate(coupled.sets):
             strain = wp.zeros(
-                (len(element_set.term.measure.strains), 2 * element_set.elements), dtype=net.real, device=net.device
+                (len(element_set.term.measure.strains), 2 * element_set.elements),
+                dtype=coupled.real,
+                device=coupled.device,
             )
             state.q.assign(newton.q)
-            net.strains(state, i, strain)
+            coupled.strains(state, i, strain)
             strains.append(strain.numpy())
         return np.concatenate([values.ravel() for values in strains])
 
     before, frames = energies(), state.frame.numpy().copy()
-    actions = wp.array([RELAG, 0], dtype=int, device=net.device)
-    net.renew(state, newton.q, actions)
+    actions = wp.array([UPDATE_FRAMES, 0], dtype=int, device=coupled.device)
+    coupled.renew(state, newton.q, actions)
     after = energies()
     assert np.abs(before).max() > 1.0
     np.testing.assert_allclose(after, before, atol=1e-10 * np.abs(before).max())
-    edges = net.edges
+    edges = coupled.edges
     np.testing.assert_array_equal(state.frame.numpy()[:, edges:], frames[:, edges:])
-    first, second = net.host.ends.T
+    first, second = coupled.host.ends.T
     tangent = q[0, second] - q[0, first]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     np.testing.assert_allclose(state.frame.numpy()[3:, :edges].T, tangent, atol=1e-12)
@@ -183,19 +185,19 @@ def test_whipped_rods_move_as_uncoupled_rods(device):
     s = np.linspace(0.0, 1.0, 32)
     rates = np.zeros((35, 3))
     rates[:32, 1:] = np.stack([50.0 * s, 60.0 * s**3 * np.sin(20.0 * s)], -1)
-    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+    (uncoupled, uncoupled_counts), (is_coupled, coupled_counts) = (
         advance(whip(is_coupled), device, 0.02, 5, rates[: 35 if is_coupled else 32]) for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(coupled[:32], uncoupled, atol=1e-6)
+    np.testing.assert_allclose(is_coupled[:32], uncoupled, atol=1e-6)
     assert coupled_counts["retries"] <= uncoupled_counts["retries"]
 
 
 def test_joined_rods_rotate_by_more_than_a_right_angle_a_step(device):
     """Frames are updated within solves of 120 degrees a step: edges follow, and twist is kept."""
-    (uncoupled, uncoupled_counts), (coupled, coupled_counts) = (
+    (uncoupled, uncoupled_counts), (is_coupled, coupled_counts) = (
         advance(spun(is_coupled, 1.0 / 3.0), device, 1.0, 3) for is_coupled in (False, True)
     )
-    np.testing.assert_allclose(coupled[:6], uncoupled, atol=1e-6)
+    np.testing.assert_allclose(is_coupled[:6], uncoupled, atol=1e-6)
     assert uncoupled_counts["retries"] == coupled_counts["retries"]
 
 
@@ -250,7 +252,7 @@ def test_rod_order_visits_every_rod_once_from_the_supports():
     free = [np.array([20, 21]), np.array([21, 22])]
     fixed = np.zeros(23, bool)
     fixed[[0, 4, 7, 8]] = True
-    plan = outwards([*grid, *hanging, *free], fixed)
+    plan = rod_order([*grid, *hanging, *free], fixed)
     assert sorted(np.concatenate(plan.levels)) == list(range(8))
     level = {rod: i for i, rods in enumerate(plan.levels) for rod in rods}
     assert level[0] == level[1] == 0
@@ -265,7 +267,7 @@ def test_rod_order_visits_every_rod_once_from_the_supports():
 def test_report_states_the_linear_solver_of_a_coupled_system(device, scene):
     """The report states exact elimination; the memory of H is that of bands and of the remaining blocks."""
     model = (scene(True) if scene is whip else scene()).build(device, "float64")
-    newton = ddg.Integrator(model)._net.newton
+    newton = ddg.Integrator(model)._coupled.newton
     lines = model.report()
     assert ("exact" in lines) == newton._direct
     bands = 3 * 16 * newton.chains.longest * newton.chains.columns if newton.chains else 0

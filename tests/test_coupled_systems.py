@@ -9,7 +9,7 @@ from scipy.sparse.linalg import eigsh
 
 import ddg_warp as ddg
 from ddg_warp.compile.coupled import builder
-from ddg_warp.compile.coupled.builder import compile_net
+from ddg_warp.compile.coupled.builder import compile_coupled
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -73,7 +73,7 @@ def test_free_fall(device, bending):
 def test_momentum(device, scheme):
     """Linear momentum is conserved; the midpoint rule conserves angular momentum, as x_mid x f of internal forces is zero."""
     model = sheet(4).build(device, "float64")
-    mass = model.net.host.mass[: model.net.host.nodes]
+    mass = model.coupled.host.mass[: model.coupled.host.nodes]
     start = moving(model)
 
     def momenta(state):
@@ -104,7 +104,7 @@ def oscillation(device, scheme, count, period):
     model = scene.build(device, "float64")
     frequencies, shapes = modes(model)
     q = model.state().points()
-    shape = shapes[0, model.net.host.shells[0].nodes]
+    shape = shapes[0, model.coupled.host.shells[0].nodes]
     start = model.state(points=q + 1e-4 * shape / np.abs(shape).max())
     state, _ = steps(model, count, 1.0 / frequencies[0] / count, scheme, start, rtol=1e-11)
     return state.points()
@@ -148,7 +148,7 @@ def test_frequency_of_a_square_plate(device, clamped, factor):
         frequencies, shapes = modes(model, 1)
         factors.append(frequencies[0] / rate)
         if cells == 8:
-            shape = shapes[0, model.net.host.shells[0].nodes]
+            shape = shapes[0, model.coupled.host.shells[0].nodes]
             middle = np.abs(shape[:, 2]).argmax()
             points = model.state().points()
             state = model.state(points=points + 1e-5 * shape / shape[middle, 2])
@@ -354,7 +354,7 @@ def test_timed_load_on_a_free_sheet(device):
     scene = sheet(3)
     count = len(scene.shells[0].points)
     model = scene.build(device, "float64")
-    mass = model.net.host.mass[:, 0][:count]
+    mass = model.coupled.host.mass[:, 0][:count]
     scene.add_vertex_force(0, range(count), mass[:, None] * [0.0, 2.0, 0.0], amplitude=lambda t: t)
     state, _ = steps(scene.build(device, "float64"), 10, 0.1, rtol=1e-10)
     np.testing.assert_allclose(state.velocities()[:, 1], 2.0 * 0.01 * 55.0, rtol=1e-9)
@@ -398,7 +398,7 @@ def test_damping_of_a_mode(device, kind):
     scene = sheet(4, thickness=thickness, material=ddg.Material(1e6, 0.3, 1000.0, viscosity), **options)
     scene.clamp_boundary(0, side(scene))
     model = scene.build(device, "float64")
-    shape = modes(model)[1][0, model.net.host.shells[0].nodes]
+    shape = modes(model)[1][0, model.coupled.host.shells[0].nodes]
     state = model.state(points=model.state().points() + 1e-5 * shape / np.abs(shape).max())
     integrator, values, h = ddg.Integrator(model, "implicit_midpoint", rtol=1e-11), [], 0.1 / frequency
     vertex = np.abs(shape[:, 2]).argmax()
@@ -414,9 +414,9 @@ def test_point_mass_on_a_joined_rod(device):
     scene = ddg.Scene()
     rods = [scene.add_rod(np.outer(np.linspace(a, a + 1.0, 4), [1.0, 0.0, 0.0]), section=ROD) for a in (0.0, 1.0)]
     scene.join([(rods[0], -1), (rods[1], 0)])
-    before = scene.build(device).net.host.mass.sum()
+    before = scene.build(device).coupled.host.mass.sum()
     scene.add_mass(rods[1], 2, 0.5)
-    host = scene.build(device).net.host
+    host = scene.build(device).coupled.host
     assert host.mass.sum() == pytest.approx(before + 1.5)
     state, _ = steps(scene.build(device, "float64"), 5, 0.1)
     np.testing.assert_allclose(state.points()[:, 2], -9.81 * 0.01 * 15.0, atol=1e-12)
@@ -425,7 +425,7 @@ def test_point_mass_on_a_joined_rod(device):
 def test_uncoupled_rods_and_coupled_system_in_one_scene(device):
     """An uncoupled rod and a coupled system in one scene move as in separate scenes."""
     scene, *_ = stiffened(4)
-    coupled = steps(scene.build(device, "float64"), 6, 0.02)[0].points()
+    is_coupled = steps(scene.build(device, "float64"), 6, 0.02)[0].points()
     single = ddg.Scene()
     both = (single, scene)
     for each in both:
@@ -435,7 +435,7 @@ def test_uncoupled_rods_and_coupled_system_in_one_scene(device):
     together = steps(scene.build(device, "float64"), 6, 0.02)[0].points()
     first = int(scene.batches[0].nodes)
     np.testing.assert_array_equal(together[first : first + 7], uncoupled)
-    np.testing.assert_array_equal(np.delete(together, slice(first, first + 7), 0), coupled)
+    np.testing.assert_array_equal(np.delete(together, slice(first, first + 7), 0), is_coupled)
 
 
 # refusals ---------------------------------------------------------------------------------------------------------------------------
@@ -471,7 +471,7 @@ def test_restored_snapshots_continue_bitwise_in_long_steps(device):
     state, integrator = model.state(), ddg.Integrator(model)
     for _ in range(12):
         saved = state.snapshot()
-        integrator._net.newton.islands.clamped.fill_(1)
+        integrator._coupled.newton.islands.drop_compression.fill_(1)
         state = integrator.step(state, 0.05)
         restored, _ = steps(model, 1, 0.05, state=model.restore(saved))
         compare = np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose
@@ -509,7 +509,9 @@ def test_results_do_not_depend_on_the_rod_numbering(device, monkeypatch):
     """Numbering rod by rod (CPU) and node by node (GPU): a ring, curled rods with ghost nodes and a stiffened sheet."""
     results = []
     for by_node in (False, True):
-        monkeypatch.setattr(builder, "compile_net", lambda scene, along, by_node=by_node: compile_net(scene, by_node))
+        monkeypatch.setattr(
+            builder, "compile_net", lambda scene, along, by_node=by_node: compile_coupled(scene, by_node)
+        )
         (scene, *_), t = stiffened(), np.linspace(0.0, 1.0, 12, endpoint=False)
         circle = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), 0 * t], 1)
         kind = {"section": ddg.Circle(0.02), "material": RUBBER}

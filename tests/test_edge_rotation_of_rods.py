@@ -77,8 +77,8 @@ def test_coupled_rod_moves_as_uncoupled(device, scheme, action):
         state = steps(model, 50, 0.01, scheme, rtol=1e-11)
         results.append((state.points()[:9], state.directors()[:8], np.diff(state.angles()[:8])))
     assert np.abs(results[0][0] - bow()).max() > 0.02
-    for uncoupled, coupled in zip(*results, strict=True):
-        np.testing.assert_allclose(coupled, uncoupled, atol=1e-9)
+    for uncoupled, is_coupled in zip(*results, strict=True):
+        np.testing.assert_allclose(is_coupled, uncoupled, atol=1e-9)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -163,7 +163,7 @@ def test_load_stiffness_of_follower_loads(device):
     scene.add_pressure(shell, 3.0)
     model = scene.build(device, "float64")
     tangent = Tangent(model)
-    assert len(model.net.host.followers) == 4
+    assert len(model.coupled.host.followers) == 4
     random = np.random.default_rng(4)
     q = tangent.dofs(model.state()) + 0.05 * random.normal(size=tangent.size)
     step = random.normal(size=tangent.size)
@@ -186,8 +186,8 @@ def test_reactions_of_a_rotated_end(device):
     state, again = (steps(m, 400, 0.02, rtol=1e-11) for m in (model, build()))
     for name, values in state.snapshot().items():
         np.testing.assert_array_equal(values, again.snapshot()[name], err_msg=name)
-    host = model.net.host
-    x = state.net.q.numpy()[: host.nodes]
+    host = model.coupled.host
+    x = state.coupled.q.numpy()[: host.nodes]
     weight = host.mass[: host.nodes] * model.scene.gravity
     reactions = model.reactions(state, point=(0.0, 0.0, 0.0))
     np.testing.assert_allclose(sum(r.force for r in reactions), -weight.sum(0), atol=1e-6)

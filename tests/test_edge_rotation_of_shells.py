@@ -45,8 +45,8 @@ def elastic(model, state) -> float:
 def normals(state) -> np.ndarray:
     """Return the prescribed normals of rotating clamps (n, 3), as elements read them."""
     parts_of_data = []
-    for index, data in state.net.data.items():
-        element, row, _ = state.model.net.sets[index].turning.T
+    for index, data in state.coupled.data.items():
+        element, row, _ = state.model.coupled.sets[index].turning.T
         parts_of_data.append(data.numpy()[row[:, None] + np.arange(3), element[:, None]])
     return np.concatenate(parts_of_data)
 
@@ -197,7 +197,7 @@ def test_reactions_balance(device, model):
     state = solve(built, load_steps=3)
     tangent = Tangent(built)
     q = tangent.dofs(state)
-    host, x = built.net.host, q.reshape(-1, 3)[: built.net.host.nodes]
+    host, x = built.coupled.host, q.reshape(-1, 3)[: built.coupled.host.nodes]
     load = tangent.loads(1.0, q).reshape(-1, 3)[: host.nodes]
     pole = np.array([0.2, -0.1, 0.4])
     reactions = built.reactions(state, point=pole)
@@ -254,10 +254,10 @@ def test_normals_belong_to_the_state(device, scheme):
     single_state = steps(single, 5, 0.02, scheme)
     same = np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose
     same(state.points()[1], single_state.points())
-    (given_up,), (data,) = (list(s.net.data.values()) for s in (state, single_state))
+    (given_up,), (data,) = (list(s.coupled.data.values()) for s in (state, single_state))
     half = data.shape[1]
     np.testing.assert_array_equal(given_up.numpy()[:, half:], data.numpy())
-    np.testing.assert_array_equal(given_up.numpy()[:, :half], next(iter(single.state().net.data.values())).numpy())
+    np.testing.assert_array_equal(given_up.numpy()[:, :half], next(iter(single.state().coupled.data.values())).numpy())
 
 
 def test_retried_steps_rotate_along_the_arc(device):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.kernels.newton.rod_iterate import PLACE
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES
 from ddg_warp.solve.newton.coupled_newton import CoupledNewton, NewtonOptions
 
 SIZES = (2, 3, 33, 64, 65, 200, 1300)  # around one and two runs of edges; the last size has longer runs
@@ -69,7 +69,7 @@ def walk(beyond: np.ndarray, added: dict[int, np.ndarray], closed: bool) -> np.n
 
 def updated(host, base: np.ndarray, step: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return dof blocks of one world after a walk along every rod, from a straight update `q`."""
-    q, plan = q.copy(), host.outwards
+    q, plan = q.copy(), host.rod_order
     for rod in np.concatenate(plan.levels):
         run = slice(plan.start[rod], plan.start[rod + 1])
         nodes, anchored = plan.nodes[run], plan.anchored[run]
@@ -95,14 +95,14 @@ def test_edge_rotation_update_equals_a_walk_along_the_rods(device, anchors, clos
     """One world rotates edges, the other stays; repetition is bitwise equal."""
     scene, random = rods(anchors, closed), np.random.default_rng(4)
     model = scene.build(device, "float64", worlds=2)
-    newton, host = CoupledNewton(model, NewtonOptions()), model.net.host
+    newton, host = CoupledNewton(model, NewtonOptions()), model.coupled.host
     base = newton.base.numpy()
-    base[:] = model.state().net.q.numpy()
+    base[:] = model.state().coupled.q.numpy()
     direction = 0.15 * EDGE * random.normal(size=base.shape)
     fixed = np.tile(host.fixed.all(1), 2)
     straight = base + STEP_LENGTH * direction
     straight[fixed] += EDGE * random.normal(size=(fixed.sum(), 3))
-    newton.islands.todo.assign([0, PLACE])
+    newton.islands.iterate_action.assign([0, ROTATE_EDGES])
     newton.islands.step_length.fill_(STEP_LENGTH)
     newton.base.assign(base)
     newton.direction.assign(direction)

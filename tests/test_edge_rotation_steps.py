@@ -11,10 +11,10 @@ from test_predictors import DONE, RUBBER, SCHEMES, SOLVERS, T60, hair, linear_of
 
 import ddg_warp as ddg
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import DETOURS_ALLOWED, Islands
+from ddg_warp.kernels.core.islands import MAX_PROJECTED_ITERATIONS, Islands
 from ddg_warp.kernels.densities import NOT_NEGATIVE, Density, Parameter
 from ddg_warp.kernels.newton.coupled_newton import STALLED, search_kernels
-from ddg_warp.kernels.newton.edge_rotation import TURNED
+from ddg_warp.kernels.newton.edge_rotation import STRAIGHT_ROTATION
 from ddg_warp.kernels.stepping.rod_step import advance_kernel
 
 # The motion.
@@ -107,13 +107,13 @@ def test_long_steps_use_second_derivatives(device, joined):
     for _ in range(10):
         state = integrator.step(state, 1.0 / 240.0)
     assert matrix_and_stiffness(integrator) == [("gauss_newton", False)]
-    np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), TURNED)
+    np.testing.assert_array_equal(integrator._parts[0].islands.straight_rotation_limit.numpy(), STRAIGHT_ROTATION)
     start = integrator.statistics()
     assert start["outcomes"] == {"converged": 10}
     for _ in range(5):
         state = integrator.step(state, 1.0 / 15.0)
     assert matrix_and_stiffness(integrator) == [("progressive", True)]
-    np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), 0.0)
+    np.testing.assert_array_equal(integrator._parts[0].islands.straight_rotation_limit.numpy(), 0.0)
     end = integrator.statistics()
     assert end["outcomes"] == {"converged": 15}
     iterations = (15.0 * end["newton_iterations"]["mean"] - 10.0 * start["newton_iterations"]["mean"]) / 5.0
@@ -121,7 +121,7 @@ def test_long_steps_use_second_derivatives(device, joined):
     # a shorter step updates edges straight again; its matrix stays
     integrator.step(state, 1.0 / 240.0)
     assert matrix_and_stiffness(integrator) == [("progressive", True)]
-    np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), TURNED)
+    np.testing.assert_array_equal(integrator._parts[0].islands.straight_rotation_limit.numpy(), STRAIGHT_ROTATION)
     assert integrator.statistics()["outcomes"] == {"converged": 16}
 
 
@@ -200,7 +200,7 @@ def test_stiffness_is_decided_per_world(device):
         return state.points(), integrator
 
     together, integrator = run(1.0, 1e3)
-    assert (integrator._parts[0].islands.turn.numpy() > 0.0).tolist() == [True, False]
+    assert (integrator._parts[0].islands.straight_rotation_limit.numpy() > 0.0).tolist() == [True, False]
     for points, factor in zip(together, (1.0, 1e3), strict=True):
         single, single_integrator = run(factor)
         assert single_integrator._parts[0].means.stiff == (factor > 1.0)
@@ -217,7 +217,7 @@ def test_stiffness_follows_parameter_changes(device):
         model.set_parameter("rod_stretch", "stiffness", factor * axial)
         state = integrator.step(state, 0.01)
         assert integrator._parts[0].means.stiff == stiff
-        assert (integrator._parts[0].islands.turn.numpy()[0] > 0.0) == straight_update
+        assert (integrator._parts[0].islands.straight_rotation_limit.numpy()[0] > 0.0) == straight_update
     assert integrator.statistics()["outcomes"] == {"converged": 3}
 
 
@@ -297,12 +297,12 @@ def test_solve_beyond_the_projected_limit_is_halved(device, solver):
     assert set(statistics["outcomes"]) <= DONE | {"indefinite"}
     assert np.isfinite(state.points()).all()
     assert state.time == pytest.approx(0.2)
-    assert statistics["newton_iterations"]["max"] > DETOURS_ALLOWED
+    assert statistics["newton_iterations"]["max"] > MAX_PROJECTED_ITERATIONS
     for limit in (0, 7):
         _, statistics = run(limit, 1)
         assert statistics["retries"] == 0
         assert set(statistics["outcomes"]) <= DONE
-        assert statistics["newton_iterations"]["max"] > 2 * DETOURS_ALLOWED
+        assert statistics["newton_iterations"]["max"] > 2 * MAX_PROJECTED_ITERATIONS
     assert run(8, 1)[1]["outcomes"]["indefinite"] > 0
 
 
@@ -315,14 +315,14 @@ def test_projected_limit_skips_the_cold_start(device, result, projected, again):
     real = wp.float64
     islands = Islands(1, real, device)
     islands.status.fill_(getattr(outcome, result))
-    islands.detours.fill_(projected)
-    islands.patience.fill_(DETOURS_ALLOWED)
-    islands.portion.fill_(1.0)
+    islands.projected_iterations.fill_(projected)
+    islands.max_projected_iterations.fill_(MAX_PROJECTED_ITERATIONS)
+    islands.substep_fraction.fill_(1.0)
     counts = [wp.zeros(16, dtype=wp.int64, device=device) for _ in range(2)]
     remaining = wp.zeros(1, dtype=int, device=device)
     inputs = [*islands.arrays, 20, 2.0**-10, outcome.CONVERGED_TO_ROUNDING, *counts, remaining]
     wp.launch(advance_kernel(real), 1, inputs, device=device)
-    assert (islands.cautious.numpy()[0], islands.portion.numpy()[0]) == ((1, 1.0) if again else (0, 0.5))
+    assert (islands.cold_start.numpy()[0], islands.substep_fraction.numpy()[0]) == ((1, 1.0) if again else (0, 0.5))
     assert remaining.numpy()[0] == 1
 
 
@@ -351,9 +351,9 @@ def test_stall_test_uses_the_decrease_of_a_full_step(device, length, decrease, s
     )
     stalled = wp.zeros(1, dtype=int, device=device)
     for k in range(n):
-        islands.unbalanced.fill_(1)
+        islands.not_converged.fill_(1)
         islands.step_length.fill_(length)
-        islands.decrement.fill_(decrease)
+        islands.predicted_decrease.fill_(decrease)
         inputs = [change, noise, square, worst, 1e-6, 1e-4, 10 * n, 20, 0.1, 1e-8, 0.5]
         wp.launch(judge, 1, [*inputs, *islands.arrays, best, stalled, forcing, goal, limit], device=device)
         status = int(islands.status.numpy()[0])
@@ -376,8 +376,8 @@ def test_unsolved_directions_do_not_count_as_stalls(device, wanted, decrease, be
     real = wp.float64
     take = search_kernels(real, real, True, False, False)[3]
     islands, stalled = Islands(1, real, device), wp.full(1, STALLED, dtype=int, device=device)
-    islands.wanted.fill_(wanted)
-    islands.decrement.fill_(before)
+    islands.needs_direction.fill_(wanted)
+    islands.predicted_decrease.fill_(before)
     islands.iteration.fill_(iteration)
     inputs = [wp.full(1, v, dtype=real, device=device) for v in (decrease, 0.0)]
     iterations, work = wp.zeros(1, dtype=int, device=device), wp.zeros(1, dtype=wp.int64, device=device)

@@ -58,7 +58,7 @@ def run(scene, device, dt, steps, start=None, **options) -> Run:
     model, state, energy, statistics, error = attempt(
         scene, device, dt, steps, ("rod 0", "node", "smaller dt"), start, **options
     )
-    assert (model.net is not None) == Run.joined
+    assert (model.coupled is not None) == Run.joined
     points = state.points()[: scene.batches[0].nodes]
     return Run(model, points, energy, model.energies(state), statistics, error)
 

@@ -108,7 +108,7 @@ def test_crease_opens(device, bending, degrees):
     assert statistics["retries"] == 0
     far = points[:, 0] == points[:, 0].max()
     assert np.abs(state.points()[far] - start[far]).max() > 0.05
-    assert np.abs(state.net.q.numpy()[len(points) :, 0]).max(initial=0.0) < 0.5 * np.pi
+    assert np.abs(state.coupled.q.numpy()[len(points) :, 0]).max(initial=0.0) < 0.5 * np.pi
 
 
 @pytest.mark.parametrize("bending", BENDING)

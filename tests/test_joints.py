@@ -76,7 +76,7 @@ def bent(model, rotation: float):
     # first with frame updates, so that lagged data differ from rest; then without
     for size, carry in ((0.05, True), (rotation, False)):
         noise = rng.uniform(-1.0, 1.0, len(q))
-        spins = np.arange(len(q)) >= len(q) - 3 * model.net.host.spins
+        spins = np.arange(len(q)) >= len(q) - 3 * model.coupled.host.spins
         step = np.where(tangent.angle, size, 0.05) * noise
         moved = tangent.dofs(state) + np.where(tangent.free, step, 0.0) * np.where(spins & carry, 4.0, 1.0)
         if carry:
@@ -121,7 +121,7 @@ def test_rigid_rotation_costs_nothing(device, name):
     """Rods and joint rotate alike: angles between rods stay, and no element has energy, before and after frame updates."""
     model = SCENES[name]().build(device, "float64")
     tangent, state = Tangent(model), model.state()
-    host, rotation = model.net.host, Rotation.from_rotvec([0.7, -0.4, 0.9])
+    host, rotation = model.coupled.host, Rotation.from_rotvec([0.7, -0.4, 0.9])
     blocks = tangent.dofs(state).reshape(-1, 3)
     blocks[: host.nodes] = rotation.apply(blocks[: host.nodes])
     director, t = host.frame[:3].T, host.frame[3:].T
@@ -143,7 +143,7 @@ def test_rigid_rotation_costs_nothing(device, name):
         assert tangent.element_energies(state).sum() < 1e-25
         assert np.abs(tangent.gradient(state)).max() < 1e-10
         model.carry_frames(state)
-    assert not state.net.q.numpy()[-host.spins :].any()  # the joint's rotation has moved into its frames
+    assert not state.coupled.q.numpy()[-host.spins :].any()  # the joint's rotation has moved into its frames
     blocks[-host.spins :] = 0.0
     tangent.parts[0].assign(state, blocks.ravel())
     model.carry_frames(state)

@@ -128,7 +128,7 @@ def test_pressure_follows_and_does_its_work(device):
     q0, random = tangent.dofs(model.state()), np.random.default_rng(1)
     q0 = q0 + 0.02 * random.normal(size=q0.shape)
     q1 = q0 + 0.02 * random.normal(size=q0.shape)
-    solver = search.net.newton
+    solver = search.coupled.newton
     solver.begin(q1, tangent.parts[-1].dead_loads(0.7), 0.7, np.ones(1))
     solver.base.assign(q0.reshape(-1, 3))
     solver.balance()  # no element is evaluated, so internal forces are zero
@@ -196,5 +196,5 @@ def test_choice_by_size(device, monkeypatch):
     result = simulate(scene, device=device, precision="float64", progress=False)
     assert result.statistics["pcg_iterations"] > 0
     assert sum(result.statistics["outcomes"].values()) == 2
-    assert Equilibrium(model, StaticsOptions(mode="follow")).net is None
-    assert Continuation(model, {}).corrector.equilibrium.net is None
+    assert Equilibrium(model, StaticsOptions(mode="follow")).coupled is None
+    assert Continuation(model, {}).corrector.equilibrium.coupled is None

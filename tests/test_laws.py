@@ -111,7 +111,7 @@ def test_a_joined_rod_keeps_its_law(device):
     scene.clamp(stub, edges=[0, 1, 2])
     scene.join([(0, 0), (stub, 0)], rigid=False)
     model = scene.build(device, "float64")
-    assert len([element_set for element_set in model.net.sets if element_set.term.name == "rod_bend_twist"]) == 2
+    assert len([element_set for element_set in model.coupled.sets if element_set.term.name == "rod_bend_twist"]) == 2
     names = model.parameters().keys()
     assert {"net/rod_bend_twist/limit", "net/rod_bend_twist 1/stiffness_1"} <= names
     joined, _ = moved(scene, device)
@@ -303,10 +303,10 @@ def test_shells_with_and_without_a_law_are_two_sets(device):
     points, triangles = meshes.rectangle(4, 3, (0.4, 0.3))
     scene.add_shell(np.asarray(points) + [0.0, 1.0, 0.0], triangles, thickness=0.01, material=RUBBER)
     model = scene.build(device, "float64")
-    assert len([part for part in model.net.sets if part.term.name == "shell_bend_dof"]) == 2
+    assert len([part for part in model.coupled.sets if part.term.name == "shell_bend_dof"]) == 2
     start = model.state().points()
     for shell in (0, 1):
-        model.set_rest(shell, metric=1.1 * model.net.host.shells[shell].plate.abar)
+        model.set_rest(shell, metric=1.1 * model.coupled.host.shells[shell].plate.abar)
     model.set_rest(0, curvature=0.01 * np.ones((len(triangles), 3)))
     half = len(start) // 2
     integrator, state = ddg.Integrator(model, rtol=1e-8), model.state()

@@ -409,7 +409,7 @@ def test_pairs_are_listed_once(device):
     scene.add_dipoles(rods, cutoff=0.6)
     scene.add_dipoles(rods[0], cutoff=0.6)
     (pairs,) = [
-        element_set for element_set in scene.build(device).net.sets if element_set.term.name.startswith("dipoles")
+        element_set for element_set in scene.build(device).coupled.sets if element_set.term.name.startswith("dipoles")
     ]
     # middles at 1/8, 3/8, 5/8, 7/8: of each rod the pairs (0, 2) and (1, 3), half a metre apart
     assert pairs.elements == 4

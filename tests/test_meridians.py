@@ -130,7 +130,7 @@ def test_rigid_rotation_of_a_meridian(device):
     for state in states:
         fixed = np.array([0, 1, 3, 4])
         np.testing.assert_allclose(state.points()[fixed], motion.place(1.0, points)[fixed], atol=1e-12)
-        (rim,) = state.net.data.values()
+        (rim,) = state.coupled.data.values()
         np.testing.assert_allclose(rim.numpy()[:3, 0], motion.rotation(0.8) @ [0.0, 0.0, 1.0], atol=1e-12)
     bent = [model.energies(state)["axisymmetric_rim"] for state in states]
     assert bent[0] == pytest.approx(bent[1], rel=1e-9)

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.kernels.newton.edge_rotation import LEAP, edge_functions
+from ddg_warp.kernels.newton.edge_rotation import MAX_PREDICTED_ROTATION_COSINE, edge_functions
 
 slow = pytest.mark.slow
 DONE = {"converged", "converged_to_rounding"}
@@ -100,12 +100,15 @@ def test_predictor_extrapolates_the_rotation_of_an_edge(device, dim):
     assert not had_length.all()
     np.testing.assert_allclose(angle_between(e, end)[~had_length], 0.0, rtol=0.0, atol=1e-12)
     rotation = angle_between((e - de)[had_length], e[had_length])
-    assert (rotation > np.arccos(LEAP)).any() and (rotation < 1e-3).any()
+    assert (rotation > np.arccos(MAX_PREDICTED_ROTATION_COSINE)).any() and (rotation < 1e-3).any()
     np.testing.assert_allclose(
-        angle_between(e, end)[had_length], np.minimum(rotation, np.arccos(LEAP)), rtol=0.0, atol=1e-12
+        angle_between(e, end)[had_length],
+        np.minimum(rotation, np.arccos(MAX_PREDICTED_ROTATION_COSINE)),
+        rtol=0.0,
+        atol=1e-12,
     )
     # e lies between e0 and the end, which are then twice as far apart
-    total = rotation + np.minimum(rotation, np.arccos(LEAP))
+    total = rotation + np.minimum(rotation, np.arccos(MAX_PREDICTED_ROTATION_COSINE))
     np.testing.assert_allclose(
         angle_between((e - de)[had_length], end[had_length]), np.minimum(total, 2 * np.pi - total), rtol=0.0, atol=1e-12
     )

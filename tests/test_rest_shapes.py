@@ -173,14 +173,14 @@ def test_failed_set_rest_changes_nothing(device):
     """Everything that may fail comes before the first change: plate and elements stay."""
     scene, points, triangles = patch()
     model = scene.build(device, "float64")
-    plate, version = model.net.host.shells[0].plate, model.version
+    plate, version = model.coupled.host.shells[0].plate, model.version
     before = Tangent(model).gradient(model.state())
-    first = dict(model.net.host.shells[0].first)
-    model.net.host.shells[0].first.pop("shell_bend_dof")
+    first = dict(model.coupled.host.shells[0].first)
+    model.coupled.host.shells[0].first.pop("shell_bend_dof")
     with pytest.raises(KeyError):
         model.set_rest(0, metric=grown_metric(points, triangles, 0.9))
-    model.net.host.shells[0].first.update(first)
-    assert model.net.host.shells[0].plate is plate
+    model.coupled.host.shells[0].first.update(first)
+    assert model.coupled.host.shells[0].plate is plate
     assert model.version == version
     np.testing.assert_array_equal(Tangent(model).gradient(model.state()), before)
 

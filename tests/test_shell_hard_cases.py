@@ -158,7 +158,7 @@ def test_energy_and_moment_of_a_fold(device, degrees):
     arm = state.points()[far] - points[on[0]]
     moment = np.cross(arm, force) @ axis / np.linalg.norm(axis)
     assert moment == pytest.approx(stiffness * angle, rel=1e-9)
-    assert np.abs(state.net.q.numpy()[4:, 0]).max() < 0.5 * np.pi
+    assert np.abs(state.coupled.q.numpy()[4:, 0]).max() < 0.5 * np.pi
 
 
 def creased(device, bending="hinge"):
@@ -168,7 +168,7 @@ def creased(device, bending="hinge"):
     strip = scene.add_shell(points, triangles, thickness=1e-3, material=MATERIAL, bending=bending)
     scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
     model = scene.build(device, "float64")
-    shell = model.net.host.shells[strip]
+    shell = model.coupled.host.shells[strip]
     return model, shell, shell.surface.edges_on(np.abs(points[:, 0] - 0.5) < 1e-9)
 
 

@@ -99,14 +99,14 @@ def test_referenced_arrays_and_views_do_not_change(device, name):
     """Objects taken from a released state stay: a member, an array, a slice, a NumPy view on the CPU."""
     model = model_of(name, device)
     takes = {
-        "part": lambda state: state.groups[0] if state.groups else state.net,
-        "array": lambda state: state.groups[0].x if state.groups else state.net.q,
-        "slice": lambda state: (state.groups[0].v if state.groups else state.net.v)[:2],
-        "list": lambda state: state.groups or state.net.lag,
-        "names": lambda state: (state.groups[0] if state.groups else state.net).arrays(),
+        "part": lambda state: state.groups[0] if state.groups else state.coupled,
+        "array": lambda state: state.groups[0].x if state.groups else state.coupled.q,
+        "slice": lambda state: (state.groups[0].v if state.groups else state.coupled.v)[:2],
+        "list": lambda state: state.groups or state.coupled.lag,
+        "names": lambda state: (state.groups[0] if state.groups else state.coupled).arrays(),
     }
     if model.wp_device.is_cpu:
-        takes["view"] = lambda state: (state.groups[0].x if state.groups else state.net.q).numpy()
+        takes["view"] = lambda state: (state.groups[0].x if state.groups else state.coupled.q).numpy()
 
     def values(taken):
         if isinstance(taken, list):

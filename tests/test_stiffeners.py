@@ -181,10 +181,10 @@ def test_initial_states_rotate_the_rod(device):
     points = rotation.place(1.0, rest)
     state = model.state(points=points, velocities=np.cross(spin, points))
     assert np.abs(list(elastic(model, state).values())).max() < 1e-18
-    rates = state.net.v.numpy().reshape(2, -1, 3)[:, model.net.host.rods[0].edges, 0]
+    rates = state.coupled.v.numpy().reshape(2, -1, 3)[:, model.coupled.host.rods[0].edges, 0]
     np.testing.assert_allclose(rates, spin @ rotation.turn(1.0, X[None])[0], rtol=1e-9)
     without_spin = model.state(points=points, velocities=np.cross(spin, points), spins=np.zeros(len(line) - 1))
-    assert not without_spin.net.v.numpy().reshape(2, -1, 3)[:, model.net.host.rods[0].edges, 0].any()
+    assert not without_spin.coupled.v.numpy().reshape(2, -1, 3)[:, model.coupled.host.rods[0].edges, 0].any()
 
 
 @pytest.mark.parametrize("scheme", [pytest.param("implicit_euler", marks=pytest.mark.slow), "implicit_midpoint"])
@@ -259,7 +259,7 @@ def test_folds_across_the_rod_are_free(device):
         state = model.state(points=folded)
         np.testing.assert_allclose(state.angles(), 0.5 * (left - right), atol=1e-12)
         assert model.energies(state)["glued_edge"] < 1e-20
-        assert np.abs(Tangent(model).gradient(state)[3 * model.net.host.rods[0].edges]).max() < 1e-12
+        assert np.abs(Tangent(model).gradient(state)[3 * model.coupled.host.rods[0].edges]).max() < 1e-12
 
 
 def test_half_a_plate_on_a_symmetry_plane(device):

@@ -91,7 +91,7 @@ def test_launches_are_exclusive_on_a_shared_stream(monkeypatch, shared):
     """The second of two launching threads waits for the first on a shared stream, and overlaps it elsewhere."""
     from ddg_warp import capture_lock as threads
 
-    monkeypatch.setattr(threads._turns, "shared", shared)
+    monkeypatch.setattr(threads._serialise, "shared", shared)
     inside, overlapped, release = threading.Event(), threading.Event(), threading.Event()
 
     @threads.launches

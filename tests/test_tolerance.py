@@ -130,14 +130,14 @@ def test_loose_tolerance_carries_the_weight(device, kind, solver):
 
 
 def _masses(model) -> list[float]:
-    parts = [group.host.mass for group in model.groups] + ([model.net.host.mass[:, 2]] if model.net else [])
+    parts = [group.host.mass for group in model.groups] + ([model.coupled.host.mass[:, 2]] if model.coupled else [])
     return [float(mass.sum()) for mass in parts]
 
 
 def test_clusters_of_the_subset_residual_test(device):
     """Every node is in one cluster of each size; area fractions of a sheet sum to one, limits follow their roots."""
     model = scene_of_many_nodes("sheet").build(device, "float64")
-    host = model.net.host
+    host = model.coupled.host
     bodies = host.bodies
     assert bodies.count == 1
     inside = bodies.levels[0].items
@@ -159,11 +159,11 @@ def test_load_scale_is_per_body(device):
     scene.clamp(heavy, edges=[0])
     scene.join([(heavy, -1), (second_heavy, 0)])
     model = scene.build(device, "float64")
-    bodies = model.net.host.bodies
+    bodies = model.coupled.host.bodies
     weight = [9.81 * 1000.0 * np.pi * radius**2 for radius in (0.01, 0.01, 0.01, 0.1, 0.1)]
-    force = 9.81 * model.net.host.mass[:, 2] * (np.arange(model.net.host.blocks) < model.net.host.nodes)
+    force = 9.81 * model.coupled.host.mass[:, 2] * (np.arange(model.coupled.host.blocks) < model.coupled.host.nodes)
     assert bodies.loads(force) == pytest.approx(weight, rel=0.02)
-    force[model.net.host.rods[0].nodes] = 0.0
+    force[model.coupled.host.rods[0].nodes] = 0.0
     mean = sum(bodies.loads(force)[1:3]) / 3
     assert bodies.loads(force)[0] == pytest.approx(mean, rel=0.02)
 
@@ -182,7 +182,7 @@ def test_load_scale_of_a_couple(device, joined, twist):
             scene.join([(rod, 0), (second, -1)], rigid=False)
         model = scene.build(device, "float64")
         if joined:
-            load = outer_forces(model.net.host, np.zeros(3)).sum()
+            load = outer_forces(model.coupled.host, np.zeros(3)).sum()
         else:
             load = model.groups[0].outer.numpy()[0]
         assert load == pytest.approx(0.6 / 2.0)

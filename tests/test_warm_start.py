@@ -18,7 +18,7 @@ from test_predictors import (
 import ddg_warp as ddg
 from ddg_warp import device_arrays
 from ddg_warp.kernels.core.islands import LOAD_SCALE, SCALARS
-from ddg_warp.kernels.newton.edge_rotation import LEAP, edge_functions
+from ddg_warp.kernels.newton.edge_rotation import MAX_PREDICTED_ROTATION_COSINE, edge_functions
 from ddg_warp.kernels.stepping import coupled_warm_start
 
 T240 = 1.0 / 240.0
@@ -27,7 +27,7 @@ STEPS = np.array([T240, T240, T240, 0.5 * T240, 0.01, 0.01])
 
 def accelerations(state) -> list[wp.array]:
     """Return correction arrays of a state, of rod groups and of the coupled system."""
-    return [part.a for part in (*state.groups, *([state.net] if state.net else []))]
+    return [part.a for part in (*state.groups, *([state.coupled] if state.coupled else []))]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -48,7 +48,7 @@ def test_warm_start_extrapolates_the_rotation_of_an_edge(device, dim):
     out, inputs = wp.zeros(200, dtype=V, device=device), [wp.array(a, dtype=V, device=device) for a in (e, e1, de)]
     wp.launch(call, 200, inputs, [out], device=device)
     end, e0 = out.numpy(), e1 - de
-    small = np.cos(angle_between(e0, e1)) > LEAP
+    small = np.cos(angle_between(e0, e1)) > MAX_PREDICTED_ROTATION_COSINE
     assert small[:2].all() and 50 < small.sum() < 198
     np.testing.assert_allclose(end[~small], e[~small], rtol=0.0, atol=1e-15 * 10.0)
     np.testing.assert_allclose(end[0], e[0], rtol=1e-14)
@@ -81,7 +81,7 @@ def test_warm_start_extrapolates_angular_acceleration(device, solver, supported)
     state = model.state(velocities=(points - rotated_about(points, -angle, pivot)) / dt)
     added = (points - rotated_about(points, predicted_angle - angle, pivot)) / dt**2
     (a,) = accelerations(state)
-    a.assign(model.order.put_blocks(added, a.numpy(), "added") if state.net else added[:, None])
+    a.assign(model.order.put_blocks(added, a.numpy(), "added") if state.coupled else added[:, None])
     result = predicted(integrator, state, dt, warm=True).points()
     np.testing.assert_allclose(
         result, rotated_about(points, 2.0 * angle - predicted_angle, pivot), rtol=0.0, atol=1e-12
@@ -126,7 +126,7 @@ def test_warm_start_is_exact_in_free_flight(device, options):
         state = integrator.step(state, dt)
     assert integrator.statistics()["newton_iterations"]["max"] == 0
     added = [device_arrays.download(group.a) for group in state.groups]
-    result = model.order.nodes(added, state.net and state.net.a)
+    result = model.order.nodes(added, state.coupled and state.coupled.a)
     np.testing.assert_allclose(result, np.tile([0.0, 0.0, -9.81], (model.points_count, 1)), rtol=0.0, atol=1e-4)
     fall = 9.81 * np.sum(STEPS * np.cumsum(STEPS))  # by implicit Euler
     expected = start.points() + velocity * state.time - [0.0, 0.0, fall]
@@ -170,7 +170,7 @@ def test_warm_start_weight_follows_the_persistence_of_corrections(device):
     """
     real, (*_, trust) = (
         wp.float64,
-        coupled_warm_start.foresight_kernels(wp.float64, wp.float64, device_arrays.serial(device)),
+        coupled_warm_start.warm_start_kernels(wp.float64, wp.float64, device_arrays.serial(device)),
     )
     rtol = 0.1
     # m a.b, m a.a, m b.b, m |a|, and the weight
@@ -203,7 +203,7 @@ def test_shock_is_not_extrapolated(device):
     for _ in range(60):
         before, state = state, integrator.step(state, T240)
         change = np.linalg.norm(state.velocities() - before.velocities(), axis=1).max() / T240
-        kept = np.linalg.norm(state.net.a.numpy()[: model.points_count], axis=1).max()
+        kept = np.linalg.norm(state.coupled.a.numpy()[: model.points_count], axis=1).max()
         trusted.append(kept / change if change > 50.0 else np.nan)
     assert 0.0 < np.nanmin(trusted) < 0.06
 

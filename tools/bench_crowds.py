@@ -88,7 +88,7 @@ def run(name: str, device, limit: float) -> list[dict]:
     integrator = ddg.Integrator(model, check_every=1, rtol=rtol, outliers=outliers)
     steps = ddg.StepControl(integrator, *CONTROL.get(name, ONE_LENGTH))
     state = scene.initial(model) if scene.initial else model.state()
-    contact = integrator._net.newton.contact  # for the time of a search, which has no public interface
+    contact = integrator._coupled.newton.contact  # for the time of a search, which has no public interface
     state = integrator.step(state, dt / 2**steps.halvings)
     wp.synchronize_device(device)
     rows, energies, astray = [], [sum(model.energies(state).values())], 0.0
@@ -108,7 +108,7 @@ def run(name: str, device, limit: float) -> list[dict]:
         rows.append(
             {
                 "case": name,
-                "nodes": model.net.host.nodes,
+                "nodes": model.coupled.host.nodes,
                 "dt": (state.time - since) / number,
                 "rtol": rtol,
                 "outliers": outliers,
@@ -147,7 +147,7 @@ def _search_time(contact, state) -> float:
     """Return the least time of a captured search [s]."""
     search, times = contact.search, []
     with wp.ScopedCapture(device=search.device, force_module_load=False) as capture:
-        search.search(state.net.q)
+        search.search(state.coupled.q)
     for _ in range(4):
         wp.synchronize_device(search.device)
         began = time.perf_counter()

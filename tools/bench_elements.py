@@ -73,7 +73,7 @@ TIMED = ("twisted", "planar", "twisted exact", "net", "net exact")
 
 def newton_of(integrator):
     """Return the solver of the uncoupled rods, or of the coupled system."""
-    return (integrator._net or integrator._chains[0]).newton
+    return (integrator._coupled or integrator._chains[0]).newton
 
 
 def cubin(data: bytes) -> dict:
@@ -108,13 +108,13 @@ def registers() -> list[dict]:
     for kind, precision in KINDS:
         model = scene(kind, 2, 9).build("cpu", precision)
         integrator = ddg.Integrator(model)
-        if model.net is not None:
-            terms, kernels = [part.term for part in model.net.sets], newton_of(integrator)._evaluate
-            reverse = CoupledStepAdjoint(model, "implicit_euler")._pull
+        if model.coupled is not None:
+            terms, kernels = [part.term for part in model.coupled.sets], newton_of(integrator)._evaluate
+            reverse = CoupledStepAdjoint(model, "implicit_euler")._vjp
         else:
             (group,) = model.groups
             terms, kernels = group.kind.terms, [newton_of(integrator)._evaluate]
-            reverse = RodStepAdjoint(model, group, "implicit_euler")._pull
+            reverse = RodStepAdjoint(model, group, "implicit_euler")._vjp
         of_terms = [f" {term.name}" for term in terms]
         named = list(zip(of_terms if len(kernels) == len(terms) > 1 else [""], kernels, strict=True))
         if precision == "float64":
@@ -139,7 +139,7 @@ def times() -> list[dict]:
             began = time.perf_counter()
             state = integrator.step(state, DT)
             steps.append(time.perf_counter() - began)
-        lasts, launches = state.net if model.net else state.groups[0].last, []
+        lasts, launches = state.coupled if model.coupled else state.groups[0].last, []
         newton.islands.status.zero_()
         with wp.ScopedCapture("cpu", force_module_load=False) as capture:
             newton.evaluate(lasts)

@@ -75,7 +75,7 @@ def from_torch(model, name: str) -> dict:
         wp.synchronize_device(device)
         forward.append(middle - began)
         backward.append(time.perf_counter() - middle)
-    system = simulator.engine(model.worlds).adjoint.net.solve.system
+    system = simulator.engine(model.worlds).adjoint.coupled.solve.system
     times = {"forward": 1e3 * min(forward), "backward": 1e3 * min(backward)}
     times["ratio"] = times["backward"] / times["forward"]
     return times | {"iterations": int(system.iterations.numpy().max()), "failed": int(system.failed.numpy().sum())}
@@ -89,14 +89,16 @@ def by_factors(model) -> dict:
     adjoint = Adjoint(integrator)
     after, tape = adjoint.step(state, DT)
     cotangent = model.empty_state()
-    wp.copy(cotangent.net.q, after.net.q)  # the loss is half the sum of squares
+    wp.copy(cotangent.coupled.q, after.coupled.q)  # the loss is half the sum of squares
     gradients, seconds = [], []
     for factors in (False, True, True):
         began = time.perf_counter()
         start, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, cotangent, DT, factors)
         wp.synchronize_device(model.wp_device)
         seconds.append(time.perf_counter() - began)
-        gradients.append([np.array(values.numpy()) for values in (start.net.q, start.net.v, *inputs[-1].parameters)])
+        gradients.append(
+            [np.array(values.numpy()) for values in (start.coupled.q, start.coupled.v, *inputs[-1].parameters)]
+        )
     pairs = [(a, b) for a, b in zip(*gradients[:2], strict=True) if np.abs(b).max() > 0.0]
     error = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
     return {"factors": 1e3 * min(seconds[1:]), "error": error}
@@ -106,7 +108,7 @@ def measure(name: str, size: int, worlds: int, device: str, precision: str) -> d
     """Return a row of the table."""
     build, _ = CASES[name]
     model = build(size).build(device, precision, worlds=worlds)
-    dofs = worlds * int((~model.net.host.fixed).sum())
+    dofs = worlds * int((~model.coupled.host.fixed).sum())
     row = {"scene": name, "size": size, "worlds": worlds, "dofs": dofs, "precision": precision}
     row |= from_torch(model, MEASURED[name]) | {"factors": "", "error": ""}
     if dofs <= LARGEST:

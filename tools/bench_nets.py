@@ -102,7 +102,7 @@ def measure(name: str, edges: int, model, linear: str, steps: int, exact: np.nda
     return {
         "scene": name,
         "edges": edges,
-        "dofs": int((~model.net.host.fixed).sum()),
+        "dofs": int((~model.coupled.host.fixed).sum()),
         "precision": model.precision,
         "linear": linear,
         "ms_per_step": 1e3 * seconds,

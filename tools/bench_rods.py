@@ -180,16 +180,16 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
     Their solver keeps the residual before its last update. The evaluation resumes rods that stopped at an earlier state, so call it
     last.
     """
-    worst = [] if integrator._net is None else [np.abs(integrator._net.newton.right.numpy()).max()]
+    worst = [] if integrator._coupled is None else [np.abs(integrator._coupled.newton.right.numpy()).max()]
     for chain in integrator._chains:
         newton = chain.newton
         newton.islands.status.zero_()
         newton.islands.iteration.zero_()
         newton.evaluate(state.groups[chain.index].last)
         newton.check()
-        newton.islands.unbalanced.fill_(1)
+        newton.islands.not_converged.fill_(1)
         newton.sweep()
-        worst.append(float(newton.islands.residual.numpy().max()))
+        worst.append(float(newton.islands.max_residual.numpy().max()))
     return max(worst)
 
 

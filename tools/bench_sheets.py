@@ -58,8 +58,8 @@ def equilibrium(cells: int, pressure: float, solver: str, device) -> dict:
     small = plate(4, pressure).build(device.alias, model.precision)
     Equilibrium(small, StaticsOptions(solver=solver)).load(small.state(), 1)  # compiles
     search = Equilibrium(model, StaticsOptions(solver=solver))
-    if search.net:
-        device_arrays.load_kernels(search.net.newton.kernels, device)
+    if search.coupled:
+        device_arrays.load_kernels(search.coupled.newton.kernels, device)
     clock = time.perf_counter if device.is_cuda else time.process_time
     began = clock()
     state = search.load(model.state(), 1)
@@ -90,11 +90,11 @@ def equilibria(chosen, device) -> list[dict]:
 
 def floors(newton) -> dict[str, float]:
     """Return least bytes moved by elements with assembly, and by an iteration of conjugate gradients."""
-    net, linear = newton.net, 4 if newton.linear is wp.float32 else 8
+    coupled, linear = newton.coupled, 4 if newton.linear is wp.float32 else 8
     blocks, real = newton.all, 8 if newton.real is wp.float64 else 4
     matrix = 9 * linear * newton.system.entries * newton.worlds
     geometry = blocks * 3 * real
-    data = sum(4 * elements.slots.size + real * elements.parameters.buffer.size for elements in net.sets)
+    data = sum(4 * elements.slots.size + real * elements.parameters.buffer.size for elements in coupled.sets)
     vectors = blocks * 3 * linear
     return {"assembly": matrix + geometry + data, "iteration": matrix + 9 * vectors + 9 * linear * blocks}
 
@@ -136,20 +136,20 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
     wp.synchronize_device(device)
     step = ((time.perf_counter() if device.is_cuda else time.process_time()) - began) / steps
     statistics = integrator.statistics()
-    newton, net = integrator._net.newton, state.net
+    newton, coupled = integrator._coupled.newton, state.coupled
     triangles = len(model.surfaces.triangles)
     newton.islands.status.zero_()
-    newton.islands.wanted.fill_(1)
+    newton.islands.needs_direction.fill_(1)
     repeats = 3 if quick else 30
 
     def assembly():
-        newton.evaluate(net)
+        newton.evaluate(coupled)
         newton.assemble()
 
     newton.forcing.zero_()
     newton.krylov.rho_first.fill_(1.0)
     parts = {
-        "evaluate": clocked(device, lambda: newton.evaluate(net), repeats),
+        "evaluate": clocked(device, lambda: newton.evaluate(coupled), repeats),
         "assembly": clocked(device, assembly, repeats),
         "balance": clocked(device, newton.balance, repeats),
         "iteration": clocked(device, newton.krylov.cycle, repeats),

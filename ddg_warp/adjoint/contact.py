@@ -8,7 +8,7 @@ from ddg_warp.kernels.adjoint import contact_parameters
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
 from ddg_warp.kernels.collision.contact.assembly import sum_kernel
 from ddg_warp.solve.collision.incidence import Incidence
-from ddg_warp.solve.collision.rolling_rotation import turned_by
+from ddg_warp.solve.collision.rolling_rotation import rotated_by
 from ddg_warp.solve.equilibrium.friction_jacobian import FrictionJacobian
 from ddg_warp.solve.linear.exact_contact import ExactContact
 from ddg_warp.solve.linear.sparse_system import lists
@@ -43,20 +43,20 @@ class ContactAdjoint:
         by_radius: gradient by radii (worlds, bodies), added to.
     """
 
-    def __init__(self, net):
-        contact, real, device = net.host.touching, net.real, net.device
-        self.net, self.system = net, ExactContact(net)
+    def __init__(self, coupled):
+        contact, real, device = coupled.host.touching, coupled.real, coupled.device
+        self.coupled, self.system = coupled, ExactContact(coupled)
         terms, search = self.system.terms, self.system.search
         serial, nodes = device_arrays.serial(device), len(terms.forces)
-        every = wp.zeros(net.blocks, dtype=wp.uint8, device=device)
+        every = wp.zeros(coupled.blocks, dtype=wp.uint8, device=device)
         self.lags = contact.law.lags if terms.frictions else 1
         self._rubs = terms.frictions or [None] * len(terms.lists)
         kinds = [pairs.kind for pairs in search.lists]
-        self._pull = [pull_kernel(kind, contact.density, real) for kind in kinds]
+        self._vjp = [pull_kernel(kind, contact.density, real) for kind in kinds]
         leads = [friction.directions[0] is not None for friction in terms.frictions]
         self._rolls = [friction.rolls for friction in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
-        self.rubbing, spins = FrictionJacobian(net, self.system), bool(self._spins)
+        self.rubbing, spins = FrictionJacobian(coupled, self.system), bool(self._spins)
         self._direct = contact_parameters.direction_kernels(real) if any(leads) else ()
         direction_nodes = search.shapes.beside
         self._leads = [
@@ -69,23 +69,23 @@ class ContactAdjoint:
         rolling = zip(kinds, self._items, self._rolls, strict=True)
         self._rub_items = [Incidence(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling]
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
-        self.by_radius = self._zeros(*net.touching["radius"].shape)
+        self.by_radius = self._zeros(*coupled.touching["radius"].shape)
         self._things, self._starts, self._spun_things = {}, {}, {}
         self._by_spun = self._zeros(SPUN, *self.by_radius.shape)
         for size in search.shapes.sizes:
             owner = search.shapes.things(size)[2]
-            self._things[size] = self._zeros(net.worlds * len(owner))
-            self._spun_things[size] = self._zeros(SPUN if spins else 0, net.worlds * len(owner))
+            self._things[size] = self._zeros(coupled.worlds * len(owner))
+            self._spun_things[size] = self._zeros(SPUN if spins else 0, coupled.worlds * len(owner))
             starts = np.searchsorted(owner, np.arange(len(contact.bodies) + 1)).astype(np.int32)
             self._starts[size] = wp.array(starts, dtype=int, device=device)
         most = max(self._pieces(pairs)[0] for pairs in search.lists)
-        self._partial = self._zeros(NUMBERS, net.worlds * most, *terms.law.stiffness.shape[1:])
+        self._partial = self._zeros(NUMBERS, coupled.worlds * most, *terms.law.stiffness.shape[1:])
         self._reserve()
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        first = [*self._pull, *self.rubbing.kernels, self._add, *self._group, self._bodies, *self._direct]
+        first = [*self._vjp, *self.rubbing.kernels, self._add, *self._group, self._bodies, *self._direct]
         return [
             *first,
             *(k for pair in self._sides for k in pair),
@@ -93,13 +93,13 @@ class ContactAdjoint:
         ]
 
     @property
-    def by_rate(self) -> wp.array:
+    def grad_inverse_step(self) -> wp.array:
         """Row of `by_groups`: gradient by the inverse step."""
         return self.by_groups[RATE].flatten()
 
-    def outgrown(self, q: wp.array) -> bool:
+    def has_overflow(self, q: wp.array) -> bool:
         """Regrow lists after a capacity overflow as `ExactContact`; return True if the last `pull` is to be repeated."""
-        grown = self.system.outgrown(q)
+        grown = self.system.has_overflow(q)
         if grown:
             self._reserve()
         return grown
@@ -112,7 +112,7 @@ class ContactAdjoint:
         for items, pairs in {*zip(self._items, lists, strict=True), *zip(self._rub_items, lists, strict=True)}:
             items.reserve(pairs.capacity)
 
-    def pull(self, positions: tuple, w: wp.array, rate: wp.array, gradients: tuple) -> None:
+    def vjp(self, positions: tuple, w: wp.array, rate: wp.array, gradients: tuple) -> None:
         """Add the gradients by dof blocks and by contact parameters, after `find` of `system` with the same arguments.
 
         Args:
@@ -121,21 +121,21 @@ class ContactAdjoint:
             rate: inverse step of each world [1/s].
             gradients: gradients by these `positions`, added to.
         """
-        terms, (_, before, q), (by_lagged, by_before, by_q) = self.system.terms, positions, gradients
+        terms, (_, before, q), (by_lagged, by_before, grad_q) = self.system.terms, positions, gradients
         for array in (*self._things.values(), *self._spun_things.values()):
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
             self._items[i].list(part.count, part.factor)
             inputs = [*read, part.factor.nodes, q, w]
-            self._take_turns(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
-            self._add_up(self._items[i], part, part.gradient, by_q)
+            self._take_turns(self._vjp[i], pairs, inputs, [part.gradient, self._numbers])
+            self._add_up(self._items[i], part, part.gradient, grad_q)
             self._sum(i, self._items[i], part)
             if rub:
                 items = self._rub_items[i]
                 items.list(rub.count, rub.factor)
-                written = self.rubbing.pull(i, (rub.factor.nodes, rub.factor.angles), positions, w, rate, self._numbers)
-                for values, gradient in zip(written, (by_q, by_before, by_lagged), strict=True):
+                written = self.rubbing.vjp(i, (rub.factor.nodes, rub.factor.angles), positions, w, rate, self._numbers)
+                for values, gradient in zip(written, (grad_q, by_before, by_lagged), strict=True):
                     self._add_up(items, rub, values, gradient)
                 self._sum(i, items, rub)
                 self._lead(i, rub, by_lagged)
@@ -149,7 +149,7 @@ class ContactAdjoint:
             self._by_spun.zero_()
             for row in range(SPUN):
                 self._to_bodies(self._spun_row(row), self._by_spun[row])
-            self._spins.pull(before, q, self._by_spun, [by_before, by_q, self.by_radius])
+            self._spins.vjp(before, q, self._by_spun, [by_before, grad_q, self.by_radius])
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array):
         """Return the friction matrix as `FrictionJacobian`; a following `pull` has room for all pairs."""
@@ -158,7 +158,7 @@ class ContactAdjoint:
             self._reserve()
         return matrix
 
-    def roll(self, q: wp.array, before: wp.array, by_before: wp.array, by_q: wp.array) -> None:
+    def roll(self, q: wp.array, before: wp.array, by_before: wp.array, grad_q: wp.array) -> None:
         """Add the terms of transported frames to gradients by blocks q and `before`, after `pull` of an equilibrium.
 
         Reads from the device.
@@ -166,7 +166,7 @@ class ContactAdjoint:
         if self.system.terms.rolls:
             cotangent = by_before.numpy().astype(float).ravel()
             for gradient, derivative in zip(
-                (by_q, by_before), turned_by(self.net, q.numpy(), before.numpy()), strict=True
+                (grad_q, by_before), rotated_by(self.coupled, q.numpy(), before.numpy()), strict=True
             ):
                 gradient.assign(gradient.numpy() - (derivative.T @ cotangent).reshape(-1, 3))
 
@@ -182,7 +182,7 @@ class ContactAdjoint:
         number, size = self._pieces(pairs)
         lists = [part.count, part.starts, part.partners]
         inputs = [*lists, part.pairs, pairs.sides, law, self._numbers, number, size]
-        self._launch(pieces, self.net.worlds * number, inputs, [self._partial])
+        self._launch(pieces, self.coupled.worlds * number, inputs, [self._partial])
         self._launch(total, self.by_groups.shape[1:], [self._partial, number], [self.by_groups])
         self._to_things(index, items, part, (self._numbers[THICKNESS],) * 2, self._things)
 
@@ -197,7 +197,7 @@ class ContactAdjoint:
     def _to_bodies(self, primitives: dict[int, wp.array], out: wp.array) -> None:
         """Sum values of primitives, by primitive size, over bodies (worlds, bodies)."""
         for size, values in primitives.items():
-            starts, count = self._starts[size], len(values) // self.net.worlds
+            starts, count = self._starts[size], len(values) // self.coupled.worlds
             self._launch(self._bodies, out.shape, [values, starts, count], [out])
 
     def _spun_row(self, row: int) -> dict[int, wp.array]:
@@ -206,9 +206,9 @@ class ContactAdjoint:
 
     def _led(self, ends: np.ndarray) -> tuple:
         """Return for every node the first primitives with an end there (offsets, items), and scratch of the gradient by directions."""
-        starts, items = lists(ends.ravel(), self.net.blocks)
-        by_direction = wp.zeros((self.net.worlds, len(ends)), dtype=self.net.vector, device=self.net.device)
-        upload = (device_arrays.upload(np.asarray(v, np.int32), int, self.net.device) for v in (starts, items))
+        starts, items = lists(ends.ravel(), self.coupled.blocks)
+        by_direction = wp.zeros((self.coupled.worlds, len(ends)), dtype=self.coupled.vector, device=self.coupled.device)
+        upload = (device_arrays.upload(np.asarray(v, np.int32), int, self.coupled.device) for v in (starts, items))
         return *upload, by_direction
 
     def _lead(self, index: int, rub, by_lagged: wp.array) -> None:
@@ -216,7 +216,7 @@ class ContactAdjoint:
         if self._leads[index]:
             per_primitive, gather = self._direct
             starts, items, by_direction = self._leads[index]
-            flat, nodes = by_direction.flatten(), by_lagged.reshape((self.net.worlds, self.net.blocks))
+            flat, nodes = by_direction.flatten(), by_lagged.reshape((self.coupled.worlds, self.coupled.blocks))
             self._launch(
                 per_primitive, len(flat), [rub.count, rub.starts, rub.partners, self.rubbing.by_direction], [flat]
             )
@@ -228,13 +228,13 @@ class ContactAdjoint:
         return -(-pairs.first.count // size), size
 
     def _zeros(self, *shape: int) -> wp.array:
-        return wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+        return wp.zeros(shape, dtype=self.coupled.real, device=self.coupled.device)
 
     def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        device_arrays.take_turns(kernel, count, inputs, outputs, self.net.device)
+        device_arrays.take_turns(kernel, count, inputs, outputs, self.coupled.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        device_arrays.sweep(kernel, count, inputs, outputs, self.net.device)
+        device_arrays.sweep(kernel, count, inputs, outputs, self.coupled.device)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)
+        wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)

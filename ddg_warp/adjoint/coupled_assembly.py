@@ -18,22 +18,22 @@ class CoupledAssembly:
     """
 
     def __init__(self, model):
-        net, real = model.net, model.types.real
-        self.net, self.real, self.device = net, real, net.device
+        coupled, real = model.coupled, model.types.real
+        self.coupled, self.real, self.device = coupled, real, coupled.device
         self.gather, self._frames, self._rows = coupled_assembly.gather_kernels(real)
-        self._frame = coupled_assembly.frame_kernel(real) if net.edges else None
-        self._lags = [coupled_step.lag_kernel(p.term, real) if p.term.measure.advance else None for p in net.sets]
-        self._meets = [self._list(part.host.slots, net.blocks) for part in net.sets]
-        self._edges = self._list(np.reshape(net.host.ends, (-1, 2)).T, net.blocks) if net.edges else None
+        self._frame = coupled_assembly.frame_kernel(real) if coupled.edges else None
+        self._lags = [coupled_step.lag_kernel(p.term, real) if p.term.measure.advance else None for p in coupled.sets]
+        self._meets = [self._list(part.host.slots, coupled.blocks) for part in coupled.sets]
+        self._edges = self._list(np.reshape(coupled.host.ends, (-1, 2)).T, coupled.blocks) if coupled.edges else None
         self._framed, self.slots, self.lags = [], [], []  # the first: of the frames that elements read
-        for part in net.sets:
+        for part in coupled.sets:
             measure = part.term.measure
-            angles = part.host.slots[measure.nodes : measure.nodes + measure.frames] - net.host.nodes
-            self._framed.append(self._list(angles, net.edges) if measure.frames else None)
-            shape = measure.slots, part.elements * net.worlds
-            self.slots.append(wp.zeros(shape, dtype=net.vector, device=self.device))
+            angles = part.host.slots[measure.nodes : measure.nodes + measure.frames] - coupled.host.nodes
+            self._framed.append(self._list(angles, coupled.edges) if measure.frames else None)
+            shape = measure.slots, part.elements * coupled.worlds
+            self.slots.append(wp.zeros(shape, dtype=coupled.vector, device=self.device))
             self.lags.append(self.make(measure.lag_size + measure.data_size, part.elements))
-        self._ends = wp.zeros((2, max(1, net.edges * net.worlds)), dtype=net.vector, device=self.device)
+        self._ends = wp.zeros((2, max(1, coupled.edges * coupled.worlds)), dtype=coupled.vector, device=self.device)
 
     @property
     def kernels(self) -> list:
@@ -43,13 +43,13 @@ class CoupledAssembly:
 
     def make(self, rows: int, elements: int) -> wp.array:
         """Zeros of elements of all worlds."""
-        shape = max(1, rows), max(1, elements * self.net.worlds)
+        shape = max(1, rows), max(1, elements * self.coupled.worlds)
         return wp.zeros(shape, dtype=self.real, device=self.device)
 
     def make_own(self) -> list[wp.array]:
         """Zeros of the own lagged rows of every set."""
         result = []
-        for part in self.net.sets:
+        for part in self.coupled.sets:
             measure = part.term.measure
             own = (measure.lag_size - FRAME * measure.frames, part.elements) if measure.advance else (1, 0)
             result.append(self.make(*own))
@@ -60,21 +60,23 @@ class CoupledAssembly:
         for array in (*self.slots, *self.lags):
             array.zero_()
 
-    def collect(self, by_q: wp.array, frame: wp.array, by_data: list[wp.array]) -> None:
+    def collect(self, grad_q: wp.array, frame: wp.array, by_data: list[wp.array]) -> None:
         """Add shares to the blocks, frames and constant data that they belong to."""
-        net = self.net
-        for i, (part, slot, lag) in enumerate(zip(net.sets, self.slots, self.lags, strict=True)):
+        coupled = self.coupled
+        for i, (part, slot, lag) in enumerate(zip(coupled.sets, self.slots, self.lags, strict=True)):
             starts, items, count = self._meets[i]
-            self._launch(self.gather, len(by_q), [starts, items, count, net.blocks, slot], [by_q])
+            self._launch(self.gather, len(grad_q), [starts, items, count, coupled.blocks, slot], [grad_q])
             if self._framed[i]:
                 starts, items, count = self._framed[i]
-                self._launch(self._frames, net.edges * net.worlds, [starts, items, count, net.edges, lag], [frame])
+                self._launch(
+                    self._frames, coupled.edges * coupled.worlds, [starts, items, count, coupled.edges, lag], [frame]
+                )
             if part.term.measure.data_size:
                 self._launch(self._rows, by_data[i].shape, [lag, part.term.measure.lag_size], [by_data[i]])
 
     def add_own(self, out: list[wp.array]) -> None:
         """Add what is brought of own lagged rows."""
-        for part, lag, rows in zip(self.net.sets, self.lags, out, strict=True):
+        for part, lag, rows in zip(self.coupled.sets, self.lags, out, strict=True):
             if part.term.measure.advance:
                 self._launch(self._rows, rows.shape, [lag, FRAME * part.term.measure.frames], [rows])
 
@@ -85,7 +87,7 @@ class CoupledAssembly:
         q: wp.array,
         frame: wp.array,
         own: list[wp.array],
-        by_q: wp.array,
+        grad_q: wp.array,
         by_data: list[wp.array],
         by_frame: wp.array,
         by_own: list[wp.array],
@@ -97,20 +99,20 @@ class CoupledAssembly:
             frame, own: by the frames, added to, and own lagged rows of `after`.
             by_frame, by_own: by those of `before`.
         """
-        net = self.net
+        coupled = self.coupled
         self.clear()
         for i, kernel in enumerate(self._lags):
             if kernel:
-                at = net.elements(after, i, q)
+                at = coupled.elements(after, i, q)
                 at.lag = before.lag[i]
-                count = net.sets[i].elements * net.worlds
+                count = coupled.sets[i].elements * coupled.worlds
                 self._launch(kernel, count, [at, own[i]], [self.slots[i], self.lags[i]])
-        self.collect(by_q, frame, by_data)
-        if net.edges:
-            read = [q, net.ends, net.blocks, before.frame, frame]
-            self._launch(self._frame, net.edges * net.worlds, read, [self._ends, by_frame])
+        self.collect(grad_q, frame, by_data)
+        if coupled.edges:
+            read = [q, coupled.ends, coupled.blocks, before.frame, frame]
+            self._launch(self._frame, coupled.edges * coupled.worlds, read, [self._ends, by_frame])
             starts, items, count = self._edges
-            self._launch(self.gather, len(by_q), [starts, items, count, net.blocks, self._ends], [by_q])
+            self._launch(self.gather, len(grad_q), [starts, items, count, coupled.blocks, self._ends], [grad_q])
         self.add_own(by_own)
 
     def _list(self, targets: np.ndarray, count: int) -> tuple[wp.array, wp.array, int]:

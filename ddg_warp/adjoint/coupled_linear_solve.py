@@ -9,7 +9,7 @@ import warp as wp
 from ddg_warp.adjoint.linear_solve import HostSolve
 from ddg_warp.compile.dof_map import FREE
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.adjoint.coupled_linear_solve import chain_kernel
+from ddg_warp.kernels.adjoint.coupled_linear_solve import chain_rule_kernel
 from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
 
@@ -31,14 +31,14 @@ class CoupledLinearSolve:
     """
 
     def __init__(self, model, drag, contact, steps: bool):
-        net = self.net = model.net
+        coupled = self.coupled = model.coupled
         self.model, self.drag = model, drag
         self.system = ExactSystem(model, drag and drag.inertia, contact) if steps else None
         self.failed = self.system and self.system.failed
         self.held = None
-        self._rate = wp.zeros(net.worlds, dtype=net.real, device=net.device)
-        self._chain = chain_kernel(net.real)
-        self._left_out = self.system and self.system.bits(~net.host.fixed | _moved(net.host))
+        self._rate = wp.zeros(coupled.worlds, dtype=coupled.real, device=coupled.device)
+        self._chain = chain_rule_kernel(coupled.real)
+        self._left_out = self.system and self.system.bits(~coupled.host.fixed | _moved(coupled.host))
 
     @cached_property
     def tangent(self) -> CoupledTangent:
@@ -55,7 +55,7 @@ class CoupledLinearSolve:
         return [*self.system.kernels, self._chain] if self.system else []
 
     def __call__(
-        self, state, rate: float, time: float, right: wp.array, w: wp.array, factors: bool = False, rubbing=None
+        self, state, rate: float, time: float, rhs: wp.array, w: wp.array, factors: bool = False, rubbing=None
     ) -> None:
         """Write w (W N,), zero at fixed dofs.
 
@@ -72,7 +72,7 @@ class CoupledLinearSolve:
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if self.system and not factors:
             self._rate.fill_(rate)
-            self.system.solve(state, coefficient, self._rate, right, w)
+            self.system.solve(state, coefficient, self._rate, rhs, w)
             return
         if self.system and self.system.contact:
             raise SolverError(
@@ -81,25 +81,29 @@ class CoupledLinearSolve:
             )
         tangent, host = self.tangent, self._host
         more = self.drag.matrix if self.drag else None
-        rhs = tangent.into(right.numpy().astype(float).ravel())
-        solution = host(SimpleNamespace(net=state), rate, coefficient, None if rate else time, rhs, more, rubbing)
+        rhs = tangent.into(rhs.numpy().astype(float).ravel())
+        solution = host(SimpleNamespace(coupled=state), rate, coefficient, None if rate else time, rhs, more, rubbing)
         w.assign(tangent.back(solution).reshape(-1, 3))
         if host.held is not None:
             self.held = wp.empty_like(w)
             self.held.assign(tangent.back(host.held).reshape(-1, 3))
 
-    def chain(self, by_lagged: wp.array, by_q: wp.array) -> None:
+    def chain(self, by_lagged: wp.array, grad_q: wp.array) -> None:
         """Overwrite free entries of `by_q` (W N,) with the gradient `by_lagged`, and add `by_lagged` to its fixed entries.
 
         The result is the right-hand side g of the friction iteration before; `by_lagged` is zeroed.
         """
         wp.launch(
-            self._chain, len(by_q), [self.system.fixed, self.net.blocks], [by_lagged, by_q], device=self.net.device
+            self._chain,
+            len(grad_q),
+            [self.system.fixed, self.coupled.blocks],
+            [by_lagged, grad_q],
+            device=self.coupled.device,
         )
 
-    def stays(self, by_q: wp.array, out: wp.array) -> None:
+    def stays(self, grad_q: wp.array, out: wp.array) -> None:
         """Write the entries of a gradient by fixed dofs (W N,) that belong to the start of a step: dofs without prescribed motion."""
-        self.system.part(by_q, self._left_out, out)
+        self.system.part(grad_q, self._left_out, out)
 
 
 def _moved(host) -> np.ndarray:

@@ -24,26 +24,26 @@ class CoupledPredictor:
         by_q: gradient by predicted blocks, scratch.
     """
 
-    def __init__(self, model, net, motion, midpoint: bool):
-        host, real, device = net.host, model.types.real, model.wp_device
-        self.model, self.net, self.motion, self._midpoint = model, net, motion, midpoint
-        self.carries = midpoint and net.edges > 0
-        self._islands = Islands(net.worlds, real, device)
-        self._islands.portion.fill_(1.0)
-        self._dt, self._none = (wp.zeros(net.worlds, dtype=real, device=device) for _ in range(2))
-        self._q, self._base, self._target, self.by_q, self._along = (
-            wp.zeros(net.worlds * net.blocks, dtype=net.vector, device=device) for _ in range(5)
+    def __init__(self, model, coupled, motion, midpoint: bool):
+        host, real, device = coupled.host, model.types.real, model.wp_device
+        self.model, self.coupled, self.motion, self._midpoint = model, coupled, motion, midpoint
+        self.carries = midpoint and coupled.edges > 0
+        self._islands = Islands(coupled.worlds, real, device)
+        self._islands.substep_fraction.fill_(1.0)
+        self._dt, self._none = (wp.zeros(coupled.worlds, dtype=real, device=device) for _ in range(2))
+        self._q, self._base, self._target, self.grad_q, self._along = (
+            wp.zeros(coupled.worlds * coupled.blocks, dtype=coupled.vector, device=device) for _ in range(5)
         )
-        self.frame, self._lag = net.lagged() if self.carries else (None, None)
+        self.frame, self._lag = coupled.lagged() if self.carries else (None, None)
         self._begin, _ = coupled_newton.step_kernels(real, midpoint, device_arrays.serial(device))
-        self._unplace, self._pass_on, self._turn, self._pull = coupled_predictor.net_kernels(real, midpoint)
-        plan, loops = host.outwards, np.array([rod.piece.kind.closed for rod in host.rods], int)
+        self._unplace, self._pass_on, self._turn, self._vjp = coupled_predictor.predictor_kernels(real, midpoint)
+        plan, loops = host.rod_order, np.array([rod.piece.kind.closed for rod in host.rods], int)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
         nodes, next_nodes = plan.nodes, plan.nodes[plan.ahead(loops)]
         self._nodes, self._ahead = self._put(nodes), self._put(next_nodes)
         anchored = device_arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
         self._rods = [self._put(plan.start), self._nodes, anchored, self._put(plan.last_anchors()), self._put(loops)]
-        placed = np.zeros(net.blocks, np.uint8)
+        placed = np.zeros(coupled.blocks, np.uint8)
         placed[nodes[~plan.anchored]] = 1
         self._placed = device_arrays.upload(placed, wp.uint8, device)
         self._levels = []  # last level first: rods, and their anchor nodes with the path nodes of each
@@ -52,23 +52,23 @@ class CoupledPredictor:
             meets, index = np.unique(nodes[path_nodes], return_inverse=True)
             starts, items = lists(index.ravel(), len(meets))
             self._levels.append((self._put(level), *map(self._put, (meets, starts, path_nodes[items]))))
-        self._meets = [self._put(values) for values in lists(np.concatenate([nodes, next_nodes]), net.blocks)]
+        self._meets = [self._put(values) for values in lists(np.concatenate([nodes, next_nodes]), coupled.blocks)]
         self._excess, self._added, self._by_base, self._by_step = (
-            wp.zeros((net.worlds, len(nodes)), dtype=net.vector, device=device) for _ in range(4)
+            wp.zeros((coupled.worlds, len(nodes)), dtype=coupled.vector, device=device) for _ in range(4)
         )
         self._solver = self._for = None
 
     @classmethod
-    def of(cls, model, net, motion, scheme: str | None) -> "CoupledPredictor | None":
+    def of(cls, model, coupled, motion, scheme: str | None) -> "CoupledPredictor | None":
         """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         midpoint = scheme == "implicit_midpoint"
-        needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
-        return cls(model, net, motion, midpoint) if needed else None
+        needed = scheme and (coupled.host.followers or (midpoint and (coupled.edges or coupled.host.drag)))
+        return cls(model, coupled, motion, midpoint) if needed else None
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture, after `suit`."""
-        kernels_of_predictor = [self._begin, self._unplace, self._pass_on, self._turn, self._pull, *self.net.carries]
+        kernels_of_predictor = [self._begin, self._unplace, self._pass_on, self._turn, self._vjp, *self.coupled.carries]
         parts = (self.motion, self._solver.turns)
         return kernels_of_predictor + [kernel for part in parts if part for kernel in part.kernels]
 
@@ -77,7 +77,7 @@ class CoupledPredictor:
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
-            self._islands.turn.assign(step.limits(s)["turn"])
+            self._islands.straight_rotation_limit.assign(step.limits(s)["straight_rotation_limit"])
         if self._solver is not None and self._solver.linear is step.newton.linear:
             return False
         self._solver = solver = copy.copy(step.newton)  # with arrays of its own
@@ -88,11 +88,13 @@ class CoupledPredictor:
 
     def find(self, before: CoupledState) -> None:
         """Compute the predictor of a step from the state `before`; launches only."""
-        net, solver, islands = self.net, self._solver, self._islands
-        islands.todo.zero_()
-        inputs = [before.q, before.v, solver.held, net.moves, self._dt, self._none, self._none, *islands.arrays]
+        coupled, solver, islands = self.coupled, self._solver, self._islands
+        islands.iterate_action.zero_()
+        inputs = [before.q, before.v, solver.held, coupled.moves, self._dt, self._none, self._none, *islands.arrays]
         outputs = [self._q, self._base, self._target]
-        device_arrays.sweep(self._begin, net.blocks, [*inputs, net.blocks], outputs, net.device, worlds=net.worlds)
+        device_arrays.sweep(
+            self._begin, coupled.blocks, [*inputs, coupled.blocks], outputs, coupled.device, worlds=coupled.worlds
+        )
         if self.motion:
             self.motion.place(islands, self._q)
         if solver.turns:
@@ -100,9 +102,9 @@ class CoupledPredictor:
         self.state = replace(before, q=self._q)
         if self.carries:
             self.state = replace(self.state, frame=self.frame, lag=self._lag)
-            net.carry(before, self.state)
+            coupled.carry(before, self.state)
 
-    def pull(self, before: CoupledState, by_fixed: wp.array, start: CoupledState, by_rate: wp.array) -> None:
+    def vjp(self, before: CoupledState, by_fixed: wp.array, start: CoupledState, grad_inverse_step: wp.array) -> None:
         """Add the gradient by the state before the step, given `by_q`, which is overwritten.
 
         Args:
@@ -111,24 +113,33 @@ class CoupledPredictor:
             start: gradient by the state before the step.
             by_rate: gradient by the inverse step.
         """
-        net, islands, worlds = self.net, self._islands, self.net.worlds
+        coupled, islands, worlds = self.coupled, self._islands, self.coupled.worlds
         for array in (self._along, self._excess, self._added, self._by_base, self._by_step):
             array.zero_()
-        inputs = [*self._rods, self._solver.held, islands.todo, net.blocks, self.by_q]
+        inputs = [*self._rods, self._solver.held, islands.iterate_action, coupled.blocks, self.grad_q]
         for rods, meets, starts, items in self._levels:
             self._launch(self._unplace, (len(rods), worlds), [rods, *inputs], [self._excess, self._added])
-            read = [meets, starts, items, net.blocks, self._added]
-            self._launch(self._pass_on, (len(meets), worlds), read, [self.by_q, self._along])
-        held_mass = [self._solver.held, self.net.moves]
-        read = [self._nodes, self._ahead, self._q, before.q, before.v, *held_mass, islands.rate, islands.turn]
-        read += [islands.todo, net.blocks, self._excess]
+            read = [meets, starts, items, coupled.blocks, self._added]
+            self._launch(self._pass_on, (len(meets), worlds), read, [self.grad_q, self._along])
+        held_mass = [self._solver.held, self.coupled.moves]
+        read = [
+            self._nodes,
+            self._ahead,
+            self._q,
+            before.q,
+            before.v,
+            *held_mass,
+            islands.inverse_step,
+            islands.straight_rotation_limit,
+        ]
+        read += [islands.iterate_action, coupled.blocks, self._excess]
         self._launch(self._turn, (len(self._nodes), worlds), read, [self._by_base, self._by_step])
-        read = [self.by_q, self._along, self._placed, *self._meets, len(self._nodes), self._by_base, self._by_step]
-        read += [before.v, *held_mass, islands.todo, islands.rate, net.blocks]
-        self._launch(self._pull, len(self._q), read, [by_fixed, start.q, start.v, by_rate])
+        read = [self.grad_q, self._along, self._placed, *self._meets, len(self._nodes), self._by_base, self._by_step]
+        read += [before.v, *held_mass, islands.iterate_action, islands.inverse_step, coupled.blocks]
+        self._launch(self._vjp, len(self._q), read, [by_fixed, start.q, start.v, grad_inverse_step])
 
     def _put(self, values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.net.device)
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.coupled.device)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)
+        wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)

@@ -82,45 +82,47 @@ class CoupledStepAdjoint:
     """
 
     def __init__(self, model, scheme: str | None, posed: bool = False):
-        net, real = model.net, model.types.real
-        self.model, self.net, self.real, self.device = model, net, real, model.wp_device
-        host, count = net.host, net.worlds * net.blocks
+        coupled, real = model.coupled, model.types.real
+        self.model, self.coupled, self.real, self.device = model, coupled, real, model.wp_device
+        host, count = coupled.host, coupled.worlds * coupled.blocks
         self.axes = host.axes
         midpoint = scheme == "implicit_midpoint"
-        self.supports = Supports(model, net, midpoint) if (scheme or posed) and host.moves else None
+        self.supports = Supports(model, coupled, midpoint) if (scheme or posed) and host.moves else None
         motion = self.supports.motion if self.supports else None
         self._midpoint, drag = midpoint, bool(host.drag and scheme)
-        self.followers = Followers(model, net, midpoint) if host.followers and scheme else None
-        self.predictor = CoupledPredictor.of(model, net, motion, scheme)
+        self.followers = Followers(model, coupled, midpoint) if host.followers and scheme else None
+        self.predictor = CoupledPredictor.of(model, coupled, motion, scheme)
         self._shares = CoupledAssembly(model)
-        self.drag = CoupledDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
-        self.contact = ContactAdjoint(net) if host.touching else None
+        self.drag = CoupledDragAdjoint(model, coupled, midpoint, self._shares.gather) if drag else None
+        self.contact = ContactAdjoint(coupled) if host.touching else None
         self.solve = CoupledLinearSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
-        self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
+        self.gravity = wp.array(
+            np.tile(model.scene.gravity, (coupled.worlds, 1)), dtype=coupled.vector, device=self.device
+        )
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
-        storages = [coupled_storage(part.term, real) for part in net.sets]
-        self._pull = [elements.pull_kernel(storage, 0, real, True, True) for storage in storages]
+        storages = [coupled_storage(part.term, real) for part in coupled.sets]
+        self._vjp = [elements.pull_kernel(storage, 0, real, True, True) for storage in storages]
         self._strains = [
             elements.strain_kernel(storage, 0, real, True) if part.term.density.lagged else None
-            for storage, part in zip(storages, net.sets, strict=True)
+            for storage, part in zip(storages, coupled.sets, strict=True)
         ]
         self._solution, self._inert, self._start, self._ended = coupled_step.step_kernels(real, midpoint, drag)
         self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
-        self._rates, self._rubbing = (wp.zeros(net.worlds, dtype=real, device=self.device) for _ in range(2))
+        self._rates, self._rubbing = (wp.zeros(coupled.worlds, dtype=real, device=self.device) for _ in range(2))
 
-        def make(dtype=net.vector):
+        def make(dtype=coupled.vector):
             return wp.zeros(count, dtype=dtype, device=self.device)
 
         def of_sets(rows):
-            return [self._shares.make(rows(part.term), part.elements) for part in net.sets]
+            return [self._shares.make(rows(part.term), part.elements) for part in coupled.sets]
 
         self._by_end, self._by_q, self._w, self._end, self._stays = (make() for _ in range(5))
         self._by_lagged = make() if self.contact and self.contact.lags > 1 else None
-        self._given_frame = self._shares.make(FRAME, net.edges)
+        self._given_frame = self._shares.make(FRAME, coupled.edges)
         # of frames and own lagged rows: of what the step ends in, of its solve, and of where it starts
-        self._by_frame = [self._shares.make(FRAME, net.edges) for _ in range(2)]
+        self._by_frame = [self._shares.make(FRAME, coupled.edges) for _ in range(2)]
         self._by_own = [self._shares.make_own() for _ in range(3)]
-        self._start_state = net.empty()
+        self._start_state = coupled.empty()
         self._inputs = CoupledInputs(
             parameters=of_sets(lambda term: len(term.parameter_names)),
             data=of_sets(lambda term: term.measure.data_size),
@@ -132,16 +134,18 @@ class CoupledStepAdjoint:
             damping=make(real),
             gravity=make(),
             drag=self.drag.by_coefficients if drag else None,
-            elements_rate=[wp.zeros(part.elements * net.worlds, dtype=real, device=self.device) for part in net.sets],
+            elements_rate=[
+                wp.zeros(part.elements * coupled.worlds, dtype=real, device=self.device) for part in coupled.sets
+            ],
         )
         if self.contact:
             self._inputs.touching, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
-            self._inputs.elements_rate.append(self.contact.by_rate)
+            self._inputs.elements_rate.append(self.contact.grad_inverse_step)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *(kernel for kernel in self._strains if kernel)]
+        own = [*self._vjp, *(kernel for kernel in self._strains if kernel)]
         own += [self._solution, self._inert, self._start, self._ended]
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
         return own + [kernel for part in parts if part for kernel in part.kernels]
@@ -166,17 +170,19 @@ class CoupledStepAdjoint:
 
     def keep(self, step, before: CoupledState) -> CoupledSavedStep:
         """What the step that a `CoupledStep` has just made leaves for its reverse; `before` has to stay as it is."""
-        net, q = self.net, wp.clone(step.newton.q)
+        coupled, q = self.coupled, wp.clone(step.newton.q)
         data = {index: wp.clone(values) for index, values in step._data.items()}
         solved = replace(before, q=q, data=data)
-        if net.edges:
+        if coupled.edges:
             frame, lag = step._lagged
             solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
         islands = step.islands
         lagged = [wp.clone(values) for values in step.newton.contact.solutions] if self.contact else []
-        return CoupledSavedStep(before, solved, wp.clone(islands.portion), wp.clone(islands.retries), lagged=lagged)
+        return CoupledSavedStep(
+            before, solved, wp.clone(islands.substep_fraction), wp.clone(islands.retries), lagged=lagged
+        )
 
-    def pull(
+    def vjp(
         self,
         kept: CoupledSavedStep,
         after: CoupledState,
@@ -185,10 +191,10 @@ class CoupledStepAdjoint:
         states=None,
         factors: bool = False,
     ) -> tuple[CoupledState, CoupledInputs]:
-        """As `RodStepAdjoint.pull`; `factors`: as of `CoupledLinearSolve`."""
-        net, solved, before, shares = self.net, kept.solved, kept.before, self._shares
-        rate, last = 1.0 / s, net.blocks - net.host.spins
-        start, inputs, by_end, by_q, w = self._start_state, self._inputs, self._by_end, self._by_q, self._w
+        """As `RodStepAdjoint.vjp`; `factors`: as of `CoupledLinearSolve`."""
+        coupled, solved, before, shares = self.coupled, kept.solved, kept.before, self._shares
+        rate, last = 1.0 / s, coupled.blocks - coupled.host.spins
+        start, inputs, by_end, grad_q, w = self._start_state, self._inputs, self._by_end, self._by_q, self._w
         self._clear()
         frame, carried = self._given_frame, self._by_frame[0]
         of_end, own, first = self._by_own
@@ -196,17 +202,17 @@ class CoupledStepAdjoint:
         # strains of the end, which the next step is damped from
         for i, kernel in enumerate(self._strains):
             if kernel:
-                read = [net.elements(after, i), given.last[i]]
+                read = [coupled.elements(after, i), given.last[i]]
                 self._over(i, kernel, read, [shares.slots[i], shares.lags[i], inputs.parameters[i]])
         shares.collect(by_end, frame, inputs.end_data)
-        for part, rows, lag in zip(net.sets, of_end, given.lag, strict=True):
+        for part, rows, lag in zip(coupled.sets, of_end, given.lag, strict=True):
             if part.term.measure.advance:
                 wp.copy(rows, lag)
         shares.add_own(of_end)
         ended, predictor, by_predicted, tangents = solved.q, self.predictor, None, before.q
         if predictor:
             self.lagged(before, states)
-            lagged, by_predicted = predictor.state, predictor.by_q
+            lagged, by_predicted = predictor.state, predictor.grad_q
             by_predicted.zero_()
             tangents = lagged.q if self._midpoint else tangents
             solved = replace(solved, frame=lagged.frame, lag=lagged.lag)
@@ -217,8 +223,8 @@ class CoupledStepAdjoint:
         # the solve
         if self.drag:
             self.drag.resist(before, tangents, rate)
-        read = [given.q, given.v, by_end, self._inertia, rate, last, net.blocks]
-        self._launch(self._solution, len(by_q), read, [by_q])
+        read = [given.q, given.v, by_end, self._inertia, rate, last, coupled.blocks]
+        self._launch(self._solution, len(grad_q), read, [grad_q])
         self._rates.fill_(rate)
         self._rubbing.fill_(kept.rubbing or rate)
         rough, ways = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
@@ -230,59 +236,70 @@ class CoupledStepAdjoint:
             if self.contact:
                 rates = after.rate, before.rate if at is before.q else None
                 self.contact.system.find(at, before.q, q, self._rubbing, rates)
-            self.solve(damped, rate, kept.time, by_q, w, factors, rough)
+            self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
             shares.clear()
-            for i, kernel in enumerate(self._pull):
+            for i, kernel in enumerate(self._vjp):
                 written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
                 written += [start.last[i], inputs.elements_rate[i]]
-                self._over(i, kernel, [net.elements(damped, i, rate=self._rates), w], written)
-            shares.collect(by_q, carried, inputs.data)
+                self._over(i, kernel, [coupled.elements(damped, i, rate=self._rates), w], written)
+            shares.collect(grad_q, carried, inputs.data)
             shares.add_own(own)
             if self.drag:
-                self.drag.pull(before, tangents, q, w, rate, by_q, start, inputs.rate, by_tangents)
-            read = [q, before.q, before.v, w, net.mass, self.gravity, net.host.nodes, last, net.blocks, rate]
+                self.drag.vjp(before, tangents, q, w, rate, grad_q, start, inputs.rate, by_tangents)
+            read = [
+                q,
+                before.q,
+                before.v,
+                w,
+                coupled.mass,
+                self.gravity,
+                coupled.host.nodes,
+                last,
+                coupled.blocks,
+                rate,
+            ]
             written = [start.q, start.v, inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity]
             self._launch(self._inert, len(q), [*read, self._damping], written)
             if self.contact:
-                by_lagged = next(by for of, by in ((before.q, start.q), (q, by_q), (at, self._by_lagged)) if of is at)
-                self.contact.pull((at, before.q, q), w, self._rubbing, (by_lagged, start.q, by_q))
+                by_lagged = next(by for of, by in ((before.q, start.q), (q, grad_q), (at, self._by_lagged)) if of is at)
+                self.contact.vjp((at, before.q, q), w, self._rubbing, (by_lagged, start.q, grad_q))
                 if kept.rubbing:
-                    self.contact.roll(q, before.q, start.q, by_q)
+                    self.contact.roll(q, before.q, start.q, grad_q)
             if at is not before.q and at is not q:
-                self.solve.chain(self._by_lagged, by_q)
+                self.solve.chain(self._by_lagged, grad_q)
         if self.solve.held is not None:
-            wp.map(wp.add, by_q, self.solve.held, out=by_q)
+            wp.map(wp.add, grad_q, self.solve.held, out=grad_q)
         if self.supports:
             self.supports.follow(*states)
-            frame, by_frame = (net.frames(array) for array in (solved.frame, carried))
-            held, angle = net.components(by_q), net.angles(by_q)
-            self.supports.pull(net.points(solved.q), frame, held, angle, by_frame)
+            frame, by_frame = (coupled.frames(array) for array in (solved.frame, carried))
+            held, angle = coupled.components(grad_q), coupled.angles(grad_q)
+            self.supports.vjp(coupled.points(solved.q), frame, held, angle, by_frame)
         if self.followers:
-            of = net.components(inputs.load), net.angles(inputs.load), net.components(by_predicted)
-            self.followers.pull(net.points(lagged.q), *of)
+            of = coupled.components(inputs.load), coupled.angles(inputs.load), coupled.components(by_predicted)
+            self.followers.vjp(coupled.points(lagged.q), *of)
         if predictor:
             if predictor.carries:
                 written = by_predicted, inputs.data, self._by_frame[1], first
                 shares.uncarry(before, lagged, lagged.q, carried, own, *written)
                 carried, own = self._by_frame[1], first
-            predictor.pull(before, by_q, start, inputs.rate)
+            predictor.vjp(before, grad_q, start, inputs.rate)
         start.frame, start.lag = carried, own
         if s < np.inf:
-            self.solve.stays(by_q, self._stays)
+            self.solve.stays(grad_q, self._stays)
         self._launch(
             self._start,
-            len(by_q),
-            [given.q, given.v, by_end, solved.q, before.q, self._stays, self._inertia, last, net.blocks, rate],
+            len(grad_q),
+            [given.q, given.v, by_end, solved.q, before.q, self._stays, self._inertia, last, coupled.blocks, rate],
             [start.q, start.v, inputs.rate],
         )
         return start, inputs
 
-    def outgrown(self, q: wp.array) -> bool:
+    def has_overflow(self, q: wp.array) -> bool:
         """Whether the last `pull`, to a solution q, had more pairs in contact than there was room for, and is to be done again.
 
         Reads from the device where there is contact.
         """
-        return self.contact is not None and self.contact.outgrown(q)
+        return self.contact is not None and self.contact.has_overflow(q)
 
     def _clear(self) -> None:
         """Zero what is added to."""
@@ -300,7 +317,7 @@ class CoupledStepAdjoint:
         self._shares.clear()
 
     def _over(self, index: int, kernel, inputs: list, outputs: list) -> None:
-        self._launch(kernel, (self.net.worlds, self.net.sets[index].elements), inputs, outputs)
+        self._launch(kernel, (self.coupled.worlds, self.coupled.sets[index].elements), inputs, outputs)
 
     def _launch(self, kernel, count: int | tuple[int, int], inputs: list, outputs: list) -> None:
         wp.launch(kernel, count, inputs, outputs, device=self.device)

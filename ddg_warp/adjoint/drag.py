@@ -7,11 +7,11 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.adjoint.drag import chain_kernels, net_kernels
+from ddg_warp.kernels.adjoint.drag import coupled_kernels, rod_kernels
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.kernels.forces.drag import ROWS, block_inertia
-from ddg_warp.solve.forces.drag import ChainDrag, CoupledDrag
+from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
 from ddg_warp.solve.linear.sparse_system import lists
 
 
@@ -24,8 +24,8 @@ class RodDragAdjoint:
 
     def __init__(self, model, group, midpoint: bool):
         kind, real, device = group.kind, model.types.real, model.wp_device
-        self.model, self.group, self.drag = model, group, ChainDrag(model, group, midpoint)
-        self._edges, self._nodes = chain_kernels(kind, real, midpoint)
+        self.model, self.group, self.drag = model, group, RodGroupDrag(model, group, midpoint)
+        self._edges, self._nodes = rod_kernels(kind, real, midpoint)
         shape = group.nodes, group.columns
         self._by_edge, self._by_velocity, self.by_coefficients = (
             device_arrays.allocate((rows, *shape), real, device) for rows in (kind.dim, kind.dim, ROWS)
@@ -50,14 +50,14 @@ class RodDragAdjoint:
             shape = group.nodes, group.columns
             twisted = shape if kind.twist else (1, 1)
             self._islands = Islands(group.columns, real, device)
-            self._islands.coefficient.fill_(1.0)
+            self._islands.inertia_coefficient.fill_(1.0)
             self._inertia = SimpleNamespace(
                 mass=device_arrays.allocate(shape, rod_layout.inertia_type(kind, real), device)
             )
             self._inertia.rotary, self._inertia.target_angle = (
                 device_arrays.allocate(twisted, real, device) for _ in range(2)
             )
-        self._islands.rate.fill_(rate)
+        self._islands.inverse_step.fill_(rate)
         self.resist(before, tangents, self._inertia, self._islands)
         inertia = device_arrays.download(self._inertia.mass).T.ravel()
         blocks = np.zeros((len(inertia), kind.block, kind.block))
@@ -66,7 +66,7 @@ class RodDragAdjoint:
             blocks[:, kind.dim, kind.dim] = inertia["spin"]
         return sparse.block_diag(blocks, format="csc")
 
-    def pull(
+    def vjp(
         self,
         before,
         tangents: wp.array,
@@ -75,7 +75,7 @@ class RodDragAdjoint:
         rate: wp.array,
         by_fixed,
         start,
-        by_rate,
+        grad_inverse_step,
         by_tangents=None,
     ) -> None:
         """Add the gradients of drag.
@@ -96,7 +96,7 @@ class RodDragAdjoint:
             start.x,
             start.v,
             start.theta,
-            by_rate,
+            grad_inverse_step,
         ]
         self._launch(self._nodes, [*read, group.fixed, self._by_edge, self._by_velocity], outputs)
 
@@ -114,21 +114,24 @@ class CoupledDragAdjoint:
         inertia: inertia and drag of the dof blocks in the current solve (worlds, N), written by `resist`.
     """
 
-    def __init__(self, model, net, midpoint: bool, gather):
-        real, device, (ends, angles, _) = model.types.real, net.device, net.host.drag
-        self.net, self.drag, self._gather = net, CoupledDrag(model, midpoint), gather
-        self._edges, self._nodes = net_kernels(real, midpoint)
+    def __init__(self, model, coupled, midpoint: bool, gather):
+        real, device, (ends, angles, _) = model.types.real, coupled.device, coupled.host.drag
+        self.coupled, self.drag, self._gather = coupled, CoupledDrag(model, midpoint), gather
+        self._edges, self._nodes = coupled_kernels(real, midpoint)
         self._ends, self._angles = (
             wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device) for values in (ends.T, angles)
         )
         self._starts, self._items = (
-            wp.array(values.astype(np.int32), dtype=int, device=device) for values in lists(ends.ravel(), net.blocks)
+            wp.array(values.astype(np.int32), dtype=int, device=device)
+            for values in lists(ends.ravel(), coupled.blocks)
         )
-        self._edge_count, count = len(ends.T), len(ends.T) * net.worlds
-        self._by_tangent, self._by_velocity = (wp.zeros((2, count), dtype=net.vector, device=device) for _ in range(2))
+        self._edge_count, count = len(ends.T), len(ends.T) * coupled.worlds
+        self._by_tangent, self._by_velocity = (
+            wp.zeros((2, count), dtype=coupled.vector, device=device) for _ in range(2)
+        )
         self.by_coefficients = wp.zeros((ROWS, count), dtype=real, device=device)
-        self.inertia = wp.zeros((net.worlds, net.blocks), dtype=block_inertia(real), device=device)
-        self._islands = Islands(net.worlds, real, device)
+        self.inertia = wp.zeros((coupled.worlds, coupled.blocks), dtype=block_inertia(real), device=device)
+        self._islands = Islands(coupled.worlds, real, device)
 
     @property
     def kernels(self) -> list:
@@ -137,8 +140,8 @@ class CoupledDragAdjoint:
 
     def resist(self, before, tangents: wp.array, rate: float) -> None:
         """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""
-        self._islands.rate.fill_(rate)
-        target = SimpleNamespace(q=tangents, outer=self.net.still, mass=self.inertia)
+        self._islands.inverse_step.fill_(rate)
+        target = SimpleNamespace(q=tangents, outer=self.coupled.still, mass=self.inertia)
         self.drag.resist(before, target, self._islands)
 
     @property
@@ -146,7 +149,7 @@ class CoupledDragAdjoint:
         """Drag matrix of `inertia`, in dof blocks of space components."""
         return sparse.block_diag(self.inertia.numpy()["resistance"].reshape(-1, 3, 3), format="csc")
 
-    def pull(
+    def vjp(
         self,
         before,
         tangents: wp.array,
@@ -155,20 +158,20 @@ class CoupledDragAdjoint:
         rate: float,
         by_fixed,
         start,
-        by_rate,
+        grad_inverse_step,
         by_tangents,
     ):
-        """Add gradients as `RodDragAdjoint.pull`, for a solve with the solution q; `by_tangents` is required."""
-        net, drag = self.net, self.drag
-        read = [tangents, before.q, before.v, q, self._ends, self._angles, net.drag, drag.flow, w, rate]
+        """Add gradients as `RodDragAdjoint.vjp`, for a solve with the solution q; `by_tangents` is required."""
+        coupled, drag = self.coupled, self.drag
+        read = [tangents, before.q, before.v, q, self._ends, self._angles, coupled.drag, drag.flow, w, rate]
         outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]
-        self._launch(self._edges, self.by_coefficients.shape[1], [*read, net.blocks], outputs)
+        self._launch(self._edges, self.by_coefficients.shape[1], [*read, coupled.blocks], outputs)
         for slots, target in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):
             self._launch(
-                self._gather, len(q), [self._starts, self._items, self._edge_count, net.blocks, slots], [target]
+                self._gather, len(q), [self._starts, self._items, self._edge_count, coupled.blocks, slots], [target]
             )
-        inputs = [self.inertia, before.q, q, w, rate, net.blocks]
-        self._launch(self._nodes, len(q), inputs, [by_fixed, start.q, by_rate])
+        inputs = [self.inertia, before.q, q, w, rate, coupled.blocks]
+        self._launch(self._nodes, len(q), inputs, [by_fixed, start.q, grad_inverse_step])
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)
+        wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)

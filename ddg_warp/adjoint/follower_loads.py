@@ -45,7 +45,7 @@ class Followers:
         """Evaluate time functions of loads at the time of the residual."""
         self._loads.upload(t0, t1)
 
-    def pull(self, x: wp.array, w: wp.array, w_angle: wp.array | None, by_x: wp.array) -> None:
+    def vjp(self, x: wp.array, w: wp.array, w_angle: wp.array | None, by_x: wp.array) -> None:
         """Add the gradient with respect to predicted nodes.
 
         Args:

@@ -58,7 +58,7 @@ class Adjoint:
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()
         self.chains = [RodStepAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
-        self.net = CoupledStepAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
+        self.coupled = CoupledStepAdjoint(self.model, integrator.scheme) if self.model.coupled is not None else None
         self._grips = (
             self.model.empty_state().grips
         )  # gradient with respect to grip poses; see `ddg_warp.torch.grip_poses`
@@ -66,7 +66,7 @@ class Adjoint:
     @property
     def parts(self) -> list:
         """Adjoints of the rod groups and of the coupled system, in the order of the integrator's steppers."""
-        return [*self.chains, *([self.net] if self.net else [])]
+        return [*self.chains, *([self.coupled] if self.coupled else [])]
 
     def step(self, state: State, dt: float) -> tuple[State, Tape]:
         """Return the state after a step, and the tape of its backward pass, which stays valid while referenced.
@@ -85,9 +85,9 @@ class Adjoint:
             adjoint.keep(part, state.groups[part.index])
             for adjoint, part in zip(self.chains, integrator._chains, strict=True)
         ]
-        return kept + ([self.net.keep(integrator._net, state.net)] if self.net else [])
+        return kept + ([self.coupled.keep(integrator._coupled, state.coupled)] if self.coupled else [])
 
-    def pull(self, tape: Tape, cotangent: State) -> tuple[State, list]:
+    def vjp(self, tape: Tape, cotangent: State) -> tuple[State, list]:
         """Return the VJP of a step: the gradient with respect to its start state, and `RodInputs` of every rod group and
         `CoupledInputs`.
 
@@ -105,9 +105,9 @@ class Adjoint:
             _require_one_solve(adjoint, kept, ends, part)
         arguments = tape.before, tape.after, tape.parts, cotangent, self.integrator._solved(tape.dt)
         gradients = self.pull_parts(*arguments)
-        while self.outgrown(tape.parts):
+        while self.has_overflow(tape.parts):
             gradients = self.pull_parts(*arguments)
-        if self.net and self.net.solve.failed is not None and self.net.solve.failed.numpy().any():
+        if self.coupled and self.coupled.solve.failed is not None and self.coupled.solve.failed.numpy().any():
             gradients = self.pull_parts(*arguments, factors=True)
         gradients = _copied(*gradients)
         for adjoint, part in zip(self.chains, self.integrator._chains, strict=True):
@@ -126,9 +126,9 @@ class Adjoint:
             adjoint.upload(start, start + dt)
         return changed
 
-    def outgrown(self, parts: list) -> bool:
-        """Return True if contact pairs of the last `pull_parts` exceeded the capacity; see `CoupledStepAdjoint.outgrown`."""
-        return self.net is not None and self.net.outgrown(parts[-1].solved.q)
+    def has_overflow(self, parts: list) -> bool:
+        """Return True if contact pairs of the last `pull_parts` exceeded the capacity; see `CoupledStepAdjoint.has_overflow`."""
+        return self.coupled is not None and self.coupled.has_overflow(parts[-1].solved.q)
 
     def pull_parts(
         self, before: State, after: State, parts: list, cotangent: State, s: float, factors: bool = False
@@ -139,14 +139,14 @@ class Adjoint:
         """
         groups, inputs = [], []
         for adjoint, kept, end, by_end in zip(self.chains, parts, after.groups, cotangent.groups, strict=False):
-            start, read = adjoint.pull(kept, end, by_end, s, (before, after))
+            start, read = adjoint.vjp(kept, end, by_end, s, (before, after))
             groups.append(start)
             inputs.append(read)
-        net = None
-        if self.net:
-            net, read = self.net.pull(parts[-1], after.net, cotangent.net, s, (before, after), factors)
+        coupled = None
+        if self.coupled:
+            coupled, read = self.coupled.vjp(parts[-1], after.coupled, cotangent.coupled, s, (before, after), factors)
             inputs.append(read)
-        return State(self.model, groups, net, before.time, self._grips), inputs
+        return State(self.model, groups, coupled, before.time, self._grips), inputs
 
 
 def refuse_gyroscopic(caller: str, wanted: bool | None) -> None:
@@ -180,15 +180,15 @@ class EquilibriumAdjoint:
     def __init__(self, model, posed: bool = False):
         self.model = model
         self.chains = [RodStepAdjoint(model, group, None, posed) for group in model.groups]
-        self.net = CoupledStepAdjoint(model, None, posed) if model.net is not None else None
+        self.coupled = CoupledStepAdjoint(model, None, posed) if model.coupled is not None else None
         self.by_before = None
 
     @property
     def parts(self) -> list:
         """Adjoints of the rod groups and of the coupled system."""
-        return [*self.chains, *([self.net] if self.net else [])]
+        return [*self.chains, *([self.coupled] if self.coupled else [])]
 
-    def pull(self, state: State, cotangent: State, controls: Controls | None = None) -> list:
+    def vjp(self, state: State, cotangent: State, controls: Controls | None = None) -> list:
         """Return the gradient with respect to the inputs of the residual: `RodInputs` of every rod group, `CoupledInputs`.
 
         Args:
@@ -212,19 +212,19 @@ class EquilibriumAdjoint:
         for own, group_state, by_group in zip(self.chains, state.groups, cotangent.groups, strict=True):
             kept = SavedStep(group_state, group_state.x, group_state.theta, group_state.frame, None, time=state.time)
             inputs += _copied(
-                self.model.empty_state(), [own.pull(kept, group_state, by_group, np.inf, (state, state))[1]]
+                self.model.empty_state(), [own.vjp(kept, group_state, by_group, np.inf, (state, state))[1]]
             )[1]
-        if self.net:
-            kept = CoupledSavedStep(state.net, state.net, None, time=state.time)
-            if self.rubs:
+        if self.coupled:
+            kept = CoupledSavedStep(state.coupled, state.coupled, None, time=state.time)
+            if self.has_friction:
                 kept = replace(kept, before=self._before(state), rubbing=1.0 / state.sliding.increment)
-            asked = kept, state.net, cotangent.net, np.inf, (state, state)
-            start, read = self.net.pull(*asked)
-            while self.net.outgrown(state.net.q):
-                start, read = self.net.pull(*asked)
-            if self.rubs:
+            asked = kept, state.coupled, cotangent.coupled, np.inf, (state, state)
+            start, read = self.coupled.vjp(*asked)
+            while self.coupled.has_overflow(state.coupled.q):
+                start, read = self.coupled.vjp(*asked)
+            if self.has_friction:
                 self.by_before = self.model.empty_state()
-                wp.copy(self.by_before.net.q, start.q)
+                wp.copy(self.by_before.coupled.q, start.q)
             inputs += _copied(self.model.empty_state(), [read])[1]
         for own in inputs:
             for array in (own.gravity, own.mass):
@@ -232,9 +232,13 @@ class EquilibriumAdjoint:
         return inputs
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """True if equilibria have friction."""
-        return self.net is not None and self.net.net.host.touching is not None and self.net.net.host.touching.rubs
+        return (
+            self.coupled is not None
+            and self.coupled.coupled.host.touching is not None
+            and self.coupled.coupled.host.touching.has_friction
+        )
 
     def _before(self, state: State) -> CoupledState:
         """Return the coupled state of the equilibrium before."""
@@ -243,7 +247,7 @@ class EquilibriumAdjoint:
                 "contact: by friction an equilibrium depends on the way there, which this state does not know; take the one that "
                 "statics.solve returned, not one made of its positions"
             )
-        return replace(state.net, q=state.sliding.begun(state.net.q))
+        return replace(state.coupled, q=state.sliding.begun(state.coupled.q))
 
 
 def _copied(state: State, inputs: list) -> tuple[State, list]:

@@ -155,7 +155,7 @@ def _transposed(matrix: sparse.csc_matrix):
     return lambda rhs: factors.solve(rhs, trans="T")
 
 
-class ClosedChains:
+class ClosedRodSolve:
     """Solver of closed rods by conjugate gradients, preconditioned by the opened rods; interface of `CyclicReduction`."""
 
     def __init__(self, system: PcgNewton):
@@ -168,12 +168,12 @@ class ClosedChains:
         system = self.system
         return [system._factor, system._start, system._product, system._advance, self._check]
 
-    def solve(self, matrix, right, count, wanted, solution: wp.array, failed: wp.array, again: bool = False) -> None:
+    def solve(self, matrix, rhs, count, wanted, solution: wp.array, failed: wp.array, again: bool = False) -> None:
         """Solve as `CyclicReduction.solve`; `failed` marks rods with a residual left."""
         system = self.system
-        wp.copy(system.islands.wanted, wanted)
+        wp.copy(system.islands.needs_direction, wanted)
         system.factorise()
-        system.right, system.direction = right, solution
+        system.rhs, system.direction = rhs, solution
         system.direct()
         failed.zero_()
         read = [system.rho, system.rho_first, MISSED]
@@ -202,7 +202,7 @@ class DirectSolve:
         if kind.closed:
             options = NewtonOptions(psd="none", linear_rtol=LINEAR_RTOL)
             self.system = PcgNewton(model, group, options, linear=real)
-            self.solver, self.failed = ClosedChains(self.system), self.system.islands.bad
+            self.solver, self.failed = ClosedRodSolve(self.system), self.system.islands.lost_pivots
             return
         few = automatic(group) == "partitioned"
         if not few and linear is None:
@@ -216,7 +216,7 @@ class DirectSolve:
             self.solver = CyclicReduction(kind.block, *size, precision_of_factors, device, repeated=linear is not None)
         else:
             self.solver = Elimination(kind, *size, precision_of_factors, device)
-        self.failed = self.system.islands.bad
+        self.failed = self.system.islands.lost_pivots
         if linear is not None:
             self._product = iterative_refinement.product_kernel(kind, real)
             self._guess, self._rest, self._add = iterative_refinement.refine_kernels(kind, real, linear)
@@ -232,41 +232,52 @@ class DirectSolve:
         refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
         return [*around, self.system._assemble, *self.solver.kernels, *refined]
 
-    def __call__(self, solved, last: wp.array, rate: float, coefficient: float, right: wp.array, w: wp.array, resisted):
+    def __call__(self, solved, last: wp.array, rate: float, coefficient: float, rhs: wp.array, w: wp.array, resisted):
         """Write w; launches only. Arguments as of `RodLinearSolve`, `coefficient` that of inertia [1/s^2]."""
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
         islands = system.islands
         islands.arrays[0].zero_()
-        islands.coefficient.fill_(coefficient)
-        islands.rate.fill_(rate)
-        islands.unbalanced.fill_(1)  # assemble the matrices of all rods
+        islands.inertia_coefficient.fill_(coefficient)
+        islands.inverse_step.fill_(rate)
+        islands.not_converged.fill_(1)  # assemble the matrices of all rods
         if resisted:
             resisted[0].resist(*resisted[1:], system, islands)
         system.evaluate(last)
         if self.solver is None:
-            islands.stale.zero_()  # keep the frames of the step
-            (system.x, system.theta), system.right, system.direction = self._moved, right, w
+            islands.frames_outdated.zero_()  # keep the frames of the step
+            (system.x, system.theta), system.rhs, system.direction = self._moved, rhs, w
             device_arrays.copy(system.x, solved.x)
             device_arrays.copy(system.theta, solved.theta)
             system.eliminate()
             return
         system.assemble_blocks()
         if not self.passes:
-            self._solve(right, w)
+            self._solve(rhs, w)
             return
         nodes, count = w.shape[1:], self.group.count
-        self._launch(self._guess, nodes, [right, system.mass, islands.coefficient], [w])
+        self._launch(self._guess, nodes, [rhs, system.mass, islands.inertia_coefficient], [w])
         for done in range(self.passes):
             self._launch(self._product, nodes, [system.factor, system.geometric, w, count], [self._elements])
-            read = [right, w, self._elements, system.mass, system.rotary, islands.coefficient, self.group.fixed, count]
+            read = [
+                rhs,
+                w,
+                self._elements,
+                system.mass,
+                system.rotary,
+                islands.inertia_coefficient,
+                self.group.fixed,
+                count,
+            ]
             self._launch(self._rest, nodes, read, [self._right])
             self._solve(self._right, self._found, again=done > 0)
             self._launch(self._add, w.shape, [self._found], [w])
 
-    def _solve(self, right: wp.array, solution: wp.array, again: bool = False) -> None:
+    def _solve(self, rhs: wp.array, solution: wp.array, again: bool = False) -> None:
         system = self.system
-        self.solver.solve(system.blocks, right, self.group.count, self._wanted, solution, system.islands.bad, again)
+        self.solver.solve(
+            system.blocks, rhs, self.group.count, self._wanted, solution, system.islands.lost_pivots, again
+        )
 
     def _launch(self, kernel, shape: tuple, inputs: list, outputs: list) -> None:
         wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
@@ -324,7 +335,7 @@ class RodLinearSolve:
         self._measure, self._judge = float32_error.stiffness_kernels(group.kind, real)
         self._poor = wp.zeros(1, dtype=int, device=device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
-        parts = -(-group.nodes // float32_error.PART)
+        parts = -(-group.nodes // float32_error.SEGMENT)
         self._found = wp.zeros((float32_error.ROWS, parts, group.columns), dtype=real, device=device)
 
     @property
@@ -333,7 +344,7 @@ class RodLinearSolve:
         watch = [*self.exact.kernels, self._measure, self._judge] if self.exact else []
         return [*self.system.kernels, *watch]
 
-    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
+    def __call__(self, solved, last: wp.array, s: float, rhs: wp.array, w: wp.array, resisted=None) -> None:
         """Write w (block, n, R), zero at fixed dofs, for a right-hand side that is zero there.
 
         Args:
@@ -349,9 +360,9 @@ class RodLinearSolve:
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if not rate:
             more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
-            self._on_host(solved, last, rate, coefficient, right, w, more)
+            self._on_host(solved, last, rate, coefficient, rhs, w, more)
             return
-        arguments = solved, last, rate, coefficient, right, w, resisted
+        arguments = solved, last, rate, coefficient, rhs, w, resisted
         if self.exact is None:
             self.system(*arguments)
             return
@@ -368,11 +379,11 @@ class RodLinearSolve:
         direct(*arguments)
         wp.copy(self.failed, direct.failed)
 
-    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array, more) -> None:
+    def _on_host(self, solved, last, rate: float, coefficient: float, rhs: wp.array, w: wp.array, more) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)
         groups = [data if each is self.group else None for each in self.model.groups]
         factor = None if rate else solved.time
-        b = device_arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
+        b = device_arrays.download(rhs).astype(float).transpose(2, 1, 0).ravel()
         solution = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
         device_arrays.assign(w, self.tangent.blocks(solution).transpose(2, 1, 0))
         by_fixed = self.host.held

@@ -39,12 +39,12 @@ class RodPredictor:
         self._direction = self._predict = self._for = None
         self.by_x, self._excess, self._added = (make(kind.block) for _ in range(3))
         self._islands = Islands(group.columns, real, device)
-        self._islands.portion.fill_(1.0)
+        self._islands.substep_fraction.fill_(1.0)
         self._dt = wp.zeros(model.worlds, dtype=real, device=device)
         self._none = wp.zeros(group.columns, dtype=real, device=device)
         self._begin = rod_step.begin_kernel(kind, real, midpoint)
         self._carry = rod_elements.frame_kernel(kind, real, unit=False) if self.carries else None
-        self._pull = rod_predictor.predict_kernel(kind, real, midpoint)
+        self._vjp = rod_predictor.predict_kernel(kind, real, midpoint)
 
     @classmethod
     def of(cls, model, group, motion, scheme: str | None) -> "RodPredictor | None":
@@ -56,7 +56,7 @@ class RodPredictor:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture, after `suit`."""
-        return [self._begin, self._predict, self._pull, *([self._carry] if self._carry else [])]
+        return [self._begin, self._predict, self._vjp, *([self._carry] if self._carry else [])]
 
     def suit(self, solved, s: float) -> bool:
         """Prepare for solves of a `RodStep` over s [s]; return True if kernels or arrays have changed."""
@@ -64,7 +64,7 @@ class RodPredictor:
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
-            self._islands.turn.assign(solved.limits(s)["turn"])
+            self._islands.straight_rotation_limit.assign(solved.limits(s)["straight_rotation_limit"])
         if self._direction is not None and self._direction.dtype is linear:
             return False
         kind, real = self.group.kind, self.model.types.real
@@ -75,7 +75,7 @@ class RodPredictor:
     def find(self, before) -> None:
         """Compute the predictor of a step from the state `before` of the group; launches only."""
         group, islands = self.group, self._islands
-        islands.bent.zero_()
+        islands.rotate_predictor.zero_()
         wp.launch(
             self._begin,
             group.node_threads,
@@ -94,7 +94,7 @@ class RodPredictor:
             device=self.model.wp_device,
         )
 
-    def pull(self, before, gather, window: wp.array, by_fixed: wp.array, start, by_rate: wp.array) -> None:
+    def vjp(self, before, gather, window: wp.array, by_fixed: wp.array, start, grad_inverse_step: wp.array) -> None:
         """Add the gradients `by_x` and `by_frame` to `start`, the gradient by the state before the step.
 
         Args:
@@ -109,10 +109,10 @@ class RodPredictor:
             self._launch(self._carry, [self.x, before.frame, group.count, self.by_frame], [window, start.frame])
             self._launch(gather, [window, group.count], [self.by_x])
         wp.launch(
-            self._pull,
+            self._vjp,
             group.columns,
             [self.x, before.x, before.v, group.fixed, group.anchor, group.count, *self._islands.arrays, self.by_x],
-            [self._excess, self._added, by_fixed, start.x, start.v, by_rate],
+            [self._excess, self._added, by_fixed, start.x, start.v, grad_inverse_step],
             device=self.model.wp_device,
         )
 

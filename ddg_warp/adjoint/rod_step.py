@@ -94,7 +94,7 @@ class RodStepAdjoint:
         self.predictor = RodPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         storage, viscous = rod_storage(kind, real), kind.viscous
-        self._pull = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
+        self._vjp = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
         self._strain = [elements.strain_kernel(storage, i, real, False) for i in terms] if viscous else []
         self._frame = rod_elements.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
         self._ends, self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
@@ -159,9 +159,11 @@ class RodStepAdjoint:
         newton, twist = step.newton, self.group.kind.twist
         theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
         islands = step.islands
-        return SavedStep(before, wp.clone(newton.x), theta, frame, wp.clone(islands.portion), wp.clone(islands.retries))
+        return SavedStep(
+            before, wp.clone(newton.x), theta, frame, wp.clone(islands.substep_fraction), wp.clone(islands.retries)
+        )
 
-    def pull(self, kept: SavedStep, after: RodGroupState, given: RodGroupState, s: float, states=None) -> tuple:
+    def vjp(self, kept: SavedStep, after: RodGroupState, given: RodGroupState, s: float, states=None) -> tuple:
         """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
         equilibria.
 
@@ -209,7 +211,7 @@ class RodStepAdjoint:
         read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
         written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
         self.solve(kept, before.last, s, self._right, inputs.load, resisted)
-        for kernel in self._pull:
+        for kernel in self._vjp:
             self._launch(kernel, read, written)
         self._launch(self._nodes, [window, group.count], [self._dof])
         if self.solve.held is not None:
@@ -219,16 +221,16 @@ class RodStepAdjoint:
         if self.supports and kind.twist:
             held = self._dof[: kind.dim], self._dof[kind.dim]
             self.supports.follow(*states)
-            self.supports.pull(kept.x, kept.frame, *held, lagged)
+            self.supports.vjp(kept.x, kept.frame, *held, lagged)
         if self.drag:
             by_tangents = predictor.by_x if self._midpoint else None
             read = before, tangents, kept, inputs.load, self._rate, self._dof, start, inputs.rate
-            self.drag.pull(*read, by_tangents)
+            self.drag.vjp(*read, by_tangents)
         if self.followers:
             w = inputs.load[: kind.dim], inputs.load[kind.dim] if kind.twist else None
-            self.followers.pull(predictor.x, *w, predictor.by_x[: kind.dim])
+            self.followers.vjp(predictor.x, *w, predictor.by_x[: kind.dim])
         if predictor:
-            predictor.pull(before, self._nodes, window, self._dof, start, inputs.rate)
+            predictor.vjp(before, self._nodes, window, self._dof, start, inputs.rate)
         self._launch(
             self._start,
             [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, inputs.load, self._dof]
@@ -251,7 +253,7 @@ class RodStepAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
+        own = [*self._vjp, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
         own += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]

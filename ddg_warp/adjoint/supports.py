@@ -26,9 +26,9 @@ class Supports:
     def __init__(self, model, part, midpoint: bool):
         self.model, self.part, real = model, part, model.types.real
         host = part.host
-        self.motion = CoupledMotion(model, midpoint) if part is model.net else Motion(model, part, midpoint)
+        self.motion = CoupledMotion(model, midpoint) if part is model.coupled else Motion(model, part, midpoint)
         self.islands = Islands(part.columns, real, model.wp_device)
-        self.islands.portion.fill_(1.0)
+        self.islands.substep_fraction.fill_(1.0)
         self._angles = angle_kernel(part.dim, real, midpoint)
         turning, ends = host.turning[:, 0], host.edge_ends(host.turning[:, 0])
         loose = np.flatnonzero(~host.holding(ends).all((1, 2)))
@@ -54,7 +54,7 @@ class Supports:
         """Compute grip poses between the states of the model at both ends of the step; launches only."""
         self.motion.follow(before, after)
 
-    def pull(self, x: wp.array, frame: wp.array, by_node: wp.array, angle: wp.array, by_frame: wp.array) -> None:
+    def vjp(self, x: wp.array, frame: wp.array, by_node: wp.array, angle: wp.array, by_frame: wp.array) -> None:
         """Convert gradients by prescribed angles to gradients by directors (`by_director`), edge nodes and lagged frames.
 
         Args:

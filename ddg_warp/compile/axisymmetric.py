@@ -18,7 +18,7 @@ from ddg_warp.kernels.terms import AXISYMMETRIC
 
 
 @dataclass
-class NetMeridian:
+class CoupledMeridian:
     """Shell of revolution in the coupled system: dof blocks of its nodes (n,), rest geometry and material.
 
     Attributes:
@@ -101,7 +101,7 @@ class BandPressure(Load):
         return across, weight
 
 
-def meridian(shell, index: int, supports, nodes: np.ndarray) -> NetMeridian:
+def meridian(shell, index: int, supports, nodes: np.ndarray) -> CoupledMeridian:
     """Return the rest geometry of one `AxisymmetricShell`.
 
     Raises:
@@ -134,7 +134,7 @@ def meridian(shell, index: int, supports, nodes: np.ndarray) -> NetMeridian:
         if kind[end] == "pole":
             tangent[end] = (1.0, 0.0) if end == 0 else (-1.0, 0.0)
     thickness = np.broadcast_to(shell.thickness, (n - 1,))
-    result = NetMeridian(
+    result = CoupledMeridian(
         nodes, points, radius, length, halves, curvature, tangent, tuple(kind), clamps, thickness, shell.material
     )
     if isinstance(shell.rest, str) and shell.rest == "shape":
@@ -174,7 +174,7 @@ def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return 2.0 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / (norms + np.sum(a * b, -1))
 
 
-def _curvature(shell: NetMeridian, edges: np.ndarray) -> np.ndarray:
+def _curvature(shell: CoupledMeridian, edges: np.ndarray) -> np.ndarray:
     """Return the curvatures of the points at nodes, consistent with the strain measures (n, 2) [1/m]."""
     result, sines, length = np.zeros((len(shell.points), 2)), edges[:, 1] / np.linalg.norm(edges, axis=1), shell.length
     R = shell.node_radius
@@ -189,7 +189,7 @@ def _curvature(shell: NetMeridian, edges: np.ndarray) -> np.ndarray:
     return result
 
 
-def element_sets(shell: NetMeridian) -> list[ElementSet]:
+def element_sets(shell: CoupledMeridian) -> list[ElementSet]:
     """Return membrane of edges, bending of inner nodes and of both ends; nodes counted along the meridian.
 
     The last entry of the `normals` of a rim (tangents prescribed by clamps) is 0 at the first end and 1 at the last.

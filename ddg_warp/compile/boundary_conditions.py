@@ -44,7 +44,7 @@ def load_rods(scene, storage: DofStorage) -> None:
             storage.followers += [Couple(*edge, np.array(load.couple), load.amplitude) for edge in edges]
 
 
-def hold_rods(scene, storage: DofStorage, claims: "ConstraintRegistry") -> None:
+def fix_rods(scene, storage: DofStorage, claims: "ConstraintRegistry") -> None:
     """Fix the dofs that supports of rods name."""
     places = storage.places
     for support in scene.supports:

@@ -80,7 +80,7 @@ class ContactParameters:
         return np.nonzero(meet)
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """True if there is friction."""
         return bool(self.friction.any())
 

@@ -13,7 +13,7 @@ Alternative: means of B, of first order at a jump.
 
 import numpy as np
 
-from ddg_warp.geometry.polyline import ahead
+from ddg_warp.geometry.polyline import next_edges
 
 
 class HalfCells:
@@ -26,7 +26,7 @@ class HalfCells:
     """
 
     def __init__(self, lengths: np.ndarray, closed: bool, stiffness: np.ndarray):
-        self.closed, self._lengths = closed, ahead(lengths, closed)
+        self.closed, self._lengths = closed, next_edges(lengths, closed)
         self._bending = stiffness
 
     def along(self, family: str, values: np.ndarray) -> np.ndarray:
@@ -42,7 +42,7 @@ class HalfCells:
         if values.shape == (1, 1):
             return values
         (l0, l1), (c0, c1) = self._lengths, self._compliances(values)
-        return np.minimum(*ahead(values, self.closed)) * ((l0 + l1) / (c0 + c1))
+        return np.minimum(*next_edges(values, self.closed)) * ((l0 + l1) / (c0 + c1))
 
     def viscosity(self, values: np.ndarray) -> np.ndarray:
         """Return retardation times of the cells, means weighted by the bending compliance of each half.
@@ -54,14 +54,14 @@ class HalfCells:
     def _weighted(self, values: np.ndarray, weights) -> np.ndarray:
         if values.shape == (1, 1):
             return values
-        (a, b), (w0, w1) = ahead(values, self.closed), weights
+        (a, b), (w0, w1) = next_edges(values, self.closed), weights
         return a + (b - a) * (w1 / (w0 + w1))
 
     def _compliances(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the compliances of both halves times the smaller stiffness."""
         if values.shape == (1, 1):
             return self._lengths
-        (a, b), (l0, l1) = ahead(values, self.closed), self._lengths
+        (a, b), (l0, l1) = next_edges(values, self.closed), self._lengths
         less, more = np.minimum(a, b), np.maximum(a, b)
         ratio = np.divide(less, more, out=np.ones(more.shape), where=more > 0.0)
         return np.where(a > b, ratio, 1.0) * l0, np.where(b > a, ratio, 1.0) * l1

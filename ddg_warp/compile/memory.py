@@ -9,13 +9,13 @@ from ddg_warp.errors import SceneError, SolverError
 # Least bytes of a dof block in float64, constant arrays, states and solver together: of uncoupled rods and of the coupled system.
 #
 # Measured: 600 to 750 for uncoupled rods, 1340 (joined rods) to 3360 (contact).
-ALONE, COUPLED = 550, 1300
+ROD_GROUPS, COUPLED = 550, 1300
 # Fraction of these bytes by precision; measured: 0.58 to 0.81 in mixed precision.
 LESS = {"float64": 1.0, "mixed": 0.6, "float32": 0.5}
 MOST = 2**31 - 1  # largest index on a device
 
 
-def require(scene, coupled: bool, worlds: int, precision: str, device) -> None:
+def require(scene, is_coupled: bool, worlds: int, precision: str, device) -> None:
     """Refuse more worlds than the memory or the index range of a device allows.
 
     Raises:
@@ -27,7 +27,7 @@ def require(scene, coupled: bool, worlds: int, precision: str, device) -> None:
             f"worlds = {worlds}: indices on a device count to {MOST}, and each world has {blocks} nodes and angles; build "
             f"{MOST // blocks} worlds at most, in several models if need be"
         )
-    each = blocks * (COUPLED if coupled else ALONE) * LESS[precision]
+    each = blocks * (COUPLED if is_coupled else ROD_GROUPS) * LESS[precision]
     free = free_bytes(device)
     if worlds * each > free:
         fits = int(free // each)

@@ -8,7 +8,7 @@ import warp as wp
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.newton.edge_rotation import TURNED
+from ddg_warp.kernels.newton.edge_rotation import STRAIGHT_ROTATION
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def straight_turns(errors: np.ndarray) -> np.ndarray:
     force to the next iteration. Soft rods need no more iterations for it, and a straight update is cheaper. See
     `kernels.newton.edge_rotation`.
     """
-    return np.where(stiff(errors), 0.0, TURNED)
+    return np.where(stiff(errors), 0.0, STRAIGHT_ROTATION)
 
 
 def stiff(errors: np.ndarray) -> np.ndarray:
@@ -110,9 +110,9 @@ def rounding(model, s: float = np.inf) -> tuple[float, str]:
         errors = group.float32_errors(s)
         rod = int(group.host.rods[int(errors.argmax()) % group.rods])
         worst.append((float(errors.max()), f"rod {rod} ('{model.curves.names[rod]}')"))
-    if model.net is not None:
-        host = model.net.host
-        errors = model.net.rod_errors(s)
+    if model.coupled is not None:
+        host = model.coupled.host
+        errors = model.coupled.rod_errors(s)
         names = [f"rod {rod.rod} ('{model.curves.names[rod.rod]}')" for rod in host.rods] * (
             len(errors) // max(1, len(host.rods))
         )

@@ -8,7 +8,7 @@ import numpy as np
 from ddg_warp.compile import boundary_conditions
 from ddg_warp.compile.dof_map import DofStorage, RodDofMap, RodIndexMap
 from ddg_warp.compile.ghost_nodes import GhostNodes
-from ddg_warp.compile.rods import UniformRods, alike, compress, net_rods, piece_of
+from ddg_warp.compile.rods import UniformRods, alike, compress, coupled_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.forces.drag import ROWS as DRAG_ROWS
@@ -125,7 +125,7 @@ class RodGroupData(DofStorage):
         return f"{kind} {k - self.first[column]} of rod {self.rods[column]}"
 
 
-def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[RodGroupData]:
+def compile_rod_groups(scene: Scene, chosen: np.ndarray | None = None) -> list[RodGroupData]:
     """Return the groups of uncoupled rods of a scene, with boundary conditions, masses and loads.
 
     Args:
@@ -139,7 +139,7 @@ def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[RodGr
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
     ghosts, laws = GhostNodes(scene), drag.Laws(scene)
-    chosen = ~net_rods(scene) if chosen is None else chosen
+    chosen = ~coupled_rods(scene) if chosen is None else chosen
     parts = [part for batch in scene.batches for part in alike(scene.dimension, batch, ghosts, laws, chosen)]
     parts.sort(key=lambda part: (*part.kind.key, part.nodes))
     groups: list[list[UniformRods]] = []
@@ -152,7 +152,7 @@ def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[RodGr
     chains = [_join(group, ghosts, laws) for group in groups]
     for chain in chains:
         claims = boundary_conditions.ConstraintRegistry(scene, chain)
-        boundary_conditions.hold_rods(scene, chain, claims)
+        boundary_conditions.fix_rods(scene, chain, claims)
         claims.finish()
         boundary_conditions.add_masses(scene, chain)
         boundary_conditions.load_rods(scene, chain)

@@ -13,7 +13,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import drag
-from ddg_warp.scene.contact import touching_names
+from ddg_warp.scene.contact import contact_names
 from ddg_warp.scene.descriptions import RodBatch
 from ddg_warp.scene.scene import Scene
 from ddg_warp.scene.validate import check_batch
@@ -64,7 +64,7 @@ class RodArrays:
     drag: np.ndarray | None  # coefficients of the drag law (R, edges, rows), None without
 
 
-def net_rods(scene: Scene) -> np.ndarray:
+def coupled_rods(scene: Scene) -> np.ndarray:
     """Return the mask of coupled rods (R,) bool: joined, attached, magnetised or in contact."""
     members = [rod for joint in scene.joints for rod, _ in joint.members]
     members += [attachment.rod for attachment in scene.attachments]
@@ -72,7 +72,7 @@ def net_rods(scene: Scene) -> np.ndarray:
     chosen[np.array(members, int)] = True
     for magnet in scene.magnets:
         chosen[magnet.rods] = True
-    names = touching_names(scene)
+    names = contact_names(scene)
     for batch in scene.batches:
         if batch.name in names:
             chosen[batch.first : batch.first + batch.rods] = True
@@ -160,7 +160,7 @@ def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArra
                     "end lies along the other or points back; give a tangent along the rod and a director across it"
                 )
     twist = polyline.reference_twist(tangents, frames, batch.closed) if kind.twist else np.zeros((len(rows), 0))
-    voronoi = 0.5 * sum(polyline.ahead(lengths, batch.closed))
+    voronoi = 0.5 * sum(polyline.next_edges(lengths, batch.closed))
     if before:
         voronoi[:, 0] = 0.5 * lengths[:, 1]
     if after:
@@ -234,7 +234,7 @@ def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi)
     elif kind.twist:
         shape = [*polyline.curvatures(tangents, frames, batch.closed, batch.by_angle), twist]
     else:
-        (t0, t1) = polyline.ahead(tangents, batch.closed)
+        (t0, t1) = polyline.next_edges(tangents, batch.closed)
         if np.any(polyline.length(polyline.cross(t0, t1)) > 1e-9):
             raise SceneError(
                 f"rod {batch.first} ('{batch.name}') is curved at rest, which needs twist=True; "

@@ -262,7 +262,7 @@ def shell_elements(
     return sets
 
 
-def triangles_beside(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.ndarray]:
+def adjacent_triangles(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.ndarray]:
     """Return, by term, the triangles that determine the stiffness of bending elements at edges. Hinges have two, tilts one."""
     hinges = surface.edge_triangles[_hinges(surface, kinds)[0]]
     if bending == "isometric":

@@ -32,7 +32,7 @@ from ddg_warp.run.summary import write_json
 INDEX, SCRATCH = "index.json", ".partial"
 DONE = "converged"  # outcome of an episode that ran to its end
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
-SHARE = 0.05  # largest fraction of a writer's time spent on saving the index
+FRACTION = 0.05  # largest fraction of a writer's time spent on saving the index
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ class EpisodeWriter:
         episode = Episode(name, split, outcome, failure, **made, frames=frames, worlds=worlds, file=file)
         self._episodes[name] = episode
         # A large index is not saved after every episode; unsaved episodes are run again after a kill.
-        if time.perf_counter() - self._saved > self._cost / SHARE:
+        if time.perf_counter() - self._saved > self._cost / FRACTION:
             self._save()
         return episode
 

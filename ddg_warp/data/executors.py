@@ -20,7 +20,7 @@ class SweepError(RuntimeError):
     """Error that ends a sweep early: a sample failed for no reason of a solver, or workers were lost. Finished episodes are kept."""
 
 
-def in_turn(function: Callable, tasks: Iterable) -> Iterator[tuple]:
+def one_by_one(function: Callable, tasks: Iterable) -> Iterator[tuple]:
     """Execute tasks in this process, one after the other."""
     for task in tasks:
         yield task, function(task)

@@ -121,7 +121,7 @@ def draw(ranges: Mapping[str, object], samples: int, design: str = "random", see
         )
     if design == "grid":
         return [shared | dict(zip(names, values, strict=True)) for values in itertools.product(*levels)]
-    shares = _shares(len(names), samples, design, seed)
+    shares = _fractions(len(names), samples, design, seed)
     return [shared | {name: ranges[name].at(u) for name, u in zip(names, row, strict=True)} for row in shares]
 
 
@@ -221,7 +221,7 @@ def check_kind(name: str, range_, kind: type) -> None:
             raise SceneError(f"ranges: {name} is {KINDS[kind]}, and {value!r} is none; correct the values of {name}")
 
 
-def _shares(columns: int, samples: int, design: str, seed: int) -> list[list[float]]:
+def _fractions(columns: int, samples: int, design: str, seed: int) -> list[list[float]]:
     """Return points of the unit cube, (samples, columns)."""
     if not columns:
         return [[] for _ in range(samples)]

@@ -24,7 +24,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.data.episodes import DONE, Episodes, EpisodeWriter
-from ddg_warp.data.executors import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
+from ddg_warp.data.executors import KEPT, SweepError, in_processes, on_ray, one_by_one, require_ray
 from ddg_warp.data.parameter_ranges import GROWING, KINDS, MOST, Range, check_kind, check_names, draw, seed_of
 from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.paths import as_path
@@ -204,7 +204,7 @@ def _finished(run: Run, samples: Iterator[Sample], workers: int | None, ray: boo
     """Yield (sample, outcome) of all samples, as they finish."""
     if ray:
         return on_ray(run, samples, workers, gpus)
-    return in_processes(run, samples, min(workers, MOST)) if workers and workers > 1 else in_turn(run, samples)
+    return in_processes(run, samples, min(workers, MOST)) if workers and workers > 1 else one_by_one(run, samples)
 
 
 def _runner(subject: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun | FunctionRun:

@@ -92,14 +92,14 @@ def frames_at_nodes(first: tuple, second: tuple, beyond, tangents: np.ndarray | 
     return tangents, material_directors(transport(u1, t1, tangents), tangents, angle)
 
 
-def ahead(values: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
+def next_edges(values: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return values on the edges before and after every vertex."""
     return (values, np.roll(values, -1, axis=1)) if closed else (values[:, :-1], values[:, 1:])
 
 
 def reference_twist(tangents: np.ndarray, frames: np.ndarray, closed: bool) -> np.ndarray:
     """Return the angle from the frame transported from the edge before to the frame of each edge (R, vertices)."""
-    (t0, t1), (u0, u1) = ahead(tangents, closed), ahead(frames, closed)
+    (t0, t1), (u0, u1) = next_edges(tangents, closed), next_edges(frames, closed)
     return signed_angle(transport(u0, t0, t1), u1, t1)
 
 
@@ -110,7 +110,7 @@ def curvatures(
 
     The magnitude is 2 tan(phi/2), about the means of both edges' directors; or phi `by_angle`, about the directors halfway between.
     """
-    (t0, t1), (u0, u1) = ahead(tangents, closed), ahead(frames, closed)
+    (t0, t1), (u0, u1) = next_edges(tangents, closed), next_edges(frames, closed)
     kb = 2.0 * cross(t0, t1) / (1.0 + dot(t0, t1))[..., None]
     if by_angle:
         half = 0.5 * reference_twist(tangents, frames, closed)
@@ -123,6 +123,6 @@ def curvatures(
 
 def planar_curvature(edges: np.ndarray, closed: bool, by_angle: bool = False) -> np.ndarray:
     """Return the integrated signed curvature of planar edges (R, edges, 2): 2 tan(phi/2), or phi `by_angle`."""
-    e, f = ahead(unit(edges), closed)
+    e, f = next_edges(unit(edges), closed)
     half = (e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]) / (1.0 + dot(e, f))
     return 2.0 * (np.arctan(half) if by_angle else half)

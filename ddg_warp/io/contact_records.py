@@ -39,7 +39,7 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Touching:
-    """Names and typical scales of contact, for recordings; `Model.touching`.
+    """Names and typical scales of contact, for recordings; `Model.contact_parameters`.
 
     Attributes:
         names: of objects with contact, as in `Contacts`.

@@ -41,7 +41,7 @@ def read_rods(path) -> CurveSet:
     neighbours = _neighbours(edges, len(nodes))
     for node, adjacent in enumerate(neighbours):
         _refuse_joint(f"{path}: node {node + base}", adjacent)
-    paths = _chains(neighbours)
+    paths = _polylines(neighbours)
     order = np.concatenate([nodes_in_order for nodes_in_order, _ in paths])
     counts, closed = [len(nodes_in_order) for nodes_in_order, _ in paths], [closed for _, closed in paths]
     return checked_curves(nodes[order], counts, closed, None, "Nodes", str(path))
@@ -126,7 +126,7 @@ def _refuse_joint(node: str, adjacent: list[int]) -> None:
         raise CurveError(f"{node}: an edge is listed twice; remove one")
 
 
-def _chains(neighbours: list[list[int]]) -> list[tuple[list[int], bool]]:
+def _polylines(neighbours: list[list[int]]) -> list[tuple[list[int], bool]]:
     """Return paths and cycles as (nodes in order, closed), ordered by first node in the file."""
     ends = [node for node, adjacent in enumerate(neighbours) if len(adjacent) == 1]
     visited: set[int] = set()

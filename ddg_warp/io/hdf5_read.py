@@ -93,10 +93,10 @@ def rows(dataset: h5py.Dataset, path: Path, chosen=slice(None)) -> np.ndarray:
         except OSError as error:
             if error.errno is not None or not dataset.chunks:
                 raise
-            raise _told(dataset, path) from error
+            raise _described(dataset, path) from error
 
 
-def _told(dataset: h5py.Dataset, path: Path) -> TrajectoryError:
+def _described(dataset: h5py.Dataset, path: Path) -> TrajectoryError:
     """Return an error that names the damaged and the readable rows of a dataset."""
     count, size = len(dataset), dataset.chunks[0]
     lost = [first for first in range(0, count, size) if not _readable(dataset, first)]

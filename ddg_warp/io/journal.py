@@ -201,7 +201,7 @@ def transaction(path, scratch: str = "", new: bool = False) -> Iterator[h5py.Fil
     try:
         with h5py.File(raw, "w" if new else "r+", libver=FORMAT) as file:
             if scratch in file:
-                raw.scratch = _places(file[scratch])
+                raw.scratch = _offsets(file[scratch])
             version = _next_version(file, old_size)
             yield file
         raw.sync()
@@ -241,7 +241,7 @@ def _next_version(file: h5py.File, size: int) -> Version:
     return Version(size, place=dataset.id.get_offset(), token=before, next=token)
 
 
-def _places(group: h5py.Group) -> list[tuple[int, int]]:
+def _offsets(group: h5py.Group) -> list[tuple[int, int]]:
     """Return the byte ranges (start, stop) of the datasets below a group."""
     ranges = []
 

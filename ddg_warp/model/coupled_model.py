@@ -11,7 +11,7 @@ from ddg_warp.compile.precision import float32_error, stiffnesses
 from ddg_warp.kernels.elements import coupled_element as elements
 from ddg_warp.kernels.elements import coupled_frames as frames
 from ddg_warp.kernels.elements import element_path
-from ddg_warp.kernels.newton.rod_iterate import RELAG
+from ddg_warp.kernels.newton.rod_iterate import UPDATE_FRAMES
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.model.rod_elements import RodElements
 
@@ -135,7 +135,7 @@ class CoupledModel:
         self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
         self._stiffnesses = None, None  # key and values
         self._along = {}  # elements of pieces of rods
-        self.weighed, self.drag, drag_mass = False, None, np.zeros((host.blocks, 3))
+        self.has_custom_mass, self.drag, drag_mass = False, None, np.zeros((host.blocks, 3))
         if host.drag:
             ends, angles, coefficients = host.drag
             self.drag = wp.array(np.tile(coefficients, (1, worlds)), dtype=real, device=device)
@@ -181,7 +181,7 @@ class CoupledModel:
 
     def dof_masses(self) -> np.ndarray:
         """Return masses of all dofs, world by world (W N 3,)."""
-        if self.weighed:
+        if self.has_custom_mass:
             return self.mass.numpy().astype(float).ravel()
         return np.tile(self.host.mass.ravel(), self.worlds)
 
@@ -304,7 +304,7 @@ class CoupledModel:
 
     def renew(self, state: CoupledState, q: wp.array, todo: wp.array) -> None:
         """Update frames and time-lagged data of `state` to iterate q in worlds that `todo` marks; strains stay."""
-        self._carry(state, state, q, state, todo, RELAG, 1)
+        self._carry(state, state, q, state, todo, UPDATE_FRAMES, 1)
 
     def _carry(self, before, after, q: wp.array, kept, moved: wp.array, wanted: int, within: int) -> None:
         """Launch the frame and lag kernels of `kernels.elements.coupled_frames`."""

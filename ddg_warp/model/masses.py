@@ -8,7 +8,7 @@ def point_masses(model) -> tuple[np.ndarray, np.ndarray]:
 
     Rows of one node (joined rods) each have the mass of their own rod.
     """
-    order, net = model.order, model.net
+    order, coupled = model.order, model.coupled
     start = np.concatenate([[0], np.cumsum(order.curves.counts)])
     lumped, added = np.zeros(order.points_count), np.zeros(order.points_count)
     for rods, node, mass in model.scene.masses:
@@ -16,8 +16,8 @@ def point_masses(model) -> tuple[np.ndarray, np.ndarray]:
     for group in model.groups:
         k, column, rows = order.places(group)
         lumped[rows] = group.host.mass[k, column] - added[rows]
-    if net is not None:
-        host = net.host
+    if coupled is not None:
+        host = coupled.host
         for rod in host.rods:
             row = start[rod.rod]
             lumped[row : row + len(rod.nodes)] = rod.piece.mass[rod.row][rod.first : rod.first + len(rod.nodes)]

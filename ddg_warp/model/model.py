@@ -10,7 +10,7 @@ from ddg_warp.capture_lock import launches, one_at_a_time
 from ddg_warp.compile import memory
 from ddg_warp.compile.boundary_conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
-from ddg_warp.compile.rod_groups import compile_chains
+from ddg_warp.compile.rod_groups import compile_rod_groups
 from ddg_warp.errors import SceneError
 from ddg_warp.io.contact_records import Touching
 from ddg_warp.io.obstacles import Obstacles
@@ -55,39 +55,39 @@ class Model:
         self.types = choose(asked, self.wp_device)
         self.worlds, self.allow_rounding = worlds, allow_rounding
         self.version = self.layout = 0  # see `note_change`
-        memory.require(scene, needs_net(scene), worlds, self.precision, self.wp_device)
+        memory.require(scene, needs_coupling(scene), worlds, self.precision, self.wp_device)
         with memory.named("build", self.wp_device):
             self._compile(scene)
         warn_of_rounding(self, scene.analysis)
 
     def _compile(self, scene) -> None:
-        self.chains = compile_chains(scene)
+        self.chains = compile_rod_groups(scene)
         self.motions = scene_motions(scene)
         self.grips = [motion for motion in self.motions if isinstance(motion, Grip)]
         self.groups = [RodGroup(chain, scene, self.worlds, self.wp_device, self.types.real) for chain in self.chains]
-        self.net = self._build_net() if needs_net(scene) else None
+        self.coupled = self._build_net() if needs_coupling(scene) else None
         self.order = UserNumbering(self)
 
     def _build_net(self):
-        from ddg_warp.compile.coupled.builder import compile_net
+        from ddg_warp.compile.coupled.builder import compile_coupled
         from ddg_warp.model.coupled_model import CoupledModel
 
         supports = [*self.scene.shell_supports, *self.scene.ring_supports]
         turning = [s.motion is not None and s.motion.turns for s in supports]
         place = {id(motion): i for i, motion in enumerate(self.motions)}
         motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
-        net = compile_net(self.scene, along=self.wp_device.is_cpu)
-        return CoupledModel(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
+        coupled = compile_coupled(self.scene, along=self.wp_device.is_cpu)
+        return CoupledModel(coupled, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
 
     def __repr__(self) -> str:
-        scene, net = self.scene, self.net
+        scene, coupled = self.scene, self.coupled
         lines = [f"<Model on {self.device} in {self.precision}, {self.worlds} worlds of {self.points_count} points:"]
         if self.groups:
             lines.append(f"{sum(group.rods for group in self.groups)} rods of their own in {len(self.groups)} groups,")
-        if net:
-            rods, shells, turned = len(net.host.rods), len(net.host.shells), len(scene.axisymmetric_shells)
+        if coupled:
+            rods, shells, turned = len(coupled.host.rods), len(coupled.host.shells), len(scene.axisymmetric_shells)
             lines.append(
-                f"a net of {rods} rods, {shells} shells, {turned} shells of revolution ({net.host.blocks} blocks);"
+                f"a net of {rods} rods, {shells} shells, {turned} shells of revolution ({coupled.host.blocks} blocks);"
             )
         return "\n ".join([*lines, "model.report() says more>"])
 
@@ -123,7 +123,7 @@ class Model:
     @property
     def touching(self) -> Touching | None:
         """Contact metadata of recordings: labels, sizes, force scale; None without contact."""
-        host = self.net.host.touching if self.net is not None else None
+        host = self.coupled.host.touching if self.coupled is not None else None
         if host is None:
             return None
         forces = (host.stiffness * host.range)[host.meeting]
@@ -136,14 +136,14 @@ class Model:
         """Contact queries at given states (`ContactModel`); None without contact."""
         from ddg_warp.solve.collision.contact_model import ContactModel
 
-        if self.net is None or self.net.host.touching is None:
+        if self.coupled is None or self.coupled.host.touching is None:
             return None
-        return ContactModel(self.net, self.types.real, self.net.rest().q)
+        return ContactModel(self.coupled, self.types.real, self.coupled.rest().q)
 
     @property
     def magnetic(self) -> bool:
         """True if rods are in a magnetic field."""
-        return self.net is not None and any(part.term.measure.field for part in self.net.sets)
+        return self.coupled is not None and any(part.term.measure.field for part in self.coupled.sets)
 
     @property
     def points_count(self) -> int:
@@ -181,12 +181,12 @@ class Model:
         return drag(self, state)
 
     @one_at_a_time
-    def pushed_apart(self, state: State, gap: float | None = None) -> tuple[State, float]:
+    def resolve_overlaps(self, state: State, gap: float | None = None) -> tuple[State, float]:
         """Return a state without overlaps and the largest node displacement [m]; see `postprocess.overlap_resolution`."""
-        from ddg_warp.postprocess.overlap_resolution import pushed_apart
+        from ddg_warp.postprocess.overlap_resolution import resolve_overlaps
 
-        check_state("pushed_apart", self, state)
-        return pushed_apart(self, state, gap)
+        check_state("resolve_overlaps", self, state)
+        return resolve_overlaps(self, state, gap)
 
     @one_at_a_time
     def contacts(self, state: State):
@@ -215,7 +215,7 @@ class Model:
         Raises:
             ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
         """
-        parts = self.net.sets if self.net is not None else ()
+        parts = self.coupled.sets if self.coupled is not None else ()
         values, remade = self.valid_values(term, parameter, values), False
         if values.shape == (1,) and self.worlds == 1:
             values = values.reshape(())  # one a world, of one world, is one number
@@ -263,7 +263,7 @@ class Model:
 
     def _terms(self) -> dict[str, dict]:
         """Return the parameters of all terms: term -> name -> `Parameter`."""
-        parts = self.net.sets if self.net is not None else ()
+        parts = self.coupled.sets if self.coupled is not None else ()
         terms: dict[str, dict] = {}
         for term in (*(t for group in self.groups for t in group.kind.terms), *(part.term for part in parts)):
             terms.setdefault(term.name, {}).update({parameter.name: parameter for parameter in term.parameters})
@@ -301,7 +301,7 @@ class Model:
                 result[f"{i}/{name.replace('.', '/')}"] = values
             result |= {f"{i}/mass": group.host.mass, f"{i}/rotary_inertia": group.host.rotary}
         laws: dict[str, list] = {}
-        for part in self.net.sets if self.net is not None else ():
+        for part in self.coupled.sets if self.coupled is not None else ():
             laws.setdefault(part.term.name, []).append(part)
         for term, parts in laws.items():
             for number, part in enumerate(parts):  # one element set for each law
@@ -344,36 +344,39 @@ class Model:
                     theta = np.zeros((group.nodes, group.columns))
                     self.order.put_edges(group, angles, theta, "angles")
                     device_arrays.assign(data.theta, theta)
-        if self.net is not None:
-            state.net = self.net.rest()
-            for values, array, label in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
+        if self.coupled is not None:
+            state.coupled = self.coupled.rest()
+            for values, array, label in (
+                (points, state.coupled.q, "points"),
+                (velocities, state.coupled.v, "velocities"),
+            ):
                 if values is not None:
                     array.assign(self.order.put_blocks(values, array.numpy(), label))
             if angles is not None and self.scene.attachments:
                 raise ValueError("angles: edges that are glued to a shell turn with it; leave angles out")
-            for edge_values, array, label in ((spins, state.net.v, "spins"), (angles, state.net.q, "angles")):
+            for edge_values, array, label in ((spins, state.coupled.v, "spins"), (angles, state.coupled.q, "angles")):
                 if edge_values is not None:
                     values, start = self.order.of_edges(edge_values, label)
                     blocks = array.numpy().reshape(self.worlds, -1, 3)
-                    for rod in self.net.host.rods:
+                    for rod in self.coupled.host.rods:
                         blocks[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
                     array.assign(blocks.reshape(-1, 3))
         if points is not None:
             self.carry_frames(state)
-        if self.net is not None:
+        if self.coupled is not None:
             rod_shell_coupling.follow(
-                self.net, state.net, angles=points is not None, rates=velocities is not None and spins is None
+                self.coupled, state.coupled, angles=points is not None, rates=velocities is not None and spins is None
             )
         self.update_strains(state)
         return state
 
     def empty_state(self) -> State:
         """Allocate a state."""
-        net, grips = self.net.empty() if self.net is not None else None, None
+        coupled, grips = self.coupled.empty() if self.coupled is not None else None, None
         if self.grips:
             shape = (6, self.worlds * len(self.grips))
             grips = GripState(wp.zeros(shape, dtype=self.types.real, device=self.wp_device))
-        return State(self, [self.group_state(group) for group in self.groups], net, grips=grips)
+        return State(self, [self.group_state(group) for group in self.groups], coupled, grips=grips)
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:
         """Return the state of a `State.snapshot`, bit by bit.
@@ -434,16 +437,16 @@ class Model:
                     device=self.wp_device,
                 )
                 wp.copy(data.frame, new)
-        if self.net is not None:
-            self.net.carry(state.net, state.net)
+        if self.coupled is not None:
+            self.coupled.carry(state.coupled, state.coupled)
 
     def update_strains(self, state: State) -> None:
         """Store the strains of a state for strain-rate damping."""
         for group, data in zip(self.groups, state.groups, strict=True):
             if group.kind.viscous:
                 self.strains(group, data, data.last)
-        if self.net is not None:
-            self.net.update_strains(state.net)
+        if self.coupled is not None:
+            self.coupled.update_strains(state.coupled)
 
     def strains(self, group: RodGroup, data: RodGroupState, out: wp.array, stress: wp.array | None = None) -> None:
         """Launch the strain kernel of a group; write elastic stresses to `stress` if given. Can be captured."""
@@ -465,7 +468,7 @@ def _device(name):
         raise SceneError(f"device is {name!r}; there is {devices}") from None
 
 
-def needs_net(scene) -> bool:
+def needs_coupling(scene) -> bool:
     """Return True if a scene has more than uncoupled rods."""
     parts = scene.shells, scene.joints, scene.attachments, scene.magnets, scene.axisymmetric_shells, scene.touching
     return any(map(bool, parts))

@@ -47,12 +47,12 @@ class ModelBuilder:
 
 def _tables(model) -> list:
     """Return parameter tables of rod groups and element sets, each with its axis of worlds."""
-    sets = model.net.sets if model.net is not None else ()
+    sets = model.coupled.sets if model.coupled is not None else ()
     return [(group.parameters, 1) for group in model.groups] + [(part.parameters, 0) for part in sets]
 
 
 def _shells(model) -> list:
-    return model.net.host.shells if model.net is not None else []
+    return model.coupled.host.shells if model.coupled is not None else []
 
 
 def _in_worlds(name: str, values: np.ndarray, axis: int, worlds: int, wanted: int) -> np.ndarray:

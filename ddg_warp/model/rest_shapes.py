@@ -101,10 +101,12 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
 def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
     """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
     check_model("set_rest", model)
-    if model.net is None or not 0 <= argument_checks.index("set_rest: shell", shell) < len(model.net.host.shells):
-        count = 0 if model.net is None else len(model.net.host.shells)
+    if model.coupled is None or not 0 <= argument_checks.index("set_rest: shell", shell) < len(
+        model.coupled.host.shells
+    ):
+        count = 0 if model.coupled is None else len(model.coupled.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
-    net_shell, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
+    net_shell, bending = model.coupled.host.shells[shell], model.scene.shells[shell].bending
     membrane = model.scene.shells[shell].membrane
     surface, changes = net_shell.surface, dict(plate or {})
     count = len(surface.triangles)
@@ -131,7 +133,7 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         angle = _shaped("angle", angle, (len(surface.edges),))
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
     plate = replace(net_shell.plate, **changes)
-    sets = {part.term.law: part for part in model.net.sets}
+    sets = {part.term.law: part for part in model.coupled.sets}
     elements_of = shells.shell_elements(surface, plate, net_shell.kinds, bending, membrane)
     places = [(sets[e.term.law], net_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
     net_shell.plate = plate  # nothing can fail after this
@@ -152,8 +154,8 @@ def set_rest_strains(model, strains: dict) -> None:
     """
     check_model("set_rest_strains", model)
     uncoupled = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
-    coupled = {part.term.name for part in model.net.sets} if model.net is not None else set()
-    allowed, updates = sorted(name for name in uncoupled if name.partition(".")[0] not in coupled), []
+    is_coupled = {part.term.name for part in model.coupled.sets} if model.coupled is not None else set()
+    allowed, updates = sorted(name for name in uncoupled if name.partition(".")[0] not in is_coupled), []
     if not isinstance(strains, Mapping):
         raise ValueError(
             f"set_rest_strains: strains are {argument_checks.shown(strains)}; give values by name, of {allowed}"

@@ -17,13 +17,13 @@ class RodElements:
         lists: elements along every rod, by span.
     """
 
-    def __init__(self, net, kind, rods: np.ndarray, nodes: int):
-        self.net, self._terms, self._rods = net, kind.terms, len(rods)
+    def __init__(self, coupled, kind, rods: np.ndarray, nodes: int):
+        self.coupled, self._terms, self._rods = coupled, kind.terms, len(rods)
         self.sets, self.lists = {}, {}
         for term in kind.terms:
-            index = next(i for i, part in enumerate(net.sets) if part.term.law == term.law)
+            index = next(i for i, part in enumerate(coupled.sets) if part.term.law == term.law)
             self.sets[term.measure.span] = index
-            self.lists[term.measure.span] = of_rods(net.host.sets[index].owner[0], rods)
+            self.lists[term.measure.span] = of_rods(coupled.host.sets[index].owner[0], rods)
         self._elements = {span: _padded(elements, nodes) for span, elements in self.lists.items()}
 
     def parameters(self, but: dict | None = None) -> dict[str, np.ndarray]:
@@ -32,9 +32,12 @@ class RodElements:
         Args:
             but: arrays by "term.parameter" that are left out if unchanged; updated to the current ones.
         """
-        result, worlds = {}, self.net.worlds
+        result, worlds = {}, self.coupled.worlds
         for term in self._terms:
-            table, elements = self.net.sets[self.sets[term.measure.span]].parameters, self._elements[term.measure.span]
+            table, elements = (
+                self.coupled.sets[self.sets[term.measure.span]].parameters,
+                self._elements[term.measure.span],
+            )
             for parameter, values in table.values.items():
                 name, (several, along) = f"{term.name}.{parameter}", values.shape
                 if but is not None:

@@ -45,7 +45,7 @@ class RodGroup:
         self.still = wp.zeros(self.columns, dtype=real, device=device)
         self.mass = put(host.mass, real)
         self.rotary = put(host.rotary, real)
-        self.weighed = False
+        self.has_custom_mass = False
         self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
         self.anchor = put(_last_anchor(host), int)
@@ -107,7 +107,7 @@ class RodGroup:
 
     def dof_masses(self) -> np.ndarray:
         """Return masses of all dofs, rod by rod (columns n block,)."""
-        if self.weighed:
+        if self.has_custom_mass:
             mass, rotary = (device_arrays.download(array).astype(float) for array in (self.mass, self.rotary))
         else:
             mass, rotary = (np.tile(values, (1, self.worlds)) for values in (self.host.mass, self.host.rotary))

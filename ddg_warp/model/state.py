@@ -98,14 +98,16 @@ class State:
             state is later by `lead`.
     """
 
-    def __init__(self, model, groups: list[RodGroupState], net=None, time: float = 0.0, grips: GripState | None = None):
+    def __init__(
+        self, model, groups: list[RodGroupState], coupled=None, time: float = 0.0, grips: GripState | None = None
+    ):
         self.stable: bool | np.ndarray | None = None
         self.outcome: str | np.ndarray | None = None
         self.unbalanced: float | np.ndarray | None = None
         self.sliding: Sliding | None = None
         self.model = model
         self.groups = groups
-        self.net = net
+        self.coupled = coupled
         self.grips = grips
         self.time = time
         self.spun = False
@@ -136,7 +138,9 @@ class State:
         if attributes["sliding"] is not None:
             velocity, increment = attributes["sliding"]
             attributes = attributes | {
-                "sliding": Sliding(wp.array(velocity, dtype=state.net.v.dtype, device=state.net.v.device), increment)
+                "sliding": Sliding(
+                    wp.array(velocity, dtype=state.coupled.v.dtype, device=state.coupled.v.device), increment
+                )
             }
         vars(state).update(attributes)
         return state
@@ -147,7 +151,7 @@ class State:
 
     def parts(self) -> dict:
         """Return the states of rod groups, the coupled system and grips, by name."""
-        single = {"net": self.net, "grips": self.grips}
+        single = {"net": self.coupled, "grips": self.grips}
         groups = {str(i): group for i, group in enumerate(self.groups)}
         return groups | {name: part for name, part in single.items() if part is not None}
 
@@ -165,42 +169,48 @@ class State:
     @property
     def rubbing(self) -> wp.array:
         """Slip velocities of dof blocks (W N,) for friction."""
-        return self.net.v if self.sliding is None else self.sliding.velocity
+        return self.coupled.v if self.sliding is None else self.sliding.velocity
 
     def points(self) -> np.ndarray:
         """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices."""
-        return self.model.order.nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
+        return self.model.order.nodes(
+            [arrays.download(group.x) for group in self.groups], self.coupled and self.coupled.q
+        )
 
     def velocities(self) -> np.ndarray:
         """Return velocities of nodes, ordered as `points` [m/s]."""
-        return self.model.order.nodes([arrays.download(group.v) for group in self.groups], self.net and self.net.v)
+        return self.model.order.nodes(
+            [arrays.download(group.v) for group in self.groups], self.coupled and self.coupled.v
+        )
 
     def obstacle_points(self) -> np.ndarray:
         """Return positions of nodes of moving obstacles (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
         model = self.model
         if model.obstacles is None:
             return np.zeros((0, 3) if model.worlds == 1 else (model.worlds, 0, 3))
-        nodes = np.concatenate(model.net.host.obstacles)[model.obstacles.moving]
-        values = self.net.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes]
+        nodes = np.concatenate(model.coupled.host.obstacles)[model.obstacles.moving]
+        values = self.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes]
         return values[0] if model.worlds == 1 else values
 
     def angles(self) -> np.ndarray | None:
         """Return twist angles of edges (edges,) or (worlds, edges) [rad]; None if no rod has twist."""
         model = self.model
-        net = None
-        if model.net is not None and model.net.edges:
-            net = self.net.q.numpy().reshape(model.worlds, -1, 3)[:, model.net.angle_start :, 0]
-        return model.order.edges([arrays.download(data.theta) for data in self.groups], net)
+        coupled = None
+        if model.coupled is not None and model.coupled.edges:
+            coupled = self.coupled.q.numpy().reshape(model.worlds, -1, 3)[:, model.coupled.angle_start :, 0]
+        return model.order.edges([arrays.download(data.theta) for data in self.groups], coupled)
 
     def directors(self) -> np.ndarray | None:
         """Return the first material director of edges (edges, 3) or (worlds, edges, 3); None without twist."""
         model = self.model
-        values, net = [], None
-        if model.net is not None and model.net.edges:
-            frame = np.moveaxis(self.net.frame.numpy().reshape(6, model.worlds, -1), 0, -1)
-            angle = self.net.q.numpy().reshape(model.worlds, -1, 3)[:, model.net.angle_start :][:, : model.net.edges, 0]
+        values, coupled = [], None
+        if model.coupled is not None and model.coupled.edges:
+            frame = np.moveaxis(self.coupled.frame.numpy().reshape(6, model.worlds, -1), 0, -1)
+            angle = self.coupled.q.numpy().reshape(model.worlds, -1, 3)[:, model.coupled.angle_start :][
+                :, : model.coupled.edges, 0
+            ]
             u, t = frame[..., :3], frame[..., 3:]
-            net = polyline.material_directors(u, t, angle)
+            coupled = polyline.material_directors(u, t, angle)
         for group, data in zip(model.groups, self.groups, strict=True):
             if not group.kind.twist:
                 values.append(np.zeros(0))
@@ -208,7 +218,7 @@ class State:
             frame, theta = arrays.download(data.frame), arrays.download(data.theta)
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
             values.append(polyline.material_directors(u, t, theta))
-        return model.order.edges(values, net, 3)
+        return model.order.edges(values, coupled, 3)
 
     def poses(self) -> np.ndarray | None:
         """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""

@@ -43,7 +43,7 @@ class UserNumbering:
         """Shells as triangles among the rows of `State.points`; None without."""
         if not self.model.scene.shells:
             return None
-        shells, rods = self.model.net.host.shells, int(self.curves.counts.sum())
+        shells, rods = self.model.coupled.host.shells, int(self.curves.counts.sum())
         points = np.cumsum([0] + [len(shell.nodes) for shell in shells])
         triangles = np.cumsum([0] + [len(shell.surface.triangles) for shell in shells])
         return Surfaces(
@@ -67,10 +67,10 @@ class UserNumbering:
     @cached_property
     def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows of `State.points` from the coupled system, and the dof blocks that fill them."""
-        if self.model.net is None:
+        if self.model.coupled is None:
             return np.zeros(0, int), np.zeros(0, int)
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        host = self.model.net.host
+        host = self.model.coupled.host
         rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
         first = len(start) - 1 - len(host.meridians)
         rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
@@ -86,7 +86,9 @@ class UserNumbering:
     @property
     def points_count(self) -> int:
         """Rows of `State.points` in one world."""
-        vertices = 0 if self.model.net is None else sum(len(shell.nodes) for shell in self.model.net.host.shells)
+        vertices = (
+            0 if self.model.coupled is None else sum(len(shell.nodes) for shell in self.model.coupled.host.shells)
+        )
         return int(self.curves.counts.sum()) + vertices
 
     @cached_property
@@ -106,7 +108,7 @@ class UserNumbering:
         for group in self.model.groups:
             if group.kind.twist:
                 result[self.edge_places(group)[2]] = True
-        for rod in self.model.net.host.rods if self.model.net is not None else ():
+        for rod in self.model.coupled.host.rods if self.model.coupled is not None else ():
             result[self.edge_starts[rod.rod] + np.arange(len(rod.edges))] = True
         return result
 
@@ -206,9 +208,9 @@ class UserNumbering:
                 out[world][index[:, None], axes] = value[k, column + world * group.rods]
         return out[0] if self.model.worlds == 1 else out
 
-    def edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
+    def edges(self, values: list[np.ndarray], coupled: np.ndarray | None = None, width: int = 0):
         """Return edge values in user order from groups (node, column) and coupled rod edges (worlds, edges)."""
-        if not any(group.kind.twist for group in self.model.groups) and net is None:
+        if not any(group.kind.twist for group in self.model.groups) and coupled is None:
             return None
         out = np.zeros((self.model.worlds, self.edges_count, *([width] if width else [])))
         for group, value in zip(self.model.groups, values, strict=True):
@@ -216,9 +218,9 @@ class UserNumbering:
                 k, column, index = self.edge_places(group)
                 for world in range(self.model.worlds):
                     out[world][index] = value[k, column + world * group.rods]
-        for rod in self.model.net.host.rods if net is not None else ():
+        for rod in self.model.coupled.host.rods if coupled is not None else ():
             rows = self.edge_starts[rod.rod] + np.arange(len(rod.edges))
-            out[:, rows] = net[:, rod.edges - self.model.net.angle_start]
+            out[:, rows] = coupled[:, rod.edges - self.model.coupled.angle_start]
         return out[0] if self.model.worlds == 1 else out
 
 

@@ -13,7 +13,7 @@ def refuse_underflow(model) -> None:
     if model.precision != "float32" or model.allow_rounding:
         return
     values_by_name = {name: values for name, values in model.parameters().items() if "/stiffness" in name}
-    for i, shell in enumerate(model.net.host.shells if model.net is not None else ()):
+    for i, shell in enumerate(model.coupled.host.shells if model.coupled is not None else ()):
         values_by_name[f"shell {i}, squared area of a triangle"] = shell.plate.area**2
     for name, values in values_by_name.items():
         size = np.abs(values[np.nonzero(values)])
@@ -39,7 +39,7 @@ def refuse_curved_membranes(model) -> None:
 
 def refuse_friction(model) -> None:
     """Refuse frictional contact in analyses of equilibria that are independent of the load path."""
-    contact = model.net.host.touching if model.net is not None else None
+    contact = model.coupled.host.touching if model.coupled is not None else None
     pairs = zip(*contact.meeting, strict=True) if contact is not None else ()
     rough = next(((g, h) for g, h in pairs if contact.friction[g, h] > 0.0), None)
     if rough is None:

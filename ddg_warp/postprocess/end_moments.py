@@ -29,9 +29,9 @@ def of_group(group, data, moments: np.ndarray) -> None:
             moments[:, k, world, rods] = _about(moments[:, k, world, rods], at_node, inside)
 
 
-def of_net(net, state, index: int, moments: np.ndarray) -> None:
+def of_coupled(coupled, state, index: int, moments: np.ndarray) -> None:
     """Refer moments (3, worlds, elements) of coupled rods or rigid joints to the directors at the node."""
-    part, host, worlds = net.sets[index], net.host, net.worlds
+    part, host, worlds = coupled.sets[index], coupled.host, coupled.worlds
     measure, slots = part.term.measure, part.host.slots
     frame = state.frame.numpy().astype(np.float64).reshape(6, worlds, -1)
     angle = state.q.numpy().astype(np.float64).reshape(worlds, -1, 3)[:, host.nodes :][:, : host.rod_edges, 0]

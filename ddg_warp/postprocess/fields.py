@@ -111,7 +111,7 @@ def _elements(model, state) -> Iterator[tuple]:
         The term, strains and stresses (worlds, E, strains), energy per length (worlds, E), and arrays (E,) of rows of the points
         that an element contributes to, -1 for ghosts.
     """
-    from ddg_warp.postprocess.quantities import group_strains, net_strains
+    from ddg_warp.postprocess.quantities import coupled_strains, group_strains
 
     start = np.concatenate([[0], np.cumsum(model.curves.counts)])
     for group, data in zip(model.groups, state.groups, strict=True):
@@ -132,16 +132,16 @@ def _elements(model, state) -> Iterator[tuple]:
                 cut = (k, slice(None), rod, slice(place[3], place[3] + n))
                 strain, stress = (np.moveaxis(values[cut], 0, 1) for values in (strains, stresses))
                 yield term, strain, stress, _energy(strain, stress, np.moveaxis(rest[k, :, rod], 0, 1)), rows
-    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+    for index, part in enumerate(model.coupled.sets if model.coupled is not None else ()):
         term = part.term
         if not term.measure.name.startswith(ROD_MEASURES):
             continue
         n, span = len(term.measure.strains), term.measure.span
-        strain, stress = (np.moveaxis(values, 0, -1) for values in net_strains(model.net, state, index))
+        strain, stress = (np.moveaxis(values, 0, -1) for values in coupled_strains(model.coupled, state, index))
         rest = np.zeros_like(strain)
         for i, name in enumerate(term.rest):
             rest[..., i] = part.parameters[name]
-        rods = {rod.rod: rod for rod in model.net.host.rods}
+        rods = {rod.rod: rod for rod in model.coupled.host.rods}
         owner, k = part.host.owner
         first, nodes, all_nodes = (
             np.array([value(rods[rod]) for rod in owner], int)

@@ -10,11 +10,11 @@ from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
-from ddg_warp.solve.linear.solver_selection import automatic, net_preconditioner
+from ddg_warp.solve.linear.solver_selection import automatic, coupled_preconditioner
 from ddg_warp.solve.linear.sparse_system import SparseSystem
 from ddg_warp.solve.stepping.decoupled_step import uncoupled
 from ddg_warp.solve.stepping.rod_step import DIRECT
-from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, suited
+from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, choose_solver
 
 SOLVERS = {
     "chain": "PCG (closed chains)",
@@ -44,10 +44,10 @@ def report(model) -> str:
         lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
         lines += step_lines(model, lambda s, group=group: (group.float32_errors(s), _split_errors(group, s)))
         lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
-    if model.net is not None:
-        lines += net_lines(model)
-        present |= {part.term.name for part in model.net.sets}
-        if touching := model.net.host.touching:
+    if model.coupled is not None:
+        lines += coupled_lines(model)
+        present |= {part.term.name for part in model.coupled.sets}
+        if touching := model.coupled.host.touching:
             potentials = contact_potentials(touching)
             lines += contact_lines(touching)
             lines += [f"  {each.name}: {each.density.name}, {each.text}" for each in potentials]
@@ -57,7 +57,7 @@ def report(model) -> str:
         lines.append(f"drawn {2.0 * DRAWN:g} m thick, as their section has no radius: {', '.join(bare)}")
     absent = sorted({term.name for term in ALL.values()} - present)
     lines.append("not in this scene: " + ", ".join(absent))
-    if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):
+    if not any(group.kind.twist for group in model.groups) and (model.coupled is None or not model.coupled.edges):
         lines.append("no angles, no frames, no rotary inertia")
     return "\n".join(lines)
 
@@ -67,12 +67,14 @@ def _split_errors(group, s: float) -> np.ndarray:
 
 
 def step_lines(model, errors_of: Callable) -> list[str]:
-    """Return lines on solver choices for steps of the scene's analysis, if any; `errors_of`: s -> errors, see `suited`."""
+    """Return lines on solver choices for steps of the scene's analysis, if any; `errors_of`: s -> errors, see `choose_solver`."""
     analysis = model.scene.analysis
     if not isinstance(analysis, Dynamics):
         return []
     errors = errors_of(analysis.dt * (0.5 if analysis.scheme == "implicit_midpoint" else 1.0))
-    means = suited(model.precision, LinearSolverChoice(model.types.linear), *(each.max(initial=0.0) for each in errors))
+    means = choose_solver(
+        model.precision, LinearSolverChoice(model.types.linear), *(each.max(initial=0.0) for each in errors)
+    )
     taken = ["edges turned, second derivatives"] * means.stiff
     taken += [f"linear algebra in {means}"] * (means.linear is not model.types.linear or means.split)
     return [f"  over steps of {analysis.dt:g} s: {', '.join(taken)}"] if taken else []
@@ -98,7 +100,7 @@ def contact_potentials(touching) -> list[Potential]:
     law, kinds = touching.law, {body.kind for body in touching.bodies}
     optional = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
     pairs = ["edge_edge", *(name for kind, name in optional if kind in kinds)]
-    friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if touching.rubs]
+    friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if touching.has_friction]
     return [*(contact_potential(law.name, touching.density, pair) for pair in pairs), *friction]
 
 
@@ -107,18 +109,18 @@ def _between(values: np.ndarray) -> str:
     return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
-def net_lines(model) -> list[str]:
+def coupled_lines(model) -> list[str]:
     """Return lines on dofs, terms and matrix of the coupled system."""
-    host, net = model.net.host, model.net
-    name, linear = net_preconditioner(net), model.types.linear
-    chains = RodSubstructuring.of(net, name)
-    table = SparseSystem(net, chains and chains.kept)
+    host, coupled = model.coupled.host, model.coupled
+    name, linear = coupled_preconditioner(coupled), model.types.linear
+    chains = RodSubstructuring.of(coupled, name)
+    table = SparseSystem(coupled, chains and chains.kept)
     lines = [
         f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
         f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "
         f"{int((~host.fixed).sum())} free dofs"
     ]
-    for part in net.sets:
+    for part in coupled.sets:
         measure, density = part.term.measure.name, part.term.density.name
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     if host.drag:
@@ -139,7 +141,7 @@ def net_lines(model) -> list[str]:
     if uncoupled(model):
         lines.append("  in steps in which nothing comes near: rods on their own, one Newton loop a rod")
     return lines + step_lines(
-        model, lambda s: (model.net.rod_errors(s), model.net.split_errors(s) if split else np.array([np.inf]))
+        model, lambda s: (model.coupled.rod_errors(s), model.coupled.split_errors(s) if split else np.array([np.inf]))
     )
 
 

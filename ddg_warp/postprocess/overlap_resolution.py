@@ -15,7 +15,7 @@ BEYOND = 1.02  # gap that pairs are moved to over the required one, for few roun
 
 
 @launches
-def pushed_apart(model, state, gap: float | None = None):
+def resolve_overlaps(model, state, gap: float | None = None):
     """Return a copy of a state, with nodes moved until no two surfaces are closer than a gap.
 
     Each round moves close pairs apart along the line between their closest points, by least squares. Fixed dofs stay. Crossing rods
@@ -34,45 +34,45 @@ def pushed_apart(model, state, gap: float | None = None):
     """
     touch = model.touch
     if touch is None:
-        raise SceneError("pushed_apart: this scene has no contact; add scene.contact()")
-    net, host = model.net, model.net.host
+        raise SceneError("resolve_overlaps: this scene has no contact; add scene.contact()")
+    coupled, host = model.coupled, model.coupled.host
     least = (
         PART * float(host.touching.range.min())
         if gap is None
-        else argument_checks.positive("pushed_apart: gap", gap, "m")
+        else argument_checks.positive("resolve_overlaps: gap", gap, "m")
     )
     if least > touch.search.reach:
         raise SceneError(
-            f"pushed_apart: gap is {least:.6g} m; contact is within {touch.search.reach:.6g} m, which it may not exceed"
+            f"resolve_overlaps: gap is {least:.6g} m; contact is within {touch.search.reach:.6g} m, which it may not exceed"
         )
     new = state.copy()
-    start = new.net.q.numpy().reshape(-1, 3).astype(float)
+    start = new.coupled.q.numpy().reshape(-1, 3).astype(float)
     x, free = start.copy(), np.tile(~host.fixed.astype(bool), (model.worlds, 1)).astype(float)
     for _ in range(ROUNDS):
-        new.net.q.assign(x)
-        touch.find(new.net.q)
+        new.coupled.q.assign(x)
+        touch.find(new.coupled.q)
         steps, weights, closest = np.zeros_like(x), np.zeros(len(x)), np.inf
         for pairs in touch.search.lists:
-            closest = min(closest, _part(pairs, new.net.q, free, least, steps, weights))
+            closest = min(closest, _separate(pairs, new.coupled.q, free, least, steps, weights))
         if closest >= least:
             break
         x = x + steps / np.maximum(1.0, weights)[:, None]
     else:
-        gap, pair = touch.closest(new.net.q)
+        gap, pair = touch.closest(new.coupled.q)
         raise SolverError(
-            f"pushed_apart: {pair} are still {gap:.3g} m apart, less than {least:.3g} m, after {ROUNDS} rounds; move them apart, free "
+            f"resolve_overlaps: {pair} are still {gap:.3g} m apart, less than {least:.3g} m, after {ROUNDS} rounds; move them apart, free "
             "what holds them, or give them a smaller radius",
             outcome="no_room",
         )
     moved = float(np.linalg.norm(x - start, axis=1).max(initial=0.0))
     if moved > 0.0:
         model.carry_frames(new)
-        rod_shell_coupling.follow(net, new.net, angles=True, rates=False)
+        rod_shell_coupling.follow(coupled, new.coupled, angles=True, rates=False)
         model.update_strains(new)
     return new, moved
 
 
-def _part(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray, weight_sums: np.ndarray) -> float:
+def _separate(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray, weight_sums: np.ndarray) -> float:
     """Add separating displacements of a pair list to `steps` and weights to `weight_sums`; return the smallest gap."""
     count = int(pairs.count.numpy()[0])
     if not count:

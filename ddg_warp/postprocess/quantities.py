@@ -13,7 +13,7 @@ from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
 from ddg_warp.postprocess import end_moments
 from ddg_warp.solve.equilibrium.tangent import Tangent
-from ddg_warp.solve.forces.drag import ChainDrag, CoupledDrag
+from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
 
 TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints
 
@@ -123,7 +123,7 @@ def drag(model, state) -> Drag:
         v, omega = (device_arrays.download(array).astype(float) for array in (data.v, data.omega))
         force, moment = np.zeros_like(v), np.zeros_like(omega)
         if group.kind.drag:
-            resisted = ChainDrag(model, group)
+            resisted = RodGroupDrag(model, group)
             v, omega = resisted.rates(data, state.lead)
             inertia, u = resisted.at(data, state.time)
             force = np.einsum("krij,krj->kri", inertia["resistance"], u - v)
@@ -132,17 +132,17 @@ def drag(model, state) -> Drag:
         power += work.reshape(group.worlds, group.rods).sum(1)
         forces.append(force)
         moments.append(moment)
-    if model.net is not None:
-        force = np.zeros((model.worlds, model.net.blocks, 3))
+    if model.coupled is not None:
+        force = np.zeros((model.worlds, model.coupled.blocks, 3))
         v = force
-        if model.net.host.drag:
+        if model.coupled.host.drag:
             resisted = CoupledDrag(model)
-            v = resisted.rates(state.net, state.lead)
-            inertia, u = resisted.at(state.net, state.time)
+            v = resisted.rates(state.coupled, state.lead)
+            inertia, u = resisted.at(state.coupled, state.time)
             force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
         power += (force * v).sum((1, 2))
         _, places = model.order.net_rows
-        turns = force[:, model.net.angle_start :, 0]
+        turns = force[:, model.coupled.angle_start :, 0]
         blocks = force / np.maximum(1, np.bincount(places, minlength=force.shape[1]))[:, None]
     force, moment = model.order.nodes(forces, blocks), model.order.edges(moments, turns)
     return Drag(force, moment, power if model.worlds > 1 else float(power[0]))
@@ -186,9 +186,9 @@ def _normal_moments(part, state) -> np.ndarray:
     The energy of an element is invariant under rotation of its nodes and normals. Hence the moment on the normals is minus the
     moment of its nodal forces. Of several supports at one element, each carries the component along its edge.
     """
-    worlds, count = part.net.worlds, len(part.model.scene.shell_supports)
+    worlds, count = part.coupled.worlds, len(part.model.scene.shell_supports)
     result, x = np.zeros((worlds, count, 3)), part.back(part.dofs(state)).reshape(worlds, -1, 3)
-    for index, device in enumerate(part.net.sets):
+    for index, device in enumerate(part.coupled.sets):
         host, measure = device.host, device.term.measure
         element, row, support = host.normals[:, host.normals[2] < count]
         if not element.size:
@@ -241,9 +241,9 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
             for column, rod in enumerate(group.host.rods):
                 of_rod = values[rows, : group.host.count[column] - missing, :, column]
                 rods[rod] = _each_world(np.moveaxis(of_rod, (2, 1), (0, 1)))
-    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+    for index, part in enumerate(model.coupled.sets if model.coupled is not None else ()):
         if part.term.name not in MAGNETS:
-            _add_net_stresses(model, state, index, result)
+            _add_coupled_stresses(model, state, index, result)
     return result
 
 
@@ -256,13 +256,13 @@ def group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
     return device_arrays.download(strain).reshape(split), device_arrays.download(stress).reshape(split)
 
 
-def net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
+def coupled_strains(coupled, state, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return strains and stresses of an element set (strains, worlds, elements)."""
-    part = net.sets[index]
-    shape = (len(part.term.measure.strains), net.worlds * part.elements)
-    strain, stress = (wp.zeros(shape, dtype=net.real, device=net.device) for _ in range(2))
-    net.strains(state.net, index, strain, stress)
-    split = (shape[0], net.worlds, part.elements)
+    part = coupled.sets[index]
+    shape = (len(part.term.measure.strains), coupled.worlds * part.elements)
+    strain, stress = (wp.zeros(shape, dtype=coupled.real, device=coupled.device) for _ in range(2))
+    coupled.strains(state.coupled, index, strain, stress)
+    split = (shape[0], coupled.worlds, part.elements)
     return strain.numpy().astype(float).reshape(split), stress.numpy().astype(float).reshape(split)
 
 
@@ -278,7 +278,7 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
         ValueError: there are no surfaces, or a shell has a user-defined law.
     """
     _check("triangle_fields", model, state)
-    net, surfaces = model.net, model.surfaces
+    coupled, surfaces = model.coupled, model.surfaces
     if surfaces is None:
         raise ValueError("the model has no surfaces to color")
     for number, shell in enumerate(model.scene.shells):
@@ -288,11 +288,11 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
                 "that of its material; see quantities.energies"
             )
     fields = {name: np.zeros((model.worlds, len(surfaces.triangles))) for name in ("strain", "curvature", "energy")}
-    for index, part in enumerate(net.sets):
+    for index, part in enumerate(coupled.sets):
         if not (part.term.name.startswith("shell") and part.term.density.coupled):
             continue
-        E, W = part.elements, net.worlds
-        values, slope = net_strains(net, state, index)
+        E, W = part.elements, coupled.worlds
+        values, slope = coupled_strains(coupled, state, index)
         change = np.moveaxis(
             values - np.stack([np.broadcast_to(part.parameters[name], (W, E)) for name in part.term.rest]), 0, -1
         )
@@ -320,16 +320,16 @@ def _principal(covariant: np.ndarray, metric) -> np.ndarray:
     return np.abs(mean) + root
 
 
-def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None:
+def _add_coupled_stresses(model, state, index: int, result: dict[str, list]) -> None:
     """Add the stresses of an element set to `result`, by rod or shell."""
-    net, part, scene = model.net, model.net.sets[index], model.scene
+    coupled, part, scene = model.coupled, model.coupled.sets[index], model.scene
     term = part.term
-    values = net_strains(net, state, index)[1]
+    values = coupled_strains(coupled, state, index)[1]
     if term.measure.twists:
-        end_moments.of_net(net, state.net, index, values)
+        end_moments.of_coupled(coupled, state.coupled, index, values)
     values = np.moveaxis(values, 0, -1)
     if term.density.coupled:
-        metric = _metric(part, net.worlds)
+        metric = _metric(part, coupled.worlds)
         values = _resultants(values.reshape(-1, values.shape[-1]), metric).reshape(values.shape)
     of_shells = (
         scene.shells if term.name in SHELLS else scene.axisymmetric_shells if term.name in AXISYMMETRIC else None
@@ -396,11 +396,11 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
             vertices = group.host.count[column] - (0 if group.kind.closed else 2)
             turns += (values * weight)[:vertices].sum(0)
             has_twist = True
-    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+    for index, part in enumerate(model.coupled.sets if model.coupled is not None else ()):
         of_rod = part.host.owner[0] == rod
         if part.term.measure.twists and of_rod.any():
             weight = np.broadcast_to(part.parameters["measure"], (model.worlds, part.elements))
-            turns += (net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
+            turns += (coupled_strains(model.coupled, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
             has_twist = True
     if not has_twist or model.scene.dimension == 2:
         raise ValueError(f"rod {rod} has no twist")

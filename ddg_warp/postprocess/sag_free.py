@@ -118,8 +118,8 @@ def _refuse(call: str, model) -> None:
     scene, start = model.scene, f"{call}: "
     if model.precision == "float32":
         raise SceneError(f"{start}float32 leaves too little of forces; build the model in 'mixed' or 'float64'")
-    if model.net is not None:
-        host, body = model.net.host, "a shell of revolution"
+    if model.coupled is not None:
+        host, body = model.coupled.host, "a shell of revolution"
         if host.rods:
             rod = min(each.rod for each in host.rods)
             body = f"rod {rod} ('{model.curves.names[rod]}'), which is joined, glued or magnetised"

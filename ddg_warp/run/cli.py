@@ -18,12 +18,12 @@ from ddg_warp.run.scene_registry import (
     add_parameters,
     load_scene,
     one_liner,
-    own_term,
     parameters,
     refused,
     scene_files,
     scene_name,
     stored_settings,
+    user_term,
 )
 
 DONE, FAILED, MISTAKE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
@@ -52,14 +52,14 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
     except (InputError, OSError) as error:
-        print(f"ddg-warp: {_of_a_place(error)}", file=sys.stderr)
+        print(f"ddg-warp: {_of_location(error)}", file=sys.stderr)
         return FAILED if getattr(error, "errno", None) in FULL else MISTAKE
     except KeyboardInterrupt:
         print("\nddg-warp: interrupted; what was recorded is kept", file=sys.stderr)
         return INTERRUPTED
 
 
-def _of_a_place(error: Exception) -> Exception:
+def _of_location(error: Exception) -> Exception:
     """Return the error, or for an OSError one that names the path and a remedy."""
     if not isinstance(error, OSError) or isinstance(error, ValueError) or error.filename is None:
         return error
@@ -371,7 +371,7 @@ def check_terms(chosen: argparse.Namespace) -> int:
 
     term = chosen.term
     if term is not None and ".py:" in term:
-        term = own_term(*term.rsplit(":", 1))
+        term = user_term(*term.rsplit(":", 1))
     elif term is not None and term not in ALL:
         raise InputError(f"there is no term '{term}'; there are {', '.join(ALL)}; or give FILE.py:NAME of your own")
 

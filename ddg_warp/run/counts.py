@@ -11,10 +11,10 @@ from ddg_warp.capture_lock import launches
 
 @launches
 def counts_of(integrator) -> dict[str, np.ndarray]:
-    """Return the counters of an integrator by name, for `go_on`; reads from the device."""
+    """Return the counters of an integrator by name, for `repeat`; reads from the device."""
     counts = {name: array.numpy() for name, array in _counters(integrator).items()}
     if (search := _search(integrator)) is not None:
-        counts |= {f"search/{name}": array.numpy() for name, array in _ways(search).items()}
+        counts |= {f"search/{name}": array.numpy() for name, array in _paths(search).items()}
         counts["search/room"] = np.array([(pairs.capacity, len(pairs._met)) for pairs in search.lists])
         counts["search/candidates"] = np.array(_candidates(search))
     return counts
@@ -29,7 +29,7 @@ def statistics(integrator, counts: Mapping[str, np.ndarray]) -> dict:
 
 
 @launches
-def go_on(integrator, state, dt: float, counts: Mapping[str, np.ndarray]):
+def repeat(integrator, state, dt: float, counts: Mapping[str, np.ndarray]):
     """Set the counters of a new integrator; return `state` in its buffers, for a first step of dt [s].
 
     Contact candidates are searched again for the motion of the last search and with the same capacity. Later searches then happen as
@@ -41,7 +41,7 @@ def go_on(integrator, state, dt: float, counts: Mapping[str, np.ndarray]):
     integrator._prepare(dt, state)  # may rebuild steppers
     first = integrator._buffers[integrator._own(state)].state  # tests for overlaps
     search, counters = _search(integrator), _counters(integrator)
-    motion = {} if search is None else _ways(search)
+    motion = {} if search is None else _paths(search)
     wanted = {name: array.shape for name, array in counters.items()} | {
         f"search/{name}": array.numpy().shape for name, array in motion.items()
     }
@@ -51,7 +51,7 @@ def go_on(integrator, state, dt: float, counts: Mapping[str, np.ndarray]):
         raise ValueError("the counts are of another model or another integrator; resume with the scene's own")
     if search is not None:
         _search_again(search, motion, counts)
-        integrator._net.newton.contact.terms.fit()
+        integrator._coupled.newton.contact.terms.fit()
     for name, array in counters.items():
         array.assign(counts[name])
     return first
@@ -83,7 +83,7 @@ def _counters(integrator) -> dict:
         if hasattr(part.newton, "pcg_work"):
             result[f"{k}/pcg"] = part.newton.pcg_work
     if (search := _search(integrator)) is not None:
-        contact = integrator._net.newton.contact
+        contact = integrator._coupled.newton.contact
         tally = contact.tally
         result |= {
             "contact/crossed": contact.crossed,
@@ -96,7 +96,7 @@ def _counters(integrator) -> dict:
 
 def _search(integrator):
     """Return the broad phase of the integrator, or None."""
-    contact = integrator._net.newton.contact if integrator._net is not None else None
+    contact = integrator._coupled.newton.contact if integrator._coupled is not None else None
     return contact.search if contact else None
 
 
@@ -104,6 +104,6 @@ def _candidates(search) -> int:
     return sum(int(pairs.count.numpy()[0]) for pairs in search.lists)
 
 
-def _ways(search) -> dict:
+def _paths(search) -> dict:
     """Return start and end of the motion that candidates were searched for, by name."""
     return {"start": search._start, "end": search._end}

@@ -31,7 +31,7 @@ from ddg_warp.kernels.terms import ALL, REGISTRY, Potential, Term
 from ddg_warp.run.derivative_samples import Sample, rotation
 from ddg_warp.run.derivative_samples_contact import ContactSample, FrictionSample
 from ddg_warp.run.derivative_samples_coupled import Elements
-from ddg_warp.run.derivative_samples_rod import RodSample, chain_of
+from ddg_warp.run.derivative_samples_rod import RodSample, rods_of
 
 TRAP = 2.0**-30
 
@@ -195,7 +195,7 @@ def samples_of(
     if isinstance(term, Potential):
         return [(FrictionSample if term.frictional else ContactSample)(term, None, precision, device)]
     if term.measure in {rod_term.measure for rod_term in REGISTRY.values()}:
-        return [RodSample(term, chain_of(term, closed), precision, device) for closed in chains]
+        return [RodSample(term, rods_of(term, closed), precision, device) for closed in chains]
     if term.measure.dim != 3:
         raise ValueError(f"{term.name}: of the plane are measures of rods alone; give {term.measure.name} dim = 3")
     return [Elements(term, None, precision, device)]

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.adjoint.contact import FRICTION, NUMBERS, RATE, pull_kernel, rub_kernel
-from ddg_warp.kernels.collision.contact.assembly import ROW, SLOTS, WEIGHT, factor_struct
+from ddg_warp.kernels.collision.contact.assembly import PAIR_NODES, ROW, WEIGHT, factor_struct
 from ddg_warp.kernels.collision.contact.closest_points import (
     distance_function,
     end_function,
@@ -30,7 +30,7 @@ from ddg_warp.run.derivative_samples import Sample, random_parameters
 CROSSING = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.3, -0.5, 0.3], [0.7, 0.5, 0.4]]
 OBLIQUE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.1, 0.1, 0.4], [0.9, 0.5, 0.3]]  # mollified, by `SQUARE`
 ABOVE = [[0.3, 0.3, 0.4], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-BESIDE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.3, 0.3]]
+OFFSET = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.3, 0.3]]
 SQUARE = 30.0  # squared rest length of both edges
 INNER = 0.5, 0.0  # one node in the interior of a rod, one at an end
 VELOCITY = 3.0
@@ -59,7 +59,7 @@ class ContactSample(Sample):
     def random_state(self) -> dict[str, np.ndarray]:
         """Return random data; see the class."""
         random, kind = np.random.default_rng(11), self.collision
-        base = np.array(BESIDE if kind == EDGE_POINT else CROSSING if kind == EDGES else ABOVE)
+        base = np.array(OFFSET if kind == EDGE_POINT else CROSSING if kind == EDGES else ABOVE)
         nodes = np.repeat(base[:, None], self.COUNT, 1)
         if kind == EDGES:
             nodes[:, ::2] = np.array(OBLIQUE)[:, None]
@@ -90,10 +90,10 @@ class ContactSample(Sample):
         """Return exact second derivatives by the nodes (3 nodes, 3 nodes, E)."""
         arguments, (*_, factor), count = self._given(real), self._evaluated(real), self.COUNT
         chosen = self._put(np.arange(count), int)
-        out = wp.zeros((3 * SLOTS, SLOTS, count), dtype=wp.types.vector(3, real), device=self.device)
-        inputs = [*arguments, factor, chosen, self._put([count], int), 3 * SLOTS * count]
+        out = wp.zeros((3 * PAIR_NODES, PAIR_NODES, count), dtype=wp.types.vector(3, real), device=self.device)
+        inputs = [*arguments, factor, chosen, self._put([count], int), 3 * PAIR_NODES * count]
         kernel = columns_kernel(self.collision, self.law, real, real)
-        wp.launch(kernel, 3 * SLOTS * count, [inputs[0], *inputs[2:]], [out], device=self.device)
+        wp.launch(kernel, 3 * PAIR_NODES * count, [inputs[0], *inputs[2:]], [out], device=self.device)
         return np.stack([self._flat(column) for column in out.numpy()[: 3 * self.nodes]], 1)
 
     def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -131,7 +131,7 @@ class ContactSample(Sample):
         """Return F^T F of factors (3 nodes, 3 nodes, E)."""
         rows, used = factor.row.numpy().astype(float), factor.used.numpy()
         kept = (used >> np.arange(1, len(rows) + 1)[:, None]) & 1
-        each = np.einsum("kp,kps,kpd->kpsd", kept, rows[..., WEIGHT : WEIGHT + SLOTS], rows[..., :3])
+        each = np.einsum("kp,kps,kpd->kpsd", kept, rows[..., WEIGHT : WEIGHT + PAIR_NODES], rows[..., :3])
         each = each.reshape(*kept.shape, -1)[..., : 3 * self.nodes]
         return np.einsum("kpa,kpb->abp", each, each)
 
@@ -155,7 +155,7 @@ class ContactSample(Sample):
             for slot in range(4):
                 out[column, slot, p] = y[slot] * scale[p]
 
-        out = wp.zeros((3 * self.nodes, SLOTS, self.COUNT), dtype=V, device=self.device)
+        out = wp.zeros((3 * self.nodes, PAIR_NODES, self.COUNT), dtype=V, device=self.device)
         inputs = [self._places(), self._evaluated(real)[2].bend, self._put(self.data["q"], V)]
         wp.launch(columns, (self.COUNT, 3 * self.nodes), inputs, [out], device=self.device)
         return np.stack([self._flat(column) for column in out.numpy()], 1)
@@ -244,10 +244,10 @@ class ContactSample(Sample):
 
     def _places(self) -> wp.array:
         """Return the nodes of all collisions (E,), with the last node repeated."""
-        return self._put(self.slots[np.minimum(np.arange(SLOTS), self.nodes - 1)].T, wp.vec4i)
+        return self._put(self.slots[np.minimum(np.arange(PAIR_NODES), self.nodes - 1)].T, wp.vec4i)
 
     def _parts(self, real) -> wp.array:
-        return wp.zeros((SLOTS, self.COUNT), dtype=self._vector(real), device=self.device)
+        return wp.zeros((PAIR_NODES, self.COUNT), dtype=self._vector(real), device=self.device)
 
     def _numbers(self, real) -> wp.array:
         return wp.zeros((NUMBERS, self.COUNT), dtype=real, device=self.device)
@@ -347,7 +347,7 @@ class FrictionSample(ContactSample):
         _, push, contact = self._evaluated(real, "lagged", **changed)
         factor, lagged, pair = self._factor(real, ROWS), lagged_struct(real)(), wp.types.vector(2, real)
         lagged.bound = wp.zeros(self.COUNT, dtype=real, device=device)
-        lagged.weight = wp.zeros(self.COUNT, dtype=wp.types.vector(SLOTS, real), device=device)
+        lagged.weight = wp.zeros(self.COUNT, dtype=wp.types.vector(PAIR_NODES, real), device=device)
         lagged.tangent = wp.zeros((2, self.COUNT), dtype=vector, device=device)
         slip = [wp.zeros((2, self.COUNT), dtype=pair, device=device) for _ in range(2)]
         no_pair, no_four, no_vector, no_table = self._nothing(real)

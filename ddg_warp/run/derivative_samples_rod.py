@@ -12,7 +12,7 @@ from ddg_warp.kernels.terms import REGISTRY, Term
 from ddg_warp.run.derivative_samples import Sample, random_parameters, random_strains
 
 
-def chain_of(term: Term, closed: bool) -> RodKind:
+def rods_of(term: Term, closed: bool) -> RodKind:
     """Return the kind of rod with a term: bending first, then stretch, both damped or neither."""
     names = ("planar_bend", "planar_stretch") if term.measure.dim == 2 else ("rod_bend_twist", "rod_stretch")
     bending, stretch = (REGISTRY[name].damped(term.density.lagged) for name in names)
@@ -118,7 +118,7 @@ class RodSample(Sample):
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
         kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, 0 if exact else None)
         islands, found = Islands(2, real, self.device), element_path.results_type(real, real)()
-        islands.clamped.fill_(0 if exact else 1)
+        islands.drop_compression.fill_(0 if exact else 1)
         rows = [array.reshape((*array.shape[:-2], -1)) for array in out]
         found.factor, found.second, found.gradient, found.energy, found.stiffness = rows
         found.tension = found.factor

@@ -84,7 +84,7 @@ def load_file(name: str, kind: str = "scene") -> ModuleType:
     return module
 
 
-def own_term(file: str, name: str):
+def user_term(file: str, name: str):
     """Return a user's term or potential from a file, or a term of rods with the user's density.
 
     Raises:

@@ -156,7 +156,7 @@ def simulate(
     began = time.perf_counter()
     if not isinstance(scene, Scene):
         raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
-    _judge(
+    _check(
         worlds,
         fields,
         flags={"force": force, "usd": usd, "progress": progress},
@@ -257,7 +257,7 @@ def simulate(
     return result
 
 
-def _judge(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
+def _check(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
     """Raise an error that names the first invalid argument of `simulate`."""
     argument_checks.count("worlds", worlds)
     for name, value in flags.items():
@@ -284,7 +284,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
         keep, options, clock, bar: See `simulate`.
         counts: Counters of a resumed run, see `counts_of`.
     """
-    from ddg_warp.run.counts import counts_of, go_on, statistics
+    from ddg_warp.run.counts import counts_of, repeat, statistics
     from ddg_warp.solve.stepping.integrator import Integrator
 
     analysis = result.scene.analysis
@@ -293,7 +293,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     counted = partial(counts_of, integrator)
     if not result.times:
         keep(result.state, counts=counted)
-    state = go_on(integrator, result.state, result.dt, counts) if counts else result.state
+    state = repeat(integrator, result.state, result.dt, counts) if counts else result.state
     try:
         for _ in range(round(float(state.time) / result.dt), steps):
             started = clock()

@@ -15,7 +15,7 @@ from ddg_warp.scene.prescribed_motion import Motion
 
 LAWS = ("barrier", "penalty")
 FRICTION_LAWS = ("logistic", "polynomial")
-WAYS = ("forwards", "backwards", "across")
+DIRECTIONS = ("forwards", "backwards", "across")
 ONE = "; contact_between of rods and an obstacle takes one forwards, one backwards and one across"
 
 
@@ -172,7 +172,7 @@ class Contacts:
         range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
         if np.iterable(friction) and not isinstance(friction, str):
             friction = argument_checks.vector(f"{call}friction forwards, backwards and across", friction)
-            for direction, value in zip(WAYS, friction, strict=True):
+            for direction, value in zip(DIRECTIONS, friction, strict=True):
                 _friction(f"{call}friction {direction}", value)
         elif friction is not None:
             friction = _friction(f"{call}friction", friction)
@@ -250,7 +250,7 @@ def check_contact(scene) -> None:
                     f"contact: {name} is of friction, and there is none; give friction, or leave {name} out"
                 )
     bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
-    moving, obstacles = touching_names(scene), {obstacle.name for obstacle in scene.obstacles}
+    moving, obstacles = contact_names(scene), {obstacle.name for obstacle in scene.obstacles}
     names = moving | obstacles
     named = [("objects", name, bodies) for name in scene.touching.objects or ()]
     named += [("radius", name, moving) for name in scene.touching.radius]
@@ -281,7 +281,7 @@ def _check_directed(scene, between: Between, obstacles: set[str]) -> None:
         )
 
 
-def touching_names(scene) -> set[str]:
+def contact_names(scene) -> set[str]:
     """Return the names of rods and shells with contact."""
     if scene.touching is None:
         return set()

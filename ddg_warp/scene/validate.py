@@ -184,7 +184,7 @@ def _check_shape(batch, rows: np.ndarray, dimension: int) -> None:
     message = "edge {k} has no length, nodes {k} and {k} + 1 lie at one point; remove one of them"
     _refuse(doubled, batch, message, rows)
     if batch.bend:
-        before, after = polyline.ahead(edges / lengths[..., None], batch.closed)
+        before, after = polyline.next_edges(edges / lengths[..., None], batch.closed)
         message = "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite or has no direction; move a node"
         _refuse(polyline.dot(before, after) <= -1.0 + 1e-12, batch, message, rows)
 

@@ -142,9 +142,9 @@ class Balance(torch.autograd.Function):
             engine.tables.write(call.parameters, parameters)
             for factor, state, *load_step in reversed(engine.way(end, output)):
                 inputs = engine.balance_backward(factor, state, controls, cotangent, *load_step)
-                by_input = engine.tables.pull(call.parameters, inputs, flags)
+                by_input = engine.tables.vjp(call.parameters, inputs, flags)
                 for name, value in controls.items():
-                    by_load = engine.controls.pull(name, value, inputs, flags)
+                    by_load = engine.controls.vjp(name, value, inputs, flags)
                     scaled = name in ("forces", "moments", "field")  # by the load parameter; gravity has been already
                     if name == "poses" and factor != end:
                         by_load = by_last_poses(
@@ -174,8 +174,8 @@ class Pull(torch.autograd.Function):
             ends = output[:count], output[count:]
             by_start, inputs, flags = engine.backward(call.start, call.dt, state, *ends, cotangent, controls)
             by_state = engine.layout.flagged(by_start, flags)
-            by_parameters = engine.tables.pull(call.parameters, inputs, flags)
-            by_controls = [engine.controls.pull(name, controls[name], inputs, flags) for name in call.controls]
+            by_parameters = engine.tables.vjp(call.parameters, inputs, flags)
+            by_controls = [engine.controls.vjp(name, controls[name], inputs, flags) for name in call.controls]
         return *by_state, *by_parameters, *by_controls
 
     @staticmethod

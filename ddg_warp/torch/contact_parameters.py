@@ -18,8 +18,8 @@ def contact_elements(model, name: str) -> list:
 
     They are pairs of object names, or labels of bodies; an empty list without contact.
     """
-    contact = model.net.host.touching if model.net is not None else None
-    if contact is None or (name == "contact.friction" and not contact.rubs):
+    contact = model.coupled.host.touching if model.coupled is not None else None
+    if contact is None or (name == "contact.friction" and not contact.has_friction):
         return []
     if name == RADIUS:
         return [contact.bodies[i].label for i in _round(contact)]
@@ -28,7 +28,7 @@ def contact_elements(model, name: str) -> list:
 
 def sized(model, shells: bool) -> dict[int, int]:
     """Return {row of "contact.radius": shell index} of bodies whose radius follows from a rod section or a shell thickness."""
-    contact = model.net.host.touching if model.net is not None else None
+    contact = model.coupled.host.touching if model.coupled is not None else None
     if contact is None:
         return {}
     bodies = [contact.bodies[i] for i in _round(contact)]
@@ -50,10 +50,10 @@ class ContactParameterView:
     chain = weighs = False
 
     def __init__(self, model, name: str):
-        contact, net = model.net.host.touching, model.net
+        contact, coupled = model.coupled.host.touching, model.coupled
         self.model, self.name, self.memory, self.key = model, name, self, ("contact", name)
         parameter = name.partition(".")[2]
-        self._view, usual = view(net.touching[parameter]), contact.numbers[parameter]
+        self._view, usual = view(coupled.touching[parameter]), contact.numbers[parameter]
         self._reach = contact.reach * (1.0 + ROUNDING)
         indices = (_round(contact),) if name == RADIUS else contact.meeting
         self._usual = np.tile(usual[indices], (model.worlds, 1))
@@ -93,7 +93,7 @@ class ContactParameterView:
         """Write the values of the model back."""
         self._assign(torch.as_tensor(self._usual, dtype=self._view.dtype, device=self._view.device))
 
-    def pull(self, inputs: list, flags) -> torch.Tensor:
+    def vjp(self, inputs: list, flags) -> torch.Tensor:
         """Return the gradient with respect to the values written."""
         if self.name == RADIUS:
             (bodies,) = self._at

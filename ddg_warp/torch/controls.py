@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from ddg_warp.solve.forces.control_loads import LOADS
-from ddg_warp.solve.forces.prescribed_motion import counts_turns, turns_between
+from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
 from ddg_warp.torch.state_layout import view
 
 
@@ -49,14 +49,14 @@ class StepControls:
         On CUDA without contact they are not read, which would synchronise; such steps end with a non-finite outcome.
 
         Raises:
-            SolverError: as `turns_between`.
+            SolverError: as `rotations_between`.
         """
         if self.model.wp_device.is_cuda and self.model.touch is None:
             return
         ends = poses.detach().cpu().numpy()
-        if counts_turns(ends):
+        if counts_revolutions(ends):
             begin = view(self.engine.before.grips.pose).T.reshape(ends.shape).detach().cpu().numpy()
-            turns_between(begin, np.where(np.isfinite(ends), ends, begin))
+            rotations_between(begin, np.where(np.isfinite(ends), ends, begin))
 
     def give_field(self, controls: dict) -> None:
         """Write the magnetic field of a step to the integrator."""
@@ -81,14 +81,14 @@ class StepControls:
         """Return the space components that a subsystem has."""
         return self.layout.places(("axes", part), lambda: [list(axes)])[0]
 
-    def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
+    def vjp(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Return the gradient with respect to a control of a step, or of an equilibrium at full load (worlds, ...)."""
         if name == "poses":
             return self.engine.by_poses * self.layout.by_world(flags)[:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
         if name == "field":
-            for part, data in zip(model.net.sets, inputs[-1].data, strict=True):
+            for part, data in zip(model.coupled.sets, inputs[-1].data, strict=True):
                 measure = part.term.measure
                 if measure.field:
                     first = measure.data_size - measure.field
@@ -110,7 +110,7 @@ class StepControls:
             elif group.kind.twist:
                 k, column, rows = self.layout.places(("edges", i), lambda group=group: model.order.edge_places(group))
                 result[:, rows] = w[group.kind.dim, k, :, column].T
-        if model.net is not None:
+        if model.coupled is not None:
             gradients = inputs[-1]
             if name == "gravity":
                 by_gravity = view(gradients.gravity).reshape(worlds, -1, 3).sum(1)

@@ -16,7 +16,7 @@ from ddg_warp.adjoint.implicit import Adjoint, EquilibriumAdjoint
 from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.rod_step import SavedStep
 from ddg_warp.capture_lock import alone
-from ddg_warp.kernels.adjoint.rod_step import asked_kernel, flag_kernels, smooth_kernel
+from ddg_warp.kernels.adjoint.rod_step import flag_kernels, requested_kernel, smooth_kernel
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.state import Sliding
@@ -104,7 +104,7 @@ class Engine:
         """
         integrator = self.integrator
         self.fill(self.source, state)
-        self._renumber(integrator._net)
+        self._renumber(integrator._coupled)
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
@@ -127,8 +127,8 @@ class Engine:
     @property
     def solutions(self) -> list[wp.array]:
         """Solutions of the friction iterations of the coupled system, see `NewtonContact`."""
-        net = self.integrator._net
-        return net.newton.contact.solutions if net is not None and net.newton.contact else []
+        coupled = self.integrator._coupled
+        return coupled.newton.contact.solutions if coupled is not None and coupled.newton.contact else []
 
     def lagged(self) -> list[torch.Tensor]:
         """Return copies of the `solutions` of the step just made, for the backward pass."""
@@ -140,11 +140,11 @@ class Engine:
         Raises:
             SceneError: names the pair and the overlap.
         """
-        net = self.integrator._net
-        if net is not None and net.newton.contact and not torch._C._are_functorch_transforms_active():
+        coupled = self.integrator._coupled
+        if coupled is not None and coupled.newton.contact and not torch._C._are_functorch_transforms_active():
             with torch.no_grad(), self.turn():
                 self.fill(self.source, state)
-                net.newton.contact.check(self.before.net.q)
+                coupled.newton.contact.check(self.before.coupled.q)
 
     @staticmethod
     def fill(targets: list[torch.Tensor], values) -> None:
@@ -153,18 +153,18 @@ class Engine:
 
     def _smooth(self, part, s: float, graded: bool) -> torch.Tensor:
         """Return 1 for islands stepped by a single solve over s [s] without frame updates, else NaN."""
-        key, net = id(part), part is self.integrator._net
+        key, coupled = id(part), part is self.integrator._coupled
         if key not in self._flagged:  # keyed by live steppers; a rebuilt one has another id
             islands, real, device = part.islands, self.model.types.real, self.model.wp_device
-            choice = (CoupledPredictor, part.net) if net else (RodPredictor, part.group)
+            choice = (CoupledPredictor, part.coupled) if coupled else (RodPredictor, part.group)
             predictor = choice[0].of(self.model, choice[1], part.motion, self.integrator.scheme)
-            if net:
-                frames = (part._lagged[0], self.before.net.frame) if part.net.edges else ()
+            if coupled:
+                frames = (part._lagged[0], self.before.coupled.frame) if part.coupled.edges else ()
             else:
                 frames = (part.newton.frame, self.before.groups[part.index].frame) if part.group.kind.twist else ()
             if frames and predictor and predictor.carries:
                 frames = frames[0], predictor.frame
-            if net:
+            if coupled:
                 frames = [frame.reshape((6, self.model.worlds, -1)).transpose((0, 2, 1)) for frame in frames]
             flag_array = wp.ones(len(islands), dtype=real, device=device)
             none = 2 * [wp.zeros((0, 0, 0), dtype=real, device=device)]
@@ -177,7 +177,7 @@ class Engine:
             return torch.ones_like(flags)
         if predictor:
             predictor.suit(part, s)
-            predictor.find(self.before.net if net else self.before.groups[part.index])
+            predictor.find(self.before.coupled if coupled else self.before.groups[part.index])
         launch.launch()
         return flags.clone()
 
@@ -212,7 +212,7 @@ class Engine:
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):
             for middle, *ends in ((kept.x, end.x, kept.before.x), (kept.theta, end.theta, kept.before.theta)):
                 torch.mul(sum(view(array) for array in ends), 0.5, out=view(middle))
-        if adjoint.net:
+        if adjoint.coupled:
             parts.append(self._net_kept(start, dt))
 
         def launch():
@@ -220,7 +220,7 @@ class Engine:
             self._judge()
 
         self._graphs.replay(dt, launch)
-        while adjoint.outgrown(parts):
+        while adjoint.has_overflow(parts):
             self._graphs.clear()
             self._graphs.replay(dt, launch)
         by_start, inputs = self._found
@@ -242,9 +242,9 @@ class Engine:
     def _to_rest(self, worlds, mask: wp.array) -> None:
         for state in (self.before, self.after):
             worlds.take_over(mask, worlds.start, state)
-        net = worlds.start.net
-        for array in self._net.lagged if net else ():
-            worlds.take_array(mask, net.q, array, self.model.worlds)
+        coupled = worlds.start.coupled
+        for array in self._coupled.lagged if coupled else ():
+            worlds.take_array(mask, coupled.q, array, self.model.worlds)
 
     def _judge(self) -> None:
         """Compute the flags of a backward pass; launches only."""
@@ -262,7 +262,7 @@ class Engine:
         for part, result_flags, requested in zip(cotangents, *self._flags[1:], strict=True):
             for name, array in part.arrays().items():
                 if name.rstrip("_0123456789") in GRADIENTS and array.shape[-1] % len(result_flags) == 0:
-                    cube, kernel = cubed(array), asked_kernel(array.dtype, self.model.types.real)
+                    cube, kernel = cubed(array), requested_kernel(array.dtype, self.model.types.real)
                     inputs = [result_flags, cube, cube.shape[-1] // len(result_flags)]
                     wp.launch(kernel, cube.shape, inputs, [requested], device=array.device)
             wp.launch(self._excuse, len(result_flags), [requested], [result_flags], device=result_flags.device)
@@ -281,12 +281,12 @@ class Engine:
                 SavedStep(before, solution.x, solution.theta, before.frame, None)
                 for solution, before in zip(solved, self.before.groups, strict=True)
             ]
-            if adjoint.net:
-                before, data = self.before.net, self.after.net.data
+            if adjoint.coupled:
+                before, data = self.before.coupled, self.after.coupled.data
                 if self.midpoint:
                     data = {index: wp.clone(values) for index, values in data.items()}
                 solved = replace(before, q=wp.clone(before.q), data=data)
-                self._net = CoupledSavedStep(
+                self._coupled = CoupledSavedStep(
                     before, solved, None, lagged=[wp.clone(values) for values in self.solutions]
                 )
                 self._turned = wp.clone(before.q)  # scratch
@@ -309,13 +309,13 @@ class Engine:
             for dtype in (model.types.real, model.types.real, int)
         ]
         self._flag_tensors = [view(result_flags) for result_flags in self._flags[1]]
-        kept = self._net.lagged if self.adjoint.net else []
+        kept = self._coupled.lagged if self.adjoint.coupled else []
         self._told_places = [view(place) for place in (*self._flags[0], self._codes_then, *kept)]
 
     def _load(self) -> None:
         kernels = [kernel for adjoint in self.adjoint.parts for kernel in adjoint.kernels]
         types = {array.dtype for array in self._given.arrays().values()}
-        kernels += [asked_kernel(dtype, self.model.types.real) for dtype in types]
+        kernels += [requested_kernel(dtype, self.model.types.real) for dtype in types]
         kernels += [self._solves, self._excuse, self._fails]
         device_arrays.load_kernels(kernels, self.model.wp_device)
         self.integrator._worlds.load_modules()
@@ -325,30 +325,30 @@ class Engine:
 
         Joint rotations are the rates of the step times its length, since these dofs are zero at the start of each step.
         """
-        net, before, after, kept = self.model.net, self.before.net, self.after.net, self._net
+        coupled, before, after, kept = self.model.coupled, self.before.coupled, self.after.coupled, self._coupled
         q = view(kept.solved.q)
         q.copy_(view(after.q))
         if self.midpoint:
             q.add_(view(before.q)).mul_(0.5)
             self._data_between(start, dt)
-        spins = net.host.spins
+        spins = coupled.host.spins
         if spins:
             rates = view(after.v)
             if self.midpoint:  # mean rate of both ends, over half of the step
                 rates = 0.25 * (rates + view(before.v))
-            q.view(net.worlds, -1, 3)[:, -spins:] = rates.reshape(net.worlds, -1, 3)[:, -spins:] * dt
+            q.view(coupled.worlds, -1, 3)[:, -spins:] = rates.reshape(coupled.worlds, -1, 3)[:, -spins:] * dt
         return kept
 
     def _data_between(self, start: float, dt: float) -> None:
         """Write the data of the solve at the midpoint of a step: normals rotated by supports, and the magnetic field."""
-        step = self.integrator._net
+        step = self.integrator._coupled
         step.prescribe(start, start + dt)
         if step.motion:
             step.motion.follow(self.before, self.after)
             # only normals are needed: angles are known
-            wp.copy(self._turned, self._net.solved.q)
-            step.motion.direct(self.adjoint.net.supports.islands, self._turned, self.before.net.frame)
-        for index, data in self._net.solved.data.items():
+            wp.copy(self._turned, self._coupled.solved.q)
+            step.motion.direct(self.adjoint.coupled.supports.islands, self._turned, self.before.coupled.frame)
+        for index, data in self._coupled.solved.data.items():
             wp.copy(data, step._data[index])
 
     # equilibria
@@ -363,7 +363,7 @@ class Engine:
         self.fill(tensors(start, self.fields), state)
         load = {name: options[name] for name in LOAD if name in options}
         solver = self._static({name: value for name, value in options.items() if name not in LOAD})
-        self._renumber(solver.net)
+        self._renumber(solver.coupled)
         last = solver.load(start, controls=_on_host(controls), way=path, **load)
         result = copies(tensors(last, self.fields)) + self.smooth_flags()
         if graded and last.sliding is not None:
@@ -412,10 +412,10 @@ class Engine:
         self.fill(tensors(by_state, self.fields), cotangent)
         equilibrium.time = end
         if velocity is not None:
-            equilibrium.sliding = Sliding(wp.empty_like(equilibrium.net.v), increment)
+            equilibrium.sliding = Sliding(wp.empty_like(equilibrium.coupled.v), increment)
             view(equilibrium.sliding.velocity).copy_(velocity)
-        inputs = adjoint.pull(equilibrium, by_state, _on_host(controls))
-        self.by_equilibrium = tensors(adjoint.by_before, self.fields) if adjoint.rubs else None
+        inputs = adjoint.vjp(equilibrium, by_state, _on_host(controls))
+        self.by_equilibrium = tensors(adjoint.by_before, self.fields) if adjoint.has_friction else None
         if posed:
             poses.pull_equilibrium(inputs, equilibrium, by_state)
             self.by_poses = poses.by_end

@@ -17,7 +17,7 @@ from ddg_warp.torch.gradient_check_scenes import OBJECTS
 RIGHT, NONE, REFUSED, WRONG, SILENT = "right", "none", "refused", "WRONG", "SILENT ZERO"  # results
 ANALYSES = ("implicit_euler", "implicit_midpoint", "statics")
 TOLERANCE = 1e-5  # relative error of a gradient
-SEEN = 1e-4  # floor of the relative change of the loss in an error
+RESOLVED = 1e-4  # floor of the relative change of the loss in an error
 CHANGE = 1e-4  # relative change of the loss over the increment of a difference
 
 
@@ -40,7 +40,7 @@ def compare(input_: Input, derivative: float, scale: float) -> float:
     """Return the relative error of a derivative against differences; if large, against the most consistent of several."""
 
     def error(reference: float) -> float:
-        return abs(derivative - reference) / max(abs(reference), SEEN * scale / input_.size)
+        return abs(derivative - reference) / max(abs(reference), RESOLVED * scale / input_.size)
 
     reference, spread = difference(input_, derivative, scale)
     if error(reference) <= TOLERANCE:

@@ -59,8 +59,8 @@ class Case:
         self.simulator = self.built()
         self.engine = self.simulator.engine(WORLDS)
         self.model = self.engine.model
-        contact = self.model.net.host.touching if self.model.net is not None else None
-        self.slides = self.statics and contact is not None and contact.rubs
+        contact = self.model.coupled.host.touching if self.model.coupled is not None else None
+        self.slides = self.statics and contact is not None and contact.has_friction
         axisymmetric = bool(self.model.scene.axisymmetric_shells)  # gravity is along z
         flat = axisymmetric or self.model.scene.dimension == 2
         self.place = self.engine.source[0].device
@@ -104,10 +104,10 @@ class Case:
     def _rates(self) -> torch.Tensor:
         """Return random velocities (worlds, P, 3), within the planes of skew supports."""
         rates = 0.3 * self._normal(WORLDS, self.model.points_count, 3) * self.axes
-        frames = self.model.net.host.frames if self.model.net is not None else {}
+        frames = self.model.coupled.host.frames if self.model.coupled is not None else {}
         for row, block in zip(*self.model.order.net_rows, strict=True) if frames else ():
             if block in frames:
-                normals = self._tensor(frames[block][self.model.net.host.fixed[block]])
+                normals = self._tensor(frames[block][self.model.coupled.host.fixed[block]])
                 rates[:, row] -= rates[:, row] @ normals.T @ normals
         return rates
 
@@ -131,8 +131,8 @@ class Case:
     def inputs(self) -> Iterator[Input]:
         """Yield all inputs of the object."""
         points, edges = self.model.points_count, self.model.order.edges_count
-        net = self.model.net
-        twisted = any(group.kind.twist for group in self.model.groups) or bool(net is not None and net.edges)
+        coupled = self.model.coupled
+        twisted = any(group.kind.twist for group in self.model.groups) or bool(coupled is not None and coupled.edges)
         gravity = self._tensor(self.model.scene.gravity)
         place = self._normal(WORLDS, points, 3) * self.axes
         yield self._state("positions", 0.1, lambda x: self._moved("x", "q", x * place))
@@ -221,7 +221,7 @@ class Case:
         """Return the reason why step lengths have no derivative; empty if they have one."""
         field = self.model.scene.applied_field
         moved = [motion for motion in self.model.motions if not isinstance(motion, Grip)]
-        parts = [*self.model.groups, *([self.model.net] if self.model.net is not None else [])]
+        parts = [*self.model.groups, *([self.model.coupled] if self.model.coupled is not None else [])]
         loads = any(part.host.timed for part in parts)
         if moved or loads or (field is not None and (callable(field.value) or callable(field.gradient))):
             return "the reverse does not differentiate motions, loads and fields that are functions of time"
@@ -250,9 +250,11 @@ class Case:
                 before.time, DT, before.values, after.values, entry, cotangent, self.posed
             )
             for each in read:
-                by_rate = sum(entry.numpy().sum() for entry in (each.rate, *getattr(each, "elements_rate", ())))
+                grad_inverse_step = sum(
+                    entry.numpy().sum() for entry in (each.rate, *getattr(each, "elements_rate", ()))
+                )
                 # an implicit step is over dt, the midpoint rule's over half of it
-                sums["time step"] -= by_rate / DT**2 * (2.0 if self.analysis == "implicit_midpoint" else 1.0)
+                sums["time step"] -= grad_inverse_step / DT**2 * (2.0 if self.analysis == "implicit_midpoint" else 1.0)
                 sums["mass damping"] += each.damping.numpy().sum()
         return sums
 

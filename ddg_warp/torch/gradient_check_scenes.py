@@ -72,7 +72,7 @@ def _sheet(bending: str, hold: Callable | None = None, more: Callable | None = N
     return add
 
 
-def _turned_sheet(scene: Scene, material: Material) -> None:
+def _rotated_sheet(scene: Scene, material: Material) -> None:
     """Add a sheet along a diagonal, with a skew symmetry plane across it."""
     points, triangles = meshes.rectangle(3, 2, SIDE)
     points = np.array(points, float)
@@ -126,7 +126,7 @@ def _some_drag(scene: Scene, rods) -> None:
     scene.add_mass(rods[2], -1, 0.002)
 
 
-def _touch(scene: Scene, law: str, **options) -> None:
+def _add_contact(scene: Scene, law: str, **options) -> None:
     """Add contact with friction, with a large activation distance."""
     scene.contact(law=law, range=0.02, stiffness=5.0, friction=0.3, velocity=0.5, **options)
 
@@ -137,17 +137,17 @@ def _crossing(scene: Scene, material: Material, motion: Grip | None = None, **op
     points = CURVE[3] + np.stack([0.1 * T - 0.05, 0.3 * T - 0.15, 0.014 + 0.03 * (T - 0.5) ** 2], axis=1)
     rods.append(scene.add_rod(points, section=Circle(0.003), material=material, name="upper"))
     scene.clamp(rods[0], edges=[0, -1], motion=motion)
-    _touch(scene, "barrier", lags=2, **options)
+    _add_contact(scene, "barrier", lags=2, **options)
 
 
 def _on_ball(scene: Scene, material: Material) -> None:
     """Add a rod on a ball that a grip moves."""
     scene.add_rod(CURVE, section=Circle(0.004), material=material)
     scene.add_obstacle(Sphere((0.18, 0.05, -0.352), 0.3), motion=Grip(pivot=(0.1, 0.0, -0.2)))
-    _touch(scene, "penalty")
+    _add_contact(scene, "penalty")
 
 
-def _held_on_ball(**friction) -> Callable:
+def _fixed_on_ball(**friction) -> Callable:
     """Return a function that clamps a rod and supports the far end by a ball on a grip."""
 
     def hold(scene: Scene, rod: int) -> None:
@@ -160,7 +160,7 @@ def _held_on_ball(**friction) -> Callable:
 
 def _over_plane(scene: Scene, shell: int) -> None:
     scene.add_obstacle(Plane((0.0, 0.0, -0.01), (-0.03, 0.0, 1.0)))
-    _touch(scene, "barrier")
+    _add_contact(scene, "barrier")
 
 
 def _timed(t: float) -> tuple:
@@ -194,7 +194,7 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
         for name in ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
     },
     "shell, curved membrane": (3, _sheet("midedge_dof", membrane="curved")),
-    "shell on an oblique plane": (3, _turned_sheet),
+    "shell on an oblique plane": (3, _rotated_sheet),
     "rod on a shell": (3, _stiffened),
     "shell of revolution": (3, _dome),
     "magnetised rod": (3, _rod(more=_magnetised(2e4, (0.0, 1e-2, 1e-2)))),
@@ -227,14 +227,14 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
     "rods in contact": (3, _crossing),
     "gripped rod that rolls another": (3, lambda s, m: _crossing(s, m, Grip(), rolling=True)),
     "rod on a gripped ball": (3, _on_ball),
-    "held rod on a gripped ball": (3, _rod(section=Circle(0.004), hold=_held_on_ball())),
+    "held rod on a gripped ball": (3, _rod(section=Circle(0.004), hold=_fixed_on_ball())),
     "held rod that rubs a gripped ball": (
         3,
-        _rod(section=Circle(0.004), hold=_held_on_ball(friction=0.3, velocity=0.01)),
+        _rod(section=Circle(0.004), hold=_fixed_on_ball(friction=0.3, velocity=0.01)),
     ),
     "held rod that rolls on a gripped ball": (
         3,
-        _rod(section=Circle(0.004), hold=_held_on_ball(friction=0.3, velocity=0.01, rolling=True)),
+        _rod(section=Circle(0.004), hold=_fixed_on_ball(friction=0.3, velocity=0.01, rolling=True)),
     ),
     "shell on a plane": (3, _sheet("midedge_dof", more=_over_plane)),
     "rod under a couple": (3, _rod(more=lambda s, r: s.add_couple(r, -1, (1e-4, 2e-4, -1e-4)))),

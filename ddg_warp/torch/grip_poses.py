@@ -61,7 +61,7 @@ class Poses:
                 (subsystem, put(nodes, torch.long), put(weights), put(arms), put(turned), put(directors))
             )
         self._normals = []  # element sets with gripped normals: index, elements, rows of data, weights of grips, rest normals
-        moved = adjoint.net.supports if adjoint.net else None
+        moved = adjoint.coupled.supports if adjoint.coupled else None
         for index, (where, rest) in moved.motion.normals.items() if moved else ():
             element, row, pose = where.numpy().T
             grips = np.append(moved.motion._grips.numpy(), -1)[pose]
@@ -81,7 +81,7 @@ class Poses:
             posed: True if poses were controls of the step; else poses at the end equal the start.
         """
         before, after, by_end = (self._of(state) for state in (*ends, cotangent))
-        by_start, by_pose = self.pull(inputs, before, after)
+        by_start, by_pose = self.vjp(inputs, before, after)
         self.by_end = by_end + by_pose
         by_start = by_start if posed else by_start + self.by_end
         view(by_start_state.grips.pose).copy_(by_start.reshape(-1, 6).T)
@@ -89,13 +89,13 @@ class Poses:
     def pull_equilibrium(self, inputs: list, state, cotangent) -> None:
         """Store the gradient by the poses of an equilibrium; `cotangent` is that by its state."""
         poses = self._of(state)
-        self.by_end = self._of(cotangent) + self.pull(inputs, poses, poses)[1]
+        self.by_end = self._of(cotangent) + self.vjp(inputs, poses, poses)[1]
 
     def _of(self, state) -> torch.Tensor:
         """Return the poses of a state (worlds, grips, 6)."""
         return view(state.grips.pose).T.reshape(self.model.worlds, -1, 6)
 
-    def pull(self, inputs: list, before: torch.Tensor, after: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def vjp(self, inputs: list, before: torch.Tensor, after: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the gradients by grip poses at the start and at the end of a step (worlds, grips, 6).
 
         Args:
@@ -105,7 +105,7 @@ class Poses:
         worlds, count = after.shape[:2]
         by_shift = torch.zeros((worlds, count, 3), dtype=after.dtype, device=after.device)
         by_turn, by_turned, by_end = (by_shift.new_zeros((worlds, count, 3, 3)) for _ in range(3))
-        parts = (*self.model.groups, *([self.model.net] if self.model.net is not None else []))
+        parts = (*self.model.groups, *([self.model.coupled] if self.model.coupled is not None else []))
         for entry, nodes, weights, arms, turned, directors in self._owned:
             part = entry.supports.part
             read = inputs[next(i for i, each in enumerate(parts) if each is part)]
@@ -147,7 +147,7 @@ class Poses:
     def _held(self, part, by_fixed: wp.array, nodes: torch.Tensor) -> torch.Tensor:
         """Return the gradient by nodes at given indices, in space (worlds, nodes, 3)."""
         values, worlds = view(by_fixed), self.model.worlds
-        if part is self.model.net:
+        if part is self.model.coupled:
             return values.reshape(worlds, -1, 3)[:, nodes]
         columns, kind = part.rods, part.kind
         by_node = values[: kind.dim, nodes // columns].reshape(kind.dim, len(nodes), worlds, columns)

@@ -69,7 +69,7 @@ def elements(model, name: str) -> np.ndarray:
     return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
 
 
-def array_places(model, name: str) -> tuple[int, list[ArrayParameterView | contact_parameters.ContactParameterView]]:
+def array_views(model, name: str) -> tuple[int, list[ArrayParameterView | contact_parameters.ContactParameterView]]:
     """Return the number of elements that have a parameter, and their storage; an empty list if the model has none."""
     if name in contact_parameters.NAMES:
         count = len(contact_parameters.contact_elements(model, name))
@@ -138,22 +138,22 @@ def _masses(model, name: str) -> Iterator[_Part]:
             lambda inputs: view(inputs.mass),
             group,
         )
-    if model.net is not None:
-        net, (rows, blocks) = model.net, order.net_rows
+    if model.coupled is not None:
+        coupled, (rows, blocks) = model.coupled, order.net_rows
         chosen = np.isin(rows, np.arange(order.points_count)[_rows(model, name)])
         rows, blocks = rows[chosen], blocks[chosen]
-        nodes, shape = net.host.nodes, (net.worlds, net.blocks, 3)
+        nodes, shape = coupled.host.nodes, (coupled.worlds, coupled.blocks, 3)
         yield _Part(
             -1,
             False,
             "mass",
-            net.host.mass[:nodes, 0],
+            coupled.host.mass[:nodes, 0],
             blocks,
             rows,
             total[rows],
-            lambda: view(net.mass)[:, :nodes],
+            lambda: view(coupled.mass)[:, :nodes],
             lambda inputs: view(inputs.mass).view(shape)[:, :nodes].sum(-1),
-            net,
+            coupled,
         )
 
 
@@ -174,9 +174,9 @@ def _inertia(model) -> Iterator[_Part]:
                 lambda inputs: view(inputs.rotary),
                 group,
             )
-    if model.net is not None:
-        net, host = model.net, model.net.host
-        first, last, shape = host.nodes, host.nodes + net.edges, (net.worlds, net.blocks, 3)
+    if model.coupled is not None:
+        coupled, host = model.coupled, model.coupled.host
+        first, last, shape = host.nodes, host.nodes + coupled.edges, (coupled.worlds, coupled.blocks, 3)
         blocks = np.concatenate([np.zeros(0, int), *(rod.edges for rod in host.rods)])
         rows = [model.order.edge_starts[rod.rod] + np.arange(len(rod.edges)) for rod in host.rods]
         yield _Part(
@@ -187,9 +187,9 @@ def _inertia(model) -> Iterator[_Part]:
             blocks - first,
             np.concatenate([np.zeros(0, int), *rows]),
             host.mass[blocks, 0],
-            lambda: view(net.mass)[:, first:last, :1],
+            lambda: view(coupled.mass)[:, first:last, :1],
             lambda inputs: view(inputs.mass).view(shape)[:, first:last, 0],
-            net,
+            coupled,
         )
 
 
@@ -212,16 +212,16 @@ def _drag(model, name: str) -> Iterator[_Part]:
                 lambda group=group: view(group.drag)[row],
                 lambda inputs: None if inputs.drag is None else view(inputs.drag)[row],
             )
-    if model.net is not None and model.net.host.drag:
-        net, (_, angles, coefficients) = model.net, model.net.host.drag
+    if model.coupled is not None and model.coupled.host.drag:
+        coupled, (_, angles, coefficients) = model.coupled, model.coupled.host.drag
         places, rows, first_edge = [np.zeros(0, int)], [np.zeros(0, int)], 0
-        for rod in net.host.rods:
+        for rod in coupled.host.rods:
             if rod.piece.kind.drag:
                 local_edges = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
                 places.append(first_edge + rod.first + local_edges)
                 rows.append(model.order.edge_starts[rod.rod] + local_edges)
                 first_edge += len(rod.piece.drag[rod.row])
-        places, rows, shape = np.concatenate(places), np.concatenate(rows), (net.worlds, coefficients.shape[1], 1)
+        places, rows, shape = np.concatenate(places), np.concatenate(rows), (coupled.worlds, coefficients.shape[1], 1)
         chosen = ((coefficients[drag.SPEED, places] > 0.0) == granular) | (row in BODIES.values())
         if row == drag.ROTATIONAL:
             chosen &= angles[places] >= 0
@@ -234,6 +234,6 @@ def _drag(model, name: str) -> Iterator[_Part]:
             places,
             rows,
             coefficients[row, places],
-            lambda: view(net.drag)[row].view(shape),
+            lambda: view(coupled.drag)[row].view(shape),
             lambda inputs: None if inputs.drag is None else view(inputs.drag)[row].view(shape[:2]),
         )

@@ -23,7 +23,7 @@ class TermParameterView:
 
     def __init__(self, model, index: int, chain: bool, name: str, elements: np.ndarray, inside: np.ndarray | None):
         self.model, self.index, self.chain, self.inside = model, index, chain, inside
-        self.memory = (model.groups if chain else model.net.sets)[index].parameters
+        self.memory = (model.groups if chain else model.coupled.sets)[index].parameters
         self.name = name if chain else name.rpartition(".")[2]
         self.key = id(self.memory), self.name
         self._row = list(self.memory.values).index(self.name)
@@ -82,7 +82,7 @@ class TermParameterView:
         if self._rest:
             self.model.note_change(False)
 
-    def pull(self, inputs: list, flags) -> torch.Tensor:
+    def vjp(self, inputs: list, flags) -> torch.Tensor:
         """Return the gradient by the values written."""
         if self.chain:
             array = inputs[self.index].parameters
@@ -158,13 +158,13 @@ class ArrayParameterView:
             total = total + value
         self._assign(total)
         if self.weighs:
-            self._heavy.weighed = True
+            self._heavy.has_custom_mass = True
 
     def restore(self) -> None:
         """Write the values of the model back."""
         self._assign(self._restored)
 
-    def pull(self, inputs: list, flags) -> torch.Tensor:
+    def vjp(self, inputs: list, flags) -> torch.Tensor:
         """Return the gradient by the values written."""
         gradient = self._found(inputs[self.index])
         if gradient is None:

@@ -36,7 +36,7 @@ class ParameterTensors:
             raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}")
         if name not in self._found:
             storage = (
-                named_parameters.array_places(self.model, name)
+                named_parameters.array_views(self.model, name)
                 if name in named_parameters.NAMES
                 else self._of_terms(name)
             )
@@ -51,7 +51,7 @@ class ParameterTensors:
         storage = [
             TermParameterView(model, model.groups.index(g), True, name, rows, inside) for g, inside, rows in groups
         ]
-        for i, part in enumerate(model.net.sets if model.net is not None else ()):
+        for i, part in enumerate(model.coupled.sets if model.coupled is not None else ()):
             if part.term.name == name_parts[0] and name_parts[2] in part.parameters.values:
                 storage.append(TermParameterView(model, i, False, name, start + np.arange(part.elements), None))
                 start += part.elements
@@ -61,10 +61,10 @@ class ParameterTensors:
         """Return the names of all parameters, term parameters first."""
         model = self.model
         result = {name for group in model.groups for name in group.parameters.values}
-        for part in model.net.sets if model.net is not None else ():
+        for part in model.coupled.sets if model.coupled is not None else ():
             result.update(f"{part.term.name}.{name}" for name in part.parameters.values)
         return sorted(result) + [
-            name for name in named_parameters.NAMES if named_parameters.array_places(model, name)[1]
+            name for name in named_parameters.NAMES if named_parameters.array_views(model, name)[1]
         ]
 
     def full_of(self, name: str, values: torch.Tensor) -> list[torch.Tensor]:
@@ -217,9 +217,9 @@ class ParameterTensors:
         """Return the world axes of full parameters."""
         return [int(place.chain) for name in names for place in self.of(name)[1]]
 
-    def pull(self, names: tuple, inputs: list, flags) -> list[torch.Tensor]:
+    def vjp(self, names: tuple, inputs: list, flags) -> list[torch.Tensor]:
         """Return the gradients by full parameters, in the order of `write`."""
-        return [place.pull(inputs, flags) for name in names for place in self.of(name)[1]]
+        return [place.vjp(inputs, flags) for name in names for place in self.of(name)[1]]
 
 
 def _alike(before: list, after: list) -> bool:

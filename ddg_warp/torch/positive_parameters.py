@@ -59,7 +59,7 @@ def usual_values(simulator, name: str) -> torch.Tensor:
     return (values[:1] if (values == values[:1]).all() else values).clone()
 
 
-def asked(call: str, simulator, names, batch: int | None) -> tuple[tuple[str, ...], int]:
+def requested(call: str, simulator, names, batch: int | None) -> tuple[tuple[str, ...], int]:
     """Return the names and batch size (1 by default) requested from a module of a simulator's parameters.
 
     Raises:

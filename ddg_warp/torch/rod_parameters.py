@@ -9,7 +9,7 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.drag import Laws, Viscous
 from ddg_warp.torch import contact_parameters, named_parameters
-from ddg_warp.torch.positive_parameters import asked, parameter_key, usual_values
+from ddg_warp.torch.positive_parameters import parameter_key, requested, usual_values
 
 NAMES = ("stretching", "bending", "twisting", "density", "radius")
 
@@ -42,7 +42,7 @@ class RodParameters(torch.nn.Module):
         self, simulator, batch: int | None = None, names: tuple[str, ...] = ("stretching", "bending", "twisting")
     ):
         super().__init__()
-        names, batch = asked("RodParameters", simulator, names, batch)
+        names, batch = requested("RodParameters", simulator, names, batch)
         model = simulator.model
         powers = _powers(model)
         available = [name for name in NAMES if any(name in power for power in powers.values())]
@@ -64,7 +64,7 @@ class RodParameters(torch.nn.Module):
         for parameter in ("drag.tangential", "drag.normal", "drag.rotational", contact_parameters.RADIUS):
             if parameter in self._powers:
                 self.register_buffer(
-                    f"{parameter_key(parameter)}_share", torch.tensor(_share(model, parameter), **made)
+                    f"{parameter_key(parameter)}_share", torch.tensor(_weight(model, parameter), **made)
                 )
 
     def forward(self) -> dict[str, torch.Tensor]:
@@ -91,8 +91,8 @@ class RodParameters(torch.nn.Module):
 def _powers(model) -> dict[str, dict[str, int]]:
     """Return {parameter: {factor: power}} for all parameters of a model's rods."""
     terms = [term for group in model.groups for term in group.kind.terms]
-    net = [part.term for part in (model.net.sets if model.net is not None else ())]
-    terms += [term for term in net if term.name.startswith("rod") or term.name == "rigid_joint"]
+    coupled = [part.term for part in (model.coupled.sets if model.coupled is not None else ())]
+    terms += [term for term in coupled if term.name.startswith("rod") or term.name == "rigid_joint"]
     powers: dict[str, dict[str, int]] = {}
     for term in dict.fromkeys(terms):
         for parameter, strain in zip(term.stiffness, term.measure.strains, strict=False):
@@ -102,17 +102,17 @@ def _powers(model) -> dict[str, dict[str, int]]:
             powers[f"{term.name}.crossover"] = {"radius": -1}
     if named_parameters.of_sections(model, "rod.mass").any():
         powers["rod.mass"] = {"density": 1, "radius": 2}
-        if named_parameters.array_places(model, "rod.inertia")[1]:
+        if named_parameters.array_views(model, "rod.inertia")[1]:
             powers["rod.inertia"] = {"density": 1, "radius": 4}
     for parameter, power in (("drag.tangential", 1), ("drag.normal", 1), ("drag.rotational", 2)):
-        if named_parameters.array_places(model, parameter)[1] and _share(model, parameter).any():
+        if named_parameters.array_views(model, parameter)[1] and _weight(model, parameter).any():
             powers[parameter] = {"radius": power}
     if contact_parameters.sized(model, shells=False):
         powers[contact_parameters.RADIUS] = {"radius": 1}
     return powers
 
 
-def _share(model, name: str) -> np.ndarray:
+def _weight(model, name: str) -> np.ndarray:
     """Return the sensitivity of drag coefficients of edges, or contact radii of bodies, to the section radius a.
 
     Axial and normal drag: d(1 / zeta) / d(-ln a) [m^2 / N s]. Rotational drag, proportional to a^2, and contact radii: 1.
@@ -120,7 +120,7 @@ def _share(model, name: str) -> np.ndarray:
     """
     if name == contact_parameters.RADIUS:
         return np.isin(
-            np.arange(named_parameters.array_places(model, name)[0]),
+            np.arange(named_parameters.array_views(model, name)[0]),
             list(contact_parameters.sized(model, shells=False)),
         )
     laws = Laws(model.scene)

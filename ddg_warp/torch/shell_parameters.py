@@ -7,12 +7,12 @@ import torch
 import warp as wp
 
 from ddg_warp import argument_checks
-from ddg_warp.compile.shells import triangles_beside
+from ddg_warp.compile.shells import adjacent_triangles
 from ddg_warp.errors import SceneError
 from ddg_warp.model.rest_shapes import edges_along
 from ddg_warp.torch import contact_parameters
 from ddg_warp.torch.parameter_storage import meeting
-from ddg_warp.torch.positive_parameters import asked, parameter_key, usual_values
+from ddg_warp.torch.positive_parameters import parameter_key, requested, usual_values
 
 STIFF, HEAVY = ("young", "thickness", "poisson"), ("density", "thickness")  # quantities in stiffnesses and in masses
 NUMBERS, FORMS = (*STIFF, "density"), ("metric", "curvature")  # quantities with one component and with three
@@ -72,7 +72,7 @@ class ShellParameters(torch.nn.Module):
         direction=(1.0, 0.0, 0.0),
     ):
         super().__init__()
-        names, batch = asked("ShellParameters", simulator, names, batch)
+        names, batch = requested("ShellParameters", simulator, names, batch)
         model = simulator.model
         device = str(wp.device_to_torch(model.wp_device))
         chosen = _shells(model, names, shells)
@@ -82,7 +82,7 @@ class ShellParameters(torch.nn.Module):
         self._terms, values = _shell_terms(model, chosen, self._names)
         for parameter in dict.fromkeys(parameter for term in self._terms for parameter in term.parameters):
             values[parameter_key(parameter)] = usual_values(simulator, parameter)
-        weights = _shares(by, counts)
+        weights = _weights(by, counts)
         edges = [edges_along(shell.surface.points, shell.surface.triangles, direction) for _, shell, _ in chosen]
         values |= {
             "_shares": None if weights is None else torch.as_tensor(weights, dtype=torch.float64),
@@ -181,7 +181,7 @@ def _shells(model, names, shells) -> list[tuple]:
     Raises:
         SceneError: there is no such shell, or it has no such quantity.
     """
-    model_shells = model.net.host.shells if model.net is not None else []
+    model_shells = model.coupled.host.shells if model.coupled is not None else []
     if not model_shells:
         raise SceneError("ShellParameters: the model has no shell of triangles; add one with Scene.add_shell")
     for name in names:
@@ -219,11 +219,11 @@ def _shells(model, names, shells) -> list[tuple]:
 def _shell_terms(model, chosen: list[tuple], names: tuple) -> tuple[list[_ShellTerm], dict]:
     """Return the terms with learned parameters, and buffers of element rows and triangles (., 1 or 2)."""
     terms, buffers, start = [], {}, 0
-    sets = {part.term.name: part.term for part in model.net.sets}
+    sets = {part.term.name: part.term for part in model.coupled.sets}
     for _, shell, bending in chosen:
         count = len(shell.surface.triangles)
         hinge_triangles = (
-            triangles_beside(shell.surface, shell.kinds, bending) if bending in ("hinge", "isometric") else {}
+            adjacent_triangles(shell.surface, shell.kinds, bending) if bending in ("hinge", "isometric") else {}
         )
         for name, first in shell.first.items():
             bends = "stretch" not in name
@@ -251,7 +251,7 @@ def _vertices(model, chosen: list[int]) -> dict[str, torch.Tensor]:
 
     Corners are triangle indices among the chosen shells, padded with the number of triangles.
     """
-    model_shells, first = model.net.host.shells, 0
+    model_shells, first = model.coupled.host.shells, 0
     total = sum(len(model_shells[i].surface.triangles) for i in chosen)
     vertex, triangle = [], []
     starts = np.cumsum([0, *(len(shell.nodes) for shell in model_shells)])
@@ -285,7 +285,7 @@ def _of_triangles(quantity: str, quantities: dict[str, torch.Tensor]) -> torch.T
     return form[..., COMPONENTS.index(component)]
 
 
-def _shares(spread, counts: list[int]) -> np.ndarray | None:
+def _weights(spread, counts: list[int]) -> np.ndarray | None:
     """Return weights of numbers in triangles (T, K); None for one number per triangle."""
     if isinstance(spread, str) and spread in ("shell", "element"):
         return np.repeat(np.eye(len(counts)), counts, axis=0) if spread == "shell" else None

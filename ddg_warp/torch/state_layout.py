@@ -23,7 +23,7 @@ class Field:
 
 def fields(model) -> list[Field]:
     """Return the nonempty arrays of a model's states, in order."""
-    nothing = "net/frame" if model.net is not None and not model.net.edges else ""
+    nothing = "net/frame" if model.coupled is not None and not model.coupled.edges else ""
     return [
         Field(name, array.ndim - 1, name.partition("/")[2].rstrip("_0123456789") in GRADIENTS)
         for name, array in model.empty_state().arrays().items()
@@ -77,7 +77,7 @@ class StateLayout:
             if group.kind.dim == 2:
                 x = torch.stack([x[:, 0], torch.zeros_like(x[:, 0]), x[:, 1]], 1)
             point_arrays.append(x)
-        if model.net is not None:
+        if model.coupled is not None:
             point_arrays.append(values[self._of(f"net/{blocks}")])
         return self._picked("points", point_arrays, self._point_rows).view(model.worlds, model.points_count, 3)
 
@@ -86,7 +86,7 @@ class StateLayout:
         model = self.model
         twisted = [i for i, group in enumerate(model.groups) if group.kind.twist]
         angles = [values[self._of(f"{i}/theta")].reshape(-1) for i in twisted]
-        if model.net is not None:
+        if model.coupled is not None:
             angles.append(values[self._of("net/q")][:, 0])
         none = torch.zeros(1, dtype=values[0].dtype, device=values[0].device)
         return self._picked("edges", [*angles, none], self._edge_rows).view(model.worlds, -1)
@@ -111,7 +111,7 @@ class StateLayout:
             old = values[index].reshape(shape)
             target = k[None], torch.arange(worlds, device=k.device)[:, None], column[None]
             values[index] = old.index_put(target, new).reshape(values[index].shape)
-        if model.net is not None:
+        if model.coupled is not None:
             rows, blocks_of = self.places(("given", "net"), lambda: _last(*model.order.net_rows))
             index = self._of(f"net/{blocks}")
             old = values[index].reshape(worlds, -1, 3)
@@ -130,7 +130,7 @@ class StateLayout:
                 increment = torch.zeros_like(values[index]).reshape(group.nodes, worlds, group.rods)
                 increment = increment.index_put((k[:, None], world[None], column[:, None]), more[:, rows].T)
                 values[index] = values[index] + increment.reshape(values[index].shape)
-        if model.net is not None:
+        if model.coupled is not None:
             index, (rows, owned) = self._of(f"net/{blocks}"), self.net_edges()
             increment = torch.zeros_like(values[index]).reshape(worlds, -1, 3)
             increment = increment.index_put((world[:, None], owned[None], torch.zeros_like(owned)[None]), more[:, rows])
@@ -153,7 +153,7 @@ class StateLayout:
 
     def net_edges(self) -> list[torch.Tensor]:
         """Return rows among all edges, and dof blocks, of the edges of coupled rods."""
-        return self.places(("edges", "net"), lambda: _net_edges(self.model))
+        return self.places(("edges", "net"), lambda: _coupled_edges(self.model))
 
     def places(self, key, find) -> list[torch.Tensor]:
         if key not in self._places:
@@ -178,9 +178,9 @@ class StateLayout:
         for offset, group in zip(first, model.groups, strict=False):
             k, column, points = model.order.places(group)
             rows[:, points] = offset + k * group.columns + world * group.rods + column
-        if model.net is not None:
+        if model.coupled is not None:
             points, blocks = model.order.net_rows
-            rows[:, points] = first[len(model.groups)] + world * model.net.blocks + blocks
+            rows[:, points] = first[len(model.groups)] + world * model.coupled.blocks + blocks
         return rows.ravel()
 
     def _edge_rows(self, sizes: list[int]) -> np.ndarray:
@@ -191,15 +191,15 @@ class StateLayout:
         for offset, group in zip(first, twisted, strict=False):
             k, column, edges = model.order.edge_places(group)
             rows[:, edges] = offset + k * group.columns + world * group.rods + column
-        if model.net is not None:
-            edges, blocks = _net_edges(model)
-            rows[:, edges] = first[len(twisted)] + world * model.net.blocks + blocks
+        if model.coupled is not None:
+            edges, blocks = _coupled_edges(model)
+            rows[:, edges] = first[len(twisted)] + world * model.coupled.blocks + blocks
         return rows.ravel()
 
 
-def _net_edges(model) -> tuple[np.ndarray, np.ndarray]:
+def _coupled_edges(model) -> tuple[np.ndarray, np.ndarray]:
     """Return rows among all edges, and dof blocks, of the edges of coupled rods."""
-    rods, none = model.net.host.rods, np.zeros(0, np.int64)
+    rods, none = model.coupled.host.rods, np.zeros(0, np.int64)
     rows = [model.order.edge_starts[rod.rod] + np.arange(len(rod.edges)) for rod in rods]
     return np.concatenate([none, *rows]), np.concatenate([none, *(rod.edges for rod in rods)])
 

@@ -19,7 +19,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import ANGLES, SLOTS
+from ddg_warp.kernels.collision.contact.assembly import ANGLES, PAIR_NODES
 from ddg_warp.kernels.collision.contact.closest_points import node_types, tangents_function
 from ddg_warp.kernels.collision.contact.pair_evaluation import (
     by_rate_function,
@@ -66,16 +66,16 @@ def pull_kernel(kind: Kind, density: Density, real):
             p, threshold, inner = parameters_of(law, sides, pairs[pair])
             n = nodes[pair]
             dx, _dv, dp, _dt, _ds = wp.grad(along)(corners(x, n), -corners(w, n), p, threshold, inner)
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(wp.static(PAIR_NODES)):
                 parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
             for i in range(wp.static(NUMBERS)):
                 numbers[i, pair] = real(0.0)
             for i in range(3):
                 numbers[i, pair] = dp[i]
-            by_rate = by_rate_of(law, sides, pairs[pair])
-            if by_rate > real(0.0):
+            grad_inverse_step = by_rate_of(law, sides, pairs[pair])
+            if grad_inverse_step > real(0.0):
                 numbers[wp.static(STIFFNESS), pair] = real(0.0)
-                numbers[wp.static(RATE), pair] = dp[0] * by_rate
+                numbers[wp.static(RATE), pair] = dp[0] * grad_inverse_step
 
     return pull
 
@@ -85,8 +85,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
     """Build the kernel of derivatives of friction by local node index of the solution, the start and the lagged positions.
 
     Derivatives by parameters of pairs are as in `pull_kernel`. `directed` or `rolls`: also by the directions of rods (capacity,);
-    `rod_nodes` and `multipliers` are as in `pair_friction.lag_kernel`. `spins`: also by `TURN` and `ARM` of the object
-    (SPUN, capacity). `rolls`: also by twist angles, and by radii of both primitives (ROLLED, capacity).
+    `rod_nodes` and `multipliers` are as in `pair_friction.lag_kernel`. `spins`: also by `STRAIGHT_ROTATION_LIMIT` and `ARM` of the
+        object (SPUN, capacity). `rolls`: also by twist angles, and by radii of both primitives (ROLLED, capacity).
     """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = node_types(real)
@@ -228,7 +228,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                     rolled,
                     v_rolled,
                 )
-                for slot in range(wp.static(SLOTS)):
+                for slot in range(wp.static(PAIR_NODES)):
                     parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
                     start_parts[slot, pair] = -parts[slot, pair]
                     lagged_parts[slot, pair] = V(dy[slot, 0], dy[slot, 1], dy[slot, 2])
@@ -241,8 +241,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                 if wp.static(rolls):
                     for side in range(wp.static(ANGLES)):
                         radii_out[side, pair] = dradii[side]
-                        parts[wp.static(SLOTS) + side, pair] = V(drolled[side], real(0.0), real(0.0))
-                        start_parts[wp.static(SLOTS) + side, pair] = V(-drolled[side], real(0.0), real(0.0))
+                        parts[wp.static(PAIR_NODES) + side, pair] = V(drolled[side], real(0.0), real(0.0))
+                        start_parts[wp.static(PAIR_NODES) + side, pair] = V(-drolled[side], real(0.0), real(0.0))
                 if wp.static(spins):
                     if spinning_object >= 0:
                         for i in range(3):

@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.adjoint.contact import NUMBERS
-from ddg_warp.kernels.collision.contact.assembly import taken_apart
+from ddg_warp.kernels.collision.contact.assembly import unpacked
 from ddg_warp.kernels.collision.contact.pair_evaluation import groups_function, law_struct
 from ddg_warp.kernels.collision.primitives import Kind, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
@@ -102,7 +102,7 @@ def side_kernels(kind: Kind, real):
         node = sides.second.nodes[j - w * sides.counts[1], 0] + w * sides.first.nodes_a_world
         value = real(0.0)
         for k in range(places[node], places[node] + number[node]):
-            p, local = taken_apart(items[k])
+            p, local = unpacked(items[k])
             if local == wp.static(kind.first) and pairs[p][1] == j:
                 value += values[p]
         out[j] = out[j] + value

@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.coupled_element import FRAME
-from ddg_warp.kernels.elements.variation import carried_function
+from ddg_warp.kernels.elements.variation import transported_function
 
 
 @cache
@@ -16,7 +16,7 @@ def frame_kernel(real):
     `pull`: write gradients by the edge vector, and add gradients by the previous frame.
     """
     V = wp.types.vector(3, real)
-    carried = carried_function(real)
+    carried = transported_function(real)
 
     @wp.func
     def three(a: wp.array2d(dtype=real), row: int, f: int):

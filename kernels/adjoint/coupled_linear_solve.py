@@ -40,7 +40,7 @@ def block_kernels(real, linear):
 
 
 @cache
-def chain_kernel(real):
+def chain_rule_kernel(real):
     """Build the kernel of right-hand sides of a solve that uses a lagged solution.
 
     `chain`: write the gradient by the lagged solution, given the gradient by a later solution.
@@ -49,10 +49,10 @@ def chain_kernel(real):
     _, free = product_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def chain(bits: wp.array(dtype=wp.uint8), blocks: int, by_lagged: wp.array(dtype=V), by_q: wp.array(dtype=V)):
+    def chain(bits: wp.array(dtype=wp.uint8), blocks: int, by_lagged: wp.array(dtype=V), grad_q: wp.array(dtype=V)):
         """Replace gradients at free dofs by `by_lagged`, and add it at fixed dofs, which are equal in both solutions."""
         i = wp.tid()
-        by_q[i] = by_q[i] - wp.cw_mul(by_q[i], free(bits[i % blocks])) + by_lagged[i]
+        grad_q[i] = grad_q[i] - wp.cw_mul(grad_q[i], free(bits[i % blocks])) + by_lagged[i]
         by_lagged[i] = V()
 
     return chain
@@ -69,7 +69,7 @@ def check_kernels(linear):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def rest(
-        right: wp.array(dtype=H),
+        rhs: wp.array(dtype=H),
         product: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
         blocks: int,
@@ -78,7 +78,7 @@ def check_kernels(linear):
         dots_out: wp.array2d(dtype=linear),
     ):
         i = wp.tid()
-        r = right[i] - product[i]
+        r = rhs[i] - product[i]
         z = inverse[i] * r
         residual_out[i] = r
         z_out[i] = z

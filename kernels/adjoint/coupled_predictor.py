@@ -7,11 +7,11 @@ import warp as wp
 from ddg_warp.kernels.adjoint.edge_rotation import excess_function, unplace_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.newton.edge_rotation import loose_function
-from ddg_warp.kernels.newton.rod_iterate import PLACE
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES
 
 
 @cache
-def net_kernels(real, midpoint: bool):
+def predictor_kernels(real, midpoint: bool):
     """Build the kernels of predictors with edge rotations.
 
     `unplace`: write gradients by excesses, add gradients by anchors, of the rods of one level; one thread a rod.
@@ -85,7 +85,7 @@ def net_kernels(real, midpoint: bool):
     ):
         """Write gradients by excesses and add gradients by anchors, at nodes of rods, in worlds that rotate edges."""
         i, w = wp.tid()
-        if todo[w] != wp.static(PLACE):
+        if todo[w] != wp.static(ROTATE_EDGES):
             return
         r = rods[i]
         rod = Rod()
@@ -133,7 +133,7 @@ def net_kernels(real, midpoint: bool):
         k: int,
         i: int,
     ):
-        """Return the step of a predictor; see `aim` of `kernels.newton.coupled_edge_rotation.turn_kernels`."""
+        """Return the step of a predictor; see `aim` of `kernels.newton.coupled_edge_rotation.rotation_kernels`."""
         mask = int(fixed[k])
         predicted = v0[i] / rate
         step = q[i] - q0[i]
@@ -163,7 +163,7 @@ def net_kernels(real, midpoint: bool):
     ):
         """Write gradients by base and step of the edge from every rod node, through its excess."""
         p, w = wp.tid()
-        if todo[w] != wp.static(PLACE) or nodes[p] == next_nodes[p]:
+        if todo[w] != wp.static(ROTATE_EDGES) or nodes[p] == next_nodes[p]:
             return
         a = nodes[p] + w * blocks
         b = next_nodes[p] + w * blocks
@@ -206,7 +206,7 @@ def net_kernels(real, midpoint: bool):
         by_position = cotangent[i]
         by_base = V()
         by_step = V()
-        if todo[w] == wp.static(PLACE):
+        if todo[w] == wp.static(ROTATE_EDGES):
             by_base = along[i]
             if placed[k] != wp.uint8(0):
                 by_base += by_position
@@ -221,10 +221,10 @@ def net_kernels(real, midpoint: bool):
                     by_base += base[w, p - num_places]
                     by_step += step[w, p - num_places]
         by_start = by_base
-        by_rate = V()
+        grad_inverse_step = V()
         if (mask & 7) == 7:
             fixed_out[i] = fixed_out[i] + by_position
-            by_rate = by_step
+            grad_inverse_step = by_step
         else:
             by_step_of_node = by_position + by_step
             free = free_components(mask, by_step_of_node)
@@ -232,9 +232,9 @@ def net_kernels(real, midpoint: bool):
             by_start += free - by_step
             for d in range(3):
                 if mass[k][d] > real(0.0):
-                    by_rate[d] = free[d]
+                    grad_inverse_step[d] = free[d]
         q_out[i] = q_out[i] + by_start
-        v_out[i] = v_out[i] + by_rate / rates[w]
-        rate_out[i] = rate_out[i] - wp.dot(by_rate, v0[i]) / (rates[w] * rates[w])
+        v_out[i] = v_out[i] + grad_inverse_step / rates[w]
+        rate_out[i] = rate_out[i] - wp.dot(grad_inverse_step, v0[i]) / (rates[w] * rates[w])
 
     return unplace, pass_on, turn, pull

@@ -66,7 +66,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
 
     @wp.func
     def swing(inertia: wp.array2d(dtype=Inertia), i: int, blocks: int):
-        """Of the rate over the solve in that at the end; see `drag.net_kernels`, settle."""
+        """Of the rate over the solve in that at the end; see `drag.coupled_kernels`, settle."""
         result = V(share, share, share)
         if wp.static(settles):
             node = inertia[i / blocks, i % blocks]

@@ -34,7 +34,7 @@ def resisted_function(dim: int, real):
 
 
 @cache
-def chain_kernels(kind: RodKind, real, midpoint: bool):
+def rod_kernels(kind: RodKind, real, midpoint: bool):
     """Build the kernels of uncoupled rods.
 
     `edges`: write gradients by edge vectors of `tangents`, by mean velocities of edges and by coefficients.
@@ -152,7 +152,7 @@ def chain_kernels(kind: RodKind, real, midpoint: bool):
         for d in range(wp.static(dim)):
             if ((mask >> d) & 1) == 1:
                 fixed_out[d, k, r] = fixed_out[d, k, r] - by_start[d]
-        by_rate = -wp.dot(back, x[k, r] - x0[k, r])
+        grad_inverse_step = -wp.dot(back, x[k, r] - x0[k, r])
         if wp.static(midpoint):
             for d in range(wp.static(dim)):
                 tangent_out[d, k, r] = tangent_out[d, k, r] + by_tangent[d]
@@ -165,14 +165,14 @@ def chain_kernels(kind: RodKind, real, midpoint: bool):
                 e = tangents[along(k + 1, n), r] - tangents[k, r]
                 spin = w[wp.static(dim), k, r] * coefficients[wp.static(ROTATIONAL), k, r] * wp.length(e)
                 theta_out[k, r] = theta_out[k, r] + spin * rate[r]
-                by_rate -= spin * (theta[k, r] - theta0[k, r])
-        rate_out[k, r] = rate_out[k, r] + by_rate
+                grad_inverse_step -= spin * (theta[k, r] - theta0[k, r])
+        rate_out[k, r] = rate_out[k, r] + grad_inverse_step
 
     return edges, nodes
 
 
 @cache
-def net_kernels(real, midpoint: bool):
+def coupled_kernels(real, midpoint: bool):
     """Build the kernels of the coupled system.
 
     `edges`: write gradients by both nodes of an edge, and add gradients by coefficients.

@@ -8,17 +8,17 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.newton.edge_rotation import edge_functions, onward_function
+from ddg_warp.kernels.newton.edge_rotation import edge_functions, repeat_rotation_function
 
 
 @cache
 def unplace_function(dim: int, real, Rod, anchored, by_shift, free_part, give_excess, give_added):
-    """Return the device function `unplace(rod)`: the reverse of `kernels.newton.edge_rotation.place_function`.
+    """Return the device function `unplace(rod)`: the reverse of `kernels.newton.edge_rotation.rotate_edges_function`.
 
     That function is linear in excesses and in displacements of anchors.
 
     Args:
-        Rod: struct of a rod; fields `count`, `closed` and `anchor` as in `place_function`.
+        Rod: struct of a rod; fields `count`, `closed` and `anchor` as in `rotate_edges_function`.
         anchored: (rod, j) -> True for anchors.
         by_shift: (rod, j) -> gradient by the displacement of node j beyond its step; zero for anchors.
         free_part: (rod, j, v) -> components of v at node j that count in the mean of a free rod.
@@ -76,10 +76,13 @@ def unplace_function(dim: int, real, Rod, anchored, by_shift, free_part, give_ex
 
 @cache
 def excess_function(dim: int, real, midpoint: bool):
-    """Return the device function `excess_product(e, de, f, straight)`: excess of a rotated edge, dot f; see `turns.onward_function`."""
+    """Return the device function `excess_product(e, de, f, straight)`:
+
+    excess of a rotated edge, dot f; see `turns.repeat_rotation_function`.
+    """
     V = wp.types.vector(dim, real)
     along_edge, excess_of, _ = edge_functions(dim, real)
-    onward_of = onward_function(real)
+    onward_of = repeat_rotation_function(real)
 
     @wp.func
     def excess_product(e: V, de: V, f: V, straight: real):

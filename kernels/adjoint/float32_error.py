@@ -12,7 +12,7 @@ import warp as wp
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 
-PART = 8  # nodes of a segment, one thread each
+SEGMENT = 8  # nodes of a segment, one thread each
 STIFFEST, SOFTEST, MASS = range(
     3
 )  # rows: largest stiffness of an edge or node [N/m], least bending stiffness times length [N m^3], mass [kg]
@@ -49,7 +49,7 @@ def stiffness_kernels(kind: RodKind, real):
         stiffest = real(0.0)
         softest = real(wp.inf)
         total = real(0.0)
-        for k in range(segment * wp.static(PART), wp.min(n, (segment + 1) * wp.static(PART))):
+        for k in range(segment * wp.static(SEGMENT), wp.min(n, (segment + 1) * wp.static(SEGMENT))):
             total += mass[k, r]
             if wp.static(stretches):
                 if k + 1 < n:

@@ -83,7 +83,7 @@ def refine_kernels(kind: RodKind, real, linear):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def guess(
-        right: wp.array3d(dtype=real),
+        rhs: wp.array3d(dtype=real),
         mass: wp.array2d(dtype=real),
         coefficient: wp.array(dtype=real),
         w_out: wp.array3d(dtype=real),
@@ -94,12 +94,12 @@ def refine_kernels(kind: RodKind, real, linear):
         for d in range(wp.static(block)):
             own = real(0.0)
             if d < wp.static(dim) and c > real(0.0):
-                own = right[d, k, r] / c
+                own = rhs[d, k, r] / c
             w_out[d, k, r] = own
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def rest(
-        right: wp.array3d(dtype=real),
+        rhs: wp.array3d(dtype=real),
         w: wp.array3d(dtype=real),
         elements: wp.array3d(dtype=real),
         mass: wp.array2d(dtype=real),
@@ -123,7 +123,7 @@ def refine_kernels(kind: RodKind, real, linear):
                 inertia *= mass[k, r]
             else:
                 inertia *= rotary[k, r]
-            own = right[d, k, r] - inertia * w[d, k, r] - q[d]
+            own = rhs[d, k, r] - inertia * w[d, k, r] - q[d]
             out[d, k, r] = wp.where(((mask >> d) & 1) == 0, linear(own), linear(0.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

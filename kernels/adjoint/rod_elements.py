@@ -11,7 +11,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
-from ddg_warp.kernels.elements.variation import carried_function
+from ddg_warp.kernels.elements.variation import transported_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
 
@@ -40,7 +40,7 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
     """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along_node, *_ = gather_functions(kind, real)
-    carried = carried_function(real, unit)
+    carried = transported_function(real, unit)
     closed = kind.closed
     W, put = wp.types.vector(kind.window, real), put_function(kind, real, first)
 

@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.adjoint.edge_rotation import excess_function, unplace_function
 from ddg_warp.kernels.core.dof_map import row_functions
-from ddg_warp.kernels.core.islands import BENT, RATE, TURN
+from ddg_warp.kernels.core.islands import INVERSE_STEP, ROTATE_PREDICTOR, STRAIGHT_ROTATION_LIMIT
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
 from ddg_warp.kernels.newton.edge_rotation import loose_function
@@ -106,8 +106,8 @@ def predict_kernel(kind: RodKind, real, midpoint: bool):
     ):
         r = wp.tid()
         n = count[r]
-        rate = scalars[RATE, r]
-        bent = flags[BENT, r] != 0
+        rate = scalars[INVERSE_STEP, r]
+        bent = flags[ROTATE_PREDICTOR, r] != 0
         edges = int(0)
         if bent:
             for k in range(n):
@@ -128,7 +128,7 @@ def predict_kernel(kind: RodKind, real, midpoint: bool):
         if wp.static(closed):
             if bent:
                 previous, previous_step = edge_gradient(
-                    x, x0, v0, fixed, rate, scalars[TURN, r], excess_out, n - 1, n, r
+                    x, x0, v0, fixed, rate, scalars[STRAIGHT_ROTATION_LIMIT, r], excess_out, n - 1, n, r
                 )
         for k in range(n):
             mask = int(fixed[k, r])
@@ -142,7 +142,9 @@ def predict_kernel(kind: RodKind, real, midpoint: bool):
                 gradient -= by_base
             by_step = by_base
             if k < edges:
-                following, following_step = edge_gradient(x, x0, v0, fixed, rate, scalars[TURN, r], excess_out, k, n, r)
+                following, following_step = edge_gradient(
+                    x, x0, v0, fixed, rate, scalars[STRAIGHT_ROTATION_LIMIT, r], excess_out, k, n, r
+                )
                 by_base -= following
                 by_step -= following_step
                 by_base += previous
@@ -152,18 +154,18 @@ def predict_kernel(kind: RodKind, real, midpoint: bool):
             elif bent:
                 by_base += previous
                 by_step += previous_step
-            by_rate = V()
+            grad_inverse_step = V()
             for d in range(wp.static(dim)):
                 if is_fixed:
                     fixed_out[d, k, r] = fixed_out[d, k, r] + gradient[d]
-                    by_rate[d] = by_step[d]
+                    grad_inverse_step[d] = by_step[d]
                 elif ((mask >> d) & 1) == 1:
                     fixed_out[d, k, r] = fixed_out[d, k, r] + by_step[d]
                     by_base[d] = by_base[d] - by_step[d]
                 else:
-                    by_rate[d] = by_step[d]
+                    grad_inverse_step[d] = by_step[d]
             x_out[k, r] = x_out[k, r] + by_base
-            v_out[k, r] = v_out[k, r] + by_rate / rate
-            rate_out[k, r] = rate_out[k, r] - wp.dot(by_rate, v0[k, r]) / (rate * rate)
+            v_out[k, r] = v_out[k, r] + grad_inverse_step / rate
+            rate_out[k, r] = rate_out[k, r] - wp.dot(grad_inverse_step, v0[k, r]) / (rate * rate)
 
     return pull

@@ -10,7 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.dof_map import column_of, point_functions
-from ddg_warp.kernels.core.islands import PORTION, RETRIES, STATUS
+from ddg_warp.kernels.core.islands import RETRIES, STATUS, SUBSTEP_FRACTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.elements.variation import angle_function
@@ -28,7 +28,7 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
     other kernels have written.
     """
     dim, twist = kind.dim, kind.twist
-    settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.chain_kernels`
+    settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.path_kernels`
     V = wp.types.vector(dim, real)
     end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
     start_weight = real(1.0 if midpoint else 0.0)  # derivative of the end by minus the start
@@ -146,7 +146,9 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
         v_out[k, r] = by_v
         mass_out[k, r] = wp.dot(w_free, gravity[world[r]] - step * c + before * rho)
         gravity_out[k, r] = w_free * m
-        by_rate = velocity_weight * wp.dot(ended, step) - m * wp.dot(w_free, step * (real(2.0) * rho + alpha) - before)
+        grad_inverse_step = velocity_weight * wp.dot(ended, step) - m * wp.dot(
+            w_free, step * (real(2.0) * rho + alpha) - before
+        )
         by_damping = -m * rho * wp.dot(w_free, step)
         if wp.static(twist):
             free = real(0.0)
@@ -172,9 +174,11 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
             theta_out[k, r] = by_angle
             omega_out[k, r] = free * rho * j - spun * before_kept
             rotary_out[k, r] = free * (spin * rho - rotation * c)
-            by_rate += velocity_weight * spun * rotation - j * free * (rotation * (real(2.0) * rho + alpha) - spin)
+            grad_inverse_step += velocity_weight * spun * rotation - j * free * (
+                rotation * (real(2.0) * rho + alpha) - spin
+            )
             by_damping -= j * rho * free * rotation
-        rate_out[k, r] = rate_out[k, r] + by_rate
+        rate_out[k, r] = rate_out[k, r] + grad_inverse_step
         damping_out[k, r] = by_damping
 
     return solution, start
@@ -253,7 +257,9 @@ def smooth_kernel(real):
     ):
         """Compare frames (component, edge, island) of the last solve and of the start; a world has `per_world` islands."""
         r = wp.tid()
-        same = flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING) and scalars[PORTION, r] == real(1.0)
+        same = flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING) and scalars[SUBSTEP_FRACTION, r] == real(
+            1.0
+        )
         same = same and (once == 0 or flags[RETRIES, r] == 0)
         for k in range(frame.shape[1]):
             for c in range(frame.shape[0]):
@@ -309,7 +315,7 @@ def flag_kernels(real):
 
 
 @cache
-def asked_kernel(dtype, real):
+def requested_kernel(dtype, real):
     """Build the kernel that finds non-zero cotangents.
 
     `asked`: mark islands with NaN flags that have a non-zero cotangent; each has `per_island` columns.

@@ -79,7 +79,7 @@ def sides_struct(real):
 
 
 @cache
-def things_function(real):
+def primitives_function(real):
     """Return the device function `locate(sides, pair) -> (w, i, j)`: world of a pair, and its primitives in it."""
     Sides = sides_struct(real)
 

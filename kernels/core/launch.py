@@ -44,7 +44,7 @@ def until_function(serial: bool):
 
 
 @cache
-def share_function(serial: bool):
+def items_function(serial: bool):
     """share(tid, count) -> (world, first): the world that a thread is in, and where it starts among `count` things that each has."""
 
     @wp.func

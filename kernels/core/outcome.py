@@ -9,14 +9,14 @@ NON_FINITE = 5
 # The exact Hessian has a negative pivot, and no projected Hessian is allowed. In the coupled system also: conjugate gradients have no
 # direction, as the preconditioner is not definite in this precision.
 INDEFINITE = 6
-GIVEN_UP = 7  # An earlier step failed for good; the rod stays in its last good state.
-LOST_IN_ROUNDING = 8  # Instead of CONVERGED_TO_ROUNDING where rounding decides the motion, as allowed by the user.
+STEP_FAILED = 7  # An earlier step failed for good; the rod stays in its last good state.
+ROUNDING_DOMINATED = 8  # Instead of CONVERGED_TO_ROUNDING where rounding decides the motion, as allowed by the user.
 ENERGY_DRIFT = (
     9  # The midpoint rule would have exceeded the allowed energy drift; see `kernels.stepping.rod_energy_drift`.
 )
-CROSSED = 10  # Primitives would have crossed.
-NO_ROOM = 11  # Minimum gap reached: the forces of the barrier, which grow without bound, have lost their digits.
-TURNED_TOO_FAR = 12  # Supports or obstacles would rotate farther in a step than substeps resolve.
+INTERPENETRATION = 10  # Primitives would have crossed.
+MINIMUM_GAP = 11  # Minimum gap reached: the forces of the barrier, which grow without bound, have lost their digits.
+ROTATED_TOO_FAR = 12  # Supports or obstacles would rotate farther in a step than substeps resolve.
 INVALID_INPUT = 13  # A parameter or control of a step, given as a tensor, is not finite or not allowed.
 NO_GRADIENT = 14  # A converged step through which no gradient goes; see `ddg_warp.torch.engine`.
 
@@ -27,12 +27,12 @@ NAMES = {
     LINE_SEARCH_FAILED: "line_search_failed",
     NON_FINITE: "non_finite",
     INDEFINITE: "indefinite",
-    GIVEN_UP: "given_up",
-    LOST_IN_ROUNDING: "lost_in_rounding",
+    STEP_FAILED: "given_up",
+    ROUNDING_DOMINATED: "lost_in_rounding",
     ENERGY_DRIFT: "energy_drift",
-    CROSSED: "crossed",
-    NO_ROOM: "no_room",
-    TURNED_TOO_FAR: "turned_too_far",
+    INTERPENETRATION: "crossed",
+    MINIMUM_GAP: "no_room",
+    ROTATED_TOO_FAR: "turned_too_far",
     INVALID_INPUT: "invalid_input",
     NO_GRADIENT: "no_gradient",
 }

@@ -144,7 +144,7 @@ def _gap_laws(density: Density, constants: tuple[float, ...], real):
     names = [parameter.name for parameter in density.parameters(1)]
     stiffness, reach = (names.index(name) if name in names else -1 for name in ("stiffness", "range"))
     E, P, Q = wp.types.vector(1, real), wp.types.vector(3, real), wp.types.vector(len(names), real)
-    fixed, coupled = Q(*constants), density.coupled
+    fixed, is_coupled = Q(*constants), density.coupled
 
     @wp.func
     def law_parameters(p: P):
@@ -175,7 +175,7 @@ def _gap_laws(density: Density, constants: tuple[float, ...], real):
         if gap >= p[1]:
             return E()
         c = curvature_of(E(gap), law_parameters(p))
-        if wp.static(coupled):
+        if wp.static(is_coupled):
             return E(c[0, 0])
         else:
             return c

@@ -85,7 +85,7 @@ def _split(density: Density, real, n: int):
 def _laws(density: Density, real, n: int):
     energy_of, slope_of, curvature_of = density.laws(real, n)
     law_parameters, ratio, before, rest, E, P = _split(density, real, n)
-    coupled = density.coupled
+    is_coupled = density.coupled
 
     @wp.func
     def viscous(p: P):
@@ -94,7 +94,7 @@ def _laws(density: Density, real, n: int):
 
     @wp.func
     def drag(e: E, p: P):
-        if wp.static(coupled):
+        if wp.static(is_coupled):
             return viscous(p) * (e - before(p)) * ratio(p)
         else:
             return wp.cw_mul(viscous(p), e - before(p)) * ratio(p)

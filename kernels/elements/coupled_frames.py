@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.elements.coupled_element import FRAME, elements_type, place_function
 from ddg_warp.kernels.measures import Measure
@@ -53,7 +53,7 @@ def edge_kernel(real, serial: bool):
 
     `edges`: transport frames of rod edges to the tangents at positions q, and orthonormalise.
     """
-    V, first_item, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
+    V, first_item, until = wp.types.vector(3, real), items_function(serial), until_function(serial)
     row, store = functions(real)
     transport, *_ = parallel_transport.functions(real)
 
@@ -91,7 +91,7 @@ def lag_kernel(measure: Measure, real, serial: bool):
 
     Within a solve (`within`) rows of ghost nodes are unchanged, as joints continue from their rotations.
     """
-    Elements, first_item, until = elements_type(real), share_function(serial), until_function(serial)
+    Elements, first_item, until = elements_type(real), items_function(serial), until_function(serial)
     gather, advance = place_function(measure, real), measure.advance(real)
     rows = measure.lag_size - FRAME * measure.frames
     ghosts = 3 * len(measure.vectors) if measure.spins else 0

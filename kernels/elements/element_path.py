@@ -18,7 +18,15 @@ from typing import Any
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import ACTIVE, CARRIED, CLAMPED, ITERATION, SLOT, STALE, STATUS
+from ddg_warp.kernels.core.islands import (
+    ANY_ACTIVE,
+    DROP_COMPRESSION,
+    ENERGY_BUFFER,
+    FRAMES_OUTDATED,
+    ITERATION,
+    MAX_EDGE_STIFFNESS,
+    STATUS,
+)
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.variation import variation_functions
 from ddg_warp.kernels.terms import Term
@@ -200,7 +208,7 @@ def left_out_function(term: Term, real):
 
 
 @cache
-def carried_function(real):
+def transported_function(real):
     """Build `share(k, carried)`: split the stiffness k of an edge between the matrix and its axial force.
 
     It returns the root of k' / k, the part that the matrix carries, and the slack, zero where the matrix carries all of k. See
@@ -260,12 +268,16 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
     _, jacobian_of, tension_of, curvature_of = measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
     local, short, spread, parameters = own.local, own.short, own.spread, parameter_function(storage, index, real)
-    coupled, tensions, stiffness_dofs = term.density.coupled, measure.tensions, storage.stiffness_dofs or measure.size
+    is_coupled, tensions, stiffness_dofs = (
+        term.density.coupled,
+        measure.tensions,
+        storage.stiffness_dofs or measure.size,
+    )
     write = write_function(storage, linear, real) if storage.slots else write_rows_function(Q, linear, real)
     rows = storage.num_slots or measure.size
     splits, bends = split and tensions > 0, curved and curvature_of is not None
     drop_compression = drop_compression_function(real, tensions)
-    left_out, carried_part = left_out_function(term, real), carried_function(real)
+    left_out, carried_part = left_out_function(term, real), transported_function(real)
     alone, write_gradient = len(storage.terms) == 1, write_function(storage, real, real)
     second_rows = own.second or tuple(range(measure.packed))
     where = wp.types.vector(max(1, len(second_rows)), int)(*(second_rows or (0,)))
@@ -307,13 +319,13 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
                 else:
                     results.tension[wp.static(own.tension), at] = linear(c)
         root = root_of(strain, p, shift) * wp.sqrt(w)
-        if wp.static(coupled):
+        if wp.static(is_coupled):
             factor = root * jacobian
         stiffest = real(0.0)
         for m in range(wp.static(n)):
             row = Q()
             stiffness = real(0.0)
-            if wp.static(coupled):
+            if wp.static(is_coupled):
                 row = factor[m]
                 for i in range(wp.static(stiffness_dofs)):
                     stiffness += row[i] * row[i]
@@ -389,15 +401,15 @@ def evaluate_kernel(
         island, first = items(i, j)
         if wp.static(clears_active):
             if i == 0 and j == 0:
-                flags[ACTIVE, 0] = 0
+                flags[ANY_ACTIVE, 0] = 0
         count = count_of(inputs, island)
         if flags[STATUS, island] != 0 or first >= count:
             return
         frozen = wp.static(reuse) and flags[ITERATION, island] > 0
-        clamped = wp.static(project) or flags[CLAMPED, island] != 0
-        exact = flags[ITERATION, island] >= wp.static(begin) and flags[CLAMPED, island] == 0
-        slot = 1 - flags[SLOT, island]
-        carried = scalars[CARRIED, island]
+        clamped = wp.static(project) or flags[DROP_COMPRESSION, island] != 0
+        exact = flags[ITERATION, island] >= wp.static(begin) and flags[DROP_COMPRESSION, island] == 0
+        slot = 1 - flags[ENERGY_BUFFER, island]
+        carried = scalars[MAX_EDGE_STIFFNESS, island]
         for e in range(first, last_item(first, count)):
             at = column_of(inputs, island, e)
             whole = whole_of(inputs, island, e)
@@ -406,7 +418,7 @@ def evaluate_kernel(
                 stale is not None
             ):  # before the terms: after them, dofs would be kept in 30 to 50 registers more
                 if whole and stale(q, s):
-                    flags[STALE, island] = 1
+                    flags[FRAMES_OUTDATED, island] = 1
             energy = real(0.0)
             f = W()
             stiffest = real(0.0)

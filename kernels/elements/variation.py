@@ -41,7 +41,7 @@ def variation_functions(term: Term, real):
 
 
 @cache
-def carried_function(real, unit: bool = True):
+def transported_function(real, unit: bool = True):
     """Return the device function `carried(e, u, t, du, dt)`: scalar product of a transported frame with (du, dt).
 
     The frame is (u, t), transported to the edge e and, if `unit`, orthonormalised.

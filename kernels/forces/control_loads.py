@@ -91,7 +91,7 @@ def sum_kernel(real):
 
 
 @cache
-def share_kernel(real):
+def scale_kernel(real):
     """Build the kernel of load distribution in the coupled system.
 
     `share`: raise body loads to at least the mean of their connected component.

@@ -21,7 +21,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
+from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, INVERSE_STEP, LOAD_SCALE, STATUS, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.residual.rod_residual import node_functions
@@ -60,7 +60,7 @@ def edge_function(dim: int, real):
 
 
 @cache
-def chain_kernels(kind: RodKind, real):
+def rod_kernels(kind: RodKind, real):
     """Build the kernels of drag on uncoupled rods.
 
     `resist`: write inertia and drag of every node at the start of a solve.
@@ -114,9 +114,9 @@ def chain_kernels(kind: RodKind, real):
         """
         start, r = wp.tid()
         n = count[r]
-        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
+        if scalars[STEP_PROGRESS, r] >= real(1.0) or start >= n:
             return
-        rate = scalars[RATE, r]
+        rate = scalars[INVERSE_STEP, r]
         s = real(1.0) / rate
         u = flow[0]
         one = wp.identity(n=wp.static(dim), dtype=real)
@@ -140,7 +140,7 @@ def chain_kernels(kind: RodKind, real):
                     length = wp.length(tangents[end, r] - tangents[k, r])
                     spin = coefficients[wp.static(ROTATIONAL), k, r] * length * rate
                 node.spin = spin
-                drag_mass = spin / scalars[COEFFICIENT, r]
+                drag_mass = spin / scalars[INERTIA_COEFFICIENT, r]
                 total = rotary[k, r] + drag_mass
                 rotary_out[k, r] = total
                 if drag_mass > real(0.0):
@@ -174,24 +174,24 @@ def chain_kernels(kind: RodKind, real):
         n = count[r]
         if (
             start >= n
-            or scalars[PROGRESS, r] >= real(1.0)
+            or scalars[STEP_PROGRESS, r] >= real(1.0)
             or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING)
         ):
             return
         for k in range(start, until(start, n)):
             if mass[k, r] <= real(0.0):
-                mean = (x_end[k, r] - x[k, r]) * scalars[RATE, r]
+                mean = (x_end[k, r] - x[k, r]) * scalars[INVERSE_STEP, r]
                 a = V()
                 if wp.length_sq(v0[k, r]) > real(0.0):
-                    a = (v_out[k, r] - mean) * (real(0.5) * scalars[RATE, r])
+                    a = (v_out[k, r] - mean) * (real(0.5) * scalars[INVERSE_STEP, r])
                 a_out[k, r] = a
                 v_out[k, r] = mean
             if wp.static(twist):
                 if rotary[k, r] <= real(0.0):
-                    spin = (theta_end[k, r] - theta[k, r]) * scalars[RATE, r]
+                    spin = (theta_end[k, r] - theta[k, r]) * scalars[INVERSE_STEP, r]
                     alpha = real(0.0)
                     if omega0[k, r] != real(0.0):
-                        alpha = (omega_out[k, r] - spin) * real(0.5) * scalars[RATE, r]
+                        alpha = (omega_out[k, r] - spin) * real(0.5) * scalars[INVERSE_STEP, r]
                     alpha_out[k, r] = alpha
                     omega_out[k, r] = spin
 
@@ -219,7 +219,7 @@ def mass_type(real, drag: bool):
 
 
 @cache
-def net_kernels(real):
+def coupled_kernels(real):
     """Build the kernels of drag on the coupled system.
 
     `resist`: write inertia and drag of every dof block at the start of a solve.
@@ -254,7 +254,7 @@ def net_kernels(real):
         """
         i = wp.tid()
         w = i / blocks
-        if scalars[PROGRESS, w] >= real(1.0):
+        if scalars[STEP_PROGRESS, w] >= real(1.0):
             return
         k = i - w * blocks
         D = M()
@@ -276,7 +276,7 @@ def net_kernels(real):
                 D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p) + wp.identity(n=3, dtype=real) * body
             else:
                 D[0, 0] = coefficients[wp.static(ROTATIONAL), edge + w * ends.shape[0]] * wp.length(e)
-        rate = scalars[RATE, w]
+        rate = scalars[INVERSE_STEP, w]
         block = Inertia()
         block.mass = mass[w, k]
         block.resistance = D * rate
@@ -298,15 +298,15 @@ def net_kernels(real):
         v_out: wp.array(dtype=V),
         a_out: wp.array(dtype=V),
     ):
-        """Write rates of massless dofs with drag; see `chain_kernels`."""
+        """Write rates of massless dofs with drag; see `path_kernels`."""
         i = wp.tid()
         w = i / blocks
-        if scalars[PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if scalars[STEP_PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
             return
         block = inertia[w, i - w * blocks]
         v = v_out[i]
-        mean = (q_end[i] - q[i]) * scalars[RATE, w]
-        change = (v - mean) * (real(0.5) * scalars[RATE, w])
+        mean = (q_end[i] - q[i]) * scalars[INVERSE_STEP, w]
+        change = (v - mean) * (real(0.5) * scalars[INVERSE_STEP, w])
         moved = wp.length_sq(v0[i]) > real(0.0)
         a = V()
         for d in range(3):

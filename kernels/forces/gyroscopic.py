@@ -62,7 +62,7 @@ def kick_kernel(real):
         e = get(x, b, w, columns) - get(x, a, w, columns)
         t = wp.normalize(e)
         half = real(0.25) * dt[w] * momentum / wp.length_sq(e)
-        if after != 0 and flags[wp.static(STATUS), r] == wp.static(outcome.GIVEN_UP):
+        if after != 0 and flags[wp.static(STATUS), r] == wp.static(outcome.STEP_FAILED):
             half = -half
         inverse_a = free[a] / ma
         inverse_b = free[b] / mb

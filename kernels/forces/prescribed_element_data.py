@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import MOVED, PORTION, PROGRESS
+from ddg_warp.kernels.core.islands import STEP_PROGRESS, SUBSTEP_ACCEPTED, SUBSTEP_FRACTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.forces import prescribed_motion
 
@@ -39,7 +39,7 @@ def normal_kernels(real, midpoint: bool):
     ):
         """Write normals for the solve, given `where` (element, first data row, motion) and the normal at `rest`."""
         i, w = wp.tid()
-        if scalars[PROGRESS, w] < real(1.0):
+        if scalars[STEP_PROGRESS, w] < real(1.0):
             m = where[i, 2] + w * stride + row(scalars, w, rows)
             n = turned(pose, m, reached(scalars, w), rest[i])
             write(where, i, w * elements, n, data_out)
@@ -63,9 +63,9 @@ def normal_kernels(real, midpoint: bool):
         n = V()
         for d in range(3):
             n[d] = before[where[i, 1] + d, column]
-        if flags[MOVED, w] != 0:
+        if flags[SUBSTEP_ACCEPTED, w] != 0:
             m = where[i, 2] + w * stride + row(scalars, w, rows)
-            n = turned(pose, m, scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
+            n = turned(pose, m, scalars[STEP_PROGRESS, w] + scalars[SUBSTEP_FRACTION, w], rest[i])
         write(where, i, w * elements, n, data_out)
 
     return normals, turn

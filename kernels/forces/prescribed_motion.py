@@ -16,12 +16,12 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.dof_map import column_of, point_functions
-from ddg_warp.kernels.core.islands import INTERVAL, PORTION, PROGRESS, REASON, STATUS, SUBSTEP
+from ddg_warp.kernels.core.islands import FAILURE_STATUS, INTERVAL, STATUS, STEP_PROGRESS, SUBSTEP, SUBSTEP_FRACTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements import parallel_transport
 
 POSE = 21  # Reals of a motion over a step.
-MOST_PARTS = 1024  # Maximum substeps of a step.
+MAX_SUBSTEPS = 1024  # Maximum substeps of a step.
 HALF = 1e-6  # Tolerance of half a revolution, as half the angle [rad].
 COUNTED = 3.1415926535897932 + HALF  # Length of a rotation vector above which it counts revolutions [rad].
 SLACK = 1.0 - 1e-6  # Factor on rotations that substeps have to resolve, for rounding.
@@ -81,7 +81,7 @@ def row_function(real):
     @wp.func
     def row(scalars: wp.array2d(dtype=real), i: int, rows: int):
         parts = real(1.0) / scalars[INTERVAL, i]
-        return (int(parts) - 1 + int(wp.floor(scalars[PROGRESS, i] * parts))) * rows
+        return (int(parts) - 1 + int(wp.floor(scalars[STEP_PROGRESS, i] * parts))) * rows
 
     return row
 
@@ -93,9 +93,9 @@ def reached_function(real, midpoint: bool):
     @wp.func
     def reached(scalars: wp.array2d(dtype=real), i: int):
         if wp.static(midpoint):
-            return scalars[PROGRESS, i] + real(0.5) * scalars[PORTION, i]
+            return scalars[STEP_PROGRESS, i] + real(0.5) * scalars[SUBSTEP_FRACTION, i]
         else:
-            return scalars[PROGRESS, i] + scalars[PORTION, i]
+            return scalars[STEP_PROGRESS, i] + scalars[SUBSTEP_FRACTION, i]
 
     return reached
 
@@ -129,7 +129,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         i, w = wp.tid()
         dof_index = where[i, 0]
         r = column_of(dof_index, w, columns)
-        start = scalars[PROGRESS, r]
+        start = scalars[STEP_PROGRESS, r]
         if start >= real(1.0):
             return
         position = get(x, dof_index, w, columns)
@@ -138,7 +138,7 @@ def support_kernels(dim: int, real, midpoint: bool):
             m = where[i, 1 + d]
             if m >= 0:
                 m += first
-                p = placed(pose, m, start + scalars[PORTION, r], rest[i])
+                p = placed(pose, m, start + scalars[SUBSTEP_FRACTION, r], rest[i])
                 if wp.static(midpoint):
                     p = real(0.5) * (p + placed(pose, m, start, rest[i]))
                 position[d] = p[d]
@@ -161,7 +161,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         """Write twist angles; `where` is the angle, its edge, both nodes and the pose, `rest` the first material director at rest."""
         i, w = wp.tid()
         r = column_of(where[i, 0], w, columns)
-        start = scalars[PROGRESS, r]
+        start = scalars[STEP_PROGRESS, r]
         if start >= real(1.0):
             return
         t = wp.normalize(get(x, where[i, 3], w, columns) - get(x, where[i, 2], w, columns))
@@ -203,7 +203,8 @@ def grip_kernel(real, arcs: bool):
     def turn_between(r0: X, r1: X):
         """Return the rotation vector of the shortest rotation between two orientations, exactly zero if equal.
 
-        A rotation by 180 degrees has the direction of r1 - r0. Rotation vectors that count revolutions give nan: see `turns_between`.
+        A rotation by 180 degrees has the direction of r1 - r0. Rotation vectors that count revolutions give nan: see
+        `rotations_between`.
         """
         if wp.length(r1) > real(wp.static(COUNTED)) and wp.length(r1 - r0) > real(wp.static(COUNTED)):
             return X(real(wp.nan), real(wp.nan), real(wp.nan))
@@ -240,7 +241,7 @@ def grip_kernel(real, arcs: bool):
         most: wp.array2d(dtype=real),
         parts: real,
     ):
-        """Return the number of substeps that resolve all grips: a power of two >= `parts`, above `MOST_PARTS` if too many."""
+        """Return the number of substeps that resolve all grips: a power of two >= `parts`, above `MAX_SUBSTEPS` if too many."""
         for g in range(count):
             r0 = row(before, 3, g + w * count)
             rotation = turn_between(r0, row(after, 3, g + w * count))
@@ -248,7 +249,9 @@ def grip_kernel(real, arcs: bool):
             if angle > real(0.0):
                 axis = wp.quat_rotate_inv(quaternion(r0), rotation / angle)
                 largest = wp.min(most[w, g], largest_turn(arms, g, axis, allowed[w, g]))
-                while parts * largest < real(wp.static(SLACK)) * angle and parts <= real(wp.static(float(MOST_PARTS))):
+                while parts * largest < real(wp.static(SLACK)) * angle and parts <= real(
+                    wp.static(float(MAX_SUBSTEPS))
+                ):
                     parts *= real(2.0)
         return parts
 
@@ -275,10 +278,10 @@ def grip_kernel(real, arcs: bool):
         if wp.static(arcs):
             if n == 0:
                 parts = parts_of(w, count, before, after, arms, allowed, most, real(1.0) / scalars[INTERVAL, w])
-                if parts > real(wp.static(float(MOST_PARTS))) and flags[STATUS, w] != wp.static(outcome.GIVEN_UP):
-                    flags[STATUS, w] = wp.static(outcome.GIVEN_UP)
-                    flags[REASON, w] = wp.static(outcome.TURNED_TOO_FAR)
-                    wp.atomic_add(tally, wp.static(outcome.TURNED_TOO_FAR), wp.int64(1))
+                if parts > real(wp.static(float(MAX_SUBSTEPS))) and flags[STATUS, w] != wp.static(outcome.STEP_FAILED):
+                    flags[STATUS, w] = wp.static(outcome.STEP_FAILED)
+                    flags[FAILURE_STATUS, w] = wp.static(outcome.ROTATED_TOO_FAR)
+                    wp.atomic_add(tally, wp.static(outcome.ROTATED_TOO_FAR), wp.int64(1))
                 scalars[SUBSTEP, w] = real(1.0) / parts
         m, pose_row = n % grips.shape[0], n + w * shared.shape[0]
         for c in range(wp.static(POSE)):

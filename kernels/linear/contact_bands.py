@@ -4,10 +4,10 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import WANTED
+from ddg_warp.kernels.core.islands import NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.linear.rod_band_assembly import layout_type
-from ddg_warp.kernels.linear.rod_dof_map import place_dofs, place_functions
+from ddg_warp.kernels.linear.rod_dof_map import path_node_dofs, path_node_functions
 from ddg_warp.kernels.linear.rod_matrix import block_functions
 
 
@@ -19,11 +19,11 @@ def stiffen_kernel(twist: bool, linear, rolls: bool):
 
     If friction `rolls` rods, these include twist angles.
     """
-    nb = place_dofs(twist)
+    nb = path_node_dofs(twist)
     K, M, Layout = wp.types.matrix((3, 3), linear), wp.types.matrix((nb, nb), linear), layout_type()
     V, t = wp.types.vector(3, linear), nb - 1
     load, store, _, _ = block_functions(nb, linear)
-    free_of, _ = place_functions(twist, linear)
+    free_of, _ = path_node_functions(twist, linear)
 
     @wp.func
     def wide(contact_block: K):
@@ -52,7 +52,7 @@ def stiffen_kernel(twist: bool, linear, rolls: bool):
         k, r = wp.tid()
         w = r / layout.count.shape[0]
         c = r - w * layout.count.shape[0]
-        if flags[WANTED, w] == 0 or layout.idle[r] != 0 or k >= layout.count[c]:
+        if flags[NEEDS_DIRECTION, w] == 0 or layout.idle[r] != 0 or k >= layout.count[c]:
             return
         f = free_of(layout.held[k, c])
         D = load(bands, 0, k, r)

@@ -11,7 +11,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.linear.sliced_ell import BARRED, product_functions, settle_function
+from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE, product_functions, settle_function
 
 TILE = 4096  # entries that one block of threads sums
 TILES = 1024  # largest number of such blocks in a world
@@ -132,7 +132,7 @@ def solver_kernels(linear, indefinite: bool = False):
     def invert(
         matrix: wp.array2d(dtype=linear),
         diagonal: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         positions: int,
@@ -147,11 +147,11 @@ def solver_kernels(linear, indefinite: bool = False):
         k = i - w * blocks
         if diagonal[k] < 0:  # eliminated with a rod path; stays zero
             return
-        if barred[i] == BARRED:
+        if inactive_mask[i] == ALL_INACTIVE:
             inverse_out[i] = M()
             return
         p = diagonal[k] + w * positions
-        f = free(barred[i])
+        f = free(inactive_mask[i])
         m = M()
         for r in range(3):
             for c in range(3):
@@ -166,10 +166,10 @@ def solver_kernels(linear, indefinite: bool = False):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
-        right: wp.array(dtype=H),
+        rhs: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
         diagonal: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         scale: linear,
@@ -184,8 +184,8 @@ def solver_kernels(linear, indefinite: bool = False):
             return
         k = i - w * blocks
         r, z = H(), H()
-        if barred[i] != BARRED:
-            r = scale * right[i]
+        if inactive_mask[i] != ALL_INACTIVE:
+            r = scale * rhs[i]
             if diagonal[k] >= 0:
                 z = inverse[i] * r
         residual_out[i] = r
@@ -221,7 +221,7 @@ def solver_kernels(linear, indefinite: bool = False):
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -234,7 +234,9 @@ def solver_kernels(linear, indefinite: bool = False):
         w = i / blocks
         if wanted[w] != 1:
             return
-        settle(matrix, columns, slices, barred, p, blocks, positions, i - w * blocks, w, H(), product_out, dots_out)
+        settle(
+            matrix, columns, slices, inactive_mask, p, blocks, positions, i - w * blocks, w, H(), product_out, dots_out
+        )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(
@@ -242,7 +244,7 @@ def solver_kernels(linear, indefinite: bool = False):
         product: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
         diagonal: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         rho: wp.array(dtype=linear),
         curvature: wp.array(dtype=linear),
         iterations: wp.array(dtype=int),
@@ -260,7 +262,7 @@ def solver_kernels(linear, indefinite: bool = False):
         w = i / blocks
         if i == 0:
             busy_out[0] = 0
-        if wanted[w] != 1 or barred[i] == BARRED:
+        if wanted[w] != 1 or inactive_mask[i] == ALL_INACTIVE:
             return
         k = i - w * blocks
         if ends(curvature[w], rho[w]):
@@ -281,7 +283,7 @@ def solver_kernels(linear, indefinite: bool = False):
         z: wp.array(dtype=H),
         total: wp.array(dtype=linear),
         rho: wp.array(dtype=linear),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         p: wp.array(dtype=H),
@@ -289,7 +291,7 @@ def solver_kernels(linear, indefinite: bool = False):
         """Write the next search direction."""
         i = wp.tid()
         w = i / blocks
-        if wanted[w] == 1 and barred[i] != BARRED:
+        if wanted[w] == 1 and inactive_mask[i] != ALL_INACTIVE:
             p[i] = z[i] + (total[w] / rho[w]) * p[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -195,7 +195,7 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool =
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def reduce(
         matrix: wp.array3d(dtype=linear),
-        right: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -236,7 +236,7 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool =
         if diagonal:
             o0, o1 = own_column(matrix, i, q, local_column, n, r)
         elif outer:
-            o0, o1 = right_side(right, i, n, r)
+            o0, o1 = right_side(rhs, i, n, r)
         else:
             start = 1
         for side in range(start, neighbours):
@@ -245,7 +245,7 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool =
             v0 = H()
             v1 = H()
             if outer:
-                v0, v1 = right_side(right, away, n, r)
+                v0, v1 = right_side(rhs, away, n, r)
             else:
                 v0, v1 = column(
                     matrix, wp.where(diagonal, i - 1 + side, i + 1), diagonal and side == 1, q, local_column, n, r
@@ -297,7 +297,7 @@ def last_kernel(nb: int, linear, first: bool, tensions: int = 0):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def last(
         matrix: wp.array3d(dtype=linear),
-        right: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         solution_out: wp.array3d(dtype=linear),
@@ -310,7 +310,7 @@ def last_kernel(nb: int, linear, first: bool, tensions: int = 0):
         if wp.static(first):
             n = count[r]
         L, d, Z, M, e, lost = factor(matrix, 0, n, r)
-        b0, b1 = right_side(right, 0, n, r)
+        b0, b1 = right_side(rhs, 0, n, r)
         u0, u1 = solve(L, d, Z, M, e, b0, b1)
         for c in range(wp.static(nb)):
             solution_out[c, 0, r] = u0[c]

@@ -1,4 +1,4 @@
-"""Further right-hand sides of a system eliminated by cyclic reduction, one thread block and one launch a rod.
+"""Further rhs_in-hand sides of a system eliminated by cyclic reduction, one thread block and one launch a rod.
 
 A level that eliminates the odd blocks u keeps K1 = A_u^-1 B_j^T, K2 = A_u^-1 B_u and A_u^-1 (see `cyclic_reduction`). Each level is
 then a product of small matrices, up to the last block and down again:
@@ -15,7 +15,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.linear.cyclic_reduction import block_functions
-from ddg_warp.kernels.linear.rod_dof_map import angle_function, place_dofs, solve_functions
+from ddg_warp.kernels.linear.rod_dof_map import angle_function, path_node_dofs, solve_functions
 
 
 @wp.func_native("""
@@ -144,7 +144,7 @@ def again_functions(nb: int, linear):
 
 @cache
 def again_kernel(nb: int, linear):
-    """Build the kernel for another right-hand side.
+    """Build the kernel for another rhs_in-hand side.
 
     `again`: solve the wanted rods with one thread block each, of `threads` threads.
     """
@@ -154,7 +154,7 @@ def again_kernel(nb: int, linear):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(
         packed: wp.array3d(dtype=linear),
-        right: wp.array3d(dtype=linear),
+        rhs_in: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         width: int,
@@ -178,7 +178,7 @@ def again_kernel(nb: int, linear):
             k = 2 * j + half
             value = linear(0.0)
             if k < n:
-                value = right[c - half * wp.static(nb), k, r]
+                value = rhs_in[c - half * wp.static(nb), k, r]
             rhs[r, j, c] = value
         solve(packed, r, t, threads, blocks, rhs, block_solution)
         for i in range(t, blocks * wp.static(size), threads):
@@ -193,15 +193,15 @@ def again_kernel(nb: int, linear):
 
 
 @cache
-def again_at_places_kernel(twist: bool, linear):
-    """Build the kernel for another right-hand side of rod paths in the coupled system.
+def solve_at_path_nodes_kernel(twist: bool, linear):
+    """Build the kernel for another rhs_in-hand side of rod paths in the coupled system.
 
     `again`: compute z from the residual r by dof block, and r . z; see `matrix.chain_places`.
     """
-    nb = place_dofs(twist)
+    nb = path_node_dofs(twist)
     H, parts = wp.types.vector(3, linear), 1 + twist  # dof blocks of a path node: node, twist angle of the edge ahead
     solve, angle_of = again_functions(nb, linear), angle_function(twist)
-    right, _ = solve_functions(twist, linear)
+    rhs_in, _ = solve_functions(twist, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(
@@ -235,7 +235,7 @@ def again_at_places_kernel(twist: bool, linear):
             for d in range(wp.static(nb)):
                 rhs[r, j, row + d] = linear(0.0)
             if k < n:
-                u = right(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
+                u = rhs_in(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
                 for d in range(wp.static(nb)):
                     rhs[r, j, row + d] = u[d]
         solve(packed, r, t, threads, blocks, rhs, block_solution)

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import COEFFICIENT, WANTED
+from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear.sliced_ell import inertia_function
@@ -39,11 +39,11 @@ def exact_kernels(real, linear, drag: bool, serial: bool):
             w = p / positions
             position = p - w * positions
             row = rows[position]
-            if flags[WANTED, w] == 0 or row < 0:
+            if flags[NEEDS_DIRECTION, w] == 0 or row < 0:
                 continue  # padding stays zero
             m = M()
             if row == columns[position]:
-                m = inertia_of(mass, scalars[COEFFICIENT, w], w, row)
+                m = inertia_of(mass, scalars[INERTIA_COEFFICIENT, w], w, row)
             for i in range(3):
                 for j in range(3):
                     matrix[3 * i + j, p] = m[i, j]
@@ -69,7 +69,7 @@ def exact_kernels(real, linear, drag: bool, serial: bool):
         for p in range(start, until(start, matrix.shape[1])):
             w = p / positions
             position = p - w * positions
-            if flags[WANTED, w] == 0 or starts[position] == starts[position + 1]:
+            if flags[NEEDS_DIRECTION, w] == 0 or starts[position] == starts[position + 1]:
                 continue
             elements = hessian.shape[0] / flags.shape[1]
             m = M()

@@ -36,9 +36,9 @@ def functions(size: int, linear):
     the tension of the edge behind.
 
     Updates of the two blocks ahead are `weight` (b, c) (b, c)^T, of their right-hand sides `weight` `right` (b, c). The tension
-    behind is T = `weight` (b . e1 + c . e2 + `coupling` T_ahead - `right`). `behind` and `ahead` are the effects of the two tensions
-    on the node. `pending` is the tension of the edge ahead, with row -`row` on the node and `row` on the next. `slack` is zero
-    without a tension; `free` is one for free dofs.
+    behind is T = `weight` (b . e1 + c . e2 + `coupling` T_ahead - `load`). `behind` and `ahead` are the effects of the two
+    tensions on the node. `pending` is the tension of the edge ahead, with row -`row` on the node and `row` on the next. `slack` is
+    zero without a tension; `free` is one for free dofs.
     """
     H, M = wp.types.vector(size, linear), wp.types.matrix((size, size), linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.functions(size, linear)
@@ -48,7 +48,7 @@ def functions(size: int, linear):
         node: H
         ahead: H
         pivot: linear
-        right: linear
+        load: linear
 
     @wp.struct
     class Eliminated:
@@ -56,7 +56,7 @@ def functions(size: int, linear):
         c: H
         weight: linear
         coupling: linear
-        right: linear
+        load: linear
         behind: H
         ahead: H
         pending: Pending
@@ -67,7 +67,7 @@ def functions(size: int, linear):
         gd = wp.cw_mul(g, inverse)
         out = Eliminated()
         out.weight = linear(1.0) / (pending.pivot + wp.dot(gd, g))
-        out.right = pending.right - wp.dot(gd, z)
+        out.load = pending.load - wp.dot(gd, z)
         out.b = pending.ahead - gd * Zb
         out.c = -(gd * Zc)
         out.behind = upper_vector(L, inverse, g)
@@ -79,7 +79,7 @@ def functions(size: int, linear):
             q = -wp.dot(ud, g)
             coupling = q * out.weight
             next.pivot = slack + wp.dot(ud, u) - q * coupling
-            next.right = coupling * out.right - wp.dot(ud, z)
+            next.load = coupling * out.load - wp.dot(ud, z)
             next.node = row - ud * Zb + coupling * out.b
             next.ahead = coupling * out.c - ud * Zc
             out.coupling = q

@@ -17,7 +17,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import CARRIED, WANTED
+from ddg_warp.kernels.core.islands import MAX_EDGE_STIFFNESS, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.linear import mixed_axial_force
@@ -91,7 +91,7 @@ def pair_kernel(kind: RodKind, linear):
         blocks: wp.array3d(dtype=linear),
         F: wp.array3d(dtype=linear),
         fixed: wp.array2d(dtype=wp.uint8),
-        right: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         matrix_out: wp.array3d(dtype=linear),
@@ -106,7 +106,7 @@ def pair_kernel(kind: RodKind, linear):
         k = 2 * b + p
         value = linear(0.0)
         if k < n and i < wp.static(nb):
-            value = right[i, k, r]
+            value = rhs[i, k, r]
         right_out[c, b, r] = value
         for j in range(wp.static(size)):
             offset = i * wp.static(size) + j
@@ -143,7 +143,7 @@ def unpair_kernel(kind: RodKind, real, linear):
     ):
         k, r = wp.tid()
         n = count[r]
-        if flags[WANTED, r] == 0 or k >= n:
+        if flags[NEEDS_DIRECTION, r] == 0 or k >= n:
             return
         for d in range(wp.static(nb)):
             direction_out[d, k, r] = solution[d, k, r]
@@ -156,7 +156,7 @@ def unpair_kernel(kind: RodKind, real, linear):
         for d in range(wp.static(dim)):
             step[d] = real(solution[d, k + 1, r] - solution[d, k, r])
         edge = x[k + 1, r] - x[k, r]
-        per_root = linear(real(1.0) / wp.sqrt(scalars[CARRIED, r]))
+        per_root = linear(real(1.0) / wp.sqrt(scalars[MAX_EDGE_STIFFNESS, r]))
         direction_out[wp.static(nb), k, r] = longer(F[wp.static(slack_row), k, r], pull, per_root, edge, step)
 
     return unpair

@@ -153,7 +153,7 @@ def level_kernels(linear):
         residual: wp.array(dtype=H),
         correction: wp.array(dtype=H),
         group: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         groups: int,
         blocks: int,
         wanted: wp.array(dtype=int),
@@ -169,7 +169,7 @@ def level_kernels(linear):
         y = z[i]
         g = group[k]
         if g >= 0:
-            y += wp.cw_mul(correction[g + w * groups], free(barred[i]))
+            y += wp.cw_mul(correction[g + w * groups], free(inactive_mask[i]))
         z[i] = y
         dots_out[w, k] = wp.dot(residual[i], y)
 

@@ -60,7 +60,7 @@ def read_functions(kind: RodKind, linear, rows: int, prefetch: bool):
 
 
 @cache
-def keep_functions(nb: int, linear, size: int, prefetch: bool):
+def prefetch_functions(nb: int, linear, size: int, prefetch: bool):
     """Return the device functions `kept`, `left_at` and `times`.
 
     `kept(Y, k, r)`: all kept data of an eliminated node if `prefetch`, else nothing.

@@ -8,11 +8,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import CLAMPED, COEFFICIENT, ITERATION
+from ddg_warp.kernels.core.islands import DROP_COMPRESSION, INERTIA_COEFFICIENT, ITERATION
 from ddg_warp.kernels.core.launch import first_of
 from ddg_warp.kernels.elements.coupled_element import part_function
 from ddg_warp.kernels.forces.drag import mass_type
-from ddg_warp.kernels.linear.rod_dof_map import behind_function, place_dofs, place_functions
+from ddg_warp.kernels.linear.rod_dof_map import edge_behind_function, path_node_dofs, path_node_functions
 from ddg_warp.kernels.linear.sliced_ell import second_function
 from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type
 from ddg_warp.kernels.terms import Term
@@ -25,7 +25,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     It adds the contributions of the last of the terms, and calls itself for the terms before.
     """
     term, curved = terms[-1], exact[-1]
-    measure, nb = term.measure, place_dofs(twist, split)
+    measure, nb = term.measure, path_node_dofs(twist, split)
     B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(real, linear)
     n, size, nodes, angles, tensions = (
         len(measure.strains),
@@ -163,14 +163,14 @@ def blocks_function(
     blocks come from positions of H. If `split`, the last dof of a path node is the tension of the edge behind, eliminated after both
     of its nodes; see `kernels.linear.mixed_axial_force`. A path node without tension has a row of the negative identity.
     """
-    nb = place_dofs(twist, split)
+    nb = path_node_dofs(twist, split)
     parts = 1 + twist  # dof blocks of a path node: node, twist angle of the edge ahead
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
-    free_of, block_of = place_functions(twist, linear, split)
+    free_of, block_of = path_node_functions(twist, linear, split)
     late_terms = tuple(first is not None for first in exact_from)
     add = sum_function(terms, twist, real, linear, late_terms, split) if terms else None
-    tension_behind = behind_function(terms, real, linear) if split else None
+    tension_behind = edge_behind_function(terms, real, linear) if split else None
     begin = next((first for first in exact_from if first is not None), 0)
 
     @wp.func
@@ -195,7 +195,7 @@ def blocks_function(
         first = w * layout.positions
         if wp.static(add is not None):
             # the iteration has been counted since its evaluation
-            with_second = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            with_second = flags[ITERATION, w] > wp.static(begin) and flags[DROP_COMPRESSION, w] == 0
             D, E, F = add(sets, k, c, w, with_second)
             for part in range(wp.static(parts)):
                 block = layout.places[part, k, c]
@@ -204,9 +204,9 @@ def blocks_function(
                         for d in range(3):
                             if part == 0 or d == 0:
                                 if wp.static(drag):
-                                    inertia = mass[w, block].mass[d] * scalars[COEFFICIENT, w]
+                                    inertia = mass[w, block].mass[d] * scalars[INERTIA_COEFFICIENT, w]
                                 else:
-                                    inertia = mass[w, block][d] * scalars[COEFFICIENT, w]
+                                    inertia = mass[w, block][d] * scalars[INERTIA_COEFFICIENT, w]
                                 D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
                         if wp.static(drag):
                             resistance = mass[w, block].resistance

@@ -7,13 +7,13 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import CARRIED, WANTED
+from ddg_warp.kernels.core.islands import MAX_EDGE_STIFFNESS, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS, first_of, until_function
 from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear.rod_band_assembly import blocks_function, layout_type
-from ddg_warp.kernels.linear.rod_dof_map import behind_function, place_dofs, value_function
+from ddg_warp.kernels.linear.rod_dof_map import edge_behind_function, path_node_dofs, value_function
 from ddg_warp.kernels.linear.rod_matrix import TILE, block_functions
-from ddg_warp.kernels.linear.sliced_ell import BARRED, product_functions, settle_function
+from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE, product_functions, settle_function
 from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type
 from ddg_warp.kernels.terms import Term
 
@@ -64,7 +64,7 @@ def band_kernels(
     `clear`: zero the positions of H that moved to bands.
     `product`: compute H p on active dofs, and p . H p by block.
     """
-    nb = place_dofs(twist, split)
+    nb = path_node_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
     load, store, _, _ = block_functions(nb, linear)
@@ -89,7 +89,7 @@ def band_kernels(
         w = r / layout.count.shape[0]
         c = r - w * layout.count.shape[0]
         n = layout.count[c]
-        if flags[WANTED, w] == 0 or layout.idle[r] != 0 or start >= n:
+        if flags[NEEDS_DIRECTION, w] == 0 or layout.idle[r] != 0 or start >= n:
             return
         for k in range(start, until(start, n)):
             D, E, F = blocks_at(matrix, mass, flags, scalars, layout, sets, k, c, w)
@@ -112,7 +112,7 @@ def band_kernels(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -136,7 +136,7 @@ def band_kernels(
             w = (tid - threads) / separate_blocks.shape[0]
             if wanted[w] == 1:
                 b = separate_blocks[tid - threads - w * separate_blocks.shape[0]]
-                settle(matrix, columns, slices, barred, p, blocks, positions, b, w, H(), product_out, dots_out)
+                settle(matrix, columns, slices, inactive_mask, p, blocks, positions, b, w, H(), product_out, dots_out)
             return
         tile = tid / (bands.shape[1] * TILE)
         k = tid / TILE - tile * bands.shape[1]
@@ -162,12 +162,12 @@ def band_kernels(
         node = places[0, k, c]
         if node >= 0:
             y = H(u[0], u[1], u[2])
-            settle(matrix, columns, slices, barred, p, blocks, positions, node, w, y, product_out, dots_out)
+            settle(matrix, columns, slices, inactive_mask, p, blocks, positions, node, w, y, product_out, dots_out)
         if wp.static(twist):
             angle = places[1, k, c]
             if angle >= 0:
                 y = H(u[3], linear(0.0), linear(0.0))
-                settle(matrix, columns, slices, barred, p, blocks, positions, angle, w, y, product_out, dots_out)
+                settle(matrix, columns, slices, inactive_mask, p, blocks, positions, angle, w, y, product_out, dots_out)
 
     return assemble, clear, product
 
@@ -178,7 +178,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
 
     `walk`: compute H p path by path; each block is read once, and its transposed product carried to later nodes.
     """
-    nb = place_dofs(twist, split)
+    nb = path_node_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     load, _, _, _ = block_functions(nb, linear)
     along, back = times_functions(nb, linear)
@@ -190,7 +190,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -208,7 +208,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
             shift = first_of(w, blocks)
             for b in range(blocks):
                 y = H()
-                if barred[b + shift] != BARRED:
+                if inactive_mask[b + shift] != ALL_INACTIVE:
                     y = times(matrix, columns, slices, p, b, w * positions, shift)
                 product_out[b + shift] = y
             for c in range(count.shape[0]):
@@ -244,7 +244,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
                         if angle >= 0:
                             product_out[angle + shift] += H(u[3], linear(0.0), linear(0.0))
             for b in range(blocks):
-                y = wp.cw_mul(product_out[b + shift], free(barred[b + shift]))
+                y = wp.cw_mul(product_out[b + shift], free(inactive_mask[b + shift]))
                 product_out[b + shift] = y
                 dots_out[w, b] = wp.dot(p[b + shift], y)
 
@@ -258,7 +258,7 @@ def lengthen_kernel(terms: tuple[Term, ...], real, linear):
     `lengthen`: write slack and lengthening of the edges behind path nodes, from solutions with tensions.
     """
     Layout, Along = layout_type(), along_type(real, linear)
-    tension_behind = behind_function(terms, real, linear)
+    tension_behind = edge_behind_function(terms, real, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lengthen(
@@ -272,12 +272,12 @@ def lengthen_kernel(terms: tuple[Term, ...], real, linear):
         k, r = wp.tid()
         w = r / layout.count.shape[0]
         c = r - w * layout.count.shape[0]
-        if flags[WANTED, w] == 0 or k >= layout.count[c]:
+        if flags[NEEDS_DIRECTION, w] == 0 or k >= layout.count[c]:
             return
         _t, slack = tension_behind(sets, k, c, w)
         longer_out[0, k, r] = slack
         longer_out[1, k, r] = (
-            slack * values[values.shape[0] - 1, k, r] * linear(real(1.0) / wp.sqrt(scalars[CARRIED, w]))
+            slack * values[values.shape[0] - 1, k, r] * linear(real(1.0) / wp.sqrt(scalars[MAX_EDGE_STIFFNESS, w]))
         )
 
     return lengthen

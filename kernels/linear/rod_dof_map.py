@@ -13,19 +13,19 @@ from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type
 from ddg_warp.kernels.terms import Term
 
 
-def place_dofs(twist: bool, split: bool = False) -> int:
+def path_node_dofs(twist: bool, split: bool = False) -> int:
     """Return the number of dofs of a path node: position, twist angle ahead (`twist`), tension behind (`split`)."""
     return 3 + twist + split
 
 
 @cache
-def place_functions(twist: bool, linear, split: bool = False):
+def path_node_functions(twist: bool, linear, split: bool = False):
     """Return the device functions `free_of` and `block_of`.
 
     `free_of(fixed_dofs)`: 1 at free dofs of a path node, 0 at fixed ones, from bits.
     `block_of(...)`: the block of two path nodes, from positions of H.
     """
-    nb = place_dofs(twist, split)
+    nb = path_node_dofs(twist, split)
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
 
     @wp.func
@@ -66,7 +66,7 @@ def gather_function(twist: bool, linear, split: bool = False):
 
     Blocks of its world start at `shift`.
     """
-    H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
+    H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, split), linear)
 
     @wp.func
     def gather(v: wp.array(dtype=H), node: int, angle: int, shift: int):
@@ -117,12 +117,12 @@ def solve_functions(twist: bool, linear, split: bool = False):
     `right(v, node, angle, fixed_dofs, shift)`: the right-hand side of a path node, zero at fixed dofs.
     `hand(u, b, node, angle, w, shift, z, dots_out)`: write the solution u, of residual b, to its dof blocks in world w.
     """
-    H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
-    free_of, _ = place_functions(twist, linear, split)
+    H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, split), linear)
+    free_of, _ = path_node_functions(twist, linear, split)
     gather = gather_function(twist, linear, split)
 
     @wp.func
-    def right(v: wp.array(dtype=H), node: int, angle: int, fixed_dofs: wp.uint8, shift: int):
+    def rhs(v: wp.array(dtype=H), node: int, angle: int, fixed_dofs: wp.uint8, shift: int):
         u = gather(v, node, angle, shift)
         if fixed_dofs != wp.uint8(0):
             u = wp.cw_mul(u, free_of(fixed_dofs))
@@ -141,7 +141,7 @@ def solve_functions(twist: bool, linear, split: bool = False):
                 z[angle + shift] = H(u[3], linear(0.0), linear(0.0))
                 dots_out[w, angle] = b[3] * u[3]
 
-    return right, hand
+    return rhs, hand
 
 
 def splits(term: Term) -> bool:
@@ -150,14 +150,14 @@ def splits(term: Term) -> bool:
 
 
 @cache
-def behind_function(terms: tuple[Term, ...], real, linear):
+def edge_behind_function(terms: tuple[Term, ...], real, linear):
     """Return the device function `behind(sets, k, c, w) -> (row, slack)` of the edge that ends at a path node.
 
     The slack is zero for an edge without tension.
     """
     H, Along = wp.types.vector(3, linear), along_type(real, linear)
     first, which, own_splits = len(terms) == 1, len(terms) - 1, splits(terms[-1])
-    before = None if first else behind_function(terms[:-1], real, linear)
+    before = None if first else edge_behind_function(terms[:-1], real, linear)
 
     @wp.func
     def behind(sets: wp.array(dtype=Along), k: int, c: int, w: int):

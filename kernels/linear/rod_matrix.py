@@ -9,11 +9,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import CLAMPED, COEFFICIENT, ITERATION, STATUS
+from ddg_warp.kernels.core.islands import DROP_COMPRESSION, INERTIA_COEFFICIENT, ITERATION, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.linear import block_ldlt, geometric_stiffness
-from ddg_warp.kernels.newton.line_search import rests_function
+from ddg_warp.kernels.newton.line_search import converged_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
 TILE = wp.constant(32)
@@ -75,7 +75,7 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
     stored = stored or linear
     _, previous, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
-    rests = rests_function(real)
+    rests = converged_function(real)
     curved, begin = exact_from is not None, exact_from or 0
     first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric_stiffness.block_functions(kind, linear)
 
@@ -149,7 +149,7 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
             return
         if reuse != 0 and flags[ITERATION, r] > 0:
             return
-        c = scalars[COEFFICIENT, r]
+        c = scalars[INERTIA_COEFFICIENT, r]
         b = previous(k, n)
         free = free_of(fixed, k, r)
         D = M()
@@ -174,7 +174,7 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
                     C = own(F, row, bb, r, 2)
                     D += wp.outer(C, C)
             if wp.static(curved):
-                if flags[CLAMPED, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
+                if flags[DROP_COMPRESSION, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
                     if wp.static(closed) or k < n - 2:
                         D += first_first(second, k, r)
                         E += first_mid(second, k, r)
@@ -469,13 +469,13 @@ def direct_kernel(kind: RodKind, linear):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def direct(
         factor: wp.array3d(dtype=linear),
-        right: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         solution: wp.array3d(dtype=linear),
     ):
         r = wp.tid()
         if wanted[r] != 0:
-            _total = substitute(factor, right, solution, count[r], r, r)
+            _total = substitute(factor, rhs, solution, count[r], r, r)
 
     return direct

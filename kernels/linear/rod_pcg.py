@@ -11,16 +11,16 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    CLAMPED,
-    DECREMENT,
+    DROP_COMPRESSION,
+    ENERGY_BUFFER,
     ITERATION,
-    LOST,
-    SLOT,
+    LOST_PIVOTS_TOTAL,
+    NEEDS_DIRECTION,
+    PREDICTED_DECREASE,
     STATUS,
     STEP_LENGTH,
-    TURN,
-    WANTED,
-    patience_function,
+    STRAIGHT_ROTATION_LIMIT,
+    projected_limit_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind
@@ -90,7 +90,7 @@ def solver_kernels(kind: RodKind, linear, preconditioner: str):
         factors: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
-        right: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
         residual: wp.array3d(dtype=linear),
         solution: wp.array3d(dtype=linear),
         z: wp.array3d(dtype=linear),
@@ -105,9 +105,9 @@ def solver_kernels(kind: RodKind, linear, preconditioner: str):
         if wanted[r] == 0:
             return
         n = count[r]
-        total = apply(blocks, factors, right, z, n, r)
+        total = apply(blocks, factors, rhs, z, n, r)
         for k in range(n):
-            store_vector(residual, 0, k, r, vector(right, 0, k, r))
+            store_vector(residual, 0, k, r, vector(rhs, 0, k, r))
             store_vector(p, 0, k, r, vector(z, 0, k, r))
             store_vector(solution, 0, k, r, H())
         rho[r] = total
@@ -199,30 +199,30 @@ def repeat_kernel(real, fails: bool, exact: bool = True):
     `exact`: the matrix is the exact Hessian unless that is indefinite.
     """
 
-    out_of_patience = patience_function(real)
+    out_of_patience = projected_limit_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def repeat(done: int, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), negative: wp.array(dtype=int)):
         r = wp.tid()
-        if flags[WANTED, r] == 0:
+        if flags[NEEDS_DIRECTION, r] == 0:
             return
-        if negative[r] > 0 and flags[CLAMPED, r] == 0:
-            flags[WANTED, r] = 0
+        if negative[r] > 0 and flags[DROP_COMPRESSION, r] == 0:
+            flags[NEEDS_DIRECTION, r] = 0
             negative[r] = 0
             if wp.static(fails):
                 flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
-            flags[CLAMPED, r] = 1
+            flags[DROP_COMPRESSION, r] = 1
             flags[ITERATION, r] = flags[ITERATION, r] - 1
-            flags[SLOT, r] = 1 - flags[SLOT, r]
+            flags[ENERGY_BUFFER, r] = 1 - flags[ENERGY_BUFFER, r]
         elif done != 0:
-            flags[LOST, r] = flags[LOST, r] + negative[r]
+            flags[LOST_PIVOTS_TOTAL, r] = flags[LOST_PIVOTS_TOTAL, r] + negative[r]
             negative[r] = 0
             if wp.static(exact):
                 if out_of_patience(flags, scalars, r):
-                    flags[WANTED, r] = 0
+                    flags[NEEDS_DIRECTION, r] = 0
             else:
-                flags[CLAMPED, r] = 0
+                flags[DROP_COMPRESSION, r] = 0
 
     return repeat
 
@@ -255,7 +255,7 @@ def take_kernel(kind: RodKind, real, linear):
         work: wp.array(dtype=wp.int64),
     ):
         r = wp.tid()
-        if flags[WANTED, r] == 0:
+        if flags[NEEDS_DIRECTION, r] == 0:
             return
         n = count[r]
         rotation = real(0.0)
@@ -273,7 +273,7 @@ def take_kernel(kind: RodKind, real, linear):
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
         turn_angles(theta, direction, whole, n, r)
-        if rotation > scalars[TURN, r] * scalars[TURN, r]:
+        if rotation > scalars[STRAIGHT_ROTATION_LIMIT, r] * scalars[STRAIGHT_ROTATION_LIMIT, r]:
             place(x, base, base, direction, fixed, anchor, whole, 0, n, r)
         else:
             for k in range(n):
@@ -282,7 +282,7 @@ def take_kernel(kind: RodKind, real, linear):
                     step[d] = real(direction[d, k, r])
                 x[k, r] = x[k, r] + step
         scalars[STEP_LENGTH, r] = whole
-        scalars[DECREMENT, r] = total
+        scalars[PREDICTED_DECREASE, r] = total
         wp.atomic_add(work, 0, wp.int64(iterations[r]))
 
     return take

@@ -27,8 +27,8 @@ from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, until_function
 from ddg_warp.kernels.linear.joint_schur import coupling_functions
 from ddg_warp.kernels.linear.rod_dof_map import (
     angle_function,
-    place_dofs,
-    place_functions,
+    path_node_dofs,
+    path_node_functions,
     solve_functions,
     value_function,
 )
@@ -38,20 +38,20 @@ from ddg_warp.kernels.linear.rod_matrix import (
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.linear.sliced_ell import BARRED
+from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE
 
 
 @cache
-def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
+def serial_path_nodes_kernel(twist: bool, span: int, linear, split: bool = False):
     """Build the kernel that solves paths without joints on the CPU, one thread a path.
 
-    `solve`: load, solve and finish of `chain_kernels` in one.
+    `solve`: load, solve and finish of `path_kernels` in one.
     """
-    nb = place_dofs(twist, split)
+    nb = path_node_dofs(twist, split)
     H = wp.types.vector(3, linear)
     _, _, vector, store_vector = block_functions(nb, linear)
     substitute = substitute_function(nb, span, linear, tensions=int(split))
-    right, hand = solve_functions(twist, linear, split)
+    rhs, hand = solve_functions(twist, linear, split)
     value, angle_of = value_function(twist, linear, split), angle_function(twist)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -76,7 +76,7 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
         n, first = count[c], first_of(w, blocks)
         for k in range(n):
             store_vector(
-                values, 0, k, r, right(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
+                values, 0, k, r, rhs(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
             )
         _product = substitute(factors, values, values, n, r, r)
         for k in range(n):
@@ -87,7 +87,7 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
 
 
 @cache
-def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split: bool = False):
+def path_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split: bool = False):
     """Build the kernels of substructuring.
 
     `factorise`: factorise H_II.
@@ -99,14 +99,14 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
     `spread`: write the wanted columns of wanted worlds.
     `note`: mark worlds that lost pivots.
     """
-    nb = place_dofs(twist, split)
+    nb = path_node_dofs(twist, split)
     parts, angle = 1 + twist, 2 + twist  # dof blocks of a path node (node, twist angle); index of the twist angle
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     _, _, _, store_vector = block_functions(nb, linear)
     factor = factor_function(nb, span, linear, int(split))
     substitute = substitute_function(nb, span, linear, tensions=int(split))
     substitute_all = substitute_all_function(nb, span, linear, sides)
-    free_of, _ = place_functions(twist, linear, split)
+    free_of, _ = path_node_functions(twist, linear, split)
     until = until_function(serial)
     multiply, _ = coupling_functions(linear)
 
@@ -264,7 +264,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         joint_row: wp.array(dtype=int),
         joint_rows: int,
         moved: wp.array(dtype=H),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         nodes: int,
@@ -275,7 +275,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         start = wp.tid()
         for i in range(start, until(start, z.shape[0])):
             w = i / blocks
-            if wanted[w] != 1 or barred[i] == BARRED:
+            if wanted[w] != 1 or inactive_mask[i] == ALL_INACTIVE:
                 continue
             b = i - w * blocks
             entry = where[b]

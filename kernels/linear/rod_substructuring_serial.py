@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import WANTED
+from ddg_warp.kernels.core.islands import NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of
 from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear import block_ldlt
@@ -52,7 +52,7 @@ def walk_kernel(
         scalars: wp.array2d(dtype=real),
         layout: Layout,
         sets: wp.array(dtype=Along),
-        right: wp.array(dtype=H),
+        rhs: wp.array(dtype=H),
         blocks: int,
         factors: wp.array3d(dtype=linear),
         values: wp.array3d(dtype=linear),
@@ -62,7 +62,7 @@ def walk_kernel(
         r = wp.tid()
         w = r / layout.count.shape[0]
         c = r - w * layout.count.shape[0]
-        if flags[WANTED, w] == 0:
+        if flags[NEEDS_DIRECTION, w] == 0:
             return
         n = layout.count[c]
         shift = first_of(w, blocks)
@@ -81,7 +81,7 @@ def walk_kernel(
             Zb = lower(L, E - minus_couple)
             U = upper(L, inverse, Zb)
             minus = minus_next + congruence(Zb, inverse, Zb)
-            u = value(right, layout.places, k, c, shift) - before
+            u = value(rhs, layout.places, k, c, shift) - before
             before = before2 + u * U
             store(factors, 0, k, r, U)
             if wp.static(span == 2):

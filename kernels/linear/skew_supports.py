@@ -12,7 +12,7 @@ from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 
 @cache
-def turn_kernel(real, back: bool):
+def rotate_kernel(real, back: bool):
     """Build the kernel that rotates vectors.
 
     `turn`: rotate the vectors of dof blocks `where` into their nodal frames, or back, in wanted worlds.

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
+from ddg_warp.kernels.core.islands import DROP_COMPRESSION, INERTIA_COEFFICIENT, ITERATION, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.coupled_element import factor_type, part_function
 from ddg_warp.kernels.forces.drag import mass_type
@@ -17,7 +17,7 @@ from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
 SLICE = 32  # rows of a slice of H
-BARRED = wp.constant(wp.uint8(7))  # bits of a dof block without active dofs
+ALL_INACTIVE = wp.constant(wp.uint8(7))  # bits of a dof block without active dofs
 
 
 @cache
@@ -213,10 +213,10 @@ def assemble_kernel(
         start = wp.tid()
         for p in range(start, until(start, matrix.shape[1])):
             w = p / positions
-            if flags[WANTED, w] == 0:
+            if flags[NEEDS_DIRECTION, w] == 0:
                 continue
             # the iteration has been counted since its evaluation
-            with_second = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            with_second = flags[ITERATION, w] > wp.static(begin) and flags[DROP_COMPRESSION, w] == 0
             position = p - w * positions
             row = rows[position]
             if row < 0:
@@ -224,7 +224,7 @@ def assemble_kernel(
             m = M()
             if wp.static(begins):
                 if row == columns[position]:
-                    m = inertia_of(mass, scalars[COEFFICIENT, w], w, row)
+                    m = inertia_of(mass, scalars[INERTIA_COEFFICIENT, w], w, row)
             else:
                 for i in range(3):
                     for j in range(3):
@@ -304,7 +304,7 @@ def settle_function(linear):
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         blocks: int,
         positions: int,
@@ -315,11 +315,11 @@ def settle_function(linear):
         dots_out: wp.array2d(dtype=linear),
     ):
         i = b + w * blocks
-        if barred[i] == BARRED:
+        if inactive_mask[i] == ALL_INACTIVE:
             y = H()
         else:
             y += times(matrix, columns, slices, p, b, w * positions, w * blocks)
-            y = wp.cw_mul(y, free(barred[i]))
+            y = wp.cw_mul(y, free(inactive_mask[i]))
         product_out[i] = y
         dots_out[w, b] = wp.dot(p[i], y)
 

@@ -20,7 +20,7 @@ import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.linear import block_ldlt
-from ddg_warp.kernels.linear.rod_dof_map import angle_function, gather_function, place_dofs, solve_functions
+from ddg_warp.kernels.linear.rod_dof_map import angle_function, gather_function, path_node_dofs, solve_functions
 from ddg_warp.kernels.linear.rod_matrix import block_functions
 
 
@@ -31,7 +31,7 @@ def share(n: int, side: int):
 
 
 @wp.func
-def place_of(j: int, n: int, side: int):
+def index_of(j: int, n: int, side: int):
     """Return the index of the j-th path node that a side eliminates."""
     return wp.where(side == 0, j, n - 1 - j)
 
@@ -43,7 +43,7 @@ def factor_kernels(twist: bool, span: int, linear):
     `sides`: eliminate all path nodes but the middle, one thread a side.
     `middle`: eliminate the two middle nodes.
     """
-    nb = place_dofs(twist)
+    nb = path_node_dofs(twist)
     nb2 = nb**2
     M = wp.types.matrix((nb, nb), linear)
     load, store, _, store_vector = block_functions(nb, linear)
@@ -74,7 +74,7 @@ def factor_kernels(twist: bool, span: int, linear):
     @wp.func
     def coupling(blocks: wp.array3d(dtype=linear), offset: int, j: int, n: int, side: int, r: int):
         """Return the block between a side's j-th node and the node `offset` further; its diagonal block for 0."""
-        k = place_of(j, n, side)
+        k = index_of(j, n, side)
         if side == 0:
             return load(blocks, offset * wp.static(nb2), k, r)
         return wp.transpose(load(blocks, offset * wp.static(nb2), k - offset, r))
@@ -119,7 +119,7 @@ def factor_kernels(twist: bool, span: int, linear):
                 F_ahead = coupling(blocks, 2, next_j, n, side, r)
             if j >= 0:
                 taken, couple, beyond, lost_here = eliminate(
-                    D - minus, E - minus_couple, F, factors, place_of(j, n, side), r
+                    D - minus, E - minus_couple, F, factors, index_of(j, n, side), r
                 )
                 lost_pivots += lost_here
                 minus = minus_next + taken
@@ -173,13 +173,13 @@ def solve_kernels(twist: bool, span: int, linear):
     `inward`: substitute forward along both sides up to the middle.
     `outward`: solve the middle, substitute back to both ends, and write z and r . z.
     """
-    nb = place_dofs(twist)
+    nb = path_node_dofs(twist)
     nb2 = nb**2
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     load, _, vector, store_vector = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = block_ldlt.functions(nb, linear)
     gather, angle_of = gather_function(twist, linear), angle_function(twist)
-    right, hand = solve_functions(twist, linear)
+    rhs, hand = solve_functions(twist, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def inward(
@@ -206,27 +206,27 @@ def solve_kernels(twist: bool, span: int, linear):
         before, before2 = B(), B()
         # Prefetch: data of the next path node is read first, as in `block_band.substitute_function`, and dof indices one node
         # earlier; otherwise a thread waits twice.
-        k = place_of(0, n, side)
+        k = index_of(0, n, side)
         U, V = load(factors, 0, k, r), M()
         if wp.static(span == 2):
             V = load(factors, wp.static(nb2), k, r)
-        rhs = right(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
-        k = place_of(wp.min(1, n - 1), n, side)
+        rhs = rhs(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
+        k = index_of(wp.min(1, n - 1), n, side)
         node = places[0, k, c]
         angle = angle_of(places, k, c)
         fixed = fixed_dofs[k, c]
         for j in range(share(n, side)):
-            k = place_of(j + 1, n, side)
+            k = index_of(j + 1, n, side)
             U_ahead, V_ahead = load(factors, 0, k, r), M()
             if wp.static(span == 2):
                 V_ahead = load(factors, wp.static(nb2), k, r)
-            rhs_ahead = right(residual, node, angle, fixed, first)
-            k = place_of(wp.min(j + 2, n - 1), n, side)
+            rhs_ahead = rhs(residual, node, angle, fixed, first)
+            k = index_of(wp.min(j + 2, n - 1), n, side)
             node = places[0, k, c]
             angle = angle_of(places, k, c)
             fixed = fixed_dofs[k, c]
             u = rhs - before
-            store_vector(values_out, 0, place_of(j, n, side), r, u)
+            store_vector(values_out, 0, index_of(j, n, side), r, u)
             before = before2 + u * U
             if wp.static(span == 2):
                 before2 = u * V
@@ -261,7 +261,7 @@ def solve_kernels(twist: bool, span: int, linear):
         c = r - w * count.shape[0]
         n, first, last = count[c], w * blocks, share(count[c], side)
         # prefetch dof indices and factors of the first node outward before the middle is solved
-        k = place_of(wp.max(last - 1, 0), n, side)
+        k = index_of(wp.max(last - 1, 0), n, side)
         node = places[0, k, c]
         angle = angle_of(places, k, c)
         U, V = load(factors, 0, k, r), M()
@@ -271,10 +271,10 @@ def solve_kernels(twist: bool, span: int, linear):
         value = vector(values, 0, k, r)
         h = n / 2
         a, a_right, C = B(), B(), M()
-        b_right = right(residual, places[0, h, c], angle_of(places, h, c), fixed_dofs[h, c], first)
+        b_right = rhs(residual, places[0, h, c], angle_of(places, h, c), fixed_dofs[h, c], first)
         b = b_right - vector(taken, 0, 1, r) - vector(taken, wp.static(nb), 0, r)
         if h > 0:
-            a_right = right(residual, places[0, h - 1, c], angle_of(places, h - 1, c), fixed_dofs[h - 1, c], first)
+            a_right = rhs(residual, places[0, h - 1, c], angle_of(places, h - 1, c), fixed_dofs[h - 1, c], first)
             a = a_right - vector(taken, 0, 0, r) - vector(taken, wp.static(nb), 1, r)
             C = load(factors, 0, h - 1, r)
             b -= a * C
@@ -290,10 +290,10 @@ def solve_kernels(twist: bool, span: int, linear):
             e2 = swapped
             b_right = a_right
         if last >= 0:
-            k = place_of(last, n, side)
+            k = index_of(last, n, side)
             hand(e1, b_right, places[0, k, c], angle_of(places, k, c), w, first, z, dots_out)
         for i in range(last):
-            k = place_of(wp.max(last - 2 - i, 0), n, side)
+            k = index_of(wp.max(last - 2 - i, 0), n, side)
             node_ahead = places[0, k, c]
             angle_ahead = angle_of(places, k, c)
             U_ahead, V_ahead = load(factors, 0, k, r), M()

@@ -6,30 +6,34 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    ACTIVE,
-    CLAMPED,
-    CUT,
-    DECREMENT,
-    DETOURS,
-    DRIVEN,
-    HALVINGS,
+    ANY_ACTIVE,
+    BACKTRACKS,
+    CCD_LIMITED,
+    DROP_COMPRESSION,
+    ENERGY_BUFFER,
+    ITERATE_ACTION,
     ITERATION,
-    MOVED,
-    PORTION,
-    PROGRESS,
+    NEEDS_DIRECTION,
+    PREDICTED_DECREASE,
+    PROJECTED_ITERATIONS,
     RETRIES,
-    SLOT,
     STATUS,
     STEP_LENGTH,
-    TODO,
-    WANTED,
+    STEP_PROGRESS,
+    SUBSTEP_ACCEPTED,
+    SUBSTEP_FRACTION,
+    SUPPORT_MOTION_PENDING,
 )
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 from ddg_warp.kernels.linear.sliced_ell import product_functions
-from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY, THERE
-from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, STRAIGHT
+from ddg_warp.kernels.newton.coupled_newton import SUPPORTS_ARRIVED, SUPPORTS_MOVING
+from ddg_warp.kernels.newton.rod_iterate import MOVE_STRAIGHT, ROTATE_EDGES, UPDATE_FRAMES
 
-WHOLE, UNITS, NONE = 1, 0, -1  # modes of a world's motion: one fraction, one per CCD body, no motion
+SINGLE_FRACTION, PER_BODY_FRACTION, NONE = (
+    1,
+    0,
+    -1,
+)  # modes of a world's motion: one fraction, one per CCD body, no motion
 UNBRACED = 2  # retries, until the step is halved, after which inertia stiffens contact at its minimum gap
 UNTRIED = 2  # iterates without the exact matrix after one in which it was indefinite
 
@@ -67,9 +71,9 @@ def world_kernels(real):
         """
         w = wp.tid()
         if flags[STATUS, w] == 0 and (gap[w] < least or overflow[0] != 0):
-            flags[STATUS, w] = wp.static(outcome.NO_ROOM)
+            flags[STATUS, w] = wp.static(outcome.MINIMUM_GAP)
         if flags[STATUS, w] == 0:
-            accepted = flags[SLOT, w]
+            accepted = flags[ENERGY_BUFFER, w]
             kept[1 - accepted, w] = energy[w]
             change[w] = change[w] + energy[w] - kept[accepted, w]
             noise[w] = noise[w] + wp.abs(energy[w])
@@ -80,22 +84,28 @@ def world_kernels(real):
         w = wp.tid()
         longest_out[w] = real(0.0)
         modes_out[w] = wp.static(NONE)
-        if flags[TODO, w] == wp.static(PLACE) or flags[TODO, w] == wp.static(STRAIGHT):
-            modes_out[w] = wp.where(flags[HALVINGS, w] > 0, int(wp.static(WHOLE)), int(wp.static(UNITS)))
+        if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES) or flags[ITERATE_ACTION, w] == wp.static(MOVE_STRAIGHT):
+            modes_out[w] = wp.where(
+                flags[BACKTRACKS, w] > 0, int(wp.static(SINGLE_FRACTION)), int(wp.static(PER_BODY_FRACTION))
+            )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
         """Choose modes of predictors, in worlds that take the step."""
         w = wp.tid()
         longest_out[w] = real(0.0)
-        modes_out[w] = wp.where(flags[MOVED, w] != 0, int(wp.static(UNITS)), int(wp.static(NONE)))
-        flags[DRIVEN, w] = 0
+        modes_out[w] = wp.where(
+            flags[SUBSTEP_ACCEPTED, w] != 0, int(wp.static(PER_BODY_FRACTION)), int(wp.static(NONE))
+        )
+        flags[SUPPORT_MOTION_PENDING, w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def depart(modes: wp.array(dtype=int), flags: wp.array2d(dtype=int)):
         w = wp.tid()
         if modes[w] != wp.static(NONE):
-            flags[DRIVEN, w] = wp.where(flags[DRIVEN, w] == wp.static(ON_THE_WAY), int(wp.static(THERE)), int(0))
+            flags[SUPPORT_MOTION_PENDING, w] = wp.where(
+                flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING), int(wp.static(SUPPORTS_ARRIVED)), int(0)
+            )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def expect(
@@ -110,7 +120,8 @@ def world_kernels(real):
         """Set the predicted decrease of a limited update, over its length, and keep the world from counting as stalled.
 
         If the matrix was indefinite and the step is shortened, the exact matrix is of no use yet. The next iterate is projected at
-        once, and does not count as a projected iteration (`kernels.core.islands.patience_function`). Nor is the exact matrix tried in
+        once, and does not count as a projected iteration (`kernels.core.islands.projected_limit_function`). Nor is the exact matrix
+        tried in
         the next few iterates: some of many bodies are always where it is indefinite, and each trial is a full solve.
         """
         w = wp.tid()
@@ -118,16 +129,20 @@ def world_kernels(real):
         moves = modes[w] != wp.static(NONE)
         cut = moves and time[w] < real(1.0)
         if moves:
-            flags[CUT, w] = int(cut)
-        short = cut or (moves and flags[HALVINGS, w] > 0)
-        if projected[w] > 0 and flags[CLAMPED, w] == 0 and (short or (moves and projected[w] <= wp.static(UNTRIED))):
-            flags[CLAMPED, w] = 1
+            flags[CCD_LIMITED, w] = int(cut)
+        short = cut or (moves and flags[BACKTRACKS, w] > 0)
+        if (
+            projected[w] > 0
+            and flags[DROP_COMPRESSION, w] == 0
+            and (short or (moves and projected[w] <= wp.static(UNTRIED)))
+        ):
+            flags[DROP_COMPRESSION, w] = 1
             if short:
-                flags[DETOURS, w] = flags[DETOURS, w] - 1
+                flags[PROJECTED_ITERATIONS, w] = flags[PROJECTED_ITERATIONS, w] - 1
         cut = cut and length > real(0.0)
         if cut:
-            scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
-        if cut or flags[DRIVEN, w] != 0:
+            scalars[PREDICTED_DECREASE, w] = wp.max(decrease[w], real(0.0)) / length
+        if cut or flags[SUPPORT_MOTION_PENDING, w] != 0:
             stalled[w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -146,11 +161,11 @@ def world_kernels(real):
         """
         w = wp.tid()
         if overflow[0] != 0:
-            scalars[PROGRESS, w] = real(1.0)
+            scalars[STEP_PROGRESS, w] = real(1.0)
             return
-        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if flags[SUBSTEP_ACCEPTED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             if crossed[w] > 0:
-                flags[STATUS, w] = wp.static(outcome.CROSSED)
+                flags[STATUS, w] = wp.static(outcome.INTERPENETRATION)
                 wp.atomic_add(total, 0, wp.int64(crossed[w]))
             else:
                 wp.atomic_min(least, 0, gap[w])
@@ -161,36 +176,38 @@ def world_kernels(real):
     ):
         """Mark worlds with geometric stiffness of pairs in the matrix; count consecutive projected iterates."""
         w = wp.tid()
-        if flags[WANTED, w] != 0:
-            projected[w] = wp.where(flags[CLAMPED, w] != 0, projected[w] + 1, int(0))
+        if flags[NEEDS_DIRECTION, w] != 0:
+            projected[w] = wp.where(flags[DROP_COMPRESSION, w] != 0, projected[w] + 1, int(0))
         curved[w] = wp.where(
-            flags[WANTED, w] != 0 and flags[ITERATION, w] > first_exact and flags[CLAMPED, w] == 0, 1, 0
+            flags[NEEDS_DIRECTION, w] != 0 and flags[ITERATION, w] > first_exact and flags[DROP_COMPRESSION, w] == 0,
+            1,
+            0,
         )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(flags: wp.array2d(dtype=int)):
         """Continue worlds that have converged, with updated friction; the next iterate is accepted."""
         w = wp.tid()
-        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if flags[SUBSTEP_ACCEPTED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             flags[STATUS, w] = 0
-            flags[HALVINGS, w] = 0
-            flags[DRIVEN, w] = wp.static(THERE)
-            flags[ACTIVE, 0] = 1
+            flags[BACKTRACKS, w] = 0
+            flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_ARRIVED)
+            flags[ANY_ACTIVE, 0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
         """Mark worlds with a predictor limited by CCD as moving."""
         w = wp.tid()
         if modes[w] != wp.static(NONE):
-            flags[CUT, w] = int(time[w] < real(1.0))
-            if flags[CUT, w] != 0:
-                flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+            flags[CCD_LIMITED, w] = int(time[w] < real(1.0))
+            if flags[CCD_LIMITED, w] != 0:
+                flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def less(modes: wp.array(dtype=int), longest: wp.array(dtype=real), most: real, time: wp.array(dtype=real)):
         """Correct the fraction of a motion that was shortened to `most` [m] before CCD."""
         w = wp.tid()
-        if modes[w] == wp.static(WHOLE) and longest[w] > most:
+        if modes[w] == wp.static(SINGLE_FRACTION) and longest[w] > most:
             time[w] = time[w] * (most / longest[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -203,13 +220,13 @@ def world_kernels(real):
     ):
         """Write the rate of inertia in contact stiffness of the next substep, 0 until the minimum gap was reached."""
         w = wp.tid()
-        if scalars[PROGRESS, w] >= real(1.0):
+        if scalars[STEP_PROGRESS, w] >= real(1.0):
             return
-        if scalars[PROGRESS, w] == real(0.0) and flags[RETRIES, w] == 0:
+        if scalars[STEP_PROGRESS, w] == real(0.0) and flags[RETRIES, w] == 0:
             braced[w] = 0
-        elif flags[RETRIES, w] >= wp.static(UNBRACED) and flags[STATUS, w] == wp.static(outcome.NO_ROOM):
+        elif flags[RETRIES, w] >= wp.static(UNBRACED) and flags[STATUS, w] == wp.static(outcome.MINIMUM_GAP):
             braced[w] = 1
-        rate[w] = wp.where(braced[w] != 0, real(1.0) / (dt[w] * scalars[PORTION, w]), real(0.0))
+        rate[w] = wp.where(braced[w] != 0, real(1.0) / (dt[w] * scalars[SUBSTEP_FRACTION, w]), real(0.0))
 
     return account, modes, predicted, depart, expect, refuse, curve, again, short, less, brace
 
@@ -233,11 +250,11 @@ def block_kernels(real, linear, serial: bool):
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
-    first_item, until = share_function(serial), until_function(serial)
+    first_item, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gain(
-        right: wp.array(dtype=H),
+        rhs: wp.array(dtype=H),
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
         modes: wp.array(dtype=int),
@@ -251,7 +268,7 @@ def block_kernels(real, linear, serial: bool):
         total = real(0.0)
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
-            r = right[i]
+            r = rhs[i]
             total += wp.dot(V(real(r[0]), real(r[1]), real(r[2])), q[i] - base[i])
         dots_out[w, start] = total
 
@@ -261,14 +278,14 @@ def block_kernels(real, linear, serial: bool):
         fixed: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
-        right: wp.array(dtype=H),
+        rhs: wp.array(dtype=H),
     ):
         """Subtract a product from the residual on free dofs of worlds that need a direction."""
         w, start = first_item(wp.tid(), blocks)
         if wanted[w] != 0:
             for k in range(start, until(start, blocks)):
                 i = k + w * blocks
-                right[i] = right[i] - wp.cw_mul(product[i], free(fixed[k]))
+                rhs[i] = rhs[i] - wp.cw_mul(product[i], free(fixed[k]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
@@ -308,7 +325,7 @@ def block_kernels(real, linear, serial: bool):
     ):
         """Set supports to prescribed positions after a full step, without the rounding of directions."""
         i, w = wp.tid()
-        if modes[w] == wp.static(NONE) or flags[DRIVEN, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
+        if modes[w] == wp.static(NONE) or flags[SUPPORT_MOTION_PENDING, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
             return
         k = nodes[i]
         x = q[k + w * blocks]
@@ -340,7 +357,7 @@ def block_kernels(real, linear, serial: bool):
                 if wp.abs(goal - x[c]) <= eps * (wp.abs(goal) + wp.abs(x[c])):
                     x[c] = goal
                 else:
-                    flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+                    flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
         q[k + w * blocks] = x
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -372,7 +389,7 @@ def block_kernels(real, linear, serial: bool):
                 if k < nodes and unit[k] >= 0:
                     square = wp.length_sq(q[i] - base[i])
                     if square > far * far:
-                        modes[w] = wp.static(WHOLE)
+                        modes[w] = wp.static(SINGLE_FRACTION)
                         wp.atomic_max(longest, w, wp.sqrt(square))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -387,7 +404,7 @@ def block_kernels(real, linear, serial: bool):
     ):
         """Shorten motions by one fraction so that no node moves by more than `most` [m]."""
         w, start = first_item(wp.tid(), blocks)
-        if modes[w] == wp.static(WHOLE) and longest[w] > most:
+        if modes[w] == wp.static(SINGLE_FRACTION) and longest[w] > most:
             for k in range(start, until(start, blocks)):
                 if unit[k] >= 0:
                     i = k + w * blocks
@@ -403,10 +420,10 @@ def block_kernels(real, linear, serial: bool):
     ):
         """Discard proposed motions of worlds with arrived supports or updated frames."""
         w, start = first_item(wp.tid(), blocks)
-        along = flags[DRIVEN, w] == wp.static(ON_THE_WAY)
+        along = flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING)
         if along and flags[STATUS, w] == 0:
             going[0] = 1
-        if not along or flags[TODO, w] == wp.static(RELAG):
+        if not along or flags[ITERATE_ACTION, w] == wp.static(UPDATE_FRAMES):
             for k in range(start, until(start, blocks)):
                 proposed[k + w * blocks] = q[k + w * blocks]
 

@@ -7,14 +7,22 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import CAUTIOUS, MOVED, RATE, STEP_LENGTH, TODO, TURN, TURNING
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
-from ddg_warp.kernels.newton.edge_rotation import FURTHER, edge_functions, onward_function
-from ddg_warp.kernels.newton.rod_iterate import PLACE
+from ddg_warp.kernels.core.islands import (
+    ANY_EDGE_ROTATION,
+    COLD_START,
+    INVERSE_STEP,
+    ITERATE_ACTION,
+    STEP_LENGTH,
+    STRAIGHT_ROTATION_LIMIT,
+    SUBSTEP_ACCEPTED,
+)
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
+from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, edge_functions, repeat_rotation_function
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES
 
 
 @cache
-def turn_kernels(real, linear, serial: bool):
+def rotation_kernels(real, linear, serial: bool):
     """Build the kernels of the edge-rotation update.
 
     `bend`: mark worlds whose predictor has to rotate edges.
@@ -29,8 +37,8 @@ def turn_kernels(real, linear, serial: bool):
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     along_edge, excess_of, further_of = edge_functions(3, real)
-    extrapolation_of = onward_function(real)
-    first_item, until = share_function(serial), until_function(serial)
+    extrapolation_of = repeat_rotation_function(real)
+    first_item, until = items_function(serial), until_function(serial)
 
     @wp.func
     def move_of(direction: wp.array(dtype=H), block: int, amount: real):
@@ -61,15 +69,15 @@ def turn_kernels(real, linear, serial: bool):
     ):
         """Mark worlds if a predictor q rotates an edge from `base` too far for a straight update."""
         i, w = wp.tid()
-        if flags[MOVED, w] == 0:
+        if flags[SUBSTEP_ACCEPTED, w] == 0:
             return
         a = ends[i, 0] + w * blocks
         b = ends[i, 1] + w * blocks
         e = base[b] - base[a]
-        straight = scalars[TURN, w]
+        straight = scalars[STRAIGHT_ROTATION_LIMIT, w]
         if straight == real(0.0) or wp.length_sq(q[b] - q[a] - e) > straight * straight * wp.length_sq(e):
-            flags[TODO, w] = wp.static(PLACE)
-            flags[TURNING, 0] = 1
+            flags[ITERATE_ACTION, w] = wp.static(ROTATE_EDGES)
+            flags[ANY_EDGE_ROTATION, 0] = 1
             scalars[STEP_LENGTH, w] = real(1.0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -85,11 +93,11 @@ def turn_kernels(real, linear, serial: bool):
     ):
         i = wp.tid()
         w = i / blocks
-        if flags[TODO, w] == wp.static(PLACE):
+        if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES):
             d = q[i] - base[i]
             if (int(fixed[i - w * blocks]) & 7) == 7:
                 # the motion that the rod predicts for a support, which has its prescribed position
-                d = v[i] * wp.where(flags[CAUTIOUS, w] == 0, real(1.0) / scalars[RATE, w], real(0.0))
+                d = v[i] * wp.where(flags[COLD_START, w] == 0, real(1.0) / scalars[INVERSE_STEP, w], real(0.0))
             direction_out[i] = H(linear(d[0]), linear(d[1]), linear(d[2]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -108,14 +116,14 @@ def turn_kernels(real, linear, serial: bool):
     ):
         """Write the excess of the edge from every path node to the next; see `search.move_functions`."""
         p, w = wp.tid()
-        if todo[w] != wp.static(PLACE):
+        if todo[w] != wp.static(ROTATE_EDGES):
             return
         a = nodes[p] + w * blocks
         b = next_nodes[p] + w * blocks
         amount = step_length[w]
         step = move_of(direction, b, amount) - move_of(direction, a, amount)
         edge = base[b] - base[a]
-        if extrapolation == wp.static(FURTHER):
+        if extrapolation == wp.static(EXTRAPOLATE_ROTATED):
             excess_out[w, p] = further_of(edge, predicted[b] - predicted[a], step)
         else:
             excess_out[w, p] = excess_of(
@@ -141,7 +149,7 @@ def turn_kernels(real, linear, serial: bool):
         see `solve.linear.rod_substructuring`.
         """
         p, w = wp.tid()
-        if todo[w] != wp.static(PLACE):
+        if todo[w] != wp.static(ROTATE_EDGES):
             return
         a = nodes[p] + w * blocks
         b = next_nodes[p] + w * blocks
@@ -170,7 +178,7 @@ def turn_kernels(real, linear, serial: bool):
         """
         count = starts.shape[0] - 1
         w, start = first_item(wp.tid(), count)
-        if todo[w] != wp.static(PLACE):
+        if todo[w] != wp.static(ROTATE_EDGES):
             return
         for c in range(start, until(start, count)):
             running = V()
@@ -203,7 +211,7 @@ def turn_kernels(real, linear, serial: bool):
         """
         count = rod.shape[0]
         w, start = first_item(wp.tid(), count)
-        if todo[w] != wp.static(PLACE):
+        if todo[w] != wp.static(ROTATE_EDGES):
             return
         for c in range(start, until(start, count)):
             r = rod[c]
@@ -243,7 +251,7 @@ def turn_kernels(real, linear, serial: bool):
     ):
         """Write the nodes `indices`, none an anchor; the mean of a rod without anchors follows the straight update."""
         w, first = first_item(wp.tid(), indices.shape[0])
-        if todo[w] != wp.static(PLACE):
+        if todo[w] != wp.static(ROTATE_EDGES):
             return
         amount = step_length[w]
         for i in range(first, until(first, indices.shape[0])):

@@ -7,35 +7,35 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    ACTIVE,
-    CAUTIOUS,
-    CUT,
-    DECREMENT,
+    ANY_ACTIVE,
+    ANY_EDGE_ROTATION,
+    ANY_NEEDS_DIRECTION,
+    BELOW_ROUNDING_FLOOR,
+    CCD_LIMITED,
+    COLD_START,
     DOUBTFUL,
-    DRIVEN,
-    DROWNED,
+    INVERSE_STEP,
+    ITERATE_ACTION,
     ITERATION,
     LOAD_SCALE,
-    MERIT,
-    MOVED,
-    PROGRESS,
-    RATE,
+    NEEDS_DIRECTION,
+    NOT_CONVERGED,
+    PREDICTED_DECREASE,
+    RESIDUAL_NORM_SQ,
     STATUS,
     STEP_LENGTH,
-    TODO,
-    TURN,
-    TURNING,
-    UNBALANCED,
-    WANTED,
-    WANTING,
+    STEP_PROGRESS,
+    STRAIGHT_ROTATION_LIMIT,
+    SUBSTEP_ACCEPTED,
+    SUPPORT_MOTION_PENDING,
     attempt_functions,
 )
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
-from ddg_warp.kernels.newton.line_search import DIRECT, STOP, judge_functions
-from ddg_warp.kernels.newton.rod_iterate import PLACE, STRAIGHT
-from ddg_warp.kernels.stepping.rod_warm_start import told_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
+from ddg_warp.kernels.newton.line_search import NEED_DIRECTION, STOP, line_search_functions
+from ddg_warp.kernels.newton.rod_iterate import MOVE_STRAIGHT, ROTATE_EDGES
+from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_rate_function
 
-ON_THE_WAY, THERE = 2, 1  # supports or predictor obstructed: still moving, arrived in the last update
+SUPPORTS_MOVING, SUPPORTS_ARRIVED = 2, 1  # supports or predictor obstructed: still moving, arrived in the last update
 POLISH = 1e-3  # largest forcing term of a direction after which a residual may count as rounding
 FIRST = 1e-2  # forcing term of the first direction of many bodies in contact
 STALLED = 8  # allowed iterations without progress if energy changes are below the rounding floor
@@ -56,8 +56,8 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
     `crowd`: True for relaxed convergence; see `ddg_warp.solve.newton.relaxed_convergence`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-    balanced, decide = judge_functions(renews, real, contact)
-    first_item, until = share_function(serial), until_function(serial)
+    balanced, decide = line_search_functions(renews, real, contact)
+    first_item, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
@@ -90,36 +90,36 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         `STALLED` iterations with solved directions (see `take`). On bad meshes rounding exceeds the estimate per block.
         """
         w = wp.tid()
-        flags[WANTED, w] = 0
-        flags[TODO, w] = 0
+        flags[NEEDS_DIRECTION, w] = 0
+        flags[ITERATE_ACTION, w] = 0
         # residuals left by an inexact direction are not rounding yet
         polish = (
             flags[STATUS, w] == 0
-            and flags[UNBALANCED, w] == 0
-            and flags[DROWNED, w] != 0
+            and flags[NOT_CONVERGED, w] == 0
+            and flags[BELOW_ROUNDING_FLOOR, w] != 0
             and forcing[w] > linear(wp.static(POLISH))  # in the same precision
         )
         if polish and flags[ITERATION, w] > 0:
-            flags[UNBALANCED, w] = 1
+            flags[NOT_CONVERGED, w] = 1
         if wp.static(real is wp.float32):
             if scalars[STEP_LENGTH, w] < real(1.0):  # a short step does not show how far nodes will move
                 flags[DOUBTFUL, w] = 1
         if wp.static(contact):
-            if flags[DRIVEN, w] == wp.static(ON_THE_WAY):
-                flags[UNBALANCED, w] = 1
+            if flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING):
+                flags[NOT_CONVERGED, w] = 1
         if balanced(flags, scalars, w):
             return
-        before = scalars[MERIT, w]
+        before = scalars[RESIDUAL_NORM_SQ, w]
         first = flags[ITERATION, w] == 0
         # zero length: a frame update, which predicts no decrease
         moved = not first and scalars[STEP_LENGTH, w] > real(0.0)
-        below_floor = moved and scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
+        below_floor = moved and scalars[PREDICTED_DECREASE, w] <= real(10.0) * noise[w] * floor
         action = decide(
             change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w
         )
         if action == wp.static(STOP):
             return
-        if action == wp.static(DIRECT):
+        if action == wp.static(NEED_DIRECTION):
             stalled[w] = stalled[w] + 1
             if not below_floor or square[w] < real(0.25) * best[w]:
                 best[w] = square[w]
@@ -127,8 +127,8 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             if stalled[w] > wp.static(STALLED):
                 flags[STATUS, w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
                 return
-        flags[ACTIVE, 0] = 1
-        if action == wp.static(DIRECT):
+        flags[ANY_ACTIVE, 0] = 1
+        if action == wp.static(NEED_DIRECTION):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
@@ -136,7 +136,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             till = spare * enough >= eta
             limit[w] = tightest
             if wp.static(crowd):
-                if flags[CUT, w] == 0:
+                if flags[CCD_LIMITED, w] == 0:
                     till = True
                     limit[w] = wp.where(first, real(wp.static(FIRST)), eta)
                     eta = loosest
@@ -145,16 +145,16 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             if polish:
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
-            flags[WANTED, w] = 1
-            flags[WANTING, 0] = 1
+            flags[NEEDS_DIRECTION, w] = 1
+            flags[ANY_NEEDS_DIRECTION, 0] = 1
             return
-        flags[TODO, w] = action
+        flags[ITERATE_ACTION, w] = action
         if wp.static(turns):
-            flags[TURNING, 0] = 1
+            flags[ANY_EDGE_ROTATION, 0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        right: wp.array(dtype=H),
+        rhs: wp.array(dtype=H),
         direction: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -167,7 +167,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         total = real(0.0)
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
-            total += real(wp.dot(right[i], direction[i]))
+            total += real(wp.dot(rhs[i], direction[i]))
         dots_out[w, start] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -218,26 +218,26 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         iterate is repeated with dropped compression; if there is none again, the solve ends as indefinite.
         """
         w = wp.tid()
-        if flags[WANTED, w] == 0:
+        if flags[NEEDS_DIRECTION, w] == 0:
             return
         if not wp.isfinite(decrease[w]):
             flags[STATUS, w] = wp.static(outcome.NON_FINITE)
             return
-        if flags[WANTED, w] == 3:
+        if flags[NEEDS_DIRECTION, w] == 3:
             stalled[w] = 0
-            if decrease[w] == real(0.0) and scalars[DECREMENT, w] == real(0.0) and flags[ITERATION, w] > 1:
+            if decrease[w] == real(0.0) and scalars[PREDICTED_DECREASE, w] == real(0.0) and flags[ITERATION, w] > 1:
                 flags[STATUS, w] = wp.static(outcome.INDEFINITE)
                 return
         step_length = real(1.0)
         if rotation[w] > rotation_cap * rotation_cap:
             step_length = rotation_cap / wp.sqrt(rotation[w])
         scalars[STEP_LENGTH, w] = step_length
-        scalars[DECREMENT, w] = decrease[w]
-        flags[TODO, w] = wp.static(STRAIGHT)
+        scalars[PREDICTED_DECREASE, w] = decrease[w]
+        flags[ITERATE_ACTION, w] = wp.static(MOVE_STRAIGHT)
         if wp.static(turns):
-            if rotation[w] > scalars[TURN, w] * scalars[TURN, w]:
-                flags[TODO, w] = wp.static(PLACE)
-                flags[TURNING, 0] = 1
+            if rotation[w] > scalars[STRAIGHT_ROTATION_LIMIT, w] * scalars[STRAIGHT_ROTATION_LIMIT, w]:
+                flags[ITERATE_ACTION, w] = wp.static(ROTATE_EDGES)
+                flags[ANY_EDGE_ROTATION, 0] = 1
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -255,7 +255,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         A first one starts from the iterate, which becomes the base; a shortened one from the base.
         """
         w, start = first_item(wp.tid(), blocks)
-        if todo[w] != wp.static(PLACE) and todo[w] != wp.static(STRAIGHT):
+        if todo[w] != wp.static(ROTATE_EDGES) and todo[w] != wp.static(MOVE_STRAIGHT):
             return
         length = step_length[w]
         for k in range(start, until(start, blocks)):
@@ -279,8 +279,8 @@ def freeze_kernel():
     def freeze(flags: wp.array2d(dtype=int), done: wp.array(dtype=int)):
         w = wp.tid()
         if done[w] != 0:
-            flags[WANTED, w] = 0
-        elif flags[WANTED, w] != 0:
+            flags[NEEDS_DIRECTION, w] = 0
+        elif flags[NEEDS_DIRECTION, w] != 0:
             done[w] = 1
 
     return freeze
@@ -293,8 +293,11 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
     `begin`: start a solve from the predictor.
     `finish`: write the state at the end of the substep.
     """
-    (length, restart), extrapolation_of = attempt_functions(real, midpoint), told_function(real, midpoint, contact)
-    first_item, until = share_function(serial), until_function(serial)
+    (length, restart), extrapolation_of = (
+        attempt_functions(real, midpoint),
+        extrapolation_rate_function(real, midpoint, contact),
+    )
+    first_item, until = items_function(serial), until_function(serial)
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -315,9 +318,9 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
     ):
         """Start a solve from the predictor; massless dofs, without meaningful velocities, start from the last state."""
         w, start = first_item(wp.tid(), blocks)
-        is_active = scalars[PROGRESS, w] < real(1.0)
+        is_active = scalars[STEP_PROGRESS, w] < real(1.0)
         if start == 0:
-            flags[MOVED, w] = wp.where(is_active, 1, 0)
+            flags[SUBSTEP_ACCEPTED, w] = wp.where(is_active, 1, 0)
         if not is_active:
             return
         s = length(scalars, w, dt[w])
@@ -331,7 +334,7 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
             start_q = q0[i]
             v = v0[i]
             target_out[i] = start_q + v * (rate / coefficient)
-            if flags[CAUTIOUS, w] == 0:
+            if flags[COLD_START, w] == 0:
                 for d in range(3):
                     if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
                         start_q[d] = start_q[d] + s * v[d]
@@ -357,9 +360,11 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
     ):
         """Write positions, velocities and accelerations of worlds that converged, and rates of inertia in contact if stored."""
         w, first = first_item(wp.tid(), blocks)
-        is_active = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        is_active = scalars[STEP_PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(
+            outcome.CONVERGED_TO_ROUNDING
+        )
         if first == 0:
-            flags[MOVED, w] = wp.where(is_active, 1, 0)
+            flags[SUBSTEP_ACCEPTED, w] = wp.where(is_active, 1, 0)
             if is_active and rate_out.shape[0] > 0:
                 rate_out[w] = rate[w]
         extrapolation = extrapolation_of(flags, scalars, w) * trust[w]
@@ -372,7 +377,7 @@ def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
             if is_active:
                 end = q[i]
                 a = (end - predicted[i]) * extrapolation
-                change = (end - start) * scalars[RATE, w]
+                change = (end - start) * scalars[INVERSE_STEP, w]
                 if wp.static(midpoint):
                     end = real(2.0) * end - start
                     v = real(2.0) * change - v
@@ -413,10 +418,10 @@ def static_kernels(real, linear):
             change[w, k] = change[w, k] + real(0.5) * wp.dot(q[i] - base[i], load[i] - load_base[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def less(product: wp.array(dtype=H), right: wp.array(dtype=H)):
+    def less(product: wp.array(dtype=H), rhs: wp.array(dtype=H)):
         """Subtract the product."""
         i = wp.tid()
-        right[i] = right[i] - product[i]
+        rhs[i] = rhs[i] - product[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def far(rotation: wp.array(dtype=real), rotation_cap: real, wanted: wp.array(dtype=int)):

@@ -11,9 +11,14 @@ from functools import cache
 
 import warp as wp
 
-TURNED = 0.1  # largest edge rotation of any straight update [rad]; see `ddg_warp.compile.precision.straight_turns`
-LEAP = 0.5  # cosine of the largest edge rotation that a predictor extrapolates
-ON, FURTHER = 1, 2  # extrapolations: the last step, and the last solve's correction; see `edge_functions`
+STRAIGHT_ROTATION = (
+    0.1  # largest edge rotation of any straight update [rad]; see `ddg_warp.compile.precision.straight_turns`
+)
+MAX_PREDICTED_ROTATION_COSINE = 0.5  # cosine of the largest edge rotation that a predictor extrapolates
+REPEAT_ROTATION, EXTRAPOLATE_ROTATED = (
+    1,
+    2,
+)  # extrapolations: the last step, and the last solve's correction; see `edge_functions`
 
 
 @cache
@@ -24,8 +29,8 @@ def edge_functions(dim: int, real):
     `excess(e, de, stretch, extrapolation)`: e rotated by its step and lengthened by `stretch`, minus e + de.
     `further(e, e1, de)`: the predictor's edge e, rotated and lengthened as the last predictor's edge e1 - de became e1, minus e + de.
 
-    With extrapolation `ON` the step repeats the last one, and e - de is the edge before: the rotation angle and the change of length
-    are repeated. (Repeated addition of the step would lengthen a rotating edge by the versine of its rotation.)
+    With extrapolation `REPEAT_ROTATION` the step repeats the last one, and e - de is the edge before: the rotation angle and the
+    change of length are repeated. (Repeated addition of the step would lengthen a rotating edge by the versine of its rotation.)
     """
     V = wp.types.vector(dim, real)
     tiny = 1e-13 if real == wp.float64 else 1e-6
@@ -44,15 +49,15 @@ def edge_functions(dim: int, real):
         new_length = length + stretch
         cosine = real(1.0)
         sine = real(0.0)
-        if extrapolation == wp.static(ON):
+        if extrapolation == wp.static(REPEAT_ROTATION):
             last_length = wp.length(e - de)
             new_length = real(2.0) * length - last_length
             if last_length > real(0.0):
                 cosine = (length - along) / last_length
                 sine = across_length / last_length
-            if cosine < real(LEAP):
-                cosine = real(LEAP)
-                sine = real(wp.static((1.0 - LEAP**2) ** 0.5))
+            if cosine < real(MAX_PREDICTED_ROTATION_COSINE):
+                cosine = real(MAX_PREDICTED_ROTATION_COSINE)
+                sine = real(wp.static((1.0 - MAX_PREDICTED_ROTATION_COSINE**2) ** 0.5))
         else:
             cosine = wp.cos(across_length / length)
             sine = wp.sin(across_length / length)
@@ -72,7 +77,7 @@ def edge_functions(dim: int, real):
         if before > real(0.0):
             t0, t1 = e0 / before, e1 / length
             cosine = wp.dot(t0, t1)
-            if cosine > real(LEAP):  # else no extrapolation
+            if cosine > real(MAX_PREDICTED_ROTATION_COSINE):  # else no extrapolation
                 both = t0 + t1
                 end = e - both * (wp.dot(both, e) / (real(1.0) + cosine)) + t1 * (real(2.0) * wp.dot(t0, e))
                 end *= wp.max(real(1.0) + (length - before) / wp.length(e), real(0.1))
@@ -82,21 +87,21 @@ def edge_functions(dim: int, real):
 
 
 @cache
-def onward_function(real):
-    """Return the device function `onward(straight, wanted)`: `wanted`, but `ON` only for rods that always rotate edges.
+def repeat_rotation_function(real):
+    """Return the device function `onward(straight, wanted)`: `wanted`, but `REPEAT_ROTATION` only for rods that always rotate edges.
 
     Soft rods lengthen as they move.
     """
 
     @wp.func
     def onward(straight: real, wanted: int):
-        return wp.where(straight == real(0.0) or wanted != wp.static(ON), wanted, 0)
+        return wp.where(straight == real(0.0) or wanted != wp.static(REPEAT_ROTATION), wanted, 0)
 
     return onward
 
 
 @cache
-def place_function(dim: int, real, Rod, excess, anchored, added, put_node):
+def rotate_edges_function(dim: int, real, Rod, excess, anchored, added, put_node):
     """Return the device function `place(rod)`: write the nodes of a rod after an edge-rotation update.
 
     Args:

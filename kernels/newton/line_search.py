@@ -15,42 +15,42 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    ACTIVE,
-    DECREMENT,
+    ANY_ACTIVE,
+    BACKTRACKS,
+    BELOW_ROUNDING_FLOOR,
     DOUBTED,
     DOUBTFUL,
-    DRIVEN,
-    DROWNED,
-    HALVINGS,
+    ENERGY_BUFFER,
+    FRAMES_OUTDATED,
     ITERATION,
     LOAD_SCALE,
-    MERIT,
+    MAX_RESIDUAL,
+    NEEDS_DIRECTION,
+    NOT_CONVERGED,
     POLISHED,
-    RESIDUAL,
-    SLOT,
-    STALE,
+    PREDICTED_DECREASE,
+    RESIDUAL_NORM_SQ,
     STATUS,
     STEP_LENGTH,
-    UNBALANCED,
-    WANTED,
+    SUPPORT_MOTION_PENDING,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, search_functions, shorter_function
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, UPDATE_FRAMES, search_functions, shorter_function
 
-STOP, DIRECT = 0, 3  # actions in addition to `PLACE` and `RELAG`: none, and compute a direction
+STOP, NEED_DIRECTION = 0, 3  # actions in addition to `ROTATE_EDGES` and `UPDATE_FRAMES`: none, and compute a direction
 ROUNDED, SETTLED, POLISHES = 1e-4, 1e-5, 10
 
 
 @cache
-def rests_function(real):
+def converged_function(real):
     """Return the device function `rests(flags, i)`: True if island i has converged, by the flags of its iterate."""
 
     @wp.func
     def rests(flags: wp.array2d(dtype=int), i: int):
-        if flags[UNBALANCED, i] != 0:
+        if flags[NOT_CONVERGED, i] != 0:
             return False
-        if flags[DROWNED, i] == 0:
+        if flags[BELOW_ROUNDING_FLOOR, i] == 0:
             return True
         # The rounding floor counts only after an iteration: in a coarse precision the predictor's residual may be all of the load.
         if flags[ITERATION, i] == 0:
@@ -66,15 +66,15 @@ def rests_function(real):
 
 
 @cache
-def judge_functions(twist: bool, real, driven: bool = False):
+def line_search_functions(twist: bool, real, driven: bool = False):
     """Return the device functions `balanced` and `decide` of a rod.
 
     `balanced(...)`: True if the rod has stopped.
-    `decide(...)`: next action of an active rod (`STOP`, `PLACE`, `RELAG` or `DIRECT`).
+    `decide(...)`: next action of an active rod (`STOP`, `ROTATE_EDGES`, `UPDATE_FRAMES` or `NEED_DIRECTION`).
 
     `driven`: supports may have moved in the last step, which does work unknown to the line search.
     """
-    shorter, rests = shorter_function(real), rests_function(real)
+    shorter, rests = shorter_function(real), converged_function(real)
 
     @wp.func
     def balanced(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), r: int):
@@ -83,22 +83,22 @@ def judge_functions(twist: bool, real, driven: bool = False):
             return True
         if rests(flags, r):
             flags[STATUS, r] = wp.where(
-                flags[DROWNED, r] == 0,
+                flags[BELOW_ROUNDING_FLOOR, r] == 0,
                 int(wp.static(outcome.CONVERGED)),
                 int(wp.static(outcome.CONVERGED_TO_ROUNDING)),
             )
             if wp.static(real is wp.float32):
-                if flags[DROWNED, r] != 0 and flags[DOUBTFUL, r] != 0 and flags[POLISHED, r] > 0:
+                if flags[BELOW_ROUNDING_FLOOR, r] != 0 and flags[DOUBTFUL, r] != 0 and flags[POLISHED, r] > 0:
                     flags[DOUBTED, r] = 1
             return True
         if wp.static(real is wp.float32):
-            if flags[UNBALANCED, r] == 0 and flags[POLISHED, r] == 0:
+            if flags[NOT_CONVERGED, r] == 0 and flags[POLISHED, r] == 0:
                 flags[POLISHED, r] = flags[ITERATION, r]
                 if flags[ITERATION, r] == 0 and scalars[LOAD_SCALE, r] == real(0.0):  # only rounding moves it
                     flags[POLISHED, r] = -wp.static(POLISHES)
             flags[DOUBTFUL, r] = 0
-        flags[UNBALANCED, r] = 0
-        flags[DROWNED, r] = 0
+        flags[NOT_CONVERGED, r] = 0
+        flags[BELOW_ROUNDING_FLOOR, r] = 0
         return False
 
     @wp.func
@@ -115,10 +115,10 @@ def judge_functions(twist: bool, real, driven: bool = False):
     ):
         """Return the action, from change and rounding of the energy, square and largest component of the residual.
 
-        `PLACE` leaves the shorter step in `step_length`. `RELAG` requests a frame update and a step of zero length.
+        `ROTATE_EDGES` leaves the shorter step in `step_length`. `UPDATE_FRAMES` requests a frame update and a step of zero length.
         """
         first = flags[ITERATION, r] == 0
-        scalars[RESIDUAL, r] = worst
+        scalars[MAX_RESIDUAL, r] = worst
         total = change
         if first:
             total = real(0.0)
@@ -129,50 +129,50 @@ def judge_functions(twist: bool, real, driven: bool = False):
             flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return wp.static(STOP)
         taken = scalars[STEP_LENGTH, r]
-        expected = taken * scalars[DECREMENT, r]
+        expected = taken * scalars[PREDICTED_DECREASE, r]
         accept = first
         if not first and finite:
             if expected > real(10.0) * rounding:
                 accept = total <= real(-1.0e-4) * expected + rounding
             else:
-                accept = square <= real(4.0) * scalars[MERIT, r] or taken == real(0.0)
+                accept = square <= real(4.0) * scalars[RESIDUAL_NORM_SQ, r] or taken == real(0.0)
             if wp.static(driven):
-                accept = accept or flags[DRIVEN, r] != 0
+                accept = accept or flags[SUPPORT_MOTION_PENDING, r] != 0
         if not accept:
-            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
-            if flags[HALVINGS, r] > max_halvings:
+            flags[BACKTRACKS, r] = flags[BACKTRACKS, r] + 1
+            if flags[BACKTRACKS, r] > max_halvings:
                 flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return wp.static(STOP)
             scalars[STEP_LENGTH, r] = shorter(taken, expected, total, finite)
-            return wp.static(PLACE)
+            return wp.static(ROTATE_EDGES)
         flags[ITERATION, r] = flags[ITERATION, r] + 1
         if flags[ITERATION, r] > max_iterations:
             flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
             return wp.static(STOP)
-        scalars[MERIT, r] = square
-        flags[SLOT, r] = 1 - flags[SLOT, r]
-        flags[HALVINGS, r] = 0
+        scalars[RESIDUAL_NORM_SQ, r] = square
+        flags[ENERGY_BUFFER, r] = 1 - flags[ENERGY_BUFFER, r]
+        flags[BACKTRACKS, r] = 0
         if wp.static(twist):
-            if flags[STALE, r] != 0:
+            if flags[FRAMES_OUTDATED, r] != 0:
                 # Twist angles change meaning: take no step, and compute a direction in the updated frames.
-                flags[STALE, r] = 0
-                scalars[DECREMENT, r] = real(1.0e30)
+                flags[FRAMES_OUTDATED, r] = 0
+                scalars[PREDICTED_DECREASE, r] = real(1.0e30)
                 scalars[STEP_LENGTH, r] = real(0.0)
-                return wp.static(RELAG)
-        return wp.static(DIRECT)
+                return wp.static(UPDATE_FRAMES)
+        return wp.static(NEED_DIRECTION)
 
     return balanced, decide
 
 
 @cache
-def judge_kernel(kind: RodKind, real, linear):
+def line_search_kernel(kind: RodKind, real, linear):
     """Build the kernel of the line search.
 
     `judge`: sum over a rod's nodes, decide, and write a shortened step or updated frames, one thread a rod.
     """
     V = wp.types.vector(kind.dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
-    balanced, decide = judge_functions(kind.twist, real)
+    balanced, decide = line_search_functions(kind.twist, real)
     twist, nb = kind.twist, kind.block
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -195,7 +195,7 @@ def judge_kernel(kind: RodKind, real, linear):
         scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        flags[WANTED, r] = 0
+        flags[NEEDS_DIRECTION, r] = 0
         if balanced(flags, scalars, r):
             return
         n = count[r]
@@ -214,17 +214,17 @@ def judge_kernel(kind: RodKind, real, linear):
         action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if action == wp.static(STOP):
             return
-        flags[ACTIVE, 0] = 1
-        if action == wp.static(PLACE):
+        flags[ANY_ACTIVE, 0] = 1
+        if action == wp.static(ROTATE_EDGES):
             shortened = scalars[STEP_LENGTH, r]
             place(x, base, base, direction, fixed, anchor, shortened, 0, n, r)
             turn_angles(theta, direction, shortened - taken, n, r)
         if wp.static(twist):
-            if action == wp.static(RELAG):
+            if action == wp.static(UPDATE_FRAMES):
                 relag(x, frame, n, r)
                 for k in range(n):
                     base[k, r] = x[k, r]
-        if action == wp.static(DIRECT):
-            flags[WANTED, r] = 1
+        if action == wp.static(NEED_DIRECTION):
+            flags[NEEDS_DIRECTION, r] = 1
 
     return judge

@@ -10,24 +10,24 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    ACTIVE,
-    ANGLE_CHANGE,
-    BAD,
-    CLAMPED,
-    DECREMENT,
+    ANGLE_STEP_LEFT,
+    ANY_ACTIVE,
+    DROP_COMPRESSION,
+    ITERATE_ACTION,
     ITERATION,
-    LOST,
+    LOST_PIVOTS,
+    LOST_PIVOTS_TOTAL,
+    NEEDS_DIRECTION,
+    PREDICTED_DECREASE,
     STATUS,
     STEP_LENGTH,
-    TODO,
-    TURN,
-    WANTED,
-    patience_function,
+    STRAIGHT_ROTATION_LIMIT,
+    projected_limit_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.newton.line_search import DIRECT, STOP, judge_functions
-from ddg_warp.kernels.newton.rod_iterate import PLACE, STRAIGHT
+from ddg_warp.kernels.newton.line_search import NEED_DIRECTION, STOP, line_search_functions
+from ddg_warp.kernels.newton.rod_iterate import MOVE_STRAIGHT, ROTATE_EDGES
 
 
 @cache
@@ -114,8 +114,8 @@ def decide_kernels(kind: RodKind, real, linear, exact: bool):
 
     `exact` as in `pcg.repeat_kernel`.
     """
-    balanced, decide = judge_functions(kind.twist, real)
-    out_of_patience = patience_function(real)
+    balanced, decide = line_search_functions(kind.twist, real)
+    out_of_patience = projected_limit_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
@@ -128,9 +128,9 @@ def decide_kernels(kind: RodKind, real, linear, exact: bool):
         scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        flags[WANTED, r] = 0
-        flags[TODO, r] = 0
-        flags[BAD, r] = 0
+        flags[NEEDS_DIRECTION, r] = 0
+        flags[ITERATE_ACTION, r] = 0
+        flags[LOST_PIVOTS, r] = 0
         if balanced(flags, scalars, r):
             return
         total = real(0.0)
@@ -143,17 +143,17 @@ def decide_kernels(kind: RodKind, real, linear, exact: bool):
             square += partial[2, i, r]
             worst = wp.max(worst, partial[3, i, r])
         if flags[ITERATION, r] == 0:
-            flags[LOST, r] = 0
+            flags[LOST_PIVOTS_TOTAL, r] = 0
         taken = scalars[STEP_LENGTH, r]
         action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if action == wp.static(STOP):
             return
-        flags[ACTIVE, 0] = 1
-        if action == wp.static(DIRECT):
-            flags[WANTED, r] = 1
+        flags[ANY_ACTIVE, 0] = 1
+        if action == wp.static(NEED_DIRECTION):
+            flags[NEEDS_DIRECTION, r] = 1
         else:
-            flags[TODO, r] = action
-            scalars[ANGLE_CHANGE, r] = scalars[STEP_LENGTH, r] - taken
+            flags[ITERATE_ACTION, r] = action
+            scalars[ANGLE_STEP_LEFT, r] = scalars[STEP_LENGTH, r] - taken
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(
@@ -164,18 +164,18 @@ def decide_kernels(kind: RodKind, real, linear, exact: bool):
         scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        if flags[WANTED, r] == 0:
+        if flags[NEEDS_DIRECTION, r] == 0:
             return
-        if flags[BAD, r] > 0 and flags[CLAMPED, r] == 0:
+        if flags[LOST_PIVOTS, r] > 0 and flags[DROP_COMPRESSION, r] == 0:
             # The matrix is indefinite: repeat the iterate with compression dropped.
-            flags[CLAMPED, r] = 1
+            flags[DROP_COMPRESSION, r] = 1
             flags[ITERATION, r] = flags[ITERATION, r] - 1
             scalars[STEP_LENGTH, r] = real(0.0)
             return
         if wp.static(exact):
             if out_of_patience(flags, scalars, r):
                 return
-        flags[LOST, r] = flags[LOST, r] + flags[BAD, r]
+        flags[LOST_PIVOTS_TOTAL, r] = flags[LOST_PIVOTS_TOTAL, r] + flags[LOST_PIVOTS, r]
         total = real(0.0)
         rotation = real(0.0)
         for i in range(ranges):
@@ -188,8 +188,12 @@ def decide_kernels(kind: RodKind, real, linear, exact: bool):
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
         scalars[STEP_LENGTH, r] = whole
-        scalars[ANGLE_CHANGE, r] = whole
-        scalars[DECREMENT, r] = total
-        flags[TODO, r] = wp.where(rotation > scalars[TURN, r] * scalars[TURN, r], wp.static(PLACE), wp.static(STRAIGHT))
+        scalars[ANGLE_STEP_LEFT, r] = whole
+        scalars[PREDICTED_DECREASE, r] = total
+        flags[ITERATE_ACTION, r] = wp.where(
+            rotation > scalars[STRAIGHT_ROTATION_LIMIT, r] * scalars[STRAIGHT_ROTATION_LIMIT, r],
+            wp.static(ROTATE_EDGES),
+            wp.static(MOVE_STRAIGHT),
+        )
 
     return judge, take

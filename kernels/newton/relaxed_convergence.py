@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import DROWNED, LOAD_SCALE, STATUS, UNBALANCED
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.core.islands import BELOW_ROUNDING_FLOOR, LOAD_SCALE, NOT_CONVERGED, STATUS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 
 FARTHEST = 10.0  # largest allowed residual of these bodies, over the tolerance
 
@@ -17,7 +17,7 @@ def outlier_kernels(real, serial: bool):
     `count`: count bodies above the tolerance.
     `excuse`: accept worlds with few such bodies.
     """
-    share, until = share_function(serial), until_function(serial)
+    share, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def count(
@@ -56,7 +56,7 @@ def outlier_kernels(real, serial: bool):
         w = wp.tid()
         near = worst[w] <= real(wp.static(FARTHEST)) * rtol * scalars[LOAD_SCALE, w] and wp.isfinite(square[w])
         if flags[STATUS, w] == 0 and number[w] <= most and near:
-            flags[UNBALANCED, w] = 0
-            flags[DROWNED, w] = 0
+            flags[NOT_CONVERGED, w] = 0
+            flags[BELOW_ROUNDING_FLOOR, w] = 0
 
     return count, excuse

@@ -4,13 +4,17 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
+from ddg_warp.kernels.core.islands import ANGLE_STEP_LEFT, EDGES_ROTATED, ITERATE_ACTION, STEP_LENGTH
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
-from ddg_warp.kernels.newton.edge_rotation import FURTHER, edge_functions, place_function
+from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, edge_functions, rotate_edges_function
 
-PLACE, RELAG, STRAIGHT = 1, 2, 4  # actions on an iterate: edge-rotation update, frame update, straight update
+ROTATE_EDGES, UPDATE_FRAMES, MOVE_STRAIGHT = (
+    1,
+    2,
+    4,
+)  # actions on an iterate: edge-rotation update, frame update, straight update
 
 
 @cache
@@ -51,12 +55,12 @@ def move_functions(kind: RodKind, real, linear, split: bool = False):
         """Return edge j rotated and lengthened by the step, minus the edge plus the step.
 
         `extrapolation`: see `kernels.newton.edge_rotation`. `positions`: nodes before the step whose predictor is the base, if
-            extrapolated `FURTHER`; else any array.
+            extrapolated `EXTRAPOLATE_ROTATED`; else any array.
         """
         next_node = along(j + 1, n)
         e = base[next_node, r] - base[j, r]
         de = (step_of(direction, next_node, r) - step_of(direction, j, r)) * amount
-        if extrapolation == wp.static(FURTHER):
+        if extrapolation == wp.static(EXTRAPOLATE_ROTATED):
             return further_of(e, positions[next_node, r] - positions[j, r], de)
         if wp.static(split):
             return excess_of(e, de, real(direction[wp.static(block), j, r]) * amount, extrapolation)
@@ -157,7 +161,7 @@ def search_functions(kind: RodKind, real, linear, split: bool = False):
     def put_node(rod: Rod, j: int, shift: V):
         put_at(rod.x, rod.base, rod.direction, rod.fixed, rod.amount, shift, along(j, rod.count), rod.r)
 
-    place_rod = place_function(dim, real, Rod, excess_at, anchored, added, put_node)
+    place_rod = rotate_edges_function(dim, real, Rod, excess_at, anchored, added, put_node)
 
     @wp.func
     def place(
@@ -241,21 +245,21 @@ def adjust_kernel(kind: RodKind, real, linear, split: bool = False):
         base: wp.array2d(dtype=V),
     ):
         r = wp.tid()
-        if flags[TODO, r] == wp.static(PLACE):
-            if flags[PLACED, r] == 0:
+        if flags[ITERATE_ACTION, r] == wp.static(ROTATE_EDGES):
+            if flags[EDGES_ROTATED, r] == 0:
                 # the sweep took a straight update; its base positions are needed from here on
-                flags[PLACED, r] = 1
-                straight = scalars[STEP_LENGTH, r] - scalars[ANGLE_CHANGE, r]
+                flags[EDGES_ROTATED, r] = 1
+                straight = scalars[STEP_LENGTH, r] - scalars[ANGLE_STEP_LEFT, r]
                 for j in range(count[r]):
                     back = V()
                     for d in range(wp.static(dim)):
                         back[d] = straight * real(direction[d, j, r])
                     base[j, r] = x[j, r] - back
             place(x, base, base, direction, fixed, anchor, scalars[STEP_LENGTH, r], 0, count[r], r)
-            turn_angles(theta, direction, scalars[ANGLE_CHANGE, r], count[r], r)
+            turn_angles(theta, direction, scalars[ANGLE_STEP_LEFT, r], count[r], r)
         if wp.static(twist):
-            if flags[TODO, r] == wp.static(RELAG):
+            if flags[ITERATE_ACTION, r] == wp.static(UPDATE_FRAMES):
                 relag(x, frame, count[r], r)
-        flags[TODO, r] = 0
+        flags[ITERATE_ACTION, r] = 0
 
     return adjust

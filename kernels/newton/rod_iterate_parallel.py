@@ -8,12 +8,20 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import ANGLE_CHANGE, BENT, CAUTIOUS, PROGRESS, RATE, STEP_LENGTH, TODO
+from ddg_warp.kernels.core.islands import (
+    ANGLE_STEP_LEFT,
+    COLD_START,
+    INVERSE_STEP,
+    ITERATE_ACTION,
+    ROTATE_PREDICTOR,
+    STEP_LENGTH,
+    STEP_PROGRESS,
+)
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.newton.edge_rotation import onward_function
-from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, move_functions
+from ddg_warp.kernels.newton.edge_rotation import repeat_rotation_function
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, UPDATE_FRAMES, move_functions
 from ddg_warp.kernels.stepping.rod_step import predicted_function
 
 
@@ -28,7 +36,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     step_of, excess, put_node, carry = move_functions(kind, real, linear, split)
-    onward_of = onward_function(real)
+    onward_of = repeat_rotation_function(real)
     _, reference_twist, _ = parallel_transport.functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -51,12 +59,12 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
         n = count[r]
         if k >= n - 1:
             return
-        if todo[r] == wp.static(PLACE):
+        if todo[r] == wp.static(ROTATE_EDGES):
             excess_out[k, r] = excess(
                 base, positions, direction, step_length[r], onward_of(straight[r], extrapolation), k, n, r
             )
         if wp.static(twist):
-            if todo[r] == wp.static(RELAG):
+            if todo[r] == wp.static(UPDATE_FRAMES):
                 u, t = carry(x, frame, k, n, r)
                 for c in range(3):
                     frame_out[c, k, r] = u[c]
@@ -77,7 +85,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
     ):
         """Write the exclusive sum of edges within a range of `width` nodes; of the range its sum and the sum of these sums."""
         i, r = wp.tid()
-        if todo[r] != wp.static(PLACE):
+        if todo[r] != wp.static(ROTATE_EDGES):
             return
         n = count[r]
         running = V()
@@ -103,7 +111,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
     ):
         """Replace the sum of a range by that of all ranges before; write the mean over nodes of the exclusive sums."""
         r = wp.tid()
-        if todo[r] != wp.static(PLACE):
+        if todo[r] != wp.static(ROTATE_EDGES):
             return
         n = count[r]
         running = V()
@@ -154,10 +162,10 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
     ):
         """Write a node's end position: for rotated edges the sum from the anchor before, corrected to close at the next anchor."""
         k, r = wp.tid()
-        action = flags[TODO, r]
+        action = flags[ITERATE_ACTION, r]
         if action == 0 or k >= count[r]:
             return
-        if action == wp.static(RELAG):
+        if action == wp.static(UPDATE_FRAMES):
             base[k, r] = x[k, r]
             if wp.static(twist):
                 if k < count[r] - 1:
@@ -165,7 +173,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
                         frame[c, k, r] = new_frame[c, k, r]
             return
         shift = V()
-        if action == wp.static(PLACE):
+        if action == wp.static(ROTATE_EDGES):
             p = anchors[0, k, r]
             q = anchors[1, k, r]
             shift = before(prefix, sums, width, k, r)
@@ -183,7 +191,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
         if anchors[0, k, r] != k:
             put_node(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
         if wp.static(twist):
-            theta[k, r] = theta[k, r] + scalars[ANGLE_CHANGE, r] * real(direction[wp.static(dim), k, r])
+            theta[k, r] = theta[k, r] + scalars[ANGLE_STEP_LEFT, r] * real(direction[wp.static(dim), k, r])
 
     return turn, scan, offset, move
 
@@ -215,14 +223,16 @@ def predict_kernels(kind: RodKind, real, linear):
         k, r = wp.tid()
         if k >= count[r]:
             return
-        moving = scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0
+        moving = scalars[STEP_PROGRESS, r] < real(1.0) and flags[ROTATE_PREDICTOR, r] != 0
         if k == 0:
             scalars[STEP_LENGTH, r] = real(1.0)
-            scalars[ANGLE_CHANGE, r] = real(0.0)
-            flags[TODO, r] = wp.where(moving, wp.static(PLACE), 0)
+            scalars[ANGLE_STEP_LEFT, r] = real(0.0)
+            flags[ITERATE_ACTION, r] = wp.where(moving, wp.static(ROTATE_EDGES), 0)
         if moving:
             base_out[k, r] = x0[k, r]
-            step = predicted(x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), flags[CAUTIOUS, r], scalars[RATE, r])
+            step = predicted(
+                x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), flags[COLD_START, r], scalars[INVERSE_STEP, r]
+            )
             for d in range(wp.static(nb)):
                 direction_out[d, k, r] = linear(0.0)
             for d in range(wp.static(dim)):
@@ -231,12 +241,12 @@ def predict_kernels(kind: RodKind, real, linear):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def renew(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
-        flags[TODO, r] = wp.where(scalars[PROGRESS, r] < real(1.0), wp.static(RELAG), 0)
+        flags[ITERATE_ACTION, r] = wp.where(scalars[STEP_PROGRESS, r] < real(1.0), wp.static(UPDATE_FRAMES), 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
-        bent = scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0
-        flags[TODO, r] = wp.where(bent, wp.static(PLACE), 0)
+        bent = scalars[STEP_PROGRESS, r] < real(1.0) and flags[ROTATE_PREDICTOR, r] != 0
+        flags[ITERATE_ACTION, r] = wp.where(bent, wp.static(ROTATE_EDGES), 0)
 
     return aim, renew, again

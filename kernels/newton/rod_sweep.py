@@ -17,33 +17,33 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    ACTIVE,
-    ANGLE_CHANGE,
-    CARRIED,
-    CLAMPED,
-    COEFFICIENT,
-    DECREMENT,
-    HALVINGS,
+    ANGLE_STEP_LEFT,
+    ANY_ACTIVE,
+    BACKTRACKS,
+    DROP_COMPRESSION,
+    EDGES_ROTATED,
+    ENERGY_BUFFER,
+    FRAMES_OUTDATED,
+    INERTIA_COEFFICIENT,
+    ITERATE_ACTION,
     ITERATION,
     LOAD_SCALE,
-    LOST,
-    PLACED,
-    RESIDUAL,
-    SLOT,
-    STALE,
+    LOST_PIVOTS_TOTAL,
+    MAX_EDGE_STIFFNESS,
+    MAX_RESIDUAL,
+    PREDICTED_DECREASE,
     STATUS,
     STEP_LENGTH,
-    TODO,
-    TURN,
-    patience_function,
+    STRAIGHT_ROTATION_LIMIT,
+    projected_limit_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind, inertia_type
 from ddg_warp.kernels.linear import block_ldlt, geometric_stiffness, mixed_axial_force
-from ddg_warp.kernels.linear.prefetch import keep_functions, read_functions
+from ddg_warp.kernels.linear.prefetch import prefetch_functions, read_functions
 from ddg_warp.kernels.linear.rod_matrix import block_functions
-from ddg_warp.kernels.newton.line_search import judge_functions
-from ddg_warp.kernels.newton.rod_iterate import PLACE, RELAG, search_functions
+from ddg_warp.kernels.newton.line_search import line_search_functions
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, UPDATE_FRAMES, search_functions
 
 
 @cache
@@ -56,8 +56,8 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
     Otherwise the iterate is repeated with `clamped[r]` raised: without compression and, for this iteration, without G. If `split`,
     factors end with the slack of edges, and directions with the lengthening of edges; see `kernels.linear.mixed_axial_force`.
     """
-    balanced, _ = judge_functions(kind.twist, real)
-    out_of_patience = patience_function(real)
+    balanced, _ = line_search_functions(kind.twist, real)
+    out_of_patience = projected_limit_function(real)
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2, drag, Inertia = kind.window, kind.block**2, kind.drag, inertia_type(kind, real)
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -75,7 +75,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
     slack_row = kind.factor_rows
     aa, ab, ac, bb, bc, cc = geometric_stiffness.block_functions(kind, linear)
     rows_of, entry, part, with_angle, positions = read_functions(kind, linear, rows, prefetch)
-    kept, left_at, times = keep_functions(nb, linear, kept_size, prefetch)
+    kept, left_at, times = prefetch_functions(nb, linear, kept_size, prefetch)
     _, store, vector, _ = block_functions(nb, linear)
 
     # Measured: spilling registers beyond 255 to shared memory gains 8 % on an H200; with tensions it costs 12 %.
@@ -91,7 +91,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         F: wp.array3d(dtype=linear),
         G: wp.array3d(dtype=linear),
         # balance
-        right: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
         energy_change: wp.array2d(dtype=real),
         energy_noise: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
@@ -120,8 +120,8 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         n = count[r]
         first = flags[ITERATION, r] == 0
         taken = scalars[STEP_LENGTH, r]
-        c = scalars[COEFFICIENT, r]
-        accepted_slot = flags[SLOT, r]
+        c = scalars[INERTIA_COEFFICIENT, r]
+        accepted_slot = flags[ENERGY_BUFFER, r]
         Waa = M()
         Wab = M()
         Wac = M()
@@ -140,7 +140,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             pending.pivot = linear(1.0)
         # Prefetch: data of the next node is read before this node is processed, since a sweeping thread mostly waits for memory.
         f = rows_of(F, 0, r)
-        rj = vector(right, 0, 0, r)
+        rj = vector(rhs, 0, 0, r)
         mask = fixed[0, r]
         more = energy_change[0, r]
         rounding = energy_noise[0, r]
@@ -153,7 +153,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         for j in range(n):
             next = wp.min(j + 1, n - 1)
             f_ahead = rows_of(F, next, r)
-            r_ahead = vector(right, 0, next, r)
+            r_ahead = vector(rhs, 0, next, r)
             mask_ahead = fixed[next, r]
             more_ahead = energy_change[next, r]
             rounding_ahead = energy_noise[next, r]
@@ -178,7 +178,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
                         Wbc += wp.outer(B, C)
                         Wcc += wp.outer(C, C)
                     if wp.static(exact):
-                        if flags[CLAMPED, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
+                        if flags[DROP_COMPRESSION, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
                             Waa += aa(G, j, r)
                             Wab += ab(G, j, r)
                             Wac += ac(G, j, r)
@@ -260,10 +260,10 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
                     pending = out.pending
                     near = out.b * out.weight
                     far = out.c * out.weight
-                    lag = out.right * out.weight
-                    newton -= real(out.right * lag)
-                    ra += near * out.right
-                    rb += far * out.right
+                    lag = out.load * out.weight
+                    newton -= real(out.load * lag)
+                    ra += near * out.load
+                    rb += far * out.load
                     Waa += wp.outer(near, out.b)
                     Wab += wp.outer(near, out.c)
                     Wbb += wp.outer(far, out.c)
@@ -293,42 +293,42 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             node_mass = node_mass_ahead
             spin = spin_ahead
 
-        scalars[RESIDUAL, r] = real(worst)
+        scalars[MAX_RESIDUAL, r] = real(worst)
         if first:
             if scalars[LOAD_SCALE, r] == real(0.0):
                 scalars[LOAD_SCALE, r] = real(worst)
-            flags[LOST, r] = 0
+            flags[LOST_PIVOTS_TOTAL, r] = 0
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
-        if lost_here > 0 and flags[CLAMPED, r] == 0:
+        if lost_here > 0 and flags[DROP_COMPRESSION, r] == 0:
             if wp.static(fails):
                 flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
             # The matrix is indefinite: repeat the iterate with compression (or the geometric stiffness) dropped.
-            flags[CLAMPED, r] = 1
-            flags[ACTIVE, 0] = 1
+            flags[DROP_COMPRESSION, r] = 1
+            flags[ANY_ACTIVE, 0] = 1
             return
         accept = first and finite
         if first and not finite:
             flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return
         if not first and finite:
-            expected = taken * scalars[DECREMENT, r]
+            expected = taken * scalars[PREDICTED_DECREASE, r]
             rounding_floor = floor * noise
             if expected > real(10.0) * rounding_floor:
                 accept = change <= real(-1.0e-4) * expected + rounding_floor
             else:
-                accept = newton <= scalars[DECREMENT, r]
+                accept = newton <= scalars[PREDICTED_DECREASE, r]
         if not accept:
-            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
-            if flags[HALVINGS, r] > max_halvings:
+            flags[BACKTRACKS, r] = flags[BACKTRACKS, r] + 1
+            if flags[BACKTRACKS, r] > max_halvings:
                 flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return
-            shortened = shorter(taken, taken * scalars[DECREMENT, r], change, finite)
+            shortened = shorter(taken, taken * scalars[PREDICTED_DECREASE, r], change, finite)
             scalars[STEP_LENGTH, r] = shortened
-            scalars[ANGLE_CHANGE, r] = shortened - taken
-            flags[TODO, r] = wp.static(PLACE)
-            flags[ACTIVE, 0] = 1
+            scalars[ANGLE_STEP_LEFT, r] = shortened - taken
+            flags[ITERATE_ACTION, r] = wp.static(ROTATE_EDGES)
+            flags[ANY_ACTIVE, 0] = 1
             return
 
         flags[ITERATION, r] = flags[ITERATION, r] + 1
@@ -338,26 +338,26 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         if wp.static(exact):
             if out_of_patience(flags, scalars, r):
                 return
-        flags[ACTIVE, 0] = 1
-        flags[SLOT, r] = 1 - accepted_slot
-        scalars[DECREMENT, r] = newton
-        flags[HALVINGS, r] = 0
-        flags[PLACED, r] = 0
-        flags[LOST, r] = flags[LOST, r] + lost_here
+        flags[ANY_ACTIVE, 0] = 1
+        flags[ENERGY_BUFFER, r] = 1 - accepted_slot
+        scalars[PREDICTED_DECREASE, r] = newton
+        flags[BACKTRACKS, r] = 0
+        flags[EDGES_ROTATED, r] = 0
+        flags[LOST_PIVOTS_TOTAL, r] = flags[LOST_PIVOTS_TOTAL, r] + lost_here
         if wp.static(twist):
-            if flags[STALE, r] != 0:
+            if flags[FRAMES_OUTDATED, r] != 0:
                 # Twist angles change meaning in updated frames: take no step, and compute a direction there.
-                flags[STALE, r] = 0
-                scalars[DECREMENT, r] = real(1.0e30)
+                flags[FRAMES_OUTDATED, r] = 0
+                scalars[PREDICTED_DECREASE, r] = real(1.0e30)
                 scalars[STEP_LENGTH, r] = real(0.0)
-                flags[TODO, r] = wp.static(RELAG)
+                flags[ITERATE_ACTION, r] = wp.static(UPDATE_FRAMES)
                 return
         e1 = H()
         e2 = H()
         if wp.static(split):
             pulled = linear(0.0)
             pull = linear(0.0)
-            per_root = linear(real(1.0) / wp.sqrt(scalars[CARRIED, r]))
+            per_root = linear(real(1.0) / wp.sqrt(scalars[MAX_EDGE_STIFFNESS, r]))
         rotation = real(0.0)
         x_ahead = V()
         left = kept(Y, n - 1, r)
@@ -412,9 +412,9 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
-        if rotation > scalars[TURN, r] * scalars[TURN, r]:
-            scalars[ANGLE_CHANGE, r] = whole - real(1.0)
-            flags[TODO, r] = wp.static(PLACE)
+        if rotation > scalars[STRAIGHT_ROTATION_LIMIT, r] * scalars[STRAIGHT_ROTATION_LIMIT, r]:
+            scalars[ANGLE_STEP_LEFT, r] = whole - real(1.0)
+            flags[ITERATE_ACTION, r] = wp.static(ROTATE_EDGES)
         scalars[STEP_LENGTH, r] = whole
 
     return sweep

@@ -5,10 +5,10 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.collision.contact.assembly import set_struct
-from ddg_warp.kernels.core.islands import DRIVEN, LOAD_SCALE, WANTED
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
-from ddg_warp.kernels.linear.sliced_ell import BARRED
-from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY
+from ddg_warp.kernels.core.islands import LOAD_SCALE, NEEDS_DIRECTION, SUPPORT_MOTION_PENDING
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
+from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE
+from ddg_warp.kernels.newton.coupled_newton import SUPPORTS_MOVING
 
 
 @wp.func
@@ -32,7 +32,7 @@ def resting_kernels(real, linear, serial: bool):
     `settle`: write the active dofs.
     `leave`: mark pairs without active dofs.
     """
-    PairSet, first_item, until = set_struct(real, linear), share_function(serial), until_function(serial)
+    PairSet, first_item, until = set_struct(real, linear), items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(link: wp.array(dtype=int), awake: wp.array(dtype=int), any_awake: wp.array(dtype=int)):
@@ -56,7 +56,7 @@ def resting_kernels(real, linear, serial: bool):
     ):
         """Mark bodies awake if a scaled residual, or a subset sum, exceeds `bound` or is not finite."""
         w, start = first_item(wp.tid(), owner.shape[0])
-        if flags[WANTED, w] == 0:
+        if flags[NEEDS_DIRECTION, w] == 0:
             return
         for i in range(start, until(start, owner.shape[0])):
             u = owner[i]
@@ -122,7 +122,7 @@ def resting_kernels(real, linear, serial: bool):
         fixed: wp.array(dtype=wp.uint8),
         where: wp.array(dtype=int),
         width: int,
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         idle: wp.array(dtype=int),
     ):
         """Write masks of inactive dofs, all of a sleeping island, and mark columns of rod paths with active dofs.
@@ -130,21 +130,21 @@ def resting_kernels(real, linear, serial: bool):
         No island sleeps while supports of its world are moving, or if energies are below the rounding floor without progress.
         """
         w, start = first_item(wp.tid(), body.shape[0])
-        every = any_awake[w] == 0 or stalled[w] > 0 or flags[DRIVEN, w] == wp.static(ON_THE_WAY)
+        every = any_awake[w] == 0 or stalled[w] > 0 or flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING)
         for k in range(start, until(start, body.shape[0])):
             bits = fixed[k]
             sleeps = False
             if not every and body[k] >= 0:
                 sleeps = awake[first_of(link, body[k] + w * bodies)] == 0
             if sleeps:
-                bits = BARRED
+                bits = ALL_INACTIVE
             elif where.shape[0] > 0:
                 if where[k] >= 0:
                     idle[w * width + where[k] % width] = 0
-            barred[k + w * body.shape[0]] = bits
+            inactive_mask[k + w * body.shape[0]] = bits
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def leave(threads: int, sets: wp.array(dtype=PairSet), barred: wp.array(dtype=wp.uint8)):
+    def leave(threads: int, sets: wp.array(dtype=PairSet), inactive_mask: wp.array(dtype=wp.uint8)):
         """Mark pairs without active dofs."""
         for s in range(sets.shape[0]):
             pair_set = sets[s]
@@ -152,12 +152,12 @@ def resting_kernels(real, linear, serial: bool):
                 n = pair_set.nodes[p]
                 free = int(0)
                 for local in range(4):
-                    free += wp.where(barred[n[local]] != BARRED, 1, 0)
+                    free += wp.where(inactive_mask[n[local]] != ALL_INACTIVE, 1, 0)
                 if pair_set.angles.shape[0] > 0:
                     for side in range(2):
                         angle = pair_set.angles[p][side]
                         if angle >= 0:
-                            free += 1 - int(barred[angle] & wp.uint8(1))
+                            free += 1 - int(inactive_mask[angle] & wp.uint8(1))
                 pair_set.idle[p] = wp.uint8(wp.where(free > 0, 0, 1))
 
     return begin, look, join, wake, settle, leave

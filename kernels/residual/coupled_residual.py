@@ -7,7 +7,15 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import COEFFICIENT, DOUBTFUL, DROWNED, LOAD_SCALE, SLOT, STATUS, UNBALANCED
+from ddg_warp.kernels.core.islands import (
+    BELOW_ROUNDING_FLOOR,
+    DOUBTFUL,
+    ENERGY_BUFFER,
+    INERTIA_COEFFICIENT,
+    LOAD_SCALE,
+    NOT_CONVERGED,
+    STATUS,
+)
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.newton.line_search import ROUNDED, SETTLED
@@ -39,7 +47,7 @@ def meeting_type(real, linear):
 
 
 @cache
-def given_type(real, drag: bool):
+def inputs_type(real, drag: bool):
     """Return the struct of inputs of the residual but for elements.
 
     `push`, `pressed`: contact forces of blocks, and bounds of the contact stiffness.
@@ -74,7 +82,7 @@ def given_type(real, drag: bool):
 
 
 @cache
-def found_type(real, linear):
+def results_type(real, linear):
     """Return the struct of outputs of the residual.
 
     `right`: residuals of free dofs. `least`: rounding floor. `ratio`, `square`: residual over its tolerance, and squared.
@@ -84,7 +92,7 @@ def found_type(real, linear):
 
     @wp.struct
     class Found:
-        right: wp.array(dtype=H)
+        rhs: wp.array(dtype=H)
         least: wp.array(dtype=real)
         ratio: wp.array2d(dtype=real)
         square: wp.array2d(dtype=real)
@@ -125,7 +133,7 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
     dofs = 1 if angle else 3
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     X, M, R = wp.types.vector(dofs, real), wp.types.matrix((3, 3), real), wp.types.matrix((dofs, dofs), real)
-    Given, Found = given_type(real, drag), found_type(real, linear)
+    Given, Found = inputs_type(real, drag), results_type(real, linear)
     largest = largest_function(real, dofs)
 
     @wp.func
@@ -217,13 +225,13 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
                 r[d] = linear(force[d])
                 total += force[d] * force[d]
                 if not a <= limit:
-                    flags[DROWNED, w] = 1
+                    flags[BELOW_ROUNDING_FLOOR, w] = 1
                     if not a <= least:
-                        flags[UNBALANCED, w] = 1
+                        flags[NOT_CONVERGED, w] = 1
                     if wp.static(real is wp.float32):
                         if a > real(wp.static(ROUNDED)) * load_scale * allowed and moved:
                             flags[DOUBTFUL, w] = 1
-        outputs.right[i] = r
+        outputs.rhs[i] = r
         outputs.ratio[w, k] = worst / allowed
         outputs.square[w, k] = total / (length * length)
         outputs.change[w, k] = change
@@ -242,7 +250,7 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
     `balance`: write residual and energy change of the blocks `some`, or of all if empty.
     """
     V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
-    Given, Found, F = given_type(real, drag), found_type(real, linear), wp.types.matrix((3, 3), real)
+    Given, Found, F = inputs_type(real, drag), results_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
     outer, settle = residual_functions(real, linear, drag, contact)
     largest = largest_function(real)
@@ -290,9 +298,9 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
             if some.shape[0] > 0:
                 k = some[k]
             i = k + w * inputs.blocks
-            force, size, stiff, change = outer(inputs, i, k, w, scalars[COEFFICIENT, w])
+            force, size, stiff, change = outer(inputs, i, k, w, scalars[INERTIA_COEFFICIENT, w])
             noise = wp.abs(change)
-            accepted = flags[SLOT, w]
+            accepted = flags[ENERGY_BUFFER, w]
             for n in range(sets.shape[0]):
                 element_set = sets[n]
                 f = V()

@@ -7,10 +7,10 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import COEFFICIENT, LOAD_SCALE, SLOT, STATUS
+from ddg_warp.kernels.core.islands import ENERGY_BUFFER, INERTIA_COEFFICIENT, LOAD_SCALE, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, until_function
 from ddg_warp.kernels.elements.coupled_element import part_function
-from ddg_warp.kernels.residual.coupled_residual import found_type, given_type, largest_function, residual_functions
+from ddg_warp.kernels.residual.coupled_residual import inputs_type, largest_function, residual_functions, results_type
 from ddg_warp.kernels.terms import Term
 
 
@@ -92,9 +92,9 @@ def force_function(terms: tuple[Term, ...], real, linear):
 
 
 @cache
-def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, contact: bool, serial: bool):
+def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, contact: bool, serial: bool):
     """balance(...) of the nodes and angles of places, but for those `elsewhere`; see `kernels.linear.sliced_ell`."""
-    Along, Given, Found = along_type(real, linear), given_type(real, drag), found_type(real, linear)
+    Along, Given, Found = along_type(real, linear), inputs_type(real, drag), results_type(real, linear)
     M, until = wp.types.vector(1, real), until_function(serial)
     outer, settle = residual_functions(real, linear, drag, contact)
     outer_of_angle, settle_angle = residual_functions(real, linear, drag, contact, True)
@@ -117,8 +117,8 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
         if flags[STATUS, w] != 0 or start >= count[c]:
             return
         load_scale = scalars[LOAD_SCALE, w]
-        coefficient = scalars[COEFFICIENT, w]
-        accepted = flags[SLOT, w]
+        coefficient = scalars[INERTIA_COEFFICIENT, w]
+        accepted = flags[ENERGY_BUFFER, w]
         shift = first_of(w, given.blocks)
         for k in range(start, until(start, count[c])):
             f, size, stiff, moment, size_too, stiff_too, change, noise = collect(sets, k, c, w, accepted)

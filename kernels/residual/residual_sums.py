@@ -9,7 +9,7 @@ from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 
 
 @cache
-def part_kernel(real, linear, leaf: bool, serial: bool):
+def cluster_kernel(real, linear, leaf: bool, serial: bool):
     """Build the kernel of one level of clusters.
 
     `add`: sum residuals over clusters of the level below, or over blocks (`leaf`), and flag worlds with a sum above its limit.

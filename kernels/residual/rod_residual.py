@@ -15,16 +15,16 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.islands import (
-    COEFFICIENT,
+    BELOW_ROUNDING_FLOOR,
     DOUBTFUL,
-    DROWNED,
+    EDGES_ROTATED,
+    ENERGY_BUFFER,
+    INERTIA_COEFFICIENT,
     ITERATION,
     LOAD_SCALE,
-    PLACED,
-    SLOT,
+    NOT_CONVERGED,
     STATUS,
     STEP_LENGTH,
-    UNBALANCED,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
@@ -167,15 +167,15 @@ def check_kernel(kind: RodKind, real, linear):
         n = count[r]
         if flags[STATUS, r] != 0 or start >= n:
             return
-        c = scalars[COEFFICIENT, r]
-        accepted = flags[SLOT, r]
+        c = scalars[INERTIA_COEFFICIENT, r]
+        accepted = flags[ENERGY_BUFFER, r]
         taken = scalars[STEP_LENGTH, r]
         limit = rtol * scalars[LOAD_SCALE, r]
         doubtful = real(wp.static(ROUNDED)) * scalars[LOAD_SCALE, r]
         if flags[ITERATION, r] == 0 or taken < real(1.0):
             limit /= real(n)
         settled = real(wp.static(SETTLED)) * length[r]
-        moved = flags[PLACED, r] != 0
+        moved = flags[EDGES_ROTATED, r] != 0
         for k in range(start, until(start, n)):
             f, moment, size, elastic = balance(
                 g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
@@ -200,9 +200,9 @@ def check_kernel(kind: RodKind, real, linear):
                 is_fixed = ((mask >> d) & 1) == 1
                 right_out[d, k, r] = linear(wp.where(is_fixed, real(0.0), f[d]))
                 if not is_fixed and not wp.abs(f[d]) <= limit:
-                    flags[DROWNED, r] = 1
+                    flags[BELOW_ROUNDING_FLOOR, r] = 1
                     if not wp.abs(f[d]) <= least:
-                        flags[UNBALANCED, r] = 1
+                        flags[NOT_CONVERGED, r] = 1
                     if wp.static(real is wp.float32):
                         if wp.abs(f[d]) > doubtful and not wp.abs(real(direction[d, k, r])) < settled:
                             flags[DOUBTFUL, r] = 1
@@ -210,7 +210,7 @@ def check_kernel(kind: RodKind, real, linear):
                 is_fixed = ((mask >> wp.static(dim)) & 1) == 1
                 right_out[wp.static(nb - 1), k, r] = linear(wp.where(is_fixed, real(0.0), moment))
                 if not is_fixed and not wp.abs(moment) <= limit * length[r]:
-                    flags[DROWNED, r] = 1
+                    flags[BELOW_ROUNDING_FLOOR, r] = 1
                     arm = wp.length(x[along(k + 1, n), r] - position)
                     least = floor * (
                         real(2.0) * stiff * arm * arm * reach / length[r]
@@ -218,7 +218,7 @@ def check_kernel(kind: RodKind, real, linear):
                         + wp.abs(elastic)
                     )
                     if not wp.abs(moment) <= least:
-                        flags[UNBALANCED, r] = 1
+                        flags[NOT_CONVERGED, r] = 1
                     if wp.static(real is wp.float32):
                         rotation = wp.abs(real(direction[wp.static(nb - 1), k, r]))
                         if wp.abs(moment) > doubtful * length[r] and not rotation < real(wp.static(SETTLED)):

@@ -4,11 +4,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import PROGRESS, RATE
+from ddg_warp.kernels.core.islands import INVERSE_STEP, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.linear.sliced_ell import mass_type
-from ddg_warp.kernels.stepping.rod_energy_drift import DISSIPATED, DRIFT, HELD, ROUNDING, rows_function
+from ddg_warp.kernels.stepping.rod_energy_drift import DISSIPATED, DRIFT, FIXED, ROUNDING, rows_function
 from ddg_warp.kernels.terms import Term
 
 
@@ -32,7 +32,7 @@ def element_kernel(term: Term, real, linear):
     ):
         i, j = wp.tid()
         w, e = items(i, j)
-        if scalars[PROGRESS, w] >= real(1.0):
+        if scalars[STEP_PROGRESS, w] >= real(1.0):
             return
         at = column_of(inputs, w, e)
         q, s = read(inputs, w, e, True)
@@ -42,7 +42,7 @@ def element_kernel(term: Term, real, linear):
         worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, e] = rows[wp.static(DRIFT)]
         rows_out[wp.static(ROUNDING) * worlds + w, e] = rows[wp.static(ROUNDING)] + real(stiffness[at]) * least * least
-        rows_out[wp.static(HELD) * worlds + w, e] = rows[wp.static(HELD)]
+        rows_out[wp.static(FIXED) * worlds + w, e] = rows[wp.static(FIXED)]
         rows_out[wp.static(DISSIPATED) * worlds + w, e] = rows[wp.static(DISSIPATED)]
 
     return measure
@@ -74,11 +74,11 @@ def block_kernel(real, drag: bool = False):
         """Write rows of blocks; `load` is the load at the iterate, `load_solved` the load of the solve."""
         i = wp.tid()
         w = i / blocks
-        if scalars[PROGRESS, w] >= real(1.0):
+        if scalars[STEP_PROGRESS, w] >= real(1.0):
             return
         k = i - w * blocks
         moved = q[i] - q0[i]
-        v = moved * (real(2.0) * scalars[RATE, w]) - v0[i]
+        v = moved * (real(2.0) * scalars[INVERSE_STEP, w]) - v0[i]
         worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, k] = real(2.0) * wp.dot(load_solved[i] - load[i], moved)
         rows_out[wp.static(ROUNDING) * worlds + w, k] = real(2.0) * floor * wp.abs(wp.dot(load[i], moved))
@@ -86,8 +86,8 @@ def block_kernel(real, drag: bool = False):
             m = mass[w, k].mass
         else:
             m = mass[w, k]
-        rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
-        damped = real(2.0) * damping[0] * scalars[RATE, w] * wp.dot(wp.cw_mul(m, moved), moved)
+        rows_out[wp.static(FIXED) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
+        damped = real(2.0) * damping[0] * scalars[INVERSE_STEP, w] * wp.dot(wp.cw_mul(m, moved), moved)
         if wp.static(drag):
             away = q[i] - mass[w, k].carried
             damped += real(2.0) * wp.dot(away, mass[w, k].resistance * away)

@@ -9,11 +9,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import LOAD_SCALE, PROGRESS, TODO
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.core.islands import ITERATE_ACTION, LOAD_SCALE, STEP_PROGRESS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 from ddg_warp.kernels.newton.edge_rotation import loose_function
-from ddg_warp.kernels.newton.rod_iterate import PLACE
-from ddg_warp.kernels.stepping.rod_warm_start import ahead_function
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES
+from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_step_function
 
 GROWTH, LEAST = 4.0, 0.05  # growth of the correction with full weight; smallest weight, from which it recovers
 AGREEING, ADDED, BEFORE, FORCE = range(4)  # rows of sums over nodes: m a.b, m a.a, m b.b, m |a|; see `weigh`
@@ -21,15 +21,15 @@ SUMS = 4
 
 
 @cache
-def foresight_kernels(real, linear, serial: bool):
+def warm_start_kernels(real, linear, serial: bool):
     """Build the kernels of the warm start.
 
     `foresee`: add extrapolated accelerations to the predictor.
     `weigh`: sum products of the new correction and the last extrapolated one.
     `trust`: write the weight of the correction.
     """
-    share, until = share_function(serial), until_function(serial)
-    squared_step, free_components = ahead_function(real), loose_function(3, real)
+    share, until = items_function(serial), until_function(serial)
+    squared_step, free_components = extrapolation_step_function(real), loose_function(3, real)
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -48,7 +48,7 @@ def foresight_kernels(real, linear, serial: bool):
         Worlds with edge rotations take them as a `direction`; see `ddg_warp.solve.newton.edge_rotation`.
         """
         w, start = share(wp.tid(), blocks)
-        if scalars[PROGRESS, w] >= real(1.0):
+        if scalars[STEP_PROGRESS, w] >= real(1.0):
             return
         weight = squared_step(flags, scalars, w)
         for k in range(start, until(start, blocks)):
@@ -57,7 +57,7 @@ def foresight_kernels(real, linear, serial: bool):
             predicted[i] = start_q
             more = free_components(int(fixed[k]), weight * a[i])
             q[i] = start_q + more
-            if flags[TODO, w] == wp.static(PLACE):
+            if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES):
                 direction[i] = H(linear(more[0]), linear(more[1]), linear(more[2]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -13,14 +13,23 @@ import warp as wp
 from ddg_warp.kernels.collision.broad_phase.rod_culling import DOUBT, STEPS, TICK
 from ddg_warp.kernels.collision.contact.statistics import LAST, PARTS
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import CAUTIOUS, ITERATION, LOST, MOVED, PORTION, PROGRESS, RETRIES, STATUS
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, share_function, until_function
+from ddg_warp.kernels.core.islands import (
+    COLD_START,
+    ITERATION,
+    LOST_PIVOTS_TOTAL,
+    RETRIES,
+    STATUS,
+    STEP_PROGRESS,
+    SUBSTEP_ACCEPTED,
+    SUBSTEP_FRACTION,
+)
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, items_function, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.stepping.rod_step import start_function
 
 # whether the world is stepped so; worst outcome, most iterations and lost pivots of rods, and whether the step is still to be done
 TRIED, WORST, MOST, PIVOTS, LEFT = range(5)
-TOLD = 5
+REPORTED = 5
 NODE, ANGLE, VERTEX, EDGE = 0, 2, 4, 6  # first of two rows of the dof map
 
 
@@ -83,12 +92,12 @@ def rod_kernels(kind: RodKind, real):
         n = count[c]
         tried = status[wp.static(TRIED), w] != 0
         if start == 0:
-            flags[CAUTIOUS, c] = 0
+            flags[COLD_START, c] = 0
             flags[RETRIES, c] = 0
-            flags[LOST, c] = 0
+            flags[LOST_PIVOTS_TOTAL, c] = 0
             flags[STATUS, c] = wp.static(outcome.CONVERGED)
-            scalars[PORTION, c] = real(1.0)
-            scalars[PROGRESS, c] = wp.where(tried, real(0.0), real(1.0))
+            scalars[SUBSTEP_FRACTION, c] = real(1.0)
+            scalars[STEP_PROGRESS, c] = wp.where(tried, real(0.0), real(1.0))
         if not tried or start >= n:
             return
         for k in range(start, until(start, n)):
@@ -153,8 +162,8 @@ def rod_kernels(kind: RodKind, real):
                 wp.atomic_max(status, wp.static(WORST), w, flags[STATUS, c])
             if status[wp.static(MOST), w] < flags[ITERATION, c]:
                 wp.atomic_max(status, wp.static(MOST), w, flags[ITERATION, c])
-            if flags[LOST, c] > 0:
-                wp.atomic_add(status, wp.static(PIVOTS), w, flags[LOST, c])
+            if flags[LOST_PIVOTS_TOTAL, c] > 0:
+                wp.atomic_add(status, wp.static(PIVOTS), w, flags[LOST_PIVOTS_TOTAL, c])
         for k in range(start, until(start, n)):
             q_out[index_of(dof_map, wp.static(NODE), r, k, first_of(w, sizes[0]))] = x[k, c]
             if wp.static(twist):
@@ -246,7 +255,7 @@ def world_kernels(real):
 
         Contacts along arcs are not near the straight motion of a full step.
         """
-        return scalars[PROGRESS, w] < real(1.0) and scalars[PORTION, w] == real(1.0)
+        return scalars[STEP_PROGRESS, w] < real(1.0) and scalars[SUBSTEP_FRACTION, w] == real(1.0)
 
     @wp.func
     def enter(status: wp.array2d(dtype=int), w: int, tried: bool):
@@ -343,8 +352,8 @@ def world_kernels(real):
         status[wp.static(LEFT), w] = 0
         flags[STATUS, w] = worst
         flags[ITERATION, w] = status[wp.static(MOST), w]
-        flags[MOVED, w] = 1
-        scalars[PROGRESS, w] = real(1.0)
+        flags[SUBSTEP_ACCEPTED, w] = 1
+        scalars[STEP_PROGRESS, w] = real(1.0)
         counts[wp.static(PARTS), w] = counts[wp.static(PARTS), w] + wp.int64(1)
         counts[wp.static(LAST), w] = wp.int64(0)
         counted = worst
@@ -367,7 +376,7 @@ def place_kernels(real, serial: bool):
     `stay`: copy nodes of obstacles of tried worlds.
     `follow`: write velocities of such nodes from their displacements.
     """
-    V, first_item, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
+    V, first_item, until = wp.types.vector(3, real), items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def wait(status: wp.array2d(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):

@@ -13,13 +13,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import PROGRESS, RATE, STATUS
+from ddg_warp.kernels.core.islands import INVERSE_STEP, STATUS, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_function
 from ddg_warp.kernels.elements.rod_layout import RodKind, inertia_type, rod_storage
 from ddg_warp.kernels.terms import Term
 
-DRIFT, ROUNDING, HELD, DISSIPATED = range(4)  # rows of a balance
+DRIFT, ROUNDING, FIXED, DISSIPATED = range(4)  # rows of a balance
 ROWS = 4
 
 
@@ -100,7 +100,7 @@ def rows_function(storage: ElementStorage, index: int, real):
 
 
 @cache
-def chain_kernel(kind: RodKind, real, linear):
+def rod_kernel(kind: RodKind, real, linear):
     """Build the kernel of the rows of a step of every rod, summed over ranges.
 
     Range i holds the nodes i, i + ranges, ...; see `kernels.newton.line_search_parallel`.
@@ -133,7 +133,7 @@ def chain_kernel(kind: RodKind, real, linear):
     ):
         """`load` and `load_angle` are those of the iterate, those `there` those that the step was solved with."""
         first, r = wp.tid()
-        if scalars[PROGRESS, r] >= real(1.0):
+        if scalars[STEP_PROGRESS, r] >= real(1.0):
             return
         n = middle.count[r]
         total = B()
@@ -144,14 +144,14 @@ def chain_kernel(kind: RodKind, real, linear):
                 m = mass[k, r]
             here = middle.x[k, r]
             moved = here - start.x[k, r]
-            v = moved * (real(2.0) * scalars[RATE, r]) - v0[k, r]
+            v = moved * (real(2.0) * scalars[INVERSE_STEP, r]) - v0[k, r]
             kinetic = real(0.5) * m * wp.length_sq(v)
-            damped = real(2.0) * damping[0] * scalars[RATE, r] * m * wp.length_sq(moved)
+            damped = real(2.0) * damping[0] * scalars[INVERSE_STEP, r] * m * wp.length_sq(moved)
             if wp.static(twist):
                 turned = middle.theta[k, r] - start.theta[k, r]
-                spin = turned * (real(2.0) * scalars[RATE, r]) - omega0[k, r]
+                spin = turned * (real(2.0) * scalars[INVERSE_STEP, r]) - omega0[k, r]
                 kinetic += real(0.5) * rotary[k, r] * spin * spin
-                damped += real(2.0) * damping[0] * scalars[RATE, r] * rotary[k, r] * turned * turned
+                damped += real(2.0) * damping[0] * scalars[INVERSE_STEP, r] * rotary[k, r] * turned * turned
                 if wp.static(drag):
                     damped += real(2.0) * mass[k, r].spin * turned * turned
             if wp.static(drag):
@@ -183,7 +183,7 @@ def chain_kernel(kind: RodKind, real, linear):
 
 
 @cache
-def judge_kernel(real):
+def drift_kernel(real):
     """Enters a solved step of every rod or world in its account, or has it fail.
 
     The account holds all that the scheme has made of the energy and what rounding may have, the largest kinetic and elastic energy,
@@ -201,7 +201,7 @@ def judge_kernel(real):
         failed_out: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        if scalars[PROGRESS, r] >= real(1.0) or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if scalars[STEP_PROGRESS, r] >= real(1.0) or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
             return
         drift = account[wp.static(DRIFT), r]
         rounding = account[wp.static(ROUNDING), r]
@@ -211,9 +211,9 @@ def judge_kernel(real):
         for i in range(rows.shape[1]):
             drift += rows[wp.static(DRIFT), i, r]
             rounding += rows[wp.static(ROUNDING), i, r]
-            held += rows[wp.static(HELD), i, r]
+            held += rows[wp.static(FIXED), i, r]
             dissipated += rows[wp.static(DISSIPATED), i, r]
-        held = wp.max(held, account[wp.static(HELD), r])
+        held = wp.max(held, account[wp.static(FIXED), r])
         allowed = bound * (held + dissipated) + rounding
         if not wp.abs(drift) <= wp.max(allowed, before):
             flags[STATUS, r] = wp.static(outcome.ENERGY_DRIFT)
@@ -222,7 +222,7 @@ def judge_kernel(real):
             return
         account[wp.static(DRIFT), r] = drift
         account[wp.static(ROUNDING), r] = rounding
-        account[wp.static(HELD), r] = held
+        account[wp.static(FIXED), r] = held
         account[wp.static(DISSIPATED), r] = dissipated
 
     return judge

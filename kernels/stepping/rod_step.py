@@ -20,29 +20,29 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
-    BENT,
-    CAUTIOUS,
-    DETOURS,
+    COLD_START,
+    FAILURE_STATUS,
+    INVERSE_STEP,
     ITERATION,
-    LOST,
-    MOVED,
-    PATIENCE,
-    PORTION,
-    PROGRESS,
-    RATE,
-    REASON,
+    LOST_PIVOTS_TOTAL,
+    PROJECTED_ITERATIONS,
+    PROJECTED_LIMIT,
     RETRIES,
+    ROTATE_PREDICTOR,
     STATUS,
+    STEP_PROGRESS,
+    STRAIGHT_ROTATION_LIMIT,
     SUBSTEP,
-    TURN,
+    SUBSTEP_ACCEPTED,
+    SUBSTEP_FRACTION,
     attempt_functions,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
-from ddg_warp.kernels.newton.edge_rotation import ON, onward_function
+from ddg_warp.kernels.newton.edge_rotation import REPEAT_ROTATION, repeat_rotation_function
 from ddg_warp.kernels.newton.rod_iterate import search_functions
-from ddg_warp.kernels.stepping.rod_warm_start import told_function
+from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_rate_function
 
 
 @cache
@@ -79,16 +79,16 @@ def begin_kernel(kind: RodKind, real, midpoint: bool):
     ):
         start, r = wp.tid()
         n = count[r]
-        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
+        if scalars[STEP_PROGRESS, r] >= real(1.0) or start >= n:
             return
         s = length(scalars, r, dt[world[r]])
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if start == 0:
-            if scalars[TURN, r] == real(0.0):
-                flags[BENT, r] = 1
+            if scalars[STRAIGHT_ROTATION_LIMIT, r] == real(0.0):
+                flags[ROTATE_PREDICTOR, r] = 1
             restart(flags, scalars, r, rate, coefficient, outer[r])
-        predict_length = wp.where(flags[CAUTIOUS, r] == 0, s, real(0.0))
+        predict_length = wp.where(flags[COLD_START, r] == 0, s, real(0.0))
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
             position = x0[k, r]
@@ -98,12 +98,12 @@ def begin_kernel(kind: RodKind, real, midpoint: bool):
                 if ((mask >> d) & 1) == 0:
                     position[d] = position[d] + predict_length * v[d]
             x_out[k, r] = position
-            if flags[CAUTIOUS, r] == 0 and k + 1 < n:
+            if flags[COLD_START, r] == 0 and k + 1 < n:
                 edge_change = (v0[k + 1, r] - v) * s
                 edge = x0[k + 1, r] - x0[k, r]
-                straight = scalars[TURN, r]
+                straight = scalars[STRAIGHT_ROTATION_LIMIT, r]
                 if wp.length_sq(edge_change) > straight * straight * wp.length_sq(edge):
-                    flags[BENT, r] = 1
+                    flags[ROTATE_PREDICTOR, r] = 1
             if wp.static(twist):
                 angle = theta0[k, r]
                 spin = omega0[k, r]
@@ -154,7 +154,7 @@ def predict_kernel(kind: RodKind, real, linear, midpoint: bool):
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
-    predicted, extrapolation_of = predicted_function(dim, real), onward_function(real)
+    predicted, extrapolation_of = predicted_function(dim, real), repeat_rotation_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def predict(
@@ -171,16 +171,20 @@ def predict_kernel(kind: RodKind, real, linear, midpoint: bool):
         frame: wp.array3d(dtype=real),
     ):
         r = wp.tid()
-        if scalars[PROGRESS, r] >= real(1.0):
+        if scalars[STEP_PROGRESS, r] >= real(1.0):
             return
         n = count[r]
-        if flags[BENT, r] != 0:
+        if flags[ROTATE_PREDICTOR, r] != 0:
             for k in range(n):
-                step = predicted(x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), flags[CAUTIOUS, r], scalars[RATE, r])
+                step = predicted(
+                    x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), flags[COLD_START, r], scalars[INVERSE_STEP, r]
+                )
                 base[k, r] = x0[k, r]
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(step[d])
-            extrapolation = extrapolation_of(scalars[TURN, r], wp.static(0 if midpoint else ON))
+            extrapolation = extrapolation_of(
+                scalars[STRAIGHT_ROTATION_LIMIT, r], wp.static(0 if midpoint else REPEAT_ROTATION)
+            )
             place(x, base, base, direction, fixed, anchor, real(1.0), extrapolation, n, r)
         if wp.static(carried):
             relag(x, frame, n, r)
@@ -197,10 +201,10 @@ def start_function(real):
 
     @wp.func
     def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
-        scalars[PORTION, i] = scalars[SUBSTEP, i]
-        flags[CAUTIOUS, i] = 0
+        scalars[SUBSTEP_FRACTION, i] = scalars[SUBSTEP, i]
+        flags[COLD_START, i] = 0
         flags[RETRIES, i] = 0
-        scalars[PROGRESS, i] = wp.where(flags[STATUS, i] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+        scalars[STEP_PROGRESS, i] = wp.where(flags[STATUS, i] == wp.static(outcome.STEP_FAILED), real(1.0), real(0.0))
 
     return start
 
@@ -224,7 +228,7 @@ def finish_nodes_kernel(kind: RodKind, real, midpoint: bool):
     `finish`: write positions, twist angles, velocities and accelerations at the end of the substep of rods that converged.
     """
     V, twist = wp.types.vector(kind.dim, real), kind.twist
-    until, extrapolation_of = until_function(kind.serial), told_function(real, midpoint)
+    until, extrapolation_of = until_function(kind.serial), extrapolation_rate_function(real, midpoint)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -252,9 +256,9 @@ def finish_nodes_kernel(kind: RodKind, real, midpoint: bool):
         n = count[r]
         if start >= n:
             return
-        moves = scalars[PROGRESS, r] < real(1.0) and flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        moves = scalars[STEP_PROGRESS, r] < real(1.0) and flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if start == 0:
-            flags[MOVED, r] = wp.where(moves, 1, 0)
+            flags[SUBSTEP_ACCEPTED, r] = wp.where(moves, 1, 0)
         extrapolation = extrapolation_of(flags, scalars, r)
         for k in range(start, until(start, n)):
             before = x0[k, r]
@@ -272,7 +276,7 @@ def finish_nodes_kernel(kind: RodKind, real, midpoint: bool):
             if moves:
                 end = x[k, r]
                 a = (end - predicted[k, r]) * extrapolation
-                change = (end - before) * scalars[RATE, r]
+                change = (end - before) * scalars[INVERSE_STEP, r]
                 if wp.static(midpoint):
                     end = real(2.0) * end - before
                     v = real(2.0) * change - v
@@ -281,7 +285,7 @@ def finish_nodes_kernel(kind: RodKind, real, midpoint: bool):
                 if wp.static(twist):
                     angle = theta[k, r]
                     alpha = (angle - predicted_angle[k, r]) * extrapolation
-                    spin_mean = (angle - angle0) * scalars[RATE, r]
+                    spin_mean = (angle - angle0) * scalars[INVERSE_STEP, r]
                     if wp.static(midpoint):
                         angle = real(2.0) * angle - angle0
                         spin = real(2.0) * spin_mean - spin
@@ -373,7 +377,7 @@ def advance_kernel(real):
         remaining: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if scalars[PROGRESS, r] >= real(1.0):
+        if scalars[STEP_PROGRESS, r] >= real(1.0):
             return
         result = flags[STATUS, r]
         counted = result
@@ -383,36 +387,39 @@ def advance_kernel(real):
         wp.atomic_add(work, 0, wp.int64(flags[ITERATION, r]))
         wp.atomic_max(work, 1, wp.int64(flags[ITERATION, r]))
         wp.atomic_add(work, 2, wp.int64(1))
-        if flags[LOST, r] > 0:
-            wp.atomic_add(work, 4, wp.int64(flags[LOST, r]))
+        if flags[LOST_PIVOTS_TOTAL, r] > 0:
+            wp.atomic_add(work, 4, wp.int64(flags[LOST_PIVOTS_TOTAL, r]))
         if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            scalars[PROGRESS, r] = scalars[PROGRESS, r] + scalars[PORTION, r]
-            flags[CAUTIOUS, r] = 0
-            if scalars[PROGRESS, r] < real(1.0):
+            scalars[STEP_PROGRESS, r] = scalars[STEP_PROGRESS, r] + scalars[SUBSTEP_FRACTION, r]
+            flags[COLD_START, r] = 0
+            if scalars[STEP_PROGRESS, r] < real(1.0):
                 flags[RETRIES, r] = 0
             # double the substep if it starts at a multiple of its length, so that all islands end together
-            longer = real(2.0) * scalars[PORTION, r]
+            longer = real(2.0) * scalars[SUBSTEP_FRACTION, r]
             if (
-                scalars[PROGRESS, r] < real(1.0)
+                scalars[STEP_PROGRESS, r] < real(1.0)
                 and longer <= scalars[SUBSTEP, r]
-                and wp.floor(scalars[PROGRESS, r] / longer) * longer == scalars[PROGRESS, r]
+                and wp.floor(scalars[STEP_PROGRESS, r] / longer) * longer == scalars[STEP_PROGRESS, r]
             ):
-                scalars[PORTION, r] = longer
+                scalars[SUBSTEP_FRACTION, r] = longer
         else:
             wp.atomic_add(work, 3, wp.int64(1))
             flags[RETRIES, r] = flags[RETRIES, r] + 1
             # a cold start would lead to the same step with its energy drift, or to the same minimum
-            again = result != wp.static(outcome.ENERGY_DRIFT) and flags[DETOURS, r] <= flags[PATIENCE, r]
-            if again and flags[CAUTIOUS, r] == 0:
-                flags[CAUTIOUS, r] = 1
+            again = (
+                result != wp.static(outcome.ENERGY_DRIFT)
+                and flags[PROJECTED_ITERATIONS, r] <= flags[PROJECTED_LIMIT, r]
+            )
+            if again and flags[COLD_START, r] == 0:
+                flags[COLD_START, r] = 1
             else:
-                flags[CAUTIOUS, r] = 0
-                scalars[PORTION, r] = real(0.5) * scalars[PORTION, r]
-            if flags[RETRIES, r] > retry_limit or scalars[PORTION, r] < smallest * scalars[SUBSTEP, r]:
-                flags[REASON, r] = result
-                flags[STATUS, r] = wp.static(outcome.GIVEN_UP)
-                scalars[PROGRESS, r] = real(1.0)
-        if scalars[PROGRESS, r] < real(1.0):
+                flags[COLD_START, r] = 0
+                scalars[SUBSTEP_FRACTION, r] = real(0.5) * scalars[SUBSTEP_FRACTION, r]
+            if flags[RETRIES, r] > retry_limit or scalars[SUBSTEP_FRACTION, r] < smallest * scalars[SUBSTEP, r]:
+                flags[FAILURE_STATUS, r] = result
+                flags[STATUS, r] = wp.static(outcome.STEP_FAILED)
+                scalars[STEP_PROGRESS, r] = real(1.0)
+        if scalars[STEP_PROGRESS, r] < real(1.0):
             remaining[0] = 1
 
     return advance

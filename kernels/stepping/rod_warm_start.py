@@ -10,17 +10,24 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import BENT, CAUTIOUS, ITERATION, LOAD_SCALE, PROGRESS, RATE
+from ddg_warp.kernels.core.islands import (
+    COLD_START,
+    INVERSE_STEP,
+    ITERATION,
+    LOAD_SCALE,
+    ROTATE_PREDICTOR,
+    STEP_PROGRESS,
+)
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.newton.edge_rotation import FURTHER, loose_function
+from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, loose_function
 from ddg_warp.kernels.newton.rod_iterate import search_functions
 
-FORESEEN = 6  # maximum iterations of a solve whose correction is extrapolated
+MAX_WARM_START_ITERATIONS = 6  # maximum iterations of a solve whose correction is extrapolated
 
 
 @cache
-def ahead_function(real):
+def extrapolation_step_function(real):
     """Return the device function `ahead(flags, scalars, i)`: squared step by which accelerations extrapolate the predictor.
 
     Zero after a cold start, and without loads, as the tolerance then is relative to the first residual of a solve.
@@ -28,15 +35,15 @@ def ahead_function(real):
 
     @wp.func
     def ahead(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
-        s = real(1.0) / scalars[RATE, i]
-        foreseen = flags[CAUTIOUS, i] == 0 and scalars[LOAD_SCALE, i] > real(0.0)
+        s = real(1.0) / scalars[INVERSE_STEP, i]
+        foreseen = flags[COLD_START, i] == 0 and scalars[LOAD_SCALE, i] > real(0.0)
         return wp.where(foreseen, s * s, real(0.0))
 
     return ahead
 
 
 @cache
-def told_function(real, midpoint: bool, crowd: bool = False):
+def extrapolation_rate_function(real, midpoint: bool, crowd: bool = False):
     """Return the device function `told(flags, scalars, i)`: squared rate that makes a correction an acceleration.
 
     Zero where corrections are not extrapolated: with the midpoint rule, after a cold start, or after so many iterations that the
@@ -47,16 +54,16 @@ def told_function(real, midpoint: bool, crowd: bool = False):
     def told(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
         valid = (
             wp.static(not midpoint)
-            and flags[CAUTIOUS, i] == 0
-            and (wp.static(crowd) or flags[ITERATION, i] <= wp.static(FORESEEN))
+            and flags[COLD_START, i] == 0
+            and (wp.static(crowd) or flags[ITERATION, i] <= wp.static(MAX_WARM_START_ITERATIONS))
         )
-        return wp.where(valid, scalars[RATE, i] * scalars[RATE, i], real(0.0))
+        return wp.where(valid, scalars[INVERSE_STEP, i] * scalars[INVERSE_STEP, i], real(0.0))
 
     return told
 
 
 @cache
-def foresee_kernel(kind: RodKind, real, linear):
+def warm_start_kernel(kind: RodKind, real, linear):
     """Build the kernel of the warm start.
 
     `foresee`: store the predictor of every rod that still has to move, and add extrapolated accelerations.
@@ -65,7 +72,11 @@ def foresee_kernel(kind: RodKind, real, linear):
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    until, squared_step, loose = until_function(kind.serial), ahead_function(real), loose_function(dim, real)
+    until, squared_step, loose = (
+        until_function(kind.serial),
+        extrapolation_step_function(real),
+        loose_function(dim, real),
+    )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def foresee(
@@ -83,7 +94,7 @@ def foresee_kernel(kind: RodKind, real, linear):
     ):
         start, r = wp.tid()
         n = count[r]
-        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
+        if scalars[STEP_PROGRESS, r] >= real(1.0) or start >= n:
             return
         weight = squared_step(flags, scalars, r)
         for k in range(start, until(start, n)):
@@ -92,7 +103,7 @@ def foresee_kernel(kind: RodKind, real, linear):
             predicted[k, r] = position
             correction = loose(mask, weight * a0[k, r])
             x[k, r] = position + correction
-            if flags[BENT, r] != 0:
+            if flags[ROTATE_PREDICTOR, r] != 0:
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(correction[d])
             if wp.static(twist):
@@ -126,7 +137,7 @@ def further_kernel(kind: RodKind, real, linear):
         x: wp.array2d(dtype=V),
     ):
         r = wp.tid()
-        if scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0:
-            place(x, predicted, x0, direction, fixed, anchor, real(1.0), wp.static(FURTHER), count[r], r)
+        if scalars[STEP_PROGRESS, r] < real(1.0) and flags[ROTATE_PREDICTOR, r] != 0:
+            place(x, predicted, x0, direction, fixed, anchor, real(1.0), wp.static(EXTRAPOLATE_ROTATED), count[r], r)
 
     return further

@@ -8,7 +8,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import REASON, STATUS
+from ddg_warp.kernels.core.islands import FAILURE_STATUS, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 
@@ -69,7 +69,7 @@ def blank_kernels(dtype):
         w = wp.tid()
         code = invalid[w]
         if code == 0 and wp.isnan(values[0, 0, w * width]):
-            code = wp.static(outcome.GIVEN_UP)
+            code = wp.static(outcome.STEP_FAILED)
         resting[w] = code
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -103,17 +103,17 @@ def island_kernels():
         """Collect the largest outcome of failed islands, in worlds that had not failed before."""
         i = wp.tid()
         w = i / width
-        if flags[STATUS, i] == wp.static(outcome.GIVEN_UP) and resting[w] == 0:
-            wp.atomic_max(failed, w, flags[REASON, i])
+        if flags[STATUS, i] == wp.static(outcome.STEP_FAILED) and resting[w] == 0:
+            wp.atomic_max(failed, w, flags[FAILURE_STATUS, i])
             any_failed[0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def seal(failed: wp.array(dtype=int), width: int, flags: wp.array2d(dtype=int)):
         """Stop the other islands of failed worlds, without an outcome."""
         i = wp.tid()
-        if failed[i / width] != 0 and flags[STATUS, i] != wp.static(outcome.GIVEN_UP):
-            flags[STATUS, i] = wp.static(outcome.GIVEN_UP)
-            flags[REASON, i] = 0
+        if failed[i / width] != 0 and flags[STATUS, i] != wp.static(outcome.STEP_FAILED):
+            flags[STATUS, i] = wp.static(outcome.STEP_FAILED)
+            flags[FAILURE_STATUS, i] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def enter(failed: wp.array(dtype=int), resting: wp.array(dtype=int)):
@@ -126,7 +126,7 @@ def island_kernels():
         i = wp.tid()
         if mask[i / width] != 0:
             flags[STATUS, i] = wp.static(outcome.CONVERGED)
-            flags[REASON, i] = 0
+            flags[FAILURE_STATUS, i] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def find(mask: wp.array(dtype=int), any_found: wp.array(dtype=int)):

@@ -48,7 +48,7 @@ class Slice:
         self.model = scene.build(device, "float64")
         self.tangent, self.state, self.crown = Tangent(self.model), self.model.state(), [0, cells]
         self.q = self.tangent.dofs(self.state)
-        self.last = 3 * self.model.net.host.shells[0].nodes[last]
+        self.last = 3 * self.model.coupled.host.shells[0].nodes[last]
         free = self.tangent.free.copy()
         free[self.last] = False  # the last section follows the plane
         self.free = np.flatnonzero(free)

@@ -181,13 +181,13 @@ def bending_energy(device, cells: int, bending: str, mesh: str, angle: float) ->
     state = model.state(points=positions)
     if bending == "midedge_dof":
         _relax_normals(model, state)
-    shell = model.net.host.shells[0]
+    shell = model.coupled.host.shells[0]
     weight = (np.abs(points[triangles].mean(1)[:, :2] - 0.5) < 0.25 - 1e-9).all(1).astype(float)
     area = weight @ shell.plate.area
     if bending == "hinge":
         weight = 0.5 * weight[shell.surface.edge_triangles[~shell.surface.boundary]].sum(1)
     energies = dict(Tangent(model).parts[0].energies(state))
-    return weight @ energies[model.net.host.sets[-1].term.name][0] / area * 8.0
+    return weight @ energies[model.coupled.host.sets[-1].term.name][0] / area * 8.0
 
 
 def _relax_normals(model, state) -> None:

@@ -9,5 +9,5 @@ def step_without_capture(integrator, state, dt):
     for stepper in integrator._parts:
         stepper.prescribe(state.time, state.time + dt)
     integrator._launch(source)
-    assert not integrator._net.outgrown(integrator._buffers[source].own.net)
+    assert not integrator._coupled.has_overflow(integrator._buffers[source].own.coupled)
     return integrator._buffers[1 - source]

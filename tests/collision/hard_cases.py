@@ -60,7 +60,7 @@ def forces_on(contacts, number: int) -> np.ndarray:
 
 def least_gap(model, state) -> float:
     """Return the smallest gap of rods and shells, by all pairs in NumPy [m]."""
-    shapes, x, gaps = model.touch.shapes, state.net.q.numpy(), []
+    shapes, x, gaps = model.touch.shapes, state.coupled.q.numpy(), []
     for sides in SIDES:
         if set(sides) <= set(shapes.sizes):
             distance, thickness = distances(shapes, x, *sides, *admissible_pairs(shapes, *sides))

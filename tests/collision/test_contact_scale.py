@@ -116,7 +116,7 @@ def test_overlapping_starts_are_refused_and_resolved_at_every_scale(device, buil
         state = model.state(points=low)
         with pytest.raises(ddg.SceneError, match="overlap"):
             ddg.Integrator(model).step(state, DT * length / SPEED)
-        separated, _ = model.pushed_apart(state)
+        separated, _ = model.resolve_overlaps(state)
         displacements.append((separated.points() - low) / length)
     np.testing.assert_allclose(displacements[0], displacements[1], atol=1e-6)
     np.testing.assert_allclose(displacements[2], displacements[1], atol=1e-6)

@@ -43,7 +43,7 @@ def run(device, scene, steps: int, dt: float = DT, velocities=None, worlds: int 
     decoupled = []
     for _ in range(steps):
         state = integrator.step(state, dt)
-        stepper = integrator._net.alone if integrator._net else None
+        stepper = integrator._coupled.alone if integrator._coupled else None
         decoupled.append(stepper is not None and (stepper.left.numpy() == 0))
     return state, integrator, np.array(decoupled)
 
@@ -112,7 +112,7 @@ def test_moving_obstacles_couple_rods_and_follow_their_motion(device):
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
     np.testing.assert_allclose(actual.obstacle_points(), expected.obstacle_points(), rtol=0.0, atol=1e-15)
     first, _, decoupled = run(device, scene, **(options | {"steps": 3}))
-    np.testing.assert_allclose(first.net.v.numpy()[:, 2].max(), 0.5, rtol=1e-12)
+    np.testing.assert_allclose(first.coupled.v.numpy()[:, 2].max(), 0.5, rtol=1e-12)
     assert decoupled.all()
 
 
@@ -149,9 +149,9 @@ def test_damped_and_undamped_rods_in_one_element_set(device):
     assert decoupled.all()
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-12)
     model = actual.model  # damping reads these strains in the next step
-    strains = [values.numpy().copy() for values in actual.net.last]
-    model.net.update_strains(actual.net)
-    for kept, updated in zip(strains, actual.net.last, strict=True):
+    strains = [values.numpy().copy() for values in actual.coupled.last]
+    model.coupled.update_strains(actual.coupled)
+    for kept, updated in zip(strains, actual.coupled.last, strict=True):
         np.testing.assert_allclose(kept, updated.numpy(), rtol=0.0, atol=1e-12 * np.abs(kept).max())
 
 
@@ -171,7 +171,7 @@ def test_grips_move_decoupled_rods(device):
             poses[:, 0, 1], poses[:, 0, 3] = 1e-3 * step * np.array([1.0, -0.5]), 0.02 * step
             state = integrator.step(state, DT, ddg.Controls(poses=poses))
         states.append(state)
-    assert (integrator._net.alone.left.numpy() == 0).all()
+    assert (integrator._coupled.alone.left.numpy() == 0).all()
     np.testing.assert_allclose(states[1].points(), states[0].points(), rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(states[1].angles(), states[0].angles(), rtol=0.0, atol=1e-10)
 
@@ -181,12 +181,12 @@ def test_resumed_run_repeats_its_steps_bitwise(device):
     scene, velocities = falling_rod(height=0.012, speed=0.5)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state(velocities=velocities)
-    snapshots, coupled = [], []
+    snapshots, is_coupled = [], []
     for _ in range(24):
         snapshots.append(state.snapshot())
         state = integrator.step(state, DT)
-        coupled.append(bool(integrator._net.alone.left.numpy()[0]))
-    assert len(set(coupled)) == 2
+        is_coupled.append(bool(integrator._coupled.alone.left.numpy()[0]))
+    assert len(set(is_coupled)) == 2
     for start in (3, 6, 12, 20):
         resumed, again = ddg.Integrator(model), model.restore(snapshots[start])
         for _ in range(start, 24):
@@ -218,7 +218,7 @@ def approaching_rods(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **cont
 
 
 def bound_updates(integrator) -> int:
-    return int(integrator._net.alone.runs.looks.numpy()[0])
+    return int(integrator._coupled.alone.runs.looks.numpy()[0])
 
 
 def test_sudden_motion_out_of_old_bounds_is_detected(device):
@@ -276,7 +276,7 @@ def test_reset_within_reach_is_detected(device):
     to[:, 11:, 2] = 2.2 * RADIUS
     state = integrator.reset(state, np.array([True, False]), model.state(points=to, velocities=np.stack([near[1]] * 2)))
     state = integrator.step(state, DT)
-    assert integrator._net.alone.left.numpy().tolist() == [1, 0]
+    assert integrator._coupled.alone.left.numpy().tolist() == [1, 0]
     assert state.points()[0, 16, 2] - state.points()[0, 5, 2] > 2.0 * RADIUS
     assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] < 1e-3
 
@@ -286,15 +286,15 @@ def test_run_resumed_before_contact_repeats_its_steps_bitwise(device):
     scene, velocities = approaching_rods(kick=0.01, rods=2)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state(velocities=velocities)
-    snapshots, coupled, updates = [], [], []
+    snapshots, is_coupled, updates = [], [], []
     for _ in range(130):
         snapshots.append(state.snapshot())
         state = integrator.step(state, 1 / 480)
-        coupled.append(bool(integrator._net.alone.left.numpy()[0]))
+        is_coupled.append(bool(integrator._coupled.alone.left.numpy()[0]))
         updates.append(bound_updates(integrator))
-    assert len(set(coupled)) == 2
+    assert len(set(is_coupled)) == 2
     left = int(np.flatnonzero(np.diff(updates))[2])
-    for start in (left - 1, left, left + 1, left + 2, 90, coupled.index(True) - 1, coupled.index(True) + 1):
+    for start in (left - 1, left, left + 1, left + 2, 90, is_coupled.index(True) - 1, is_coupled.index(True) + 1):
         resumed, again = ddg.Integrator(model), model.restore(snapshots[start])
         for _ in range(start, 130):
             again = resumed.step(again, 1 / 480)
@@ -371,9 +371,9 @@ def test_steps_with_controls_are_coupled(device):
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state()
     state = integrator.step(state, DT)
-    assert integrator._net.alone is not None
+    assert integrator._coupled.alone is not None
     state = integrator.step(state, DT, ddg.Controls(gravity=(0.0, 0.0, -1.0)))
-    assert integrator._net.alone is None
+    assert integrator._coupled.alone is None
 
 
 def test_changed_parameters_reach_decoupled_rods(device):
@@ -390,8 +390,8 @@ def test_changed_parameters_reach_decoupled_rods(device):
             model.set_parameter("rod_stretch", "stiffness", stiffness)
         for _ in range(3):
             state = integrator.step(state, DT)
-        assert (integrator._net.alone is None) == whole
+        assert (integrator._coupled.alone is None) == whole
         points.append(state.points())
-    usual, decoupled, coupled = points
-    np.testing.assert_allclose(decoupled, coupled, atol=1e-10)
+    usual, decoupled, is_coupled = points
+    np.testing.assert_allclose(decoupled, is_coupled, atol=1e-10)
     assert np.abs(decoupled - usual).max() > 1e-6

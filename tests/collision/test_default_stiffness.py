@@ -43,11 +43,11 @@ def test_cloth_thrown_at_a_ball_is_stopped(device, radius, speed, young, dt):
 def test_contact_forces_of_a_state_equal_its_momentum_change(device):
     """Implicit Euler has h sum F = P1 - P0 - h W, also with inertia in the stiffness, which `State` keeps."""
     dt, model, state, braced = 1e-3, *thrown_cloth(0.05, 5.0, device, 1e4), 0
-    integrator, mass = ddg.Integrator(model, rtol=1e-8), model.net.host.mass[:, :1]
+    integrator, mass = ddg.Integrator(model, rtol=1e-8), model.coupled.host.mass[:, :1]
     count = model.points_count
     for _ in range(4):
         before, state = state.velocities(), integrator.step(state, dt)
-        rate = float(state.net.rate.numpy()[0])
+        rate = float(state.coupled.rate.numpy()[0])
         if rate in (0.0, 1.0 / dt):
             change = (mass[:count] * (state.velocities() - before)).sum(0) + dt * 9.81 * np.array(
                 [0.0, 0.0, mass[:count].sum()]
@@ -66,7 +66,7 @@ def test_restart_is_bitwise_equal(device):
     for _ in range(3):
         state = integrator.step(state, 1e-3)
     again = model.restore(state.snapshot())
-    np.testing.assert_array_equal(again.net.rate.numpy(), state.net.rate.numpy())
+    np.testing.assert_array_equal(again.coupled.rate.numpy(), state.coupled.rate.numpy())
     continued, restarted = integrator.step(state, 1e-3), ddg.Integrator(model).step(again, 1e-3)
     np.testing.assert_array_equal(continued.points(), restarted.points())
 
@@ -74,7 +74,7 @@ def test_restart_is_bitwise_equal(device):
 def test_given_stiffness_is_kept(device):
     """Too small a stiffness is refused, and the first remedy named works."""
     model, state = thrown_cloth(0.05, 2.0, device, stiffness=20.0)
-    assert not model.net.host.touching.inertia.any()
+    assert not model.coupled.host.touching.inertia.any()
     assert "net/rate" not in state.arrays()
     integrator = ddg.Integrator(model)
     with pytest.raises(ddg.SolverError, match="give their contact a larger stiffness, 100 times as much") as error:
@@ -108,7 +108,7 @@ def test_default_stiffness_is_scale_invariant(kind, gravity):
             scene.add_shell(points, triangles, thickness=0.01 * length, material=material)
         scene.add_obstacle(ddg.Plane())
         scene.contact()
-        contact = scene.build("cpu").net.host.touching
+        contact = scene.build("cpu").coupled.host.touching
         sizes = young * length, length, density * length**3
         numbers = (values[contact.meeting] for values in (contact.stiffness, contact.range, contact.inertia))
         scaled.append([values / size for values, size in zip(numbers, sizes, strict=True)])

@@ -193,7 +193,7 @@ def test_friction_work_equals_lost_kinetic_energy(device):
     The rod is thrown obliquely; anisotropic friction rotates the velocity towards the rod.
     """
     speeds, model, integrator, _ = throw_rod(rod_on(ddg.Plane()), (0.6, 0.8, 0.0), device, 40, rtol=1e-10)
-    mass = model.net.host.mass[:11, 0].sum()
+    mass = model.coupled.host.mass[:11, 0].sum()
     taken = -mass * ((speeds[1:] - speeds[:-1]) * speeds[1:])[:, :2].sum()
     assert integrator.statistics()["contact"]["friction_work"] == pytest.approx(taken, rel=1e-3)
     assert taken > 0.0

@@ -262,7 +262,7 @@ def test_contact_tangent_equals_differences(name, law):
 
     def forces_at(x):
         displaced = state.copy()
-        displaced.net.q.assign((q + x * direction).reshape(-1, 3))  # in the frames of the state
+        displaced.coupled.q.assign((q + x * direction).reshape(-1, 3))  # in the frames of the state
         return tangent.gradient(displaced)
 
     step = 1e-3
@@ -444,10 +444,10 @@ def test_long_motions_past_many_bodies_are_split(device, monkeypatch):
     monkeypatch.setattr(candidate_list, "CROWD_LEAST", 1)
     in_parts = statics.Equilibrium(model)
     state = in_parts.load(model.state(), 1)
-    contact = in_parts.net.newton.contact
-    assert at_once.net.newton.contact.farthest == np.inf
+    contact = in_parts.coupled.newton.contact
+    assert at_once.coupled.newton.contact.farthest == np.inf
     assert contact.farthest < 0.05
-    assert contact.search.lists[0].capacity < at_once.net.newton.contact.search.lists[0].capacity
+    assert contact.search.lists[0].capacity < at_once.coupled.newton.contact.search.lists[0].capacity
     np.testing.assert_allclose(state.points(), rest.points(), rtol=0.0, atol=1e-8)
 
 
@@ -459,9 +459,9 @@ def test_step_fraction_of_a_long_motion(device, monkeypatch):
     motion = np.zeros_like(before)
     motion[: len(z), 2] = -12.0 * (z - z.min())  # all rods come together and pass each other
     meet = (1.0 - 4.0 / 23.0) / 12.0
-    fraction = statics.Equilibrium(model).net.share(before.ravel(), (before + motion).ravel())
+    fraction = statics.Equilibrium(model).coupled.share(before.ravel(), (before + motion).ravel())
     assert 0.85 * meet < fraction < meet
     monkeypatch.setattr(candidate_list, "CROWD", 1)
     monkeypatch.setattr(candidate_list, "CROWD_LEAST", 1)
-    limited = statics.Equilibrium(model).net.share(before.ravel(), (before + motion).ravel())
+    limited = statics.Equilibrium(model).coupled.share(before.ravel(), (before + motion).ravel())
     assert 0.2 * meet < limited < meet

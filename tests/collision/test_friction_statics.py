@@ -332,14 +332,14 @@ def test_relaxation_ends_in_no_overlap(device):
     scene.add_rod(line((-0.1, 0.01, 0.02), (0.1, 0.01, 0.02), 4), section=ddg.Circle(0.005), material=RUBBER)
     scene.contact(friction=0.3)
     model = scene.build(device, precision="float64")
-    search, state = Equilibrium(model).net, model.state()
-    begun = state.net.q.numpy().copy()
+    search, state = Equilibrium(model).coupled, model.state()
+    begun = state.coupled.q.numpy().copy()
     for displacement, expected in ((-0.04, -0.04), (0.04, 0.02)):
         moved = begun.copy()
         moved[5:10, 2] += displacement
-        state.net.q.assign(moved)
+        state.coupled.q.assign(moved)
         search._relax(lambda displacement, whole: np.array([0.5]), state, begun)
-        np.testing.assert_allclose(state.net.q.numpy()[5:10, 2] - begun[5:10, 2], expected, rtol=1e-12)
+        np.testing.assert_allclose(state.coupled.q.numpy()[5:10, 2] - begun[5:10, 2], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -223,7 +223,7 @@ def test_collisions_at_any_stiffness_ratio_lose_energy(device, ratio, young):
     scene.contact(range=RANGE, stiffness=ratio * mass_of_node(10) / dt**2, friction=MU)
     speed = np.repeat([[0.0, 0.0, 0.0], [0.05, 0.0, -0.3]], 11, axis=0)
     model, integrator, states = run(scene, device, 60, dt, velocities=speed, rtol=1e-13)
-    mass = model.net.host.mass[:22, :1]
+    mass = model.coupled.host.mass[:22, :1]
     momenta = np.array([(mass * state.velocities()).sum(0) for state in states])
     assert np.abs(momenta - momenta[0]).max() < 1e-9 * np.abs(momenta).max()
     assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] < RANGE

@@ -58,14 +58,14 @@ def test_fast_rising_obstacles_lift_a_rod(device, shape):
     scene = bar(1.3 * RADIUS, friction=0.5)
     scene.add_obstacle(SHAPES[shape], motion=motion)
     model, integrator, state = run(scene, device, 25)
-    step, gap = height / 20, model.net.host.touching.reach
+    step, gap = height / 20, model.coupled.host.touching.reach
     assert step > 2.0 * gap
     z = state.points()[:, 2]
     assert z[5] > height + 0.9 * RADIUS
     assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
-    nodes = model.net.host.obstacles[0]
+    nodes = model.coupled.host.obstacles[0]
     np.testing.assert_allclose(
-        state.net.q.numpy()[nodes] - model.net.host.rest[nodes], [[0.0, 0.0, height]] * len(nodes), atol=1e-12
+        state.coupled.q.numpy()[nodes] - model.coupled.host.rest[nodes], [[0.0, 0.0, height]] * len(nodes), atol=1e-12
     )
 
 
@@ -149,7 +149,7 @@ def test_slope_holds_by_friction_up_to_its_coefficient(device):
         speeds = []
         for _ in range(60):
             state = integrator.step(state, 0.005)
-            speeds.append((state.net.v.numpy()[:11] @ down).mean())
+            speeds.append((state.coupled.v.numpy()[:11] @ down).mean())
         if mu > np.tan(slope):
             assert abs(speeds[-1]) < velocity
         else:
@@ -162,5 +162,5 @@ def test_friction_is_lagged_as_often_as_stated(device, lags):
     scene = bar(1.3 * RADIUS, friction=0.5, lags=lags)
     scene.add_obstacle(ddg.Plane(), motion=ddg.Motion(translation=lambda t: (0.1 * t, 0.0, 0.0)))
     _, integrator, state = run(scene, device, 60)
-    assert state.net.v.numpy()[:11, 0].mean() == pytest.approx(0.1, rel=0.05)  # moves with the plane
-    assert len(integrator._net.newton.contact.solutions) == lags - 1
+    assert state.coupled.v.numpy()[:11, 0].mean() == pytest.approx(0.1, rel=0.05)  # moves with the plane
+    assert len(integrator._coupled.newton.contact.solutions) == lags - 1

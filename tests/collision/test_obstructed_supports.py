@@ -6,7 +6,7 @@ from eager_steps import step_without_capture
 
 import ddg_warp as ddg
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.newton.coupled_newton import ON_THE_WAY
+from ddg_warp.kernels.newton.coupled_newton import SUPPORTS_MOVING
 from ddg_warp.scenes import overhand_knot
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.newton.contact_newton import NewtonContact
@@ -47,7 +47,7 @@ def test_whole_step_completes_the_prescribed_motion(device, monkeypatch):
 
     def record(contact):
         islands = contact.newton.islands
-        arrays = (contact.search.time, islands.step_length, islands.driven)
+        arrays = (contact.search.time, islands.step_length, islands.support_motion_pending)
         records.append([float(values.numpy()[0]) for values in arrays])
 
     def watched(method):
@@ -57,9 +57,9 @@ def test_whole_step_completes_the_prescribed_motion(device, monkeypatch):
     monkeypatch.setattr(NewtonContact, "hold", watched(hold))
     step_without_capture(ddg.Integrator(model, rtol=1e-3), model.state(), 1 / 240)
     predictor, *steps = records
-    assert predictor[0] < 1.0 and predictor[2] == ON_THE_WAY
+    assert predictor[0] < 1.0 and predictor[2] == SUPPORTS_MOVING
     whole = [driven for fraction, length, driven in steps if fraction == 1.0 and length == 1.0]
-    assert whole and ON_THE_WAY not in whole
+    assert whole and SUPPORTS_MOVING not in whole
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ def test_rods_through_one_point_separate_by_halves(device):
     before = state.points().copy()
     with pytest.raises(SceneError, match="overlap"):
         ddg.Integrator(model).step(state, 1e-3)
-    new, moved = model.pushed_apart(state)
+    new, moved = model.resolve_overlaps(state)
     least = PART * RANGE
     assert moved == pytest.approx(0.5 * (2.0 * RADIUS + BEYOND * least), rel=1e-12)
     change = new.points() - before
@@ -47,14 +47,14 @@ def test_fixed_nodes_stay(device):
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -RADIUS - 0.5 * RANGE)))
     model = scene.build(device=device, precision="float64")
     state = model.state()
-    new, moved = model.pushed_apart(state, 0.2 * RANGE)
+    new, moved = model.resolve_overlaps(state, 0.2 * RANGE)
     change = new.points() - state.points()
     assert np.abs(change[:4]).max() == 0.0
     assert moved == pytest.approx(1.5 * RADIUS + BEYOND * 0.2 * RANGE, rel=1e-9)
     sunk = rods_through_origin((1.0, 0.0, 0.0))
     sunk.add_obstacle(ddg.Plane((0.0, 0.0, -0.25 * RADIUS)))
     model = sunk.build(device=device, precision="float64")
-    new, moved = model.pushed_apart(model.state())
+    new, moved = model.resolve_overlaps(model.state())
     assert moved == pytest.approx(0.75 * RADIUS + BEYOND * PART * RANGE, rel=1e-9)
     assert np.ptp(new.points()[:, 2]) < 1e-15
 
@@ -70,14 +70,14 @@ def test_heap_is_separated(device, precision):
     points = model.state().points()
     points[1] += 1e-4 * rng.normal(size=points[1].shape)
     state = model.state(points=points, velocities=rng.normal(size=points.shape))
-    new, moved = model.pushed_apart(state)
+    new, moved = model.resolve_overlaps(state)
     assert 2.0 * RADIUS < moved < 60.0 * RADIUS
     assert model.contacts(new).gap.min() >= PART * RANGE
     assert moved == pytest.approx(np.linalg.norm(new.points() - state.points(), axis=-1).max(), rel=1e-5)
     assert new.velocities().tobytes() == state.velocities().tobytes()
-    again, _ = model.pushed_apart(state)
+    again, _ = model.resolve_overlaps(state)
     assert again.points().tobytes() == new.points().tobytes()
-    same, none = model.pushed_apart(new, 0.5 * PART * RANGE)
+    same, none = model.resolve_overlaps(new, 0.5 * PART * RANGE)
     assert none == 0.0 and same.points().tobytes() == new.points().tobytes()
     after = ddg.Integrator(model).step(model.state(points=new.points()), 1e-4)
     assert np.isfinite(after.points()).all()
@@ -88,14 +88,16 @@ def test_refusals(device):
     for rod in range(2):
         scene.fix(rod, [0, 1, 2, 3])
     model = scene.build(device=device)
-    with pytest.raises(SolverError, match=r"pushed_apart: edge 1 of rod 0 .* and edge 1 of rod 1 .* after 1000 rounds"):
-        model.pushed_apart(model.state())
+    with pytest.raises(
+        SolverError, match=r"resolve_overlaps: edge 1 of rod 0 .* and edge 1 of rod 1 .* after 1000 rounds"
+    ):
+        model.resolve_overlaps(model.state())
     with pytest.raises(SceneError, match="it may not exceed"):
-        model.pushed_apart(model.state(), 2.0 * RANGE)
+        model.resolve_overlaps(model.state(), 2.0 * RANGE)
     with pytest.raises(SceneError, match="gap is -1"):
-        model.pushed_apart(model.state(), -1.0)
+        model.resolve_overlaps(model.state(), -1.0)
     bare = ddg.Scene()
     bare.add_rod(np.eye(3), section=ddg.Circle(radius=RADIUS), material=MATERIAL)
     model = bare.build(device=device)
     with pytest.raises(SceneError, match="has no contact"):
-        model.pushed_apart(model.state())
+        model.resolve_overlaps(model.state())

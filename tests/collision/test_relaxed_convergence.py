@@ -8,7 +8,7 @@ import warp as wp
 from eager_steps import step_without_capture
 
 import ddg_warp as ddg
-from ddg_warp.kernels.core.islands import DROWNED, STATUS, UNBALANCED
+from ddg_warp.kernels.core.islands import BELOW_ROUNDING_FLOOR, NOT_CONVERGED, STATUS
 from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.run.simulate import simulate
 from ddg_warp.solve.linear.pcg import SPARE
@@ -42,7 +42,7 @@ def step_residuals(device, outliers: float, worlds: int = 1):
     model = scene.build(device=device, worlds=worlds)
     integrator = ddg.Integrator(model, rtol=RTOL, outliers=outliers, check_every=1)
     state = integrator.step(model.state(velocities=velocities), DT)
-    newton = integrator._net.newton
+    newton = integrator._coupled.newton
     ratio, owner = newton.allowed.ratio.numpy(), newton.resting.owner.numpy()
     worst = np.zeros((worlds, newton.resting.bodies))
     for body_worst, block_ratio in zip(worst, ratio, strict=True):
@@ -73,8 +73,8 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
 
     def record(newton):
         take(newton)
-        if newton is integrator._net.newton and not newton.islands.cut.numpy()[0]:
-            newton.islands.wanted.fill_(2)
+        if newton is integrator._coupled.newton and not newton.islands.ccd_limited.numpy()[0]:
+            newton.islands.needs_direction.fill_(2)
             newton.krylov.compare()
             newton.outliers.count(SPARE * tolerance)
             reduced, limit = float(newton.forcing.numpy()[0]), float(newton.limit.numpy()[0])
@@ -130,7 +130,7 @@ def test_outliers_are_accepted_by_number_and_residual(device, case):
     bodies, off, finite, excused = CASES[case]
     scene, _ = crossed_pairs(10)
     model = scene.build(device=device, precision="float64")
-    newton = ddg.Integrator(model, rtol=RTOL, outliers=0.1)._net.newton
+    newton = ddg.Integrator(model, rtol=RTOL, outliers=0.1)._coupled.newton
     owner, islands, scale = newton.resting.owner.numpy().copy(), newton.islands, 3.0
     if bodies == (-1,):
         owner[7] = -1
@@ -141,12 +141,12 @@ def test_outliers_are_accepted_by_number_and_residual(device, case):
     newton._weight.assign(np.array([[0.0], [0.0], [1.0 if finite else np.nan]]))
     islands.load_scale.fill_(scale)
     flags = islands.arrays[0].numpy()
-    flags[[STATUS, UNBALANCED, DROWNED]] = [[0], [1], [1]]
+    flags[[STATUS, NOT_CONVERGED, BELOW_ROUNDING_FLOOR]] = [[0], [1], [1]]
     islands.arrays[0].assign(flags)
     newton.outliers.count(RTOL)
     newton.outliers.excuse()
     wp.synchronize()
-    assert (islands.arrays[0].numpy()[[UNBALANCED, DROWNED]] == (0 if excused else 1)).all()
+    assert (islands.arrays[0].numpy()[[NOT_CONVERGED, BELOW_ROUNDING_FLOOR]] == (0 if excused else 1)).all()
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.0, np.nan, "0.1", True, None])

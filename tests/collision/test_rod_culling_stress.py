@@ -48,7 +48,7 @@ def test_internal_contact_conserves_momentum(device, friction, law):
     scene, speed = colliding_objects(friction, law)
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model, rtol=1e-11), model.state(velocities=speed)
-    contact, mass = integrator._net.newton.contact, model.net.host.mass[: len(speed), :1]
+    contact, mass = integrator._coupled.newton.contact, model.coupled.host.mass[: len(speed), :1]
     start, size, total = (mass * speed).sum(0), (mass * np.abs(speed)).sum(), [sum(model.energies(state).values())]
     largest = 0.0
     for _ in range(40):
@@ -56,7 +56,7 @@ def test_internal_contact_conserves_momentum(device, friction, law):
         after, points = state.velocities(), state.points()
         forces = contact.forces.numpy()[: len(speed)]  # with friction
         assert np.abs(forces.sum(0)).max() <= 1e-13 * max(np.abs(forces).sum(), 1e-300)
-        model.touch.at(state.net.q)
+        model.touch.at(state.coupled.q)
         forces = model.touch.terms.forces.numpy()[: len(speed)]  # without
         largest = max(largest, np.abs(forces).sum())
         moments = np.cross(points, forces)

@@ -21,7 +21,7 @@ def rod(scene, points, **options) -> int:
 
 def spin(model, state, rod: int = 0) -> np.ndarray:
     """Return the rates of the twist angles of a rod [rad/s]."""
-    return state.net.v.numpy()[model.net.host.rods[rod].edges, 0]
+    return state.coupled.v.numpy()[model.coupled.host.rods[rod].edges, 0]
 
 
 def run(model, steps: int, dt: float = 1e-3, state=None, **options):
@@ -304,12 +304,12 @@ def test_rolling_friction_keeps_angular_momentum(device, rolling, kept, off):
     scene.contact(friction=0.5, rolling=rolling, range=1e-3, stiffness=500.0)
     model = scene.build(device, precision="float64")
     state = model.state(velocities=np.repeat([[0.0, -0.05, 0.3], [0.0, 0.05, -0.3]], 7, axis=0))
-    host, integrator = model.net.host, ddg.Integrator(model, rtol=1e-8)
+    host, integrator = model.coupled.host, ddg.Integrator(model, rtol=1e-8)
 
     def momentum(state) -> float:
         """Return the angular momentum of positions and spins about x, the common direction."""
         points, moves = state.points(), host.mass[:14, :1] * state.velocities()
-        spins = [host.mass[rod.edges, 0] @ state.net.v.numpy()[rod.edges, 0] for rod in host.rods]
+        spins = [host.mass[rod.edges, 0] @ state.coupled.v.numpy()[rod.edges, 0] for rod in host.rods]
         return float(np.cross(points - points.mean(0), moves).sum(0)[0] + sum(spins))
 
     before = momentum(state)

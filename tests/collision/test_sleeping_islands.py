@@ -63,8 +63,8 @@ def record_directions(device, scene, velocities, worlds: int = 1, linear="chain"
     integrator = ddg.Integrator(model, linear=linear, **options)
     state = model.state(velocities=velocities)
     integrator.step(state, 1e-9)  # loads kernels and makes room
-    newton, records = integrator._net.newton, []
-    nodes = model.net.host.nodes
+    newton, records = integrator._coupled.newton, []
+    nodes = model.coupled.host.nodes
     direct = newton.direct
 
     def record():
@@ -74,7 +74,7 @@ def record_directions(device, scene, velocities, worlds: int = 1, linear="chain"
 
     newton.direct = record
     end = step_without_capture(integrator, state, DT)
-    return end.state, end.own.net.q.numpy().reshape(worlds, -1, 3)[:, :nodes], records
+    return end.state, end.own.coupled.q.numpy().reshape(worlds, -1, 3)[:, :nodes], records
 
 
 def test_converged_island_sleeps(device):
@@ -150,11 +150,11 @@ def test_islands_are_connected_components_of_the_pairs(device):
     scene.add_rods(centres[:, None] + STRAIGHT[:, None] * direction, section=ddg.Circle(RADIUS), material=SOFT)
     scene.contact(range=1e-2)
     model = scene.build(device=device)
-    state, _ = model.pushed_apart(model.state())
+    state, _ = model.resolve_overlaps(model.state())
     integrator = ddg.Integrator(model, linear="chain")
     integrator.step(state, 1e-4)
-    newton = integrator._net.newton
-    newton.islands.wanted.fill_(1)
+    newton = integrator._coupled.newton
+    newton.islands.needs_direction.fill_(1)
     newton.resting(newton.contact.terms.products)
     link = newton.resting._link.numpy()
     nodes = np.concatenate(

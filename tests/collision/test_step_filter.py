@@ -16,7 +16,7 @@ from ddg_warp.solve.collision.collision_mesh import CollisionMesh
 
 
 def allowed_closing(gap: float) -> float:
-    """Return how far a gap may close at once [m]: to `REST` of the gap, or to `NEAR` of gap or reach where that is more."""
+    """Return how far a gap may close at once [m]: to `SLEEP` of the gap, or to `NEAR` of gap or reach where that is more."""
     return gap - max(REST * gap, NEAR * min(gap, REACH))
 
 

@@ -41,8 +41,8 @@ def run(device, scene, velocities=None, steps: int = 25, dt: float = 0.01, **opt
 
 def momentum(model, state) -> tuple[np.ndarray, np.ndarray]:
     """Return linear and angular momentum of nodes, without that of spins."""
-    mass = model.net.host.mass[: model.net.host.nodes, :1]
-    x, v = (array.numpy()[: len(mass)] for array in (state.net.q, state.net.v))
+    mass = model.coupled.host.mass[: model.coupled.host.nodes, :1]
+    x, v = (array.numpy()[: len(mass)] for array in (state.coupled.q, state.coupled.v))
     return (mass * v).sum(0), (mass * np.cross(x, v)).sum(0)
 
 
@@ -51,7 +51,7 @@ def test_colliding_rods_bounce_and_conserve_momentum(device, law):
     """Impulses sum to zero (Newton's third law), and contact dissipates kinetic energy."""
     scene, velocities = heap(law)
     model, integrator, states = run(device, scene, velocities, 30, rtol=1e-11)
-    size = model.net.host.mass[: model.net.host.nodes, 0].sum() * np.abs(velocities).max()
+    size = model.coupled.host.mass[: model.coupled.host.nodes, 0].sum() * np.abs(velocities).max()
     for state in states:
         linear, _ = momentum(model, state)
         assert np.abs(linear).max() < 1e-9 * size
@@ -115,10 +115,10 @@ def test_overflowing_lists_repeat_the_step_at_full_length(device):
     expected = states[-1].points()
     model = scene.build(device=device)
     integrator = ddg.Integrator(model)
-    for pairs in integrator._net.newton.contact.search.lists:
+    for pairs in integrator._coupled.newton.contact.search.lists:
         pairs.reserve(1)
-    integrator._net.newton.contact.search.version += 1
-    integrator._net.newton.contact.terms.fit()
+    integrator._coupled.newton.contact.search.version += 1
+    integrator._coupled.newton.contact.terms.fit()
     state = model.state(velocities=velocities)
     for _ in range(25):
         state = integrator.step(state, 0.01)
@@ -151,16 +151,16 @@ def test_forces_are_derivatives_of_the_contact_energy(device, law):
     """Contact forces of the host's tangent are central differences of the contact energy."""
     model = crossed_rods((2.0 if law == "barrier" else 1.9) * RADIUS + 2e-4, law).build(device=device)
     state = model.state()
-    q = state.net.q.numpy().copy()
+    q = state.coupled.q.numpy().copy()
     rng = np.random.default_rng(0)
-    direction = rng.normal(size=q.shape) * (np.arange(len(q)) < model.net.host.nodes)[:, None]
+    direction = rng.normal(size=q.shape) * (np.arange(len(q)) < model.coupled.host.nodes)[:, None]
 
     def energy(h):
         displaced = state.copy()
-        displaced.net.q.assign(q + h * direction)
+        displaced.coupled.q.assign(q + h * direction)
         return model.energies(displaced)["contact"]
 
-    model.touch.at(state.net.q)
+    model.touch.at(state.coupled.q)
     slope = -(model.touch.terms.forces.numpy() * direction).sum()
     h = 1e-8
     assert slope != 0.0

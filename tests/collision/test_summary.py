@@ -32,7 +32,7 @@ def test_friction_work_equals_lost_kinetic_energy(device):
     speed[0, :, 0] = 0.3  # in the first of both worlds
     state = model.state(points=state.points(), velocities=speed)
     integrator, taken, counts = ddg.Integrator(model, rtol=1e-10), 0.0, []
-    mass = model.net.host.mass[: model.points_count, :1]
+    mass = model.coupled.host.mass[: model.points_count, :1]
     for _ in range(10):
         before, state = state.velocities(), integrator.step(state, 2e-3)
         after = state.velocities()
@@ -63,7 +63,7 @@ def test_repeated_steps_count_once(device):
     for room in (None, 1):
         model = scene.build(device=device)
         integrator, state = ddg.Integrator(model), model.state()
-        contact = integrator._net.newton.contact
+        contact = integrator._coupled.newton.contact
         for pairs in contact.search.lists if room else ():
             pairs.reserve(room)
         if room:

@@ -40,7 +40,7 @@ def test_unresolved_increments_are_refused_with_sufficient_load_steps(device):
         ddg.statics.solve(model)
     assert error.value.outcome == "turned_too_far"
     load_steps = int(str(error.value).split("load_steps = ")[1].split()[0])
-    arcs = ddg.statics.Equilibrium(model).net.arcs
+    arcs = ddg.statics.Equilibrium(model).coupled.arcs
     count = arcs.increments(model.state(), None, 0.0, 1.0, load_steps)
     assert count % load_steps == 0
     with pytest.raises(ddg.SolverError, match="load_steps = "):

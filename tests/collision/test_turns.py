@@ -23,7 +23,7 @@ from turn_cases import (
 )
 
 import ddg_warp as ddg
-from ddg_warp.kernels.forces.prescribed_motion import MOST_PARTS
+from ddg_warp.kernels.forces.prescribed_motion import MAX_SUBSTEPS
 from ddg_warp.solve.collision.support_arcs import PART
 
 WIDE = "mesh", "box", "hold", "half-space"  # these move a whole rod, which cannot rotate aside
@@ -44,7 +44,7 @@ def step(made: ddg.Scene, device, controls=None, dt: float = DT, **options):
 
 def substeps(integrator) -> list[int]:
     """Number of substeps of the last step, world by world."""
-    return np.round(1.0 / integrator._net.islands.substep.numpy()).astype(int).tolist()
+    return np.round(1.0 / integrator._coupled.islands.substep.numpy()).astype(int).tolist()
 
 
 def radii(kind: str) -> list[float]:
@@ -246,9 +246,9 @@ def test_unresolved_rotations_are_refused_with_a_sufficient_step(device):
         step(made, device)
     assert error.value.outcome == "turned_too_far"
     dt = float(str(error.value).split("dt = ")[1].split()[0])
-    assert 0.1 < dt / (DT * MOST_PARTS / (40.0 * 2.0 * np.pi / (2.0 * np.arccos(1.0 - PART * 2e-5 / LAST)))) <= 1.0
+    assert 0.1 < dt / (DT * MAX_SUBSTEPS / (40.0 * 2.0 * np.pi / (2.0 * np.arccos(1.0 - PART * 2e-5 / LAST)))) <= 1.0
     integrator, _ = step(made, device, dt=dt)
-    assert substeps(integrator) == [MOST_PARTS]
+    assert substeps(integrator) == [MAX_SUBSTEPS]
     jumping = ddg.Motion(angle=lambda t: 3.0 * (t > 0.4))
     with pytest.raises(ddg.SolverError, match=r"a motion that does not jump, as this one at t = 0\.4, such as a ramp"):
         step(scene("capsule", jumping, polar_point(0.1, -1.5)), device)
@@ -279,7 +279,7 @@ def test_unresolved_grip_fails_its_world_alone(device):
     turns[1, 0, 5] = most
     integrator = ddg.Integrator(model)
     integrator.step(model.state(), DT, ddg.Controls(poses=turns))
-    assert substeps(integrator) == [1, MOST_PARTS]
+    assert substeps(integrator) == [1, MAX_SUBSTEPS]
     turns[1, 0, 5] = np.pi
     integrator = ddg.Integrator(model)
     with pytest.raises(ddg.SolverError, match="turns farther in a step than 1024 substeps resolve"):
@@ -317,7 +317,7 @@ def test_grips_and_motion_functions_are_split_together(device):
     moved = np.linalg.norm(state.points() - model.state().points(), axis=-1).reshape(2, -1)[:, [5, 16]]
     assert (moved[:, 0] > THICKNESS).all()
     assert moved[0, 1] == 0.0 and moved[1, 1] > THICKNESS
-    ends = state.net.q.numpy().reshape(2, -1, 3)[:, model.net.host.obstacles[0]]
+    ends = state.coupled.q.numpy().reshape(2, -1, 3)[:, model.coupled.host.obstacles[0]]
     np.testing.assert_allclose(ends[:, 0, :2], [polar_point(ORBIT, 0.3 * np.pi)] * 2, atol=1e-12)
     first, second = substeps(integrator)
     assert first < second == substeps_needed(0.9 * np.pi, 0.12)

@@ -76,6 +76,6 @@ def rotation_control(turns: float) -> ddg.Controls:
 
 
 def substeps_needed(angle: float, radius: float, thickness: float = THICKNESS) -> int:
-    """Return 2^k >= angle / a, where the sagitta R (1 - cos(a / 2)) is `PART` of range and thickness."""
+    """Return 2^k >= angle / a, where the sagitta R (1 - cos(a / 2)) is `SEGMENT` of range and thickness."""
     a = 2.0 * np.arccos(1.0 - PART * min(RANGE, thickness) / radius)
     return 2 ** int(np.ceil(np.log2(angle / a)))

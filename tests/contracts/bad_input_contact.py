@@ -42,7 +42,7 @@ def step(made: ddg.Scene, **options):
 def separate(made: ddg.Scene, gap):
     """Resolve overlaps of the initial state to a minimum gap."""
     model = built(made)
-    return model.pushed_apart(model.state(), gap)
+    return model.resolve_overlaps(model.state(), gap)
 
 
 def build_pair(*names, **options):
@@ -95,12 +95,12 @@ each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")]
 each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: build_pair("rod", "odd", stiffness=v),
      "'rod' and 'odd'", "stiffness")
 each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: build_pair("rod", "odd", range=v), "'rod' and 'odd'", "range")
-each("contact", "gap to push apart to", [0.0, -1.0, NAN, "far"], lambda v: separate(in_contact(), v), "pushed_apart: gap", "positive")
+each("contact", "gap to push apart to", [0.0, -1.0, NAN, "far"], lambda v: separate(in_contact(), v), "resolve_overlaps: gap", "positive")
 refuse("contact", {
-    "pushed apart too far": (lambda: separate(in_contact(), 1e3), "pushed_apart: gap is 1000 m", "may not exceed"),
-    "pushed apart without contact": (lambda: separate(scene(), None), "pushed_apart", "add scene.contact()"),
+    "pushed apart too far": (lambda: separate(in_contact(), 1e3), "resolve_overlaps: gap is 1000 m", "may not exceed"),
+    "pushed apart without contact": (lambda: separate(scene(), None), "resolve_overlaps", "add scene.contact()"),
     "pushed apart what is held": (
-        lambda: separate(obstructed(ddg.Plane((0.0, 0.0, 1.0))), None), "pushed_apart", "'obstacle'", "rounds"),
+        lambda: separate(obstructed(ddg.Plane((0.0, 0.0, 1.0))), None), "resolve_overlaps", "'obstacle'", "rounds"),
 })
 
 each("obstacles", "shape", [None, ddg.Plane, "plane", 3], obstructed,

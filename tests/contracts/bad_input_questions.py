@@ -112,13 +112,17 @@ refuse("step", {
     "each of others later": (lambda: _moving(lambda t: np.zeros((1 if t < 0.005 else 2, 3))), "translation", "(2, 3)", "t = 0.01"),
     "angle that ends": (lambda: _moving(None, lambda t: 0.0 if t < 0.005 else INF), "angle", "not finite", "t = 0.01"),
     "amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN), "amplitude", "not finite", "t = 0.01"),
-    "net, motion that ends": (lambda: _moving(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN), net=True), "translation", "t = 0.01"),
-    "net, amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN, net=True), "amplitude", "t = 0.01"),
+    "net, motion that ends": (
+        lambda: _moving(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN), coupled=True),
+        "translation",
+        "t = 0.01",
+    ),
+    "net, amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN, coupled=True), "amplitude", "t = 0.01"),
     "flow that ends": (lambda: _in_flow(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN)), "flow", "not finite", "t = 0.01"),
     "net, flow of two later": (lambda: _in_flow(lambda t: (0.0,) * (3 if t < 0.005 else 2), True), "flow", "(0.0, 0.0)", "t = 0.01"),
     "out of the plane": (lambda: _step_planar(lambda t: (0.0, t, 0.0)), "translation", "along y", "t = 0.01"),
     "motion that jumps": (lambda: _moving(_jump), "jumps at t = 0.005", "continuous"),
-    "net, motion that jumps": (lambda: _moving(_jump, net=True), "jumps at t = 0.005", "continuous"),
+    "net, motion that jumps": (lambda: _moving(_jump, coupled=True), "jumps at t = 0.005", "continuous"),
 })
 
 
@@ -131,28 +135,28 @@ def _step_scene(scene):
     return ddg.Integrator(made).step(made.state(), 0.01)
 
 
-def _in_flow(flow, net=False):
+def _in_flow(flow, coupled=False):
     scene = rods(scene=ddg.Scene(flow=flow))
     scene.drag(tangential=1.0, normal=1.0)
-    if net:
+    if coupled:
         scene.join([(0, 0), (1, 0)])
     return _step_scene(scene)
 
 
-def _moving(translation=None, angle=None, net=False):
+def _moving(translation=None, angle=None, coupled=False):
     functions = {"translation": translation, "angle": angle}
     scene = rods()
     scene.clamp(0)
     scene.fix(1, [0], motion=ddg.Motion(**{name: f for name, f in functions.items() if f}))
-    if net:
+    if coupled:
         scene.join([(1, 4), (scene.add_rod(line() + [1.0, 0.0, 0.0], section=STIFFNESS), 0)], rigid=False)
     return _step_scene(scene)
 
 
-def _loaded(amplitude, net=False):
+def _loaded(amplitude, coupled=False):
     scene = clamped()
     scene.add_force(1, -1, (0.0, 0.0, 1.0), amplitude)
-    if net:
+    if coupled:
         scene.join([(0, 0), (1, 0)])
     return _step_scene(scene)
 

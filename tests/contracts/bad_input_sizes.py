@@ -157,12 +157,12 @@ each("sizes: contact", "range beyond the scene", [1e60, 1e10, 1e3], lambda v: bu
 each("sizes: contact", "range that is lost", [1e-60, 1e-20, 1e-14], lambda v: built(crossed_rods(range=v)),
      "range between 'high' and 'high'", "lost in positions")
 each("sizes: contact", "gap that is too small", [1e-8, 1e-12, 1e-15], lambda v: step(crossed_rods(v)),
-     "edge", "of rod 0", "of rod 1", "too close for a barrier", "pushed_apart")
+     "edge", "of rod 0", "of rod 1", "too close for a barrier", "resolve_overlaps")
 each("sizes: contact", "gap that is too small for an equilibrium", [1e-12], lambda v: statics.solve(built(crossed_rods(v))),
-     "of rod 0", "of rod 1", "too close for a barrier", "pushed_apart")
+     "of rod 0", "of rod 1", "too close for a barrier", "resolve_overlaps")
 refuse("sizes: steps", {"dt of too many digits": (lambda: integrator().step(model().state(), 10**5000), "dt is", "positive")})
 refuse("sizes: contact", {
-    "no gap": (lambda: step(crossed_rods(0.0)), "of rod 0", "of rod 1", "touch at the start", "pushed_apart"),
+    "no gap": (lambda: step(crossed_rods(0.0)), "of rod 0", "of rod 1", "touch at the start", "resolve_overlaps"),
     "no radius": (lambda: built(rods(section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, radius=0.0), name="thin"),
                                 lambda s: s.contact()), "rod 1 ('thin')", "radius", "positive"),
     "held through held": (lambda: step(driven_through(), 2), "both held", "motion of support 2 (clamp)", "change that motion"),

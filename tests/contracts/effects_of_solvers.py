@@ -156,11 +156,11 @@ CALLS["reactions"] = Call(
 
 def observe_overlap_resolution(**named) -> list:
     """Observe an overlap resolution."""
-    state, distance = model("touching").pushed_apart(model("touching").state(), **named)
+    state, distance = model("touching").resolve_overlaps(model("touching").state(), **named)
     return [state.points(), distance]
 
 
-CALLS["pushed_apart"] = Call(ddg.Model.pushed_apart, observe_overlap_resolution, {}, {"gap": 2e-3}, ("state",))
+CALLS["resolve_overlaps"] = Call(ddg.Model.resolve_overlaps, observe_overlap_resolution, {}, {"gap": 2e-3}, ("state",))
 
 
 def observe_rest_shape(kind: str = "dof sheet", **named) -> list:

@@ -56,7 +56,7 @@ def _shapes(name):
 def _kernel(name, real):
     """Build the kernel of a term that evaluates everything of first order on arrays of local dofs."""
     term = SHELLS[name]
-    n, size, coupled, tensions = (
+    n, size, is_coupled, tensions = (
         len(term.measure.strains),
         term.measure.size,
         term.density.coupled,
@@ -95,7 +95,7 @@ def _kernel(name, real):
             stress_out[k, m] = slope[m]
             for i in range(wp.static(size)):
                 jacobian_out[k, m, i] = jacobian[m, i]
-            if wp.static(coupled):
+            if wp.static(is_coupled):
                 for c in range(wp.static(n)):
                     root_out[k, m, c] = root[m, c]
             else:

@@ -54,7 +54,7 @@ def test_energies_do_not_depend_on_the_direction_of_a_meridian(device):
     for reverse in (False, True):
         points, model = cap(reverse, device)
         tangent, state = Tangent(model), model.state()
-        shell = model.net.host.meridians[0]
+        shell = model.coupled.host.meridians[0]
         assert shell.kind == (("free", "pole") if reverse else ("pole", "free"))
         np.testing.assert_allclose(shell.curvature, 1.0 if reverse else -1.0, rtol=0.01)
         assert all(abs(model.energies(state)[name]) < 1e-20 for name in STATIC)

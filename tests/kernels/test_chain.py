@@ -61,9 +61,11 @@ class Problem:
             wp.copy(newton.frame, state.frame)
             device_arrays.assign(newton.theta, 2.0 * noise * random.normal(size=shape))
             device_arrays.assign(newton.target_angle, 2.0 * noise * random.normal(size=shape))
-        newton.islands.coefficient.assign(inertia * random.uniform(0.5, 1.5, size=4))
-        newton.islands.rate.fill_(1.0)
-        newton.islands.clamped.fill_(1)  # these states are compressed so much that the matrix would be indefinite
+        newton.islands.inertia_coefficient.assign(inertia * random.uniform(0.5, 1.5, size=4))
+        newton.islands.inverse_step.fill_(1.0)
+        newton.islands.drop_compression.fill_(
+            1
+        )  # these states are compressed so much that the matrix would be indefinite
         self.last = state.last
 
     def iterate(self):
@@ -111,7 +113,7 @@ class Problem:
     def inertia(self, column: int):
         """Return the diagonal of inertia, target, and external force of a rod."""
         host, kind, n = self.group.host, self.kind, self.count[column]
-        rod, c = column % 2, float(device_arrays.download(self.newton.islands.coefficient)[column])
+        rod, c = column % 2, float(device_arrays.download(self.newton.islands.inertia_coefficient)[column])
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = (
@@ -156,7 +158,7 @@ class Problem:
             wp.launch(
                 element_path.term_kernels(rod_storage(kind, real), i, real)[0],
                 (group.elements, group.columns),
-                [group.element_inputs(newton, self.last, newton.islands.rate)],
+                [group.element_inputs(newton, self.last, newton.islands.inverse_step)],
                 [device_arrays.columns(out)],
                 device=self.device,
             )
@@ -181,7 +183,7 @@ def test_sweep_equals_a_dense_solve(device, name, precision):
     problem = Problem(name, device, precision)
     before = problem.iterate_dofs()
     problem.iterate()
-    direction, decrement = problem.direction(), device_arrays.download(problem.newton.islands.decrement)
+    direction, decrement = problem.direction(), device_arrays.download(problem.newton.islands.predicted_decrease)
     tolerance = 1e-12 if precision == "float64" else 1e-4
     for column, n in enumerate(problem.count):
         H, r = problem.dense(column, before[column, :n].ravel())
@@ -194,7 +196,7 @@ def test_sweep_equals_a_dense_solve(device, name, precision):
         np.testing.assert_allclose(direction[column, :n].ravel(), expected, rtol=0, atol=tolerance * scale)
         np.testing.assert_allclose(decrement[column], r[free] @ expected[free], rtol=tolerance)
     assert (device_arrays.download(problem.newton.islands.status) == outcome.ACTIVE).all()
-    assert (device_arrays.download(problem.newton.islands.lost) == 0).all()
+    assert (device_arrays.download(problem.newton.islands.lost_pivots_total) == 0).all()
 
 
 @EVERY_KIND
@@ -235,14 +237,14 @@ def test_overshooting_step_is_backtracked_by_the_energy(device, name):
     problem = Problem(name, device, noise=0.05, inertia=1e3)
     newton, start = problem.newton, problem.iterate_dofs()
     problem.iterate()
-    direction, decrement = problem.direction(), device_arrays.download(newton.islands.decrement)
+    direction, decrement = problem.direction(), device_arrays.download(newton.islands.predicted_decrease)
     problem.put(start + 3.0 * direction)
     newton.islands.step_length.fill_(3.0)
     change = problem.energy(start + 3.0 * direction) - problem.energy(start)
     assert (change > 0.0).all()
     problem.iterate()
     shorter = device_arrays.download(newton.islands.step_length)
-    assert (device_arrays.download(newton.islands.halvings) == 1).all()
+    assert (device_arrays.download(newton.islands.backtracks) == 1).all()
     assert (device_arrays.download(newton.islands.iteration) == 1).all()
     assert (
         (0.31 < shorter) & (shorter < 1.49)
@@ -254,7 +256,7 @@ def test_overshooting_step_is_backtracked_by_the_energy(device, name):
         error = np.abs(moved[column, :n] - step[column, :n]).max()
         assert error <= second_order(start[column, :n, :dim], step[column, :n, :dim])
     problem.iterate()
-    assert (device_arrays.download(newton.islands.halvings) == 0).all()  # the shorter step is taken
+    assert (device_arrays.download(newton.islands.backtracks) == 0).all()  # the shorter step is taken
     assert (device_arrays.download(newton.islands.iteration) == 2).all()
 
 
@@ -334,7 +336,7 @@ def test_frames_are_updated_before_they_degenerate(device, case):
     h = 1e-6 / np.abs(problem.direction()).max(axis=(1, 2))
     ends = [problem.energy(start + sign * h[:, None, None] * problem.direction()) for sign in (1.0, -1.0)]
     np.testing.assert_allclose(
-        (ends[0] - ends[1]) / (2.0 * h), -device_arrays.download(newton.islands.decrement), rtol=1e-6
+        (ends[0] - ends[1]) / (2.0 * h), -device_arrays.download(newton.islands.predicted_decrease), rtol=1e-6
     )
 
 
@@ -377,6 +379,6 @@ def test_indefinite_matrix_drops_compression(device):
     state = integrator.model.state(points=points * [0.99, 1.0, 1.0] + [0.0, 0.0, 1e-4] * np.arange(12)[:, None] ** 2)
     state = integrator.step(state, 1.0)
     newton = integrator._chains[0].newton
-    assert newton.islands.clamped.numpy()[0] == 1
+    assert newton.islands.drop_compression.numpy()[0] == 1
     assert set(integrator.statistics()["outcomes"]) <= {"converged", "converged_to_rounding"}
     assert state.points()[-1, 0] < 0.5  # 50 is twenty times the load of Euler

@@ -20,7 +20,7 @@ GAPS = {smooth_penalty: (-0.3, 0.0999), log_barrier: (0.001, 0.0999)}
 def _kernel(density, n: int, real):
     E, P, M = wp.types.vector(n, real), wp.types.vector(density.parameter_size(n), real), wp.types.matrix((n, n), real)
     energy_of, slope_of, curvature_of = density.laws(real, n)
-    coupled = density.coupled
+    is_coupled = density.coupled
 
     @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def evaluate(
@@ -33,7 +33,7 @@ def _kernel(density, n: int, real):
         k = wp.tid()
         energy_out[k] = energy_of(e[k], p[k])
         slope_out[k] = slope_of(e[k], p[k])
-        if wp.static(coupled):
+        if wp.static(is_coupled):
             curvature_out[k] = curvature_of(e[k], p[k])
         else:
             curvature_out[k] = wp.diag(curvature_of(e[k], p[k]))

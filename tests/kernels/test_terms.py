@@ -192,11 +192,11 @@ def test_sample_of_nets_is_general():
 @pytest.mark.slow
 def test_table_has_chains_and_nets(device):
     """Rows of rods and indexed elements have equal columns, so that one table shows them."""
-    chain, net = (derivative_checks.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
-    assert chain[0].keys() == net[0].keys()
+    chain, coupled = (derivative_checks.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
+    assert chain[0].keys() == coupled[0].keys()
     count = len(derivative_checks.CHECKS) - 2  # without the checks of collisions
     assert [row["chain"] for row in chain] == ["open"] * count + ["closed"] * count
-    assert {row["chain"] for row in net} == {"net"}
+    assert {row["chain"] for row in coupled} == {"net"}
 
 
 def test_sample_of_collisions_is_general():

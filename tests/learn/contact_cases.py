@@ -108,8 +108,8 @@ def touching(model, speed: float = 0.02, along: float = 0.0, **options):
     for _ in range(12 if model.scene.shells and model.scene.batches else 6):  # bounces off first
         state = integrator.step(state, DT)
     state, meaning, random = state.copy(), Meaning(model), np.random.default_rng(3)
-    values = random.normal(size=(len(state.net.q), 3)) * speed
-    values[np.arange(len(values)) % model.net.blocks < model.net.host.nodes, 0] += along
+    values = random.normal(size=(len(state.coupled.q), 3)) * speed
+    values[np.arange(len(values)) % model.coupled.blocks < model.coupled.host.nodes, 0] += along
     more = {name: np.zeros(array.shape) for name, array in entries(state).items() if name != "net/v"}
     put(state, {**{n: np.zeros(1) for n in more}, "net/v": meaning.keep("net/v", values)})
     return state

@@ -39,7 +39,7 @@ class Meaning:
         part, _, name = name.partition("/")
         if name in ("a", "alpha"):
             return 0.0 * values
-        return self._net(name, values) if part == "net" else self._chain(self.model.groups[int(part)], name, values)
+        return self._coupled(name, values) if part == "net" else self._chain(self.model.groups[int(part)], name, values)
 
     def _chain(self, group, name: str, values: np.ndarray) -> np.ndarray:
         host, kind = group.host, group.kind
@@ -60,8 +60,8 @@ class Meaning:
             values[6] = 0.0  # the lagged twist only says which turn it is of
         return values * edge
 
-    def _net(self, name: str, values: np.ndarray) -> np.ndarray:
-        host = self.model.net.host
+    def _coupled(self, name: str, values: np.ndarray) -> np.ndarray:
+        host = self.model.coupled.host
         if name in ("q", "v"):
             felt = np.ones((host.blocks, 3), bool)
             felt[host.nodes :, 1:] = False
@@ -69,10 +69,10 @@ class Meaning:
             if name == "v":
                 felt &= ~host.fixed & (host.mass > 0.0)
             return np.where(np.tile(felt, (self.model.worlds, 1)), values, 0.0)
-        if name.startswith("data") or (name == "frame" and not self.model.net.edges):
+        if name.startswith("data") or (name == "frame" and not self.model.coupled.edges):
             return 0.0 * values
         if name.startswith("lag"):
-            part = self.model.net.sets[int(name[4:])]
+            part = self.model.coupled.sets[int(name[4:])]
             values[6 * (len(part.host.lag) // 7) :] = 0.0  # angles, as of chains: of a joint behind its ghost
         return values
 
@@ -149,7 +149,7 @@ def world_axis(model, name: str, values: np.ndarray) -> int | None:
         return axis if values.ndim > axis and values.shape[axis] == columns else None
     if name in ("q", "v", "a"):
         return 0
-    elements = model.net.edges if name == "frame" else model.net.sets[int(name.rpartition("_")[2])].elements
+    elements = model.coupled.edges if name == "frame" else model.coupled.sets[int(name.rpartition("_")[2])].elements
     return 1 if values.shape[1] == model.worlds * elements else None
 
 
@@ -190,8 +190,8 @@ class Difference:
             device_arrays.assign(
                 new, np.tile(values, [all_ // one for all_, one in zip(size, values.shape, strict=True)])
             )
-        for name, array in (self.model.net.touching if self.model.net else {}).items():
-            wide.net.touching[name].assign(np.tile(array.numpy(), (len(SIDES),) + (1,) * (array.ndim - 1)))
+        for name, array in (self.model.coupled.touching if self.model.coupled else {}).items():
+            wide.coupled.touching[name].assign(np.tile(array.numpy(), (len(SIDES),) + (1,) * (array.ndim - 1)))
         for shift in (shift for shift in shifts if shift.axis is not None):
             shift.write(wide, state, shift.by_worlds(step))
         after, losses = self.advancing(wide)(state), np.zeros(len(SIDES))
@@ -225,7 +225,7 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
             values = device_arrays.download(array)
             more = random.normal(size=values.shape) * (spin if rate == "omega" else speed)
             if name == "net/v":
-                more[model.net.host.nodes :] *= spin / speed
+                more[model.coupled.host.nodes :] *= spin / speed
             device_arrays.assign(array, values + meaning.keep(name, more))
     return state
 
@@ -251,7 +251,7 @@ def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
         tapes.append(tape)
     given, inputs = cotangent(model, weights), []
     for tape in reversed(tapes):
-        given, read = adjoint.pull(tape, given)
+        given, read = adjoint.vjp(tape, given)
         inputs.append(read)
     return given, inputs, Difference(model, state.copy(), weights, advancing(model), advancing)
 
@@ -259,14 +259,14 @@ def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
 def tables(model) -> list:
     """Parameter tables of all parts."""
     return [group.parameters for group in model.groups] + (
-        [part.parameters for part in model.net.sets] if model.net else []
+        [part.parameters for part in model.coupled.sets] if model.coupled else []
     )
 
 
 def by_parameters(model, inputs: list) -> list[np.ndarray]:
     """Derivatives by the parameters of each table, (rows, ...)."""
     found = [device_arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
-    return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.net else [])
+    return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.coupled else [])
 
 
 def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
@@ -341,6 +341,6 @@ def check_state(model, gradient, difference, *others: Shift) -> None:
 
 def check_length(own, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
     """What one part read of a step, dt long, against the derivative of the loss by its length."""
-    by_rate = sum(float(array.numpy().sum()) for array in (own.rate, *getattr(own, "elements_rate", ())))
+    grad_inverse_step = sum(float(array.numpy().sum()) for array in (own.rate, *getattr(own, "elements_rate", ())))
     per_step = 2.0 if scheme == "implicit_midpoint" else 1.0  # rate of the implicit Euler step that is solved, times dt
-    assert close(-per_step * by_rate / dt**2, difference.by_length(dt, step, scheme))
+    assert close(-per_step * grad_inverse_step / dt**2, difference.by_length(dt, step, scheme))

@@ -182,7 +182,7 @@ def test_a_step_in_parts_is_refused():
     after, tape = adjoint.step(state, 0.02)
     assert integrator.statistics()["retries"] > 1
     with pytest.raises(SolverError, match=r"rod \d .*took the step in parts.*take a smaller dt"):
-        adjoint.pull(tape, after)
+        adjoint.vjp(tape, after)
 
 
 def turned_clamp(joint=False):
@@ -330,4 +330,4 @@ def test_a_step_that_leaves_its_predictor_is_refused():
     after, tape = adjoint.step(lively(model, scheme="implicit_midpoint"), DT)
     tape.parts[0].retries.fill_(1)
     with pytest.raises(SolverError, match=r"rod \d .*started the step once more.*take a smaller dt"):
-        adjoint.pull(tape, after)
+        adjoint.vjp(tape, after)

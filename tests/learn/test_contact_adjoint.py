@@ -37,10 +37,10 @@ def differentiated(name: str, law: str, steps: int, speed: float = 0.0, ways=Non
     if ways:
         scene.contact_between("bar", "obstacle", friction=ways)
     model = built(scene)
-    ranges = model.net.touching["range"]
+    ranges = model.coupled.touching["range"]
     ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
     state = touching(model, along=speed)
-    model.touch.at(state.net.q)
+    model.touch.at(state.coupled.q)
     assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
     return model, *pulled(model, state, DT, steps)
 
@@ -57,11 +57,11 @@ def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
     """Return a direction in each number of contact."""
     shifts = []
     for name in names:
-        values, gradient = model.net.touching[name].numpy(), by_number(inputs, name)
+        values, gradient = model.coupled.touching[name].numpy(), by_number(inputs, name)
         assert gradient.any(), name
 
         def write(wide, _state, new, name=name):
-            wide.net.touching[name].assign(new)
+            wide.coupled.touching[name].assign(new)
 
         shifts.append(Shift(f"contact: {name}", values, gradient, along(gradient, values), write, 0))
     return shifts
@@ -113,13 +113,13 @@ def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):
 
     def found():
         _, gradient, inputs, _ = differentiated(name, "barrier", 1, SLIDING, lags=lags, **RUBBING)
-        return gradient.net.q.numpy(), by_number(inputs, "stiffness")
+        return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
     whole, chain = found(), CoupledLinearSolve.chain
 
-    def broken(own, by_lagged, by_q):
+    def broken(own, by_lagged, grad_q):
         by_lagged.zero_()
-        chain(own, by_lagged, by_q)
+        chain(own, by_lagged, grad_q)
 
     monkeypatch.setattr(CoupledLinearSolve, "chain", broken)
     for right, wrong in zip(whole, found(), strict=True):
@@ -185,14 +185,14 @@ def test_pairs_that_do_not_fit_are_made_room_for(lags):
         adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
         after, tape = adjoint.step(state, DT)
         if few:
-            contact = adjoint.net.contact
+            contact = adjoint.coupled.contact
             for pairs in contact.system.search.lists:
                 pairs.reserve(1)
             contact.system.search.version += 1
-            contact.outgrown(after.net.q)
+            contact.has_overflow(after.coupled.q)
             for pairs in contact.system.search.lists:
                 assert pairs.capacity < 1024
-        found.append(adjoint.pull(tape, after)[0].net.q.numpy())
+        found.append(adjoint.vjp(tape, after)[0].coupled.q.numpy())
     np.testing.assert_array_equal(*found)
 
 
@@ -208,7 +208,7 @@ def test_what_is_not_solved_has_no_gradient(lags, monkeypatch):
     model = built(scene_of("crossing rods", lags=lags, **RUBBING))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)
-    system, missed, chain = adjoint.net.solve.system, ExactSystem.missed, CoupledLinearSolve.chain
+    system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.chain
 
     def go_on(*given):
         system.missed = missed
@@ -219,4 +219,4 @@ def test_what_is_not_solved_has_no_gradient(lags, monkeypatch):
     with pytest.raises(
         SolverError, match=r"contact: conjugate gradients have not solved .* no gradient goes through it"
     ):
-        adjoint.pull(tape, after)
+        adjoint.vjp(tape, after)

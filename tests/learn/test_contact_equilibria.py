@@ -59,7 +59,7 @@ def pressed_model(name: str, law: str, ways=None, **contact):
     if ways:
         scene.contact_between("bar", "obstacle", friction=ways)
     model = built(scene)
-    ranges = model.net.touching["range"]
+    ranges = model.coupled.touching["range"]
     ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
     return model
 
@@ -70,7 +70,7 @@ def solved(name: str, law: str):
     assert state.stable
     assert np.abs(model.contacts(state).force).max() > 1e-4
     weights = position_weights(model, state)
-    inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    inputs = EquilibriumAdjoint(model).vjp(state, cotangent(model, weights))
     return model, inputs, difference_of(model, state, weights, start=1.0)
 
 
@@ -87,8 +87,8 @@ def test_an_equilibrium_in_contact_by_its_parameters(name, law):
 @pytest.mark.parametrize("name", ["ball", "crossing rods"])
 def test_an_equilibrium_in_contact_by_a_load(name):
     model, inputs, difference = solved(name, "barrier")
-    place = model.net.host.rods[-1].nodes[3]
-    check_load(model.net.host, place, inputs[-1].load.numpy()[place], difference)
+    place = model.coupled.host.rods[-1].nodes[3]
+    check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
 
 
 def rubbing(name: str, law: str, velocity: float, **contact):
@@ -96,8 +96,8 @@ def rubbing(name: str, law: str, velocity: float, **contact):
     model = pressed_model(name, law, friction=0.3, velocity=velocity, **contact)
     state = statics.solve(model, rtol=RTOL)
     weights = {name: values * (name == "net/q") for name, values in position_weights(model, state).items()}
-    weights["net/q"][np.arange(len(weights["net/q"])) % model.net.blocks >= model.net.host.nodes] = 0.0
-    inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    weights["net/q"][np.arange(len(weights["net/q"])) % model.coupled.blocks >= model.coupled.host.nodes] = 0.0
+    inputs = EquilibriumAdjoint(model).vjp(state, cotangent(model, weights))
     return model, state, inputs, difference_of(model, model.state(), weights)
 
 
@@ -117,8 +117,8 @@ def test_an_equilibrium_that_rubs(name, velocity, law):
     share = np.linalg.norm(touching.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(touching.force, axis=1), 1e-12)
     assert share.max() > (0.05 if velocity == 1e-4 else 1e-3)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
-    place = model.net.host.rods[-1].nodes[3] if model.net.host.rods else model.net.host.shells[0].nodes[-1]
-    check_load(model.net.host, place, inputs[-1].load.numpy()[place], difference)
+    place = model.coupled.host.rods[-1].nodes[3] if model.coupled.host.rods else model.coupled.host.shells[0].nodes[-1]
+    check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_the_way_has_to_be_known():
     with pytest.raises(
         SceneError, match=r"contact: by friction an equilibrium depends on the way there.*statics.solve"
     ):
-        EquilibriumAdjoint(model).pull(state, cotangent(model, difference.weights))
+        EquilibriumAdjoint(model).vjp(state, cotangent(model, difference.weights))
 
 
 def gripped(shape, velocity: float, ways=None, rolling: bool = False, worlds: int = 2):

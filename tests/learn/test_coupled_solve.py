@@ -52,28 +52,30 @@ def strut(density=1000.0):
 def squeezed(name: str):
     """A model, and a state in which it is shorter than at rest by a third: its Hessian is indefinite."""
     model = built({"strut": strut, "sheet": SCENES["sheet"]}[name]())
-    state, net = model.state(), model.net
-    q = net.rest().q.numpy()
-    q[: net.host.nodes, 0] *= 0.67
-    state.net.q.assign(q)
+    state, coupled = model.state(), model.coupled
+    q = coupled.rest().q.numpy()
+    q[: coupled.host.nodes, 0] *= 0.67
+    state.coupled.q.assign(q)
     return model, state
 
 
 def by_both(model, state, rate: float, **attributes):
     """The system after it has solved for one right-hand side, its solution, that of factors, and their tangent."""
-    net = model.net
-    right = np.random.default_rng(1).normal(size=(model.worlds * net.blocks, 3))
-    angles = (np.arange(net.blocks) >= net.host.nodes) & (np.arange(net.blocks) < net.blocks - net.host.spins)
+    coupled = model.coupled
+    right = np.random.default_rng(1).normal(size=(model.worlds * coupled.blocks, 3))
+    angles = (np.arange(coupled.blocks) >= coupled.host.nodes) & (
+        np.arange(coupled.blocks) < coupled.blocks - coupled.host.spins
+    )
     right[np.tile(angles, model.worlds), 1:] = 0.0
-    found = wp.zeros(len(right), dtype=net.vector, device=net.device)
+    found = wp.zeros(len(right), dtype=coupled.vector, device=coupled.device)
     coefficient, system = rate * (rate + model.scene.mass_damping), ExactSystem(model)
     for name, value in attributes.items():
         setattr(system.krylov, name, value)
-    rates = wp.full(model.worlds, rate, dtype=net.real, device=net.device)
-    system.solve(state.net, coefficient, rates, wp.array(right, dtype=net.vector, device=net.device), found)
+    rates = wp.full(model.worlds, rate, dtype=coupled.real, device=coupled.device)
+    system.solve(state.coupled, coefficient, rates, wp.array(right, dtype=coupled.vector, device=coupled.device), found)
     tangent = CoupledTangent(model, 0)
     solve = HostSolve(tangent)
-    wanted = solve(SimpleNamespace(net=state.net), rate, coefficient, None, tangent.into(right.ravel()))
+    wanted = solve(SimpleNamespace(coupled=state.coupled), rate, coefficient, None, tangent.into(right.ravel()))
     return system, found.numpy(), tangent.back(wanted).reshape(-1, 3), tangent
 
 
@@ -105,7 +107,7 @@ def test_rods_that_branch_are_eliminated():
 def test_an_indefinite_matrix(name):
     model, state = squeezed(name)
     system, found, wanted, tangent = by_both(model, state, 1.0)
-    matrix = tangent.hessian(SimpleNamespace(net=state.net)).toarray() + np.diag(tangent.mass)
+    matrix = tangent.hessian(SimpleNamespace(coupled=state.coupled)).toarray() + np.diag(tangent.mass)
     spectrum = np.linalg.eigvalsh(matrix[tangent.free][:, tangent.free])
     assert (spectrum < 0.0).sum() > 2
     assert not system.failed.numpy().any()
@@ -129,14 +131,14 @@ def test_what_rounding_leaves_is_no_failure():
 
 def test_a_world_without_a_right_hand_side():
     model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64", worlds=2)
-    state, net, system = lively(model), model.net, ExactSystem(model)
-    right = np.zeros((2 * net.blocks, 3))
-    right[net.blocks + 5] = 1.0
-    found = wp.full(len(right), net.vector(1.0, 1.0, 1.0), dtype=net.vector, device=net.device)
-    rates = wp.full(2, RATE, dtype=net.real, device=net.device)
-    system.solve(state.net, RATE**2, rates, wp.array(right, dtype=net.vector, device=net.device), found)
-    assert np.all(found.numpy()[: net.blocks] == 0.0)
-    assert np.abs(found.numpy()[net.blocks :]).max() > 0.0
+    state, coupled, system = lively(model), model.coupled, ExactSystem(model)
+    right = np.zeros((2 * coupled.blocks, 3))
+    right[coupled.blocks + 5] = 1.0
+    found = wp.full(len(right), coupled.vector(1.0, 1.0, 1.0), dtype=coupled.vector, device=coupled.device)
+    rates = wp.full(2, RATE, dtype=coupled.real, device=coupled.device)
+    system.solve(state.coupled, RATE**2, rates, wp.array(right, dtype=coupled.vector, device=coupled.device), found)
+    assert np.all(found.numpy()[: coupled.blocks] == 0.0)
+    assert np.abs(found.numpy()[coupled.blocks :]).max() > 0.0
     assert not system.failed.numpy().any()
 
 
@@ -146,7 +148,7 @@ def pulled(model, state, scheme: str, given: dict, **how):
     _, tape = adjoint.step(state, DT)
     s = DT / 2.0 if scheme == "implicit_midpoint" else DT
     given = cotangent(model, given)
-    adjoint.pull(tape, given)
+    adjoint.vjp(tape, given)
     gradient, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, given, s, **how)
     values = {name: array.numpy() for name, array in entries(gradient).items()}
     return values | {f"parameters {i}": rows.numpy() for i, rows in enumerate(inputs[-1].parameters)}
@@ -184,7 +186,7 @@ def test_what_does_not_converge_takes_factors(hasty):
     given = directions(model, state, 5)
     adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
     _, tape = adjoint.step(state, DT)
-    gradient, _ = adjoint.pull(tape, cotangent(model, given))
+    gradient, _ = adjoint.vjp(tape, cotangent(model, given))
     wanted = pulled(model, state, "implicit_euler", given, factors=True)
     for key, array in entries(gradient).items():
         np.testing.assert_array_equal(array.numpy(), wanted[key], err_msg=key)

@@ -53,7 +53,7 @@ def solved(name: str):
     model = built(CASES[name]())
     state = statics.solve(model, rtol=RTOL)
     weights = position_weights(model, state)
-    inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    inputs = EquilibriumAdjoint(model).vjp(state, cotangent(model, weights))
     return model, state, inputs, difference_of(model, state, weights, start=1.0)
 
 
@@ -75,7 +75,7 @@ def test_an_equilibrium_by_its_loads(name):
         host, (k, column) = model.groups[0].host, (3, 0)
         found, place = device_arrays.download(inputs[0].load)[:3, k, column], k * len(host.rods) + column
     else:
-        host, place = model.net.host, model.net.host.nodes - 1
+        host, place = model.coupled.host, model.coupled.host.nodes - 1
         found = inputs[-1].load.numpy()[place]
     check_load(host, place, found, difference)
 
@@ -99,13 +99,13 @@ def test_a_mechanism_has_no_gradient():
     state = statics.solve(model)
     weights = directions(model, state, 5)
     with pytest.raises(SolverError, match=r"no gradient .* the spin of edge \d of rod \d is neutral.*fix_twist"):
-        EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+        EquilibriumAdjoint(model).vjp(state, cotangent(model, weights))
 
 
 def test_velocities_of_an_equilibrium_have_no_effect():
     model, state, inputs, difference = solved("joined")
     weights = {name: values + 1.0 * name.endswith("/v") for name, values in difference.weights.items()}
-    again = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    again = EquilibriumAdjoint(model).vjp(state, cotangent(model, weights))
     np.testing.assert_array_equal(inputs[-1].load.numpy(), again[-1].load.numpy())
     assert product(state, weights) == pytest.approx(difference.loss())
 
@@ -131,8 +131,8 @@ def test_neutral_equilibria_are_refused(device):
         state = statics.solve(model)
         given = cotangent(model, position_weights(model, state))
         if held:
-            EquilibriumAdjoint(model).pull(state, given)
+            EquilibriumAdjoint(model).vjp(state, given)
             continue
         with pytest.raises(SolverError, match=r"spin of .* of rod 0 is neutral.*fix_twist") as caught:
-            EquilibriumAdjoint(model).pull(state, given)
+            EquilibriumAdjoint(model).vjp(state, given)
         assert caught.value.outcome == "neutral"

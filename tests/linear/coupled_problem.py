@@ -58,12 +58,12 @@ def branches() -> ddg.Scene:
     scene = ddg.Scene()
     trunk = scene.add_rod(line((0, 0, 0), (0.1, 0, 1), 7), section=SECTION)
     left = scene.add_rod(line((0.1, 0, 1), (0.5, 0.3, 1.6), 5), section=SECTION)
-    right = scene.add_rod(line((0.1, 0, 1), (-0.4, 0.1, 1.7), 6), section=SECTION)
+    rhs = scene.add_rod(line((0.1, 0, 1), (-0.4, 0.1, 1.7), 6), section=SECTION)
     tip = scene.batches[left].points[0, 2]
     twig = scene.add_rod(line(tip - [0.3, -0.3, 0.1], tip + [0.3, -0.3, 0.1], 7), section=SECTION)
     scene.clamp_end(trunk)
-    scene.fix(right, [3], components="xz")
-    scene.join([(trunk, -1), (left, 0), (right, 0)])
+    scene.fix(rhs, [3], components="xz")
+    scene.join([(trunk, -1), (left, 0), (rhs, 0)])
     scene.join([(left, 2), (twig, 3)])
     return scene
 
@@ -113,23 +113,23 @@ class Problem:
     ):
         random = np.random.default_rng(seed)
         self.model = scene.build(device, precision, worlds=2)
-        net, self.state = self.model.net, self.model.state()
-        self.net, self.worlds, self.blocks = net, 2, net.blocks
-        q = self.state.net.q.numpy().astype(float)
-        free = np.tile(~net.host.fixed, (2, 1))
+        coupled, self.state = self.model.coupled, self.model.state()
+        self.coupled, self.worlds, self.blocks = coupled, 2, coupled.blocks
+        q = self.state.coupled.q.numpy().astype(float)
+        free = np.tile(~coupled.host.fixed, (2, 1))
         q[:] = q * stretch + noise * random.normal(size=q.shape) * free
-        self.state.net.q.assign(q)
+        self.state.coupled.q.assign(q)
         newton = self.newton = CoupledNewton(self.model, NewtonOptions(psd=psd), preconditioner)
-        wp.copy(newton.q, self.state.net.q)
-        wp.copy(newton.base, self.state.net.q)
+        wp.copy(newton.q, self.state.coupled.q)
+        wp.copy(newton.base, self.state.coupled.q)
         newton.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)
-        newton.islands.coefficient.assign([30.0, 50.0])
-        newton.islands.rate.fill_(1.0)
-        newton.islands.wanted.fill_(1)
+        newton.islands.inertia_coefficient.assign([30.0, 50.0])
+        newton.islands.inverse_step.fill_(1.0)
+        newton.islands.needs_direction.fill_(1)
 
     def assemble(self):
         newton = self.newton
-        newton.evaluate(self.state.net)
+        newton.evaluate(self.state.coupled)
         newton.balance()
         newton.assemble()
         if newton.chains and newton.chains.exact:  # direct substructuring assembles during the solve
@@ -187,8 +187,8 @@ class Problem:
         size = 3 * self.blocks
         of_world = slice(world * size, (world + 1) * size)
         H = Tangent(self.model).hessian(self.state).toarray()[of_world, of_world]
-        return H + np.diag(self.net.host.mass.ravel() * self.newton.islands.coefficient.numpy()[world])
+        return H + np.diag(self.coupled.host.mass.ravel() * self.newton.islands.inertia_coefficient.numpy()[world])
 
     def free(self) -> np.ndarray:
         """Return the mask of free dofs (3 N,)."""
-        return ~self.net.host.fixed.ravel()
+        return ~self.coupled.host.fixed.ravel()

@@ -19,25 +19,25 @@ def coupled_copy(scene: ddg.Scene, cut: int | None = None) -> ddg.Scene:
     """
     batch = scene.batches[0]
     points, options = batch.points[0], {"section": batch.section, "natural": batch.natural}
-    coupled = ddg.Scene(gravity=scene.gravity)
+    is_coupled = ddg.Scene(gravity=scene.gravity)
     if cut:
-        one, two = coupled.add_rod(points[: cut + 1], **options), coupled.add_rod(points[cut:], **options)
-        coupled.join([(one, -1), (two, 0)])
+        one, two = is_coupled.add_rod(points[: cut + 1], **options), is_coupled.add_rod(points[cut:], **options)
+        is_coupled.join([(one, -1), (two, 0)])
     else:
-        one = coupled.add_rod(points, **options)
-        fixed = coupled.add_rod(np.outer(np.linspace(0.0, 0.1, 3), [1.0, 0.0, 0.0]) + points[0], **options)
-        coupled.join([(one, 0), (fixed, 0)], rigid=False)
-        coupled.fix(fixed, [1, 2])
-    coupled.clamp(one, [0])
-    return coupled
+        one = is_coupled.add_rod(points, **options)
+        fixed = is_coupled.add_rod(np.outer(np.linspace(0.0, 0.1, 3), [1.0, 0.0, 0.0]) + points[0], **options)
+        is_coupled.join([(one, 0), (fixed, 0)], rigid=False)
+        is_coupled.fix(fixed, [1, 2])
+    is_coupled.clamp(one, [0])
+    return is_coupled
 
 
 def matrices(problem: Problem, iterations: list[int], clamped: int) -> list[np.ndarray]:
     """Return H of both worlds, each at a given iteration."""
     newton = problem.newton
     newton.islands.iteration.assign(iterations)
-    newton.islands.clamped.fill_(clamped)
-    newton.evaluate(problem.state.net)
+    newton.islands.drop_compression.fill_(clamped)
+    newton.evaluate(problem.state.coupled)
     newton.assemble()
     return [problem.matrix(world) for world in range(2)]
 
@@ -65,9 +65,9 @@ def deflected_cut_helix(device, psd: str):
     newton, state, host = (
         CoupledNewton(model, NewtonOptions(psd=psd, rtol=1e-13), "chain"),
         model.state(),
-        model.net.host,
+        model.coupled.host,
     )
-    q = state.net.q.numpy()
+    q = state.coupled.q.numpy()
     target = q.copy()
     s = np.concatenate([s[:7], s[7:]])
     target[: host.nodes] += 0.2 * s[:, None] ** 2 * np.array([1.0, 0.5, 0.7])
@@ -75,9 +75,9 @@ def deflected_cut_helix(device, psd: str):
     for array in (newton.q, newton.base):
         array.assign(q)
     newton.target.assign(target)
-    newton.islands.coefficient.fill_(500.0)
-    newton.islands.active.fill_(1)
-    return newton, state.net
+    newton.islands.inertia_coefficient.fill_(500.0)
+    newton.islands.any_active.fill_(1)
+    return newton, state.coupled
 
 
 def test_converges_quadratically(device):

@@ -40,18 +40,18 @@ def first_direction(
     """Return a solver of two worlds at iterates off rest by `noise` [m], and the first direction (worlds, blocks, 3)."""
     random, model = np.random.default_rng(3), scene.build(device, "float64", worlds=2)
     newton = CoupledNewton(model, NewtonOptions(psd="gauss_newton"), "chain", linear, split=carried is not None)
-    state, islands = model.state().net, newton.islands
+    state, islands = model.state().coupled, newton.islands
     q = state.q.numpy()
-    free = np.tile(~model.net.host.fixed, (2, 1))
+    free = np.tile(~model.coupled.host.fixed, (2, 1))
     for array, size in ((newton.q, noise), (newton.base, noise), (newton.target, 1e-3)):
         array.assign(q + size * random.normal(size=q.shape) * free)
-    islands.coefficient.fill_(100.0)
-    islands.rate.fill_(10.0)
-    islands.clamped.fill_(1)
-    islands.carried.fill_(carried or 0.0)
+    islands.inertia_coefficient.fill_(100.0)
+    islands.inverse_step.fill_(10.0)
+    islands.drop_compression.fill_(1)
+    islands.max_edge_stiffness.fill_(carried or 0.0)
     newton.evaluate(state)
     newton.balance()
-    islands.wanted.fill_(1)
+    islands.needs_direction.fill_(1)
     newton.assemble()
     newton.direct()
     assert newton.chains.splits
@@ -67,12 +67,12 @@ def test_directions_match_full_matrix(device, twist):
     for carried in (1.0, 1e4, 1e9):  # axial stiffness is about 8e4: the last leaves no mixed edge
         newton, mixed = first_direction(scene, device, wp.float64, carried)
         np.testing.assert_allclose(mixed, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
-        element_set = next(element_set for element_set in newton.net.sets if element_set.term.measure.tensions)
+        element_set = next(element_set for element_set in newton.coupled.sets if element_set.term.measure.tensions)
         a, b = element_set.host.slots[:2]
         q = newton.q.numpy().reshape(2, -1, 3)
         edges, steps = q[:, b] - q[:, a], mixed[:, b] - mixed[:, a]
         along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
-        element = newton.chains.plan.elements(newton.net.host, element_set.host)[1]
+        element = newton.chains.plan.elements(newton.coupled.host, element_set.host)[1]
         k, c = np.nonzero(element >= 0)
         longer = device_arrays.download(newton.chains.longer).reshape(2, newton.chains.longest, 2, -1)
         slack, lengthening = longer[:, k, :, c].transpose(1, 2, 0)

@@ -59,9 +59,9 @@ def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
             wp.copy(newton.frame, state.frame)
             for array in (newton.theta, newton.target_angle):
                 device_arrays.assign(array, 2.0 * noise * random.normal(size=array.shape))
-        newton.islands.coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
-        newton.islands.rate.fill_(1.0)
-        newton.islands.clamped.fill_(int(clamped))
+        newton.islands.inertia_coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
+        newton.islands.inverse_step.fill_(1.0)
+        newton.islands.drop_compression.fill_(int(clamped))
         yield newton, state
 
 
@@ -76,7 +76,7 @@ def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
         for offset in range(1, min(kind.span, n - 1 - k) + 1):
             H[k, :, k + offset] = stored[offset, ..., k]
             H[k + offset, :, k] = stored[offset, ..., k].T
-    return H.reshape(n * nb, n * nb), device_arrays.download(newton.right)[:, :n, column].T.ravel()
+    return H.reshape(n * nb, n * nb), device_arrays.download(newton.rhs)[:, :n, column].T.ravel()
 
 
 @pytest.mark.parametrize(
@@ -99,14 +99,14 @@ def test_direction_matches_dense_solve(device, name, precision, tolerance):
         columns += newton.group.columns
         newton.iterate(state.last)
         device_arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
-        wanted = newton.islands.wanted.numpy()
+        wanted = newton.islands.needs_direction.numpy()
         assert wanted.all()
         wanted[-1] = 0
-        newton.islands.wanted.assign(wanted)
+        newton.islands.needs_direction.assign(wanted)
         newton.direct()
-        direction, decrement = device_arrays.download(newton.direction), newton.islands.decrement.numpy()
+        direction, decrement = device_arrays.download(newton.direction), newton.islands.predicted_decrease.numpy()
         assert (direction[..., -1] == 7.0).all()
-        assert (newton.islands.lost.numpy() == 0).all()
+        assert (newton.islands.lost_pivots_total.numpy() == 0).all()
         for column in range(newton.group.columns - 1):
             H, r = dense(newton, column)
             expected, n = np.linalg.solve(H, r), len(r) // newton.group.kind.block
@@ -122,11 +122,11 @@ def test_indefinite_matrices_lose_pivots(device):
     """A rod with an indefinite matrix stays and is retried without compression; the others move."""
     outcomes = set()
     for newton, state in solvers("untwisted", device, clamped=False, noise=0.25):
-        newton.islands.coefficient.fill_(0.3)
+        newton.islands.inertia_coefficient.fill_(0.3)
         before = device_arrays.download(newton.x)
         newton.iterate(state.last)
         clamped, moved = (
-            newton.islands.clamped.numpy(),
+            newton.islands.drop_compression.numpy(),
             np.abs(device_arrays.download(newton.x) - before).max(axis=(0, 2)),
         )
         for column in range(newton.group.columns):
@@ -138,7 +138,7 @@ def test_indefinite_matrices_lose_pivots(device):
         newton.iterate(state.last)
         assert (newton.islands.iteration.numpy() >= 1).all()
         assert (newton.islands.step_length.numpy() > 0.0).all()
-        assert (newton.islands.lost.numpy() == 0).all()
+        assert (newton.islands.lost_pivots_total.numpy() == 0).all()
     assert outcomes == {True, False}
 
 
@@ -146,14 +146,14 @@ def adjust_serially(newton, todo: int):
     """Return `x`, `theta` and `frame` after the same iterate action by the serial kernel."""
     group = newton.group
     copies = [wp.clone(array) for array in (newton.x, newton.theta, newton.frame, newton.base)]
-    newton.islands.todo.fill_(todo)
+    newton.islands.iterate_action.fill_(todo)
     wp.launch(
         rod_iterate.adjust_kernel(group.kind, newton.real, newton.linear),
         group.columns,
         [group.count, group.fixed, group.anchor, newton.direction, *newton.islands.arrays, *copies],
         device=newton.device,
     )
-    newton.islands.todo.fill_(todo)  # the serial kernel has reset it
+    newton.islands.iterate_action.fill_(todo)  # the serial kernel has reset it
     return [device_arrays.download(array) for array in copies[:3]]
 
 
@@ -169,8 +169,8 @@ def test_edge_rotations_match_serial_kernel(device, name, supported):
         step = 0.5 * random.normal(size=newton.direction.shape) * (mask == 0)
         device_arrays.assign(newton.direction, step)
         newton.islands.step_length.fill_(0.7)
-        newton.islands.angle_change.fill_(-0.3)
-        expected = adjust_serially(newton, rod_iterate.PLACE)
+        newton.islands.angle_step_left.fill_(-0.3)
+        expected = adjust_serially(newton, rod_iterate.ROTATE_EDGES)
         straight = device_arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
         newton.move()
         inside = np.arange(group.nodes)[:, None] < np.tile(group.host.count, 2)
@@ -185,7 +185,10 @@ def test_frame_updates_match_serial_kernel(device):
     for newton, state in solvers("twist", device, clamped=True, noise=0.3):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
-            before, (x, _, expected) = device_arrays.download(newton.frame), adjust_serially(newton, rod_iterate.RELAG)
+            before, (x, _, expected) = (
+                device_arrays.download(newton.frame),
+                adjust_serially(newton, rod_iterate.UPDATE_FRAMES),
+            )
             newton.move()
             frames = device_arrays.download(newton.frame)
             np.testing.assert_allclose(frames, expected, rtol=0, atol=1e-13)

@@ -69,8 +69,8 @@ class Problem:
             wp.copy(newton.frame, state.frame)
             device_arrays.assign(newton.theta, 0.2 * random.normal(size=newton.theta.shape))
             device_arrays.assign(newton.target_angle, 0.2 * random.normal(size=newton.theta.shape))
-        newton.islands.coefficient.assign(random.uniform(1.0, 3.0, size=4))
-        newton.islands.rate.fill_(1.0)
+        newton.islands.inertia_coefficient.assign(random.uniform(1.0, 3.0, size=4))
+        newton.islands.inverse_step.fill_(1.0)
         self.before = self.dofs()
         newton.iterate(state.last)
 
@@ -82,7 +82,7 @@ class Problem:
         """Return matrix (identity on fixed dofs), residual (zero there) and free mask, from element factors and gradients."""
         kind, host, n = self.kind, self.group.host, int(self.count[column])
         F, g = (device_arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
-        c, rod = float(device_arrays.download(self.newton.islands.coefficient)[column]), column % 2
+        c, rod = float(device_arrays.download(self.newton.islands.inertia_coefficient)[column]), column % 2
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = (
@@ -147,12 +147,12 @@ class Problem:
 @EVERY_CHAIN
 def test_blocks_and_residual_match_dense(device, name, closed):
     problem = Problem(name, closed, device)
-    right = problem.vector(problem.newton.right)
+    rhs = problem.vector(problem.newton.rhs)
     for column, n in enumerate(problem.count):
         H, r, free = problem.dense(column)
         assert 0 < (~free).sum() < free.sum()
         np.testing.assert_allclose(problem.blocks(column), H, rtol=0, atol=1e-13 * np.abs(H).max())
-        np.testing.assert_allclose(right[column, :n].ravel(), r, rtol=0, atol=1e-13 * np.abs(r).max())
+        np.testing.assert_allclose(rhs[column, :n].ravel(), r, rtol=0, atol=1e-13 * np.abs(r).max())
         if closed:
             assert (
                 np.abs(H[problem.kind.block :, :][: problem.kind.dim, -problem.kind.block :]).max() > 0.0
@@ -169,12 +169,12 @@ def test_product_matches_dense(device, name, closed):
     v = random.normal(size=(problem.kind.block, nodes, columns))
     device_arrays.assign(newton.p, v)
     device_arrays.assign(newton.q, np.full_like(v, 7.0))
-    newton.islands.wanted.assign(np.array([1, 1, 0, 1], np.int32))
+    newton.islands.needs_direction.assign(np.array([1, 1, 0, 1], np.int32))
     _, product, _ = rod_pcg.solver_kernels(problem.kind, newton.linear, "chain")
     problem.launch(
         product,
         (nodes, columns),
-        [newton.blocks, newton.p, problem.group.count, newton.islands.wanted],
+        [newton.blocks, newton.p, problem.group.count, newton.islands.needs_direction],
         [newton.q, newton.busy],
     )
     product_values = problem.vector(newton.q)
@@ -207,7 +207,7 @@ def test_factors_solve_without_seam(device, name, closed):
         total[r] = substitute(factor, v, out, count[r], r, r)
 
     total = wp.zeros(problem.group.columns, dtype=wp.float64, device=device)
-    problem.launch(solve, problem.group.columns, [newton.factors, newton.right], [newton.z, problem.group.count, total])
+    problem.launch(solve, problem.group.columns, [newton.factors, newton.rhs], [newton.z, problem.group.count, total])
     solution = problem.vector(newton.z)
     for column, n in enumerate(problem.count):
         H, r, _ = problem.dense(column)
@@ -216,7 +216,7 @@ def test_factors_solve_without_seam(device, name, closed):
         expected = np.linalg.solve(H, r)
         np.testing.assert_allclose(solution[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
         assert total.numpy()[column] == pytest.approx(r @ expected, rel=1e-12)
-    assert (device_arrays.download(newton.islands.lost) == 0).all()
+    assert (device_arrays.download(newton.islands.lost_pivots_total) == 0).all()
 
 
 @EVERY_CHAIN
@@ -225,7 +225,7 @@ def test_direction_matches_dense_solve(device, name, closed, preconditioner):
     """PCG matches; with the exact preconditioner an open rod takes one iteration."""
     problem = Problem(name, closed, device, preconditioner)
     newton = problem.newton
-    direction, decrement = problem.vector(newton.direction), device_arrays.download(newton.islands.decrement)
+    direction, decrement = problem.vector(newton.direction), device_arrays.download(newton.islands.predicted_decrease)
     iterations = device_arrays.download(newton.iterations)
     for column, n in enumerate(problem.count):
         H, r, _ = problem.dense(column)

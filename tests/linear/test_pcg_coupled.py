@@ -14,7 +14,7 @@ from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
 def test_matrix_is_exact_hessian_of_membranes(device, stretch):
     """Signed stresses make H exact: Green's strain is quadratic, isometric bending linear in the positions."""
     problem = Problem(membrane_with_springs(), device, stretch).iterate(0.1)
-    names = [part.term.name for part in problem.net.sets]
+    names = [part.term.name for part in problem.coupled.sets]
     assert sorted(names) == ["rod_stretch", "shell_isometric", "shell_stretch"]
     for world in range(2):
         exact = problem.exact(world)
@@ -23,11 +23,11 @@ def test_matrix_is_exact_hessian_of_membranes(device, stretch):
 
 def test_projected_matrix_drops_compression(device):
     problem = Problem(membrane_with_springs(), device, 0.9)
-    problem.newton.islands.coefficient.fill_(0.0)
+    problem.newton.islands.inertia_coefficient.fill_(0.0)
     free = problem.free()
     lowest = []
     for projected in (0, 1):
-        problem.newton.islands.clamped.fill_(projected)
+        problem.newton.islands.drop_compression.fill_(projected)
         H = problem.iterate(0.1).matrix(0)[np.ix_(free, free)]
         lowest.append(np.linalg.eigvalsh(H)[0] / np.abs(H).max())
     assert lowest[0] < -1e-3
@@ -38,38 +38,42 @@ def test_projected_matrix_drops_compression(device):
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 def test_directions_match_dense_solve(device, bending, precision):
     problem = Problem(frame_and_sheet(bending), device, 1.02, precision)
-    problem.newton.islands.clamped.fill_(1)
+    problem.newton.islands.drop_compression.fill_(1)
     problem.iterate(1e-7 if precision == "mixed" else 1e-13)
     free, size = problem.free(), 3 * problem.blocks
     tolerance = 2e-4 if precision == "mixed" else 1e-9
-    right = problem.newton.right.numpy().astype(float).reshape(2, size)
+    rhs = problem.newton.rhs.numpy().astype(float).reshape(2, size)
     direction = problem.newton.direction.numpy().astype(float).reshape(2, size)
     for world in range(2):
         H = problem.matrix(world).astype(float)
         assert np.abs(H - H.T).max() <= (1e-6 if precision == "mixed" else 1e-14) * np.abs(H).max()
         expected = np.zeros(size)
-        expected[free] = np.linalg.solve(H[np.ix_(free, free)], right[world, free])
+        expected[free] = np.linalg.solve(H[np.ix_(free, free)], rhs[world, free])
         assert not direction[world, ~free].any()
         np.testing.assert_allclose(direction[world], expected, rtol=0.0, atol=tolerance * np.abs(expected).max())
 
 
 def test_residual_matches_tangent(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(0.1)
-    tangent, newton, host = Tangent(problem.model), problem.newton, problem.net.host
+    tangent, newton, host = Tangent(problem.model), problem.newton, problem.coupled.host
     q = newton.q.numpy()
-    inertia = np.tile(host.mass, (2, 1)) * np.repeat(newton.islands.coefficient.numpy(), problem.blocks)[:, None]
+    inertia = (
+        np.tile(host.mass, (2, 1)) * np.repeat(newton.islands.inertia_coefficient.numpy(), problem.blocks)[:, None]
+    )
     force = tangent.loads(1.0, q.ravel()) - tangent.gradient(problem.state)
     expected = np.where(tangent.free, force - (inertia * (q - newton.target.numpy())).ravel(), 0.0)
-    residual = newton.right.numpy().ravel()
+    residual = newton.rhs.numpy().ravel()
     np.testing.assert_allclose(residual, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_product_matches_matrix(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(1e-13)
     newton, size, free = problem.newton, 3 * problem.blocks, problem.free()
-    vector = np.random.default_rng(0).normal(size=(2 * problem.blocks, 3)) * np.tile(~problem.net.host.fixed, (2, 1))
+    vector = np.random.default_rng(0).normal(size=(2 * problem.blocks, 3)) * np.tile(
+        ~problem.coupled.host.fixed, (2, 1)
+    )
     newton.krylov.p.assign(vector)
-    newton.islands.wanted.fill_(1)
+    newton.islands.needs_direction.fill_(1)
     newton.krylov.rho.fill_(1.0)
     newton.krylov.cycle()
     product = newton.krylov.product.numpy().reshape(2, size)
@@ -82,12 +86,12 @@ def test_product_matches_matrix(device):
 def test_negative_curvature_stops_pcg_and_projects(device, preconditioner):
     """An indefinite H under compression still yields a descent direction; the next matrix drops compression."""
     problem = Problem(membrane_with_springs(), device, 0.8, preconditioner=preconditioner)
-    problem.newton.islands.coefficient.fill_(1e-3)
+    problem.newton.islands.inertia_coefficient.fill_(1e-3)
     newton = problem.iterate(1e-10).newton
-    assert newton.islands.clamped.numpy().tolist() == [1, 1]
+    assert newton.islands.drop_compression.numpy().tolist() == [1, 1]
     assert newton.iterations.numpy().max() < 10
-    right, direction = (array.numpy().reshape(2, -1) for array in (newton.right, newton.direction))
-    assert ((right * direction).sum(1) > 0.0).all()
+    rhs, direction = (array.numpy().reshape(2, -1) for array in (newton.rhs, newton.direction))
+    assert ((rhs * direction).sum(1) > 0.0).all()
     assert np.isfinite(direction).all()
 
 
@@ -123,15 +127,15 @@ def test_level_blocks_are_galerkin_products(device):
     model = scene.build(device, "float64")
     integrator = ddg.Integrator(model, linear="multilevel", check_every=1)
     integrator.step(model.state(), 0.01)
-    newton = integrator._net.newton
-    newton.islands.wanted.fill_(1)
-    newton.krylov.levels.prepare(newton.matrix, newton.fixed, newton.islands.wanted)
-    table, blocks = newton.system, model.net.blocks
+    newton = integrator._coupled.newton
+    newton.islands.needs_direction.fill_(1)
+    newton.krylov.levels.prepare(newton.matrix, newton.fixed, newton.islands.needs_direction)
+    table, blocks = newton.system, model.coupled.blocks
     H = np.zeros((3 * blocks, 3 * blocks))
     rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.matrix.numpy()
     for p in np.flatnonzero(rows >= 0):
         H[3 * rows[p] : 3 * rows[p] + 3, 3 * columns[p] : 3 * columns[p] + 3] = values[:, p].reshape(3, 3)
-    free = ~model.net.host.fixed.ravel()
+    free = ~model.coupled.host.fixed.ravel()
     order = newton.krylov.levels.order.numpy()
     for level, groups in enumerate(newton.krylov.levels.counts):
         for g in range(groups):

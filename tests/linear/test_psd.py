@@ -18,7 +18,7 @@ CONVERGED = {"converged", "converged_to_rounding"}
 def elastic(problem: Problem, column: int) -> np.ndarray:
     """Return the Newton matrix of a rod on free dofs, without inertia."""
     host, kind, n, rod = problem.group.host, problem.kind, int(problem.count[column]), column % 2
-    c = float(device_arrays.download(problem.newton.islands.coefficient)[column])
+    c = float(device_arrays.download(problem.newton.islands.inertia_coefficient)[column])
     inertia = np.repeat(c * host.mass[:n, rod, None], kind.block, 1)
     if kind.twist:
         inertia[:, kind.dim] = c * host.rotary[:n, rod]
@@ -99,8 +99,8 @@ def deflected_helix(solver, device, psd: str):
     device_arrays.assign(newton.x, x)
     device_arrays.assign(newton.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
     device_arrays.assign(newton.target_angle, np.ascontiguousarray(s[:, None]))
-    newton.islands.coefficient.fill_(500.0)
-    newton.islands.active.fill_(1)
+    newton.islands.inertia_coefficient.fill_(500.0)
+    newton.islands.any_active.fill_(1)
     return newton, data.last
 
 
@@ -109,7 +109,7 @@ def errors(newton, last) -> list[float]:
     norms = []
     while not newton.islands.status.numpy()[0]:
         newton.iterate(last)
-        norms.append(float(newton.islands.decrement.numpy()[0]) ** 0.5)
+        norms.append(float(newton.islands.predicted_decrease.numpy()[0]) ** 0.5)
     assert newton.islands.status.numpy()[0] in (outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING)
     return norms[:-1]
 

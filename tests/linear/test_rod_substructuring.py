@@ -20,7 +20,7 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve.linear import cyclic_reduction, rod_substructuring
-from ddg_warp.solve.linear.solver_selection import net_preconditioner
+from ddg_warp.solve.linear.solver_selection import coupled_preconditioner
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
@@ -29,7 +29,7 @@ DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param
 def apply_preconditioner(problem: Problem, vectors: np.ndarray) -> np.ndarray:
     """Apply the preconditioner to vectors (n, worlds, 3 N), after the block Jacobi stage as in a solve."""
     newton = problem.newton
-    newton.islands.wanted.fill_(1)
+    newton.islands.needs_direction.fill_(1)
     inverse = newton.krylov.inverse.numpy().astype(float)
     results = []
     for vector in vectors:
@@ -47,13 +47,13 @@ def apply_preconditioner(problem: Problem, vectors: np.ndarray) -> np.ndarray:
 
 def pcg_iterations(problem: Problem, forcing: float) -> np.ndarray:
     """Return the PCG iterations of each world to the relative residual `forcing`, with a projected matrix."""
-    problem.newton.islands.clamped.fill_(1)
+    problem.newton.islands.drop_compression.fill_(1)
     return problem.iterate(forcing).newton.iterations.numpy()
 
 
 def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
     """Condense rod interiors, then single joints, by the formulas of `kernels.linear.rod_substructuring` with dense matrices."""
-    host, free = problem.net.host, problem.free()
+    host, free = problem.coupled.host, problem.free()
     H = np.where(np.outer(free, free), problem.matrix(world), np.diag(~free))
     pairs = problem.newton.chains.plan.pairs
     joints = [[int(b) for b in pair if b >= 0] for pair in pairs]
@@ -90,7 +90,7 @@ def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduce
     monkeypatch.setattr(rod_substructuring, "long_and_few", lambda *_: bool(reduces))
     monkeypatch.setattr(cyclic_reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
-    problem.newton.islands.clamped.fill_(1)
+    problem.newton.islands.drop_compression.fill_(1)
     problem.iterate(0.1)
     vectors = np.random.default_rng(1).normal(size=(3, 2, 3 * problem.blocks)) * problem.free()
     results = apply_preconditioner(problem, vectors)
@@ -102,7 +102,7 @@ def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduce
 def test_joints_are_shared_nodes_and_ring_closures(device):
     """Joints are shared nodes, rotations of rigid joints, and the last two nodes of a ring, which couple to its first."""
     problem = Problem(ring_and_spokes(), device, preconditioner="chain")
-    plan, host = problem.newton.chains.plan, problem.net.host
+    plan, host = problem.newton.chains.plan, problem.coupled.host
     ring, one, two, cable = host.rods
     assert {tuple(pair) for pair in plan.pairs} == {
         (ring.nodes[2], host.nodes + host.angles),
@@ -137,7 +137,7 @@ def indefinite(problem: Problem) -> bool:
 def test_preconditioner_is_symmetric_positive_definite(device, preconditioner, scene, stretch):
     """Also where H is indefinite, and where hinged joints couple in columns of the joint Schur complement."""
     problem = Problem(scene(), device, stretch, preconditioner=preconditioner)
-    problem.newton.islands.coefficient.fill_(1e-3)
+    problem.newton.islands.inertia_coefficient.fill_(1e-3)
     problem.iterate(0.5)
     free = np.flatnonzero(problem.free())
     assert indefinite(problem) or stretch > 0.9
@@ -185,14 +185,14 @@ def rod_on_a_fixed_sheet() -> ddg.Scene:
 def test_systems_with_at_most_one_joint_need_no_pcg(device, scene, precision):
     """Substructuring alone solves H d = r, without PCG iterations."""
     problem = Problem(scene(), device, 1.02, precision, "chain")
-    problem.newton.islands.clamped.fill_(1)
+    problem.newton.islands.drop_compression.fill_(1)
     matrices, newton, free = [problem.assemble().matrix(world) for world in range(2)], problem.newton, problem.free()
     newton.direct()
     assert newton.chains.exact and newton.pcg_iterations() == 0
-    right, direction = (v.numpy().astype(float).reshape(2, -1) for v in (newton.right, newton.direction))
+    rhs, direction = (v.numpy().astype(float).reshape(2, -1) for v in (newton.rhs, newton.direction))
     for world in range(2):
         expected = np.zeros(free.size)
-        expected[free] = np.linalg.solve(matrices[world][np.ix_(free, free)], right[world][free])
+        expected[free] = np.linalg.solve(matrices[world][np.ix_(free, free)], rhs[world][free])
         tolerance = (1e-9 if precision == "float64" else 2e-3) * np.abs(expected).max()
         np.testing.assert_allclose(direction[world], expected, rtol=0.0, atol=tolerance)
 
@@ -202,16 +202,16 @@ def test_elimination_detects_indefinite_matrices(device, scene):
     """Compressed to 0.7 of the length, the iterate is repeated without compression, with a definite matrix."""
     problem = Problem(scene(), device, 0.7, preconditioner="chain")
     islands = problem.newton.islands
-    islands.coefficient.fill_(1e-3)
+    islands.inertia_coefficient.fill_(1e-3)
     islands.iteration.fill_(1)
     problem.iterate(0.1)
     assert problem.newton.chains.exact
-    assert islands.clamped.numpy().tolist() == [1, 1]
-    assert islands.iteration.numpy().tolist() == islands.wanted.numpy().tolist() == [0, 0]
-    islands.wanted.fill_(1)
+    assert islands.drop_compression.numpy().tolist() == [1, 1]
+    assert islands.iteration.numpy().tolist() == islands.needs_direction.numpy().tolist() == [0, 0]
+    islands.needs_direction.fill_(1)
     problem.iterate(0.1)
-    assert islands.wanted.numpy().tolist() == [1, 1]
-    assert (problem.newton.right.numpy() * problem.newton.direction.numpy()).sum() > 0.0
+    assert islands.needs_direction.numpy().tolist() == [1, 1]
+    assert (problem.newton.rhs.numpy() * problem.newton.direction.numpy()).sum() > 0.0
 
 
 @pytest.mark.parametrize("rigid", [True, False])
@@ -223,7 +223,7 @@ def test_iterations_are_independent_of_nodes_per_rod(device, rigid, precision):
         for linear in ("block_jacobi", "chain"):
             scene = gridshell_dome.build(3, segments, rigid=rigid)
             problem = Problem(scene, device, 1.0, precision, linear, noise=0.0)
-            problem.newton.islands.coefficient.fill_(3600.0)
+            problem.newton.islands.inertia_coefficient.fill_(3600.0)
             iterations[linear, segments] = pcg_iterations(problem, 1e-3).max()
     assert iterations["chain", 15] <= iterations["chain", 5] + 2 <= 10
     assert iterations["chain", 15] < 0.1 * iterations["block_jacobi", 15]
@@ -284,9 +284,9 @@ def test_substructuring_saves_iterations_on_stiffened_sheet(device, spin, most):
 
 def test_preconditioner_choice_by_nodes_between_joints(device):
     """The choice follows the number of nodes between joints; systems without rods launch no substructuring."""
-    assert net_preconditioner(gridshell_dome.build(3, 12).build(device).net) == "chain"
-    assert net_preconditioner(gridshell_dome.build(3, 2).build(device).net) == "block_jacobi"
-    assert net_preconditioner(sheet("hinge").build(device).net) == "block_jacobi"
+    assert coupled_preconditioner(gridshell_dome.build(3, 12).build(device).coupled) == "chain"
+    assert coupled_preconditioner(gridshell_dome.build(3, 2).build(device).coupled) == "block_jacobi"
+    assert coupled_preconditioner(sheet("hinge").build(device).coupled) == "block_jacobi"
     points, triangles = meshes.rectangle(70, 70, (1.0, 1.0), "alternating")
     for rods, name in ((0, "multilevel"), (1, "chain_multilevel")):
         scene = ddg.Scene()
@@ -294,7 +294,7 @@ def test_preconditioner_choice_by_nodes_between_joints(device):
         for _ in range(rods):
             rod = scene.add_rod(line(points[0], points[0] - [1.0, 0.0, 0.0], 30), section=SECTION)
             scene.attach(rod, [0], shell, [0])
-        assert net_preconditioner(scene.build(device).net) == name
+        assert coupled_preconditioner(scene.build(device).coupled) == name
 
 
 @pytest.mark.parametrize("linear", ["block_jacobi", "chain"])
@@ -343,10 +343,10 @@ def test_assembly_along_rods_matches_incidence_lists(device, scene, psd):
             element_set["energy"].fill_(0.25)  # of the accepted iterate
         problem.assemble()
         free = problem.free()
-        vectors = (newton.right, newton.allowed.least, newton.allowed.ratio, newton.square, newton.change, newton.noise)
+        vectors = (newton.rhs, newton.allowed.least, newton.allowed.ratio, newton.square, newton.change, newton.noise)
         results.append([*(v.numpy().astype(float) for v in vectors)])
         results[-1] += [problem.matrix(world)[np.ix_(free, free)] for world in range(2)]
-        flags = islands.unbalanced.numpy().tolist(), islands.drowned.numpy().tolist()
+        flags = islands.not_converged.numpy().tolist(), islands.below_rounding_floor.numpy().tolist()
         assert flags == ([1, 1], [1, 1])
     assert problem.newton.chains.banded and any(problem.newton.local)
     for by_lists, by_dof_map in zip(*results, strict=True):

@@ -72,10 +72,10 @@ def directions(
         device_arrays.assign(newton.target, x)
         if group.kind.twist:
             wp.copy(newton.frame, state.frame)
-        newton.islands.coefficient.fill_(2.0 if psd == "gauss_newton" else 100.0)
-        newton.islands.rate.fill_(1.0)
+        newton.islands.inertia_coefficient.fill_(2.0 if psd == "gauss_newton" else 100.0)
+        newton.islands.inverse_step.fill_(1.0)
         if carried is not None:
-            newton.islands.carried.fill_(carried)
+            newton.islands.max_edge_stiffness.fill_(carried)
         edges = np.diff(device_arrays.download(newton.x), axis=0)
         for _ in range(2):  # a second one for rods with an indefinite matrix under compression
             newton.iterate(state.last)
@@ -150,11 +150,11 @@ def mixed_wavy_rod(nodes: int, axial: float, device) -> RodNewtonParallel:
     for array in (newton.x, newton.target):
         wp.copy(array, state.x)
     wp.copy(newton.frame, state.frame)
-    newton.islands.coefficient.fill_(2.5e5)
-    newton.islands.rate.fill_(500.0)
-    newton.islands.carried.fill_(2e5)
+    newton.islands.inertia_coefficient.fill_(2.5e5)
+    newton.islands.inverse_step.fill_(500.0)
+    newton.islands.max_edge_stiffness.fill_(2e5)
     newton.iterate(state.last)
-    assert (newton.islands.lost.numpy() == 0).all()
+    assert (newton.islands.lost_pivots_total.numpy() == 0).all()
     return newton
 
 
@@ -176,9 +176,11 @@ def dense(newton: RodNewtonParallel) -> tuple[np.ndarray, np.ndarray]:
         rows[k, k + 1, : kind.dim] = factor[first : first + kind.dim, k]
     rows *= fixed == 0
     H, rows = H.reshape(n * nb, n * nb), rows.reshape(n - 1, n * nb)
-    right = np.concatenate([device_arrays.download(newton.right)[..., 0].astype(float).T.ravel(), np.zeros(n - 1)])
-    solution = np.linalg.solve(np.block([[H, rows.T], [rows, -np.diag(slack)]]), right)
-    return solution[: n * nb].reshape(n, nb), slack * solution[n * nb :] / np.sqrt(newton.islands.carried.numpy()[0])
+    rhs = np.concatenate([device_arrays.download(newton.rhs)[..., 0].astype(float).T.ravel(), np.zeros(n - 1)])
+    solution = np.linalg.solve(np.block([[H, rows.T], [rows, -np.diag(slack)]]), rhs)
+    return solution[: n * nb].reshape(n, nb), slack * solution[n * nb :] / np.sqrt(
+        newton.islands.max_edge_stiffness.numpy()[0]
+    )
 
 
 @pytest.mark.parametrize("axial", [1e4, 1e6, 1e8, 1e10, 1e12])  # EA L^2 / EI

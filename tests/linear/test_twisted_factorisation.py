@@ -8,7 +8,7 @@ import warp as wp
 from rod_system import system
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.linear.rod_dof_map import place_dofs
+from ddg_warp.kernels.linear.rod_dof_map import path_node_dofs
 from ddg_warp.solve.linear.twisted_factorisation import TwistedFactorisation
 
 COUNTS = (1, 2, 3, 4, 5, 6, 17, 32, 33)
@@ -52,7 +52,7 @@ def constrain_fixed_dofs(
 @pytest.mark.parametrize("in_place", [False, True])
 def test_solutions_match_dense_solves(device, twist, span, in_place):
     """Solve nine rods of two worlds; an inactive world and an inactive rod keep their values."""
-    rng, nb, worlds, inactive = np.random.default_rng(5), place_dofs(twist), 2, 4
+    rng, nb, worlds, inactive = np.random.default_rng(5), path_node_dofs(twist), 2, 4
     places, fixed = dof_map(twist)
     bands, matrices = system(nb, COUNTS, rng, span)
     free = constrain_fixed_dofs(bands, matrices, places, fixed, nb)
@@ -85,11 +85,11 @@ def test_solutions_match_dense_solves(device, twist, span, in_place):
         if c == inactive:
             assert (z[nodes] == 7.0).all()
             continue
-        right = np.zeros((n, nb))
-        right[:, :3] = residual[nodes]
+        rhs = np.zeros((n, nb))
+        rhs[:, :3] = residual[nodes]
         if twist:
-            right[:-1, 3] = residual[FROM[-1] + nodes[:-1], 0]
-        expected = np.linalg.solve(H, (right * free[c]).ravel()).reshape(n, nb)
+            rhs[:-1, 3] = residual[FROM[-1] + nodes[:-1], 0]
+        expected = np.linalg.solve(H, (rhs * free[c]).ravel()).reshape(n, nb)
         np.testing.assert_allclose(z[nodes], expected[:, :3], rtol=0, atol=1e-11 * abs(expected).max())
         np.testing.assert_allclose(dots[0, nodes], (residual[nodes] * z[nodes]).sum(1), rtol=1e-12, atol=1e-14)
         if twist:

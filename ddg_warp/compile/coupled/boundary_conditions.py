@@ -11,73 +11,73 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry.fundamental_forms import FREE as FREE_EDGE
 
 
-def add_masses(scene, net: CoupledSystem) -> None:
+def add_masses(scene, coupled: CoupledSystem) -> None:
     """Lump masses and rotary inertia at the dofs."""
-    lumps = [(rod.all_nodes, rod.piece.mass[rod.row]) for rod in net.rods]
-    for shell in net.shells:
+    lumps = [(rod.all_nodes, rod.piece.mass[rod.row]) for rod in coupled.rods]
+    for shell in coupled.shells:
         lumps.append((shell.nodes[shell.surface.triangles].ravel(), np.repeat(shell.corner_mass, 3)))
-    for shell in net.meridians:
+    for shell in coupled.meridians:
         axisymmetric.check_gravity(scene.gravity)
         lumps.append((shell.nodes, shell.mass))
     blocks, lumped = (np.concatenate(values) for values in zip(*lumps, strict=True))
-    net.mass += np.bincount(blocks, lumped, net.blocks)[:, None]
-    for rod in net.rods:
+    coupled.mass += np.bincount(blocks, lumped, coupled.blocks)[:, None]
+    for rod in coupled.rods:
         if rod.all_edges.size:
-            net.mass[rod.all_edges, 0] += rod.piece.rotary[rod.row]
-    boundary_conditions.add_masses(scene, net)
+            coupled.mass[rod.all_edges, 0] += rod.piece.rotary[rod.row]
+    boundary_conditions.add_masses(scene, coupled)
 
 
-def hold(scene, net: CoupledSystem) -> None:
+def hold(scene, coupled: CoupledSystem) -> None:
     """Fix dofs; record the dofs and the motion of each support."""
-    claims = ConstraintRegistry(scene, net)
-    boundary_conditions.hold_rods(scene, net, claims)
+    claims = ConstraintRegistry(scene, coupled)
+    boundary_conditions.fix_rods(scene, coupled, claims)
     normals: dict[int, list] = {}
     for support in scene.shell_supports:
-        nodes = net.shells[support.shell].nodes[support.vertices]
+        nodes = coupled.shells[support.shell].nodes[support.vertices]
         each = np.arange(len(nodes))
         claims.take(support, nodes, each, each)
         for node in nodes if not support.components else ():
             normals.setdefault(int(node), []).append(support.normal)
     for support in scene.ring_supports:
-        nodes = net.meridians[support.shell].nodes[support.nodes]
+        nodes = coupled.meridians[support.shell].nodes[support.nodes]
         each = np.arange(len(nodes))
         claims.take(support, nodes, each, each)
-    for obstacle, nodes, markers in zip(scene.obstacles, net.obstacles, net.markers, strict=True):
+    for obstacle, nodes, markers in zip(scene.obstacles, coupled.obstacles, coupled.markers, strict=True):
         each = np.append(np.arange(len(nodes)), 0 * markers)  # carried nodes move with the first point
         nodes = np.append(nodes, markers)
         claims.take(obstacle, nodes, each, each)
     claims.finish()
-    frames_of_planes(net, normals)
+    frames_of_planes(coupled, normals)
 
 
-def load(scene, net: CoupledSystem) -> None:
+def load(scene, coupled: CoupledSystem) -> None:
     """Add the loads of rods, shells and rings."""
-    boundary_conditions.load_rods(scene, net)
+    boundary_conditions.load_rods(scene, coupled)
     for description in scene.shell_loads:
-        net.add_load(
-            net.shells[description.shell].nodes[description.vertices], description.force, description.amplitude
+        coupled.add_load(
+            coupled.shells[description.shell].nodes[description.vertices], description.force, description.amplitude
         )
     for description in scene.pressures:
-        shell = net.shells[description.shell]
+        shell = coupled.shells[description.shell]
         triangles = shell.nodes[shell.surface.triangles[description.triangles]]
-        _press(net, Pressure(triangles, description.pressure, description.amplitude), description.dead)
+        _press(coupled, Pressure(triangles, description.pressure, description.amplitude), description.dead)
     for description in scene.edge_couples:
-        net.followers.append(_edge_couple(net.shells[description.shell], description))
+        coupled.followers.append(_edge_couple(coupled.shells[description.shell], description))
     for description in scene.ring_loads:
         force = np.column_stack([description.force[:, 0], 0.0 * description.force[:, 0], description.force[:, 1]])
-        net.add_load(net.meridians[description.shell].nodes[description.nodes], force, description.amplitude)
+        coupled.add_load(coupled.meridians[description.shell].nodes[description.nodes], force, description.amplitude)
     for description in scene.ring_pressures:
-        ends = net.meridians[description.shell].ends[description.edges]
-        _press(net, axisymmetric.BandPressure(ends, description.pressure, description.amplitude), description.dead)
+        ends = coupled.meridians[description.shell].ends[description.edges]
+        _press(coupled, axisymmetric.BandPressure(ends, description.pressure, description.amplitude), description.dead)
 
 
-def _press(net: CoupledSystem, pressure, dead: bool) -> None:
+def _press(coupled: CoupledSystem, pressure, dead: bool) -> None:
     """Add a pressure as a follower load, or as a dead load with the forces at rest."""
     if dead:
-        forces = pressure.forces(net.rest[pressure.places])
-        net.add_load(pressure.places.ravel(), forces.reshape(-1, 3), pressure.amplitude)
+        forces = pressure.forces(coupled.rest[pressure.places])
+        coupled.add_load(pressure.places.ravel(), forces.reshape(-1, 3), pressure.amplitude)
     else:
-        net.followers.append(pressure)
+        coupled.followers.append(pressure)
 
 
 def _edge_couple(shell, description) -> EdgeCouple:

@@ -10,10 +10,10 @@ import numpy as np
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.coupled import boundary_conditions, element_sets
-from ddg_warp.compile.coupled.contact_parameters import touching
+from ddg_warp.compile.coupled.contact_parameters import contact_parameters
 from ddg_warp.compile.coupled.system import CoupledRod, CoupledShell, CoupledSystem
 from ddg_warp.compile.ghost_nodes import GhostNodes
-from ddg_warp.compile.rods import RodArrays, alike, net_rods, piece_of
+from ddg_warp.compile.rods import RodArrays, alike, coupled_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import Surface
@@ -21,7 +21,7 @@ from ddg_warp.scene import drag
 from ddg_warp.scene.shells_and_joints import COINCIDE
 
 
-def compile_net(scene, along: bool = False) -> CoupledSystem | None:
+def compile_coupled(scene, along: bool = False) -> CoupledSystem | None:
     """Return the coupled system of a scene, None without one.
 
     Args:
@@ -31,7 +31,7 @@ def compile_net(scene, along: bool = False) -> CoupledSystem | None:
     Raises:
         SceneError: a joint, support or load is impossible; the message names the object.
     """
-    chosen = net_rods(scene)
+    chosen = coupled_rods(scene)
     if not chosen.any() and not scene.shells and not scene.axisymmetric_shells:
         return None
     if scene.shells and scene.dimension == 2:
@@ -167,7 +167,7 @@ class _Builder:
         spins = sum(joint.rigid for joint in scene.joints)
         rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
         blocks = nodes + angles + spins
-        net = CoupledSystem(
+        coupled = CoupledSystem(
             rest=np.concatenate([rest_nodes, np.zeros((blocks - nodes, 3))]),
             nodes=nodes,
             angles=angles,
@@ -187,17 +187,17 @@ class _Builder:
             obstacles=[merged[numbers] for numbers in self.obstacles],
             markers=[merged[numbers] for numbers in self.markers],
         )
-        net.fixed[nodes : nodes + angles, 1:] = True
-        net.sets = element_sets.element_sets(scene, net, self.along)
-        boundary_conditions.add_masses(scene, net)
-        boundary_conditions.hold(scene, net)
-        boundary_conditions.load(scene, net)
-        net.touching = touching(scene, net)
+        coupled.fixed[nodes : nodes + angles, 1:] = True
+        coupled.sets = element_sets.element_sets(scene, coupled, self.along)
+        boundary_conditions.add_masses(scene, coupled)
+        boundary_conditions.hold(scene, coupled)
+        boundary_conditions.load(scene, coupled)
+        coupled.touching = contact_parameters(scene, coupled)
         if scene.dimension == 2:
-            net.fixed[:nodes, 1] = True
-            net.fixed[nodes : nodes + angles] = True
-            net.fixed[nodes + angles :, [0, 2]] = True
-        return net
+            coupled.fixed[:nodes, 1] = True
+            coupled.fixed[nodes : nodes + angles] = True
+            coupled.fixed[nodes + angles :, [0, 2]] = True
+        return coupled
 
     def _merge(self, points: np.ndarray) -> np.ndarray:
         """Return the new number of every node, equal for joined nodes."""

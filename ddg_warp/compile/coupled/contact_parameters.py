@@ -6,7 +6,7 @@ from ddg_warp.compile.collision_bodies import ROD, Body, ContactParameters
 from ddg_warp.compile.coupled.system import CoupledSystem
 from ddg_warp.compile.laws import contact_law
 from ddg_warp.errors import SceneError
-from ddg_warp.scene.contact import Contact, touching_names
+from ddg_warp.scene.contact import Contact, contact_names
 from ddg_warp.scene.obstacles import MESH
 
 HALF = 0.5  # default activation distance over the smallest radius
@@ -19,13 +19,13 @@ RESOLVED = 1e-13  # least activation distance over coordinates
 INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap, over nodal mass / dt^2
 
 
-def touching(scene, net: CoupledSystem) -> ContactParameters | None:
+def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | None:
     """Return the contact of the coupled system, None without."""
     law = scene.touching
     if law is None:
         return None
-    names, bodies, forces = touching_names(scene), [], []
-    for rod in net.rods:
+    names, bodies, forces = contact_names(scene), [], []
+    for rod in coupled.rods:
         batch = rod.piece.batch
         if batch.name in names:
             row = rod.rod - batch.first
@@ -43,8 +43,8 @@ def touching(scene, net: CoupledSystem) -> ContactParameters | None:
             )
             bending = max(float(np.max(_of_rod(batch, name, row))) for name in ("EI1", "EI2"))
             elastic = max(BENDING * bending / radius**2, LIMP * float(np.max(_of_rod(batch, "EA", row))))
-            forces.append((net.mass[rod.nodes, 0].max(), elastic))
-    for index, shell in enumerate(net.shells):
+            forces.append((coupled.mass[rod.nodes, 0].max(), elastic))
+    for index, shell in enumerate(coupled.shells):
         if (name := shell.surface.name) in names:
             plate = shell.plate
             half = law.radius.get(name, 0.5 * float(plate.thickness.max()))
@@ -52,18 +52,20 @@ def touching(scene, net: CoupledSystem) -> ContactParameters | None:
             bodies.append(Body(shell.nodes, MESH, half, name, f"shell {index}", cells, shell=index))
             membrane = float((plate.membrane_stiffness * np.sqrt(2.0 * plate.area)).max())
             elastic = max(BENDING * float(plate.bending_stiffness.max()) / half, STRAIN * membrane)
-            forces.append((net.mass[shell.nodes, 0].max(), elastic))
+            forces.append((coupled.mass[shell.nodes, 0].max(), elastic))
     gravity, obstacles = float(np.linalg.norm(scene.gravity)), len(scene.obstacles)
     scale = [max(WEIGHTS * mass * gravity, elastic) for mass, elastic in forces]
     scale_mass = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
     scale_mass = np.column_stack([scale_mass, np.full((2, obstacles), np.nan)])
-    for index, (obstacle, nodes, markers) in enumerate(zip(scene.obstacles, net.obstacles, net.markers, strict=True)):
+    for index, (obstacle, nodes, markers) in enumerate(
+        zip(scene.obstacles, coupled.obstacles, coupled.markers, strict=True)
+    ):
         shape, name = obstacle.shape, obstacle.name
         geometry = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
         bodies.append(Body(*geometry, still=True, markers=markers))
     result = _numbers(scene, law, bodies, *scale_mass)
-    if law.rolling and not (result.rubs and any(body.angles.size for body in bodies)):
-        lacking = "no rod touches anything" if result.rubs else "there is no friction"
+    if law.rolling and not (result.has_friction and any(body.angles.size for body in bodies)):
+        lacking = "no rod touches anything" if result.has_friction else "there is no friction"
         raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
     return result
 
@@ -115,7 +117,7 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
     inertia = np.where(np.isnan(stiffness), inertia, 0.0)
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
     density, keep = contact_law(law, stiffness, within, explicit)
-    multipliers = _by_way(rough)
+    multipliers = _by_direction(rough)
     return ContactParameters(
         law, density, keep, bodies, names.tolist(), group, *multipliers, stiffness, within, inertia, ignored
     )
@@ -149,7 +151,7 @@ def _of_both(values: np.ndarray, group: np.ndarray, moving: np.ndarray) -> np.nd
     return np.nan_to_num(np.sqrt(largest * largest.T))
 
 
-def _by_way(friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _by_direction(friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the smallest nonzero coefficient of forwards, backwards and across (..., 3), and multiples of it.
 
     So sticking contacts creep by less than the velocity of the law in every direction.

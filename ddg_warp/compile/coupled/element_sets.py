@@ -9,7 +9,7 @@ import numpy as np
 from ddg_warp.compile import axisymmetric, shells
 from ddg_warp.compile.coupled.magnets import magnet_sets
 from ddg_warp.compile.coupled.rod_shell_coupling import glue_sets
-from ddg_warp.compile.coupled.system import CoupledRod, CoupledSystem, NetSet
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledSet, CoupledSystem
 from ddg_warp.compile.element_set import ElementSet
 from ddg_warp.compile.laws import bind_law, check_laws
 from ddg_warp.compile.rods import RodArrays
@@ -18,17 +18,17 @@ from ddg_warp.geometry import fundamental_forms, polyline
 from ddg_warp.kernels.terms import JOINTS, term_key
 
 
-def element_sets(scene, net: CoupledSystem, along: bool) -> list[NetSet]:
-    """Return element sets by term, numbered `along` rods or not (`compile_net`); fix dofs without elements."""
-    joints = _joint_places(scene, net)
-    rods = [*_rod_sets(net, joints, along), *_joint_sets(net, joints), *glue_sets(scene, net)]
-    magnets = magnet_sets(scene, net) if scene.magnets else []
-    return _gather_sets([*rods, *magnets, *_shell_sets(net, scene), *_meridian_sets(net, scene)])
+def element_sets(scene, coupled: CoupledSystem, along: bool) -> list[CoupledSet]:
+    """Return element sets by term, numbered `along` rods or not (`compile_coupled`); fix dofs without elements."""
+    joints = _joint_indices(scene, coupled)
+    rods = [*_rod_sets(coupled, joints, along), *_joint_sets(coupled, joints), *glue_sets(scene, coupled)]
+    magnets = magnet_sets(scene, coupled) if scene.magnets else []
+    return _gather_sets([*rods, *magnets, *_shell_sets(coupled, scene), *_meridian_sets(coupled, scene)])
 
 
-def _joint_places(scene, net: CoupledSystem) -> list[tuple[int, int, list, Mapping]]:
+def _joint_indices(scene, coupled: CoupledSystem) -> list[tuple[int, int, list, Mapping]]:
     """Return (node, rotation block, edges, laws) of each rigid joint, edges as (rod, edge with ghosts, sign)."""
-    by_rod = {rod.rod: rod for rod in net.rods}
+    by_rod = {rod.rod: rod for rod in coupled.rods}
     result = []
     for number, joint in enumerate(joint for joint in scene.joints if joint.rigid):
         check_laws(f"rigid joint {number}", joint.laws, ("rigid_joint",))
@@ -49,15 +49,15 @@ def _joint_places(scene, net: CoupledSystem) -> list[tuple[int, int, list, Mappi
                 members.append((rod, k, 1.0))
             if closed or k > 0:
                 members.append((rod, (k - 1) % count, -1.0))
-        result.append((node, net.nodes + net.angles + number, members, joint.laws))
+        result.append((node, coupled.nodes + coupled.angles + number, members, joint.laws))
     return result
 
 
-def _rod_sets(net: CoupledSystem, joints, along: bool) -> list[NetSet]:
+def _rod_sets(coupled: CoupledSystem, joints, along: bool) -> list[CoupledSet]:
     """Return stretch and bending of rods in the order of nodes, except vertices at rigid joints."""
-    skipped = np.array([rod.rod * net.nodes + node for node, _, members, _ in joints for rod, _, _ in members], int)
+    skipped = np.array([rod.rod * coupled.nodes + node for node, _, members, _ in joints for rod, _, _ in members], int)
     alike: dict[int, list[CoupledRod]] = {}
-    for rod in net.rods:
+    for rod in coupled.rods:
         alike.setdefault(id(rod.piece), []).append(rod)
     sets = []
     for rods in alike.values():  # all rods of a piece
@@ -69,7 +69,7 @@ def _rod_sets(net: CoupledSystem, joints, along: bool) -> list[NetSet]:
             count = n if kind.closed else n - span
             k, row = np.indices((count, len(rods))).reshape(2, -1, order="F" if along else "C")
             if span == 2:
-                joined = np.isin(piece.rods[row] * net.nodes + nodes[row, (k + 1) % n], skipped)
+                joined = np.isin(piece.rods[row] * coupled.nodes + nodes[row, (k + 1) % n], skipped)
                 row, k = row[~joined], k[~joined]
             values = {}
             for name in term.parameter_names:
@@ -81,7 +81,7 @@ def _rod_sets(net: CoupledSystem, joints, along: bool) -> list[NetSet]:
                 blocks += [edges[row, k], edges[row, (k + 1) % n]]
                 lag = piece.reference_twist[row, k][None]
             sets.append(
-                NetSet(
+                CoupledSet(
                     term,
                     np.array(blocks),
                     lag,
@@ -94,7 +94,7 @@ def _rod_sets(net: CoupledSystem, joints, along: bool) -> list[NetSet]:
     return _gather_sets(sets)
 
 
-def _joint_sets(net: CoupledSystem, joints) -> list[NetSet]:
+def _joint_sets(coupled: CoupledSystem, joints) -> list[CoupledSet]:
     """Return bending and twist of the half cells between rigid joints and adjacent edges.
 
     A joint clamps each rod by the rod's frame at the node: between adjacent edges, or extrapolated at an end.
@@ -106,10 +106,10 @@ def _joint_sets(net: CoupledSystem, joints) -> list[NetSet]:
             key = member[0].piece.batch.by_angle, None if law is None else id(law)
             by_kind.setdefault(key, (law, []))[1].append((node, spin, *member))
     kinds = sorted(by_kind.items(), key=lambda item: item[0][0])
-    return [_half_cells(net, edges, by_angle, law) for (by_angle, _), (law, edges) in kinds]
+    return [_half_cells(coupled, edges, by_angle, law) for (by_angle, _), (law, edges) in kinds]
 
 
-def _half_cells(net: CoupledSystem, members: list, by_angle: bool, law) -> NetSet:
+def _half_cells(coupled: CoupledSystem, members: list, by_angle: bool, law) -> CoupledSet:
     """Return the half cells of rods with one curvature measure and one law, None for the quadratic one."""
     term = JOINTS[term_key("rigid_joint", by_angle)].of({} if law is None else {"rigid_joint": law})
     node, spin, rods, k, sign = zip(*members, strict=True)
@@ -123,9 +123,9 @@ def _half_cells(net: CoupledSystem, members: list, by_angle: bool, law) -> NetSe
     angles, neighbour_angles = (
         np.array([rod.all_edges[e] for rod, e in zip(rods, e_k, strict=True)]) for e_k in (k, neighbour)
     )
-    edge, neighbour_edge = angles - net.nodes, neighbour_angles - net.nodes
-    frames, tangents = net.frame[:3].T, net.frame[3:].T
-    lengths = polyline.length(np.diff(net.rest[net.ends], axis=1)[:, 0])
+    edge, neighbour_edge = angles - coupled.nodes, neighbour_angles - coupled.nodes
+    frames, tangents = coupled.frame[:3].T, coupled.frame[3:].T
+    lengths = polyline.length(np.diff(coupled.rest[coupled.ends], axis=1)[:, 0])
     ends = [(frames[e], tangents[e], lengths[e]) for e in (neighbour_edge, edge)]
     tangent, director = polyline.frames_at_nodes(*ends, np.where(inside, -1.0, 1.0))
     half, along = 0.5 * lengths[edge], sign[:, None]
@@ -142,10 +142,10 @@ def _half_cells(net: CoupledSystem, members: list, by_angle: bool, law) -> NetSe
         raise SceneError(
             f"{where}: the law {term.density.name!r} has no strains at rest; join rods that are straight there"
         )
-    defaults = {"measure": half, "stiffness": [*net.stiffness[:, edge]], "rest": [*rest]}
+    defaults = {"measure": half, "stiffness": [*coupled.stiffness[:, edge]], "rest": [*rest]}
     parameters = bind_law(where, term, law, defaults, partial(_spread, count), f"{count} half cells")
-    blocks = np.array([node, net.ends[edge, np.where(sign > 0, 1, 0)], angles, spin])
-    return NetSet(term, blocks, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
+    blocks = np.array([node, coupled.ends[edge, np.where(sign > 0, 1, 0)], angles, spin])
+    return CoupledSet(term, blocks, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
 
 
 def _spread(count: int, family: str, value) -> np.ndarray:
@@ -166,9 +166,9 @@ def _natural_at(piece: RodArrays, row: int, node: int) -> np.ndarray:
     raise AssertionError("a rod of a rigid joint has a bending term")
 
 
-def _shell_sets(net: CoupledSystem, scene) -> list[NetSet]:
+def _shell_sets(coupled: CoupledSystem, scene) -> list[CoupledSet]:
     sets, count = [], Counter()
-    for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
+    for index, (shell, description) in enumerate(zip(coupled.shells, scene.shells, strict=True)):
         models = description.bending, description.membrane
         try:
             shell_sets = shells.shell_elements(shell.surface, shell.plate, shell.kinds, *models)
@@ -181,16 +181,16 @@ def _shell_sets(net: CoupledSystem, scene) -> list[NetSet]:
             shell.first[elements.term.name] = count[elements.term.law]
             count[elements.term.law] += len(elements)
         if description.bending in fundamental_forms.TURNING:
-            net.fixed[shell.edges[~shells.turning(shell.kinds, description.bending)], 0] = True
+            coupled.fixed[shell.edges[~shells.turning(shell.kinds, description.bending)], 0] = True
     return sets
 
 
-def _meridian_sets(net: CoupledSystem, scene) -> list[NetSet]:
+def _meridian_sets(coupled: CoupledSystem, scene) -> list[CoupledSet]:
     none = np.zeros(0, int)
     sets = []
-    for index, shell in enumerate(net.meridians):
-        net.fixed[shell.nodes, 1] = True
-        net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
+    for index, shell in enumerate(coupled.meridians):
+        coupled.fixed[shell.nodes, 1] = True
+        coupled.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
         for elements in axisymmetric.element_sets(shell):
             sets.append(_bound(elements, shell.nodes, none, index))
             element, row, end = elements.normals.T
@@ -198,15 +198,15 @@ def _meridian_sets(net: CoupledSystem, scene) -> list[NetSet]:
     return sets
 
 
-def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
+def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> CoupledSet:
     count = len(elements.nodes)
     blocks = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
     parameters = {name: np.broadcast_to(p, (count,)) for name, p in elements.parameters.items()}
     owner = np.array([np.full(count, index), np.arange(count)])
-    return NetSet(elements.term, blocks, np.zeros((0, count)), elements.data.T, parameters, owner)
+    return CoupledSet(elements.term, blocks, np.zeros((0, count)), elements.data.T, parameters, owner)
 
 
-def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
+def _gather_sets(sets: list[CoupledSet]) -> list[CoupledSet]:
     """Merge sets of one term; the merged set is damped if a member is."""
     result = []
     for law in dict.fromkeys(s.term.law for s in sets if len(s)):
@@ -225,5 +225,5 @@ def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
         }
         first = np.cumsum([0] + [len(s) for s in same])
         normals = [s.normals + [[offset], [0], [0]] for s, offset in zip(same, first, strict=False)]
-        result.append(NetSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1), same[0].along))
+        result.append(CoupledSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1), same[0].along))
     return result

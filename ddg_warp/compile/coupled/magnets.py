@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp.compile.coupled.system import CoupledRod, CoupledSystem, NetSet
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledSet, CoupledSystem
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import MAGNETS
 from ddg_warp.scene.descriptions import Dynamics
@@ -42,10 +42,10 @@ class _Magnets:
         return np.array([np.full(len(self.k), self.rod.rod), self.k + self.rod.first])
 
 
-def magnet_sets(scene, net: CoupledSystem) -> list[NetSet]:
+def magnet_sets(scene, coupled: CoupledSystem) -> list[CoupledSet]:
     """Return the elements of magnetised edges in the applied field, and of dipole pairs."""
-    magnets = [edges for rod in net.rods if len((edges := _magnets(scene, net, rod)).k)]
-    sets = _pairs(scene, net, magnets) if scene.dipoles else []
+    magnets = [edges for rod in coupled.rods if len((edges := _magnets(scene, coupled, rod)).k)]
+    sets = _pairs(scene, coupled, magnets) if scene.dipoles else []
     if scene.applied_field is None:
         return sets
     # an initial state is at the start of the run, where loads of statics are zero
@@ -55,11 +55,11 @@ def magnet_sets(scene, net: CoupledSystem) -> list[NetSet]:
         blocks = magnet.ends if magnet.along else np.concatenate([magnet.ends, magnet.angles[None]])
         data = np.concatenate([magnet.direction, np.repeat(field[:, None], len(magnet.k), axis=1)])
         values = term.bind(measure=magnet.volume, magnetisation=magnet.size)
-        sets.append(NetSet(term, blocks, np.zeros((0, len(magnet.k))), data, values, magnet.owner))
+        sets.append(CoupledSet(term, blocks, np.zeros((0, len(magnet.k))), data, values, magnet.owner))
     return sets
 
 
-def _magnets(scene, net: CoupledSystem, rod: CoupledRod) -> _Magnets:
+def _magnets(scene, coupled: CoupledSystem, rod: CoupledRod) -> _Magnets:
     batch = rod.piece.batch
     total = np.zeros((batch.edges, 3))
     for magnet in scene.magnets:
@@ -69,11 +69,11 @@ def _magnets(scene, net: CoupledSystem, rod: CoupledRod) -> _Magnets:
     k = np.flatnonzero(size)
     ends = np.stack([rod.nodes[k], np.roll(rod.nodes, -1)[k]])
     area = np.broadcast_to(np.asarray(batch.section.area, float), (batch.rods, batch.edges))[rod.rod - batch.first, k]
-    length = np.linalg.norm(net.rest[ends[1]] - net.rest[ends[0]], axis=1)
+    length = np.linalg.norm(coupled.rest[ends[1]] - coupled.rest[ends[0]], axis=1)
     return _Magnets(rod, k, ends, area * length, (total[k] / size[k, None]).T, size[k])
 
 
-def _pairs(scene, net: CoupledSystem, magnets: list[_Magnets]) -> list[NetSet]:
+def _pairs(scene, coupled: CoupledSystem, magnets: list[_Magnets]) -> list[CoupledSet]:
     """Return the elements of all listed pairs of magnetised edges."""
     from scipy.spatial import cKDTree
 
@@ -85,7 +85,7 @@ def _pairs(scene, net: CoupledSystem, magnets: list[_Magnets]) -> list[NetSet]:
     along = np.repeat([m.along for m in magnets], counts)
     framed = np.repeat([m.rod.edges.size > 0 for m in magnets], counts)
     angle = np.concatenate([m.angles if m.rod.edges.size else np.zeros(len(m.k), int) for m in magnets])
-    middle, pairs = net.rest[ends].mean(0), []
+    middle, pairs = coupled.rest[ends].mean(0), []
     for listed in scene.dipoles:
         chosen = np.arange(len(angle)) if listed.rods is None else np.flatnonzero(np.isin(owner[0], listed.rods))
         cutoff = min(listed.cutoff, 2.0 * np.ptp(middle, axis=0).max())
@@ -112,5 +112,5 @@ def _pairs(scene, net: CoupledSystem, magnets: list[_Magnets]) -> list[NetSet]:
         )
         values = term.bind(measure=volume[i] * volume[j], magnetisation=[size[i], size[j]])
         data = np.concatenate([direction[:, i], direction[:, j]])
-        sets.append(NetSet(term, blocks, np.zeros((0, len(i))), data, values, owner[:, i]))
+        sets.append(CoupledSet(term, blocks, np.zeros((0, len(i))), data, values, owner[:, i]))
     return sets

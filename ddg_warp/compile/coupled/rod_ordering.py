@@ -84,7 +84,7 @@ class RodOrder:
         return Pieces(np.append(starts, len(self.nodes)), piece_of_node, rod, first)
 
 
-def outwards(rods: list[np.ndarray], fixed: np.ndarray) -> RodOrder:
+def rod_order(rods: list[np.ndarray], fixed: np.ndarray) -> RodOrder:
     """Return the order of rods, given as lists of dof blocks; `fixed` (N,) bool.
 
     Each rod meets an anchor if one is reachable. The first rod of a connected component without anchors comes first.

@@ -13,7 +13,7 @@ m. The series keeps the coupling no stiffer than needed if one side is much soft
 import numpy as np
 
 from ddg_warp.compile import shells
-from ddg_warp.compile.coupled.system import CoupledRod, CoupledShell, CoupledSystem, NetSet
+from ddg_warp.compile.coupled.system import CoupledRod, CoupledSet, CoupledShell, CoupledSystem
 from ddg_warp.geometry import polyline
 from ddg_warp.geometry.fundamental_forms import SYMMETRY
 from ddg_warp.kernels.terms import GLUE as TERM
@@ -22,17 +22,19 @@ GLUE = 10.0
 """Coupling stiffness over the stiffness of a rod edge and its adjacent triangles in series."""
 
 
-def glue_sets(scene, net: CoupledSystem) -> list[NetSet]:
+def glue_sets(scene, coupled: CoupledSystem) -> list[CoupledSet]:
     """Return the rod-shell coupling elements; fix twist angles of edges on a symmetry plane."""
-    rods, sets = {rod.rod: rod for rod in net.rods}, []
+    rods, sets = {rod.rod: rod for rod in coupled.rods}, []
     for (index, shell_index), vertices in _attached(scene, rods).items():
-        rod, shell = rods[index], net.shells[shell_index]
+        rod, shell = rods[index], coupled.shells[shell_index]
         edges, mesh_edges = _shared_edges(rod, shell, vertices)
         mirrored = shell.kinds.kind[mesh_edges] == SYMMETRY
-        net.fixed[rod.edges[edges[mirrored]], 0] = True
+        coupled.fixed[rod.edges[edges[mirrored]], 0] = True
         if not mirrored.all():
             sets.append(
-                _elements(net, rod, edges[~mirrored], shell, mesh_edges[~mirrored], scene.shells[shell_index].bending)
+                _elements(
+                    coupled, rod, edges[~mirrored], shell, mesh_edges[~mirrored], scene.shells[shell_index].bending
+                )
             )
     return sets
 
@@ -56,15 +58,17 @@ def _shared_edges(rod: CoupledRod, shell: CoupledShell, vertices: np.ndarray) ->
     return edges, mesh_edges[edges]
 
 
-def _elements(net: CoupledSystem, rod: CoupledRod, edges, shell: CoupledShell, mesh_edges, bending: str) -> NetSet:
+def _elements(
+    coupled: CoupledSystem, rod: CoupledRod, edges, shell: CoupledShell, mesh_edges, bending: str
+) -> CoupledSet:
     surface, piece = shell.surface, rod.piece
     ends = np.stack([rod.nodes[edges], np.roll(rod.nodes, -1)[edges]])
     corners = surface.edge_opposite[mesh_edges].T
     lone = corners.min(0) < 0
     opposite = shell.nodes[np.where(lone, corners.max(0), corners)]
-    vertices = net.rest[ends[0]], net.rest[ends[1]]
+    vertices = coupled.rest[ends[0]], coupled.rest[ends[1]]
     e = vertices[1] - vertices[0]
-    sides = net.rest[opposite] - vertices[0]
+    sides = coupled.rest[opposite] - vertices[0]
     length = np.linalg.norm(e, axis=1)
     heights = np.linalg.norm(np.cross(e, sides), axis=2) / length
     turns = shells.turning(shell.kinds, bending)[mesh_edges]
@@ -74,13 +78,13 @@ def _elements(net: CoupledSystem, rod: CoupledRod, edges, shell: CoupledShell, m
     frame, tangent = piece.director[rod.row][k], piece.tangent[rod.row][k]
     angle = np.stack([polyline.signed_angle(np.broadcast_to(frame, e.shape), side, tangent) for side in sides])
     rest = -(1.0 - fraction) * angle[0] - fraction * angle[1]
-    section = net.stiffness[:, rod.edges[edges] - net.nodes].max(axis=0)
+    section = coupled.stiffness[:, rod.edges[edges] - coupled.nodes].max(axis=0)
     stiffness = GLUE / (length**2 / section + 1.0 / _bending(shell, mesh_edges, heights))
     angles = rod.edges[edges], np.where(turns, shell.edges[mesh_edges], rod.edges[edges])
     owner = np.array([np.full(len(edges), rod.rod), k])
     data = np.stack([fraction, np.where(turns, along, 0.0)])
     law = TERM.bind(measure=length, stiffness=stiffness, rest=rest)
-    return NetSet(TERM, np.stack([*ends, *opposite, *angles]), angle, data, law, owner)
+    return CoupledSet(TERM, np.stack([*ends, *opposite, *angles]), angle, data, law, owner)
 
 
 def _bending(shell: CoupledShell, mesh_edges, heights) -> np.ndarray:

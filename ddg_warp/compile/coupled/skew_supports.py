@@ -12,26 +12,26 @@ from ddg_warp.errors import SceneError
 ALIGNED = 1e-12  # tolerance of a fixed direction from an axis that it counts as
 
 
-def frames_of_planes(net, normals: dict[int, list]) -> None:
+def frames_of_planes(coupled, normals: dict[int, list]) -> None:
     """Fix nodes along the normals of symmetry planes, in addition to other constraints.
 
     Raises:
         SceneError: a node on such a plane also has a prescribed motion.
     """
-    moves = set(net.moving[:, 0].tolist())
+    moves = set(coupled.moving[:, 0].tolist())
     for block, plane_normals in normals.items():
         if block in moves:
             raise SceneError(
                 "the point at ({:g}, {:g}, {:g}) m is on a symmetry plane across {} and moved by a support; give the support other "
-                "vertices".format(*net.rest[block], tuple(np.round(plane_normals[0], 6).tolist()))
+                "vertices".format(*coupled.rest[block], tuple(np.round(plane_normals[0], 6).tolist()))
             )
-        fixed_directions = np.concatenate([np.eye(3)[net.fixed[block]], plane_normals])
+        fixed_directions = np.concatenate([np.eye(3)[coupled.fixed[block]], plane_normals])
         _, size, directions = np.linalg.svd(fixed_directions)
         rank = int((size > 1e-9).sum())
         along = directions[:rank].T @ directions[:rank]  # projector on the fixed directions
         axes = np.diag(along) > 0.5
         if np.abs(along - np.diag(axes)).max() <= ALIGNED:
-            net.fixed[block] = axes
+            coupled.fixed[block] = axes
         else:
-            net.fixed[block] = np.arange(3) < rank
-            net.frames[block] = directions
+            coupled.fixed[block] = np.arange(3) < rank
+            coupled.frames[block] = directions

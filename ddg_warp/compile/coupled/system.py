@@ -12,7 +12,7 @@ import numpy as np
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.collision_bodies import ContactParameters
-from ddg_warp.compile.coupled.rod_ordering import RodOrder, outwards
+from ddg_warp.compile.coupled.rod_ordering import RodOrder, rod_order
 from ddg_warp.compile.dof_map import DofStorage, RodDofMap, RodIndexMap
 from ddg_warp.compile.loads import accumulate
 from ddg_warp.compile.precision import float32_error, largest_carried, stiffnesses
@@ -58,7 +58,7 @@ class CoupledShell:
 
 
 @dataclass
-class NetSet:
+class CoupledSet:
     """Element set of one term on dof blocks: lagged rows (m, E), data (d, E), parameters as in `ElementSet`.
 
     Attributes:
@@ -107,13 +107,13 @@ class CoupledSystem(DofStorage):
     spins: int
     rods: list[CoupledRod]
     shells: list[CoupledShell]
-    sets: list[NetSet]
+    sets: list[CoupledSet]
     ends: np.ndarray
     frame: np.ndarray
     stiffness: np.ndarray
     mass: np.ndarray
     fixed: np.ndarray
-    meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
+    meridians: list[axisymmetric.CoupledMeridian] = field(default_factory=list)
     obstacles: list[np.ndarray] = field(default_factory=list)
     markers: list[np.ndarray] = field(default_factory=list)
     touching: ContactParameters | None = None
@@ -198,12 +198,12 @@ class CoupledSystem(DofStorage):
         return tuple(np.concatenate(parts, -1) for parts in zip(*pieces, strict=True)) if pieces else None
 
     @cached_property
-    def outwards(self) -> RodOrder:
+    def rod_order(self) -> RodOrder:
         """Order of rods for edge-rotation updates."""
         anchors = self.fixed.all(1)
         for shell in (*self.shells, *self.meridians):
             anchors[shell.nodes] = True
-        return outwards([rod.all_nodes for rod in self.rods], anchors)
+        return rod_order([rod.all_nodes for rod in self.rods], anchors)
 
     @cached_property
     def bodies(self) -> ToleranceBodies:

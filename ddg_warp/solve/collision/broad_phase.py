@@ -224,7 +224,7 @@ class BroadPhase:
 
         Args:
             x: positions of the search.
-            shorten: called if the pairs are too many to store, see `CandidateList.crowded`; True means that motions will be
+            shorten: called if the pairs are too many to store, see `CandidateList.is_overfull`; True means that motions will be
                 shorter, and lists stay.
 
         Raises:
@@ -233,7 +233,7 @@ class BroadPhase:
         grown = False
         while self._checked():
             self.overflow.zero_()
-            spare = shorten is not None and any(pairs.crowded for pairs in self.lists) and shorten()
+            spare = shorten is not None and any(pairs.is_overfull for pairs in self.lists) and shorten()
             for pairs in self.lists:
                 pairs.dismiss() if spare else pairs.fit()
             self.version += not spare

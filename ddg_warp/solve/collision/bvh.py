@@ -107,7 +107,7 @@ class Primitives:
         self.surface.span = wp.array(np.ascontiguousarray(span), dtype=wp.types.vector(4, real), device=device)
         self.surface.nodes_a_world = len(shapes.points)
         starts = bundle_starts(owner, span if size == 2 else None, BUNDLE[device.is_cpu])
-        self.bundles = wp.array(starts, dtype=int, device=device)
+        self.bvh_leaves = wp.array(starts, dtype=int, device=device)
         self.bundle = int(np.diff(starts).max(initial=1))
         self._single = self.bundle == 1
         corners = (self.lower, self.upper) if self._single else None
@@ -131,7 +131,7 @@ class Primitives:
         inputs = [self.surface, self.count, x, move, shift, share, more]
         wp.launch(self._enclose, self.all, inputs, [*corners, lost], device=self.device)
         if not self._single:
-            inputs = [self.bundles, self.count, *corners]
+            inputs = [self.bvh_leaves, self.count, *corners]
             wp.launch(bundle, leaves.all, inputs, [leaves.lower, leaves.upper], device=self.device)
 
 

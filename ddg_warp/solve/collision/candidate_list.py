@@ -7,7 +7,7 @@ from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.collision.broad_phase.aabb import BvhPair
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import gap_kernel
-from ddg_warp.kernels.collision.broad_phase.candidates import MOST, candidate_kernels, meet_kernel
+from ddg_warp.kernels.collision.broad_phase.candidates import MOST, candidate_kernels, overlap_kernel
 from ddg_warp.kernels.collision.ccd.additive_ccd import passing_kernel
 from ddg_warp.kernels.collision.primitives import Kind, sides_struct
 from ddg_warp.kernels.core import prefix_sum
@@ -84,8 +84,12 @@ class CandidateList:
         obstacle = [number in shapes.obstacle for number in range(len(shapes.names))]
         self.sides.obstacle = wp.array(obstacle, dtype=wp.uint8, device=self.device)
         self.trees = BvhPair()
-        self.trees.lower, self.trees.upper, self.trees.bundles = first.lower, first.upper, first.bundles
-        self.trees.second_lower, self.trees.second_upper, self.trees.leaves = second.lower, second.upper, second.bundles
+        self.trees.lower, self.trees.upper, self.trees.bvh_leaves = first.lower, first.upper, first.bvh_leaves
+        self.trees.second_lower, self.trees.second_upper, self.trees.leaves = (
+            second.lower,
+            second.upper,
+            second.bvh_leaves,
+        )
         self.trees.bundle_lower, self.trees.bundle_upper = first.leaves.lower, first.leaves.upper
         self.trees.tree = second.leaves.tree.id
         if first.order is not None:
@@ -95,7 +99,7 @@ class CandidateList:
         self.starts = self._sums.starts
         self._wide = wp.vec2i(first.bundle, second.bundle)
         # successive edges of a rod have a common node
-        self._meet = meet_kernel(kind.alike, first.bundle > 2, grouped)
+        self._meet = overlap_kernel(kind.alike, first.bundle > 2, grouped)
         self.single = self._slots == 1
         self._judge, self._fill = candidate_kernels(kind, real, self.single)
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
@@ -144,7 +148,7 @@ class CandidateList:
             self.reserve(*np.maximum(present, twice).tolist())
 
     @property
-    def crowded(self) -> bool:
+    def is_overfull(self) -> bool:
         """True if an overflowing search had too many pairs or overlapping leaves to store. Reads from the device."""
         most = max(CROWD_LEAST, CROWD * self.first.all)
         return bool((self._needed.numpy() > np.maximum(most, [self.capacity, len(self._met)])).any())

@@ -22,7 +22,7 @@ class CollisionSet:
 
     Attributes:
         `factor`: see `assembly.factor_struct`.
-        `energy`, `gradient`: of each pair (capacity,) [J]; by local node or angle (`SLOTS` or `ITEMS`, capacity) [N, N m].
+        `energy`, `gradient`: of each pair (capacity,) [J]; by local node or angle (`PAIR_NODES` or `ITEMS`, capacity) [N, N m].
         `placed`, `idle`: see `assembly.set_struct`.
         `pairs`, `count`, `starts`, `partners`: as of `CandidateList`.
         `mollified`: near-parallel edges (`NearParallelEdges`) with exact Hessians; None without.
@@ -62,7 +62,7 @@ class CollisionSet:
             (self.rows, capacity), wp.types.vector(assembly.ROW, linear), self.device
         )
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
-        items, angle_capacity = (assembly.ITEMS, capacity) if self.rolls else (assembly.SLOTS, 0)
+        items, angle_capacity = (assembly.ITEMS, capacity) if self.rolls else (assembly.PAIR_NODES, 0)
         self.gradient = device_arrays.allocate((items, capacity), wp.types.vector(3, self.real), self.device)
         self.factor.angles = wp.zeros(angle_capacity, dtype=wp.vec2i, device=self.device)
         self.factor.lever = device_arrays.allocate(

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.query import look_kernel
+from ddg_warp.kernels.collision.contact.query import query_kernel
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.solve.collision.broad_phase import BroadPhase
 from ddg_warp.solve.collision.collision_mesh import CollisionMesh
@@ -27,19 +27,19 @@ class ContactModel:
 
     def __init__(
         self,
-        net,
+        coupled,
         linear,
         x: wp.array,
         silent: np.ndarray | None = None,
         margin: float | None = None,
         exact: bool = False,
     ):
-        self.net, touching = net, net.host.touching
+        self.coupled, touching = coupled, coupled.host.touching
         self.law, self.keep = touching.law, touching.keep
-        self.shapes = shapes_of(net.host)
+        self.shapes = shapes_of(coupled.host)
         margin = margin or MARGIN * max(touching.size, touching.reach)
-        radius = net.touching["radius"]
-        self.search = BroadPhase(self.shapes, x, net.worlds, reach=touching.reach, margin=margin, radius=radius)
+        radius = coupled.touching["radius"]
+        self.search = BroadPhase(self.shapes, x, coupled.worlds, reach=touching.reach, margin=margin, radius=radius)
         self.terms = ContactPotential(
             self.search,
             touching.density,
@@ -53,7 +53,7 @@ class ContactModel:
             velocity=self.law.velocity,
             linear=linear,
             silent=silent,
-            shared=net.touching,
+            shared=coupled.touching,
             exact=exact,
         )
 
@@ -76,7 +76,7 @@ class ContactModel:
         """Compute friction at blocks x for velocities v, after `at`. Not in a capture."""
         start = wp.array(x.numpy() - v.numpy(), dtype=x.dtype, device=x.device)  # slips of one second, with rate one
         self.terms.lag(x)
-        self.terms.evaluate(x, wp.full(self.net.worlds, 1.0, dtype=self.net.real, device=x.device), start)
+        self.terms.evaluate(x, wp.full(self.coupled.worlds, 1.0, dtype=self.coupled.real, device=x.device), start)
 
     def friction(self, x: wp.array, v: wp.array, rate: wp.array | None = None) -> np.ndarray:
         """Return friction on blocks (W N, 3) [N] at x with velocities v, including markers of spinning objects.
@@ -119,10 +119,10 @@ class ContactModel:
 
     def _pairs(self, pairs, terms, rubs, x: wp.array) -> dict[str, np.ndarray]:
         count = int(pairs.count.numpy()[0])
-        gap = wp.zeros(count, dtype=self.net.real, device=x.device)
+        gap = wp.zeros(count, dtype=self.coupled.real, device=x.device)
         point = wp.zeros(count, dtype=x.dtype, device=x.device)
         if count:
-            kernel = look_kernel(pairs.kind, self.net.real)
+            kernel = query_kernel(pairs.kind, self.coupled.real)
             wp.launch(kernel, count, [pairs.pairs, pairs.sides, x], [gap, point], device=x.device)
         i, j = pairs.pairs.numpy()[:count].reshape(-1, 2).T
         force, friction = (_of_first(part, pairs) for part in (terms, rubs))
@@ -152,7 +152,7 @@ class ContactModel:
             tuple(map(int, numbers)) for numbers in zip(candidates["sizes"][k], candidates["things"][k], strict=True)
         ]
         first, second = (self.shapes.describe(*primitive) for primitive in primitives)
-        world = f" in world {candidates['world'][k]}" if self.net.worlds > 1 else ""
+        world = f" in world {candidates['world'][k]}" if self.coupled.worlds > 1 else ""
         nodes = tuple(self.shapes.things(size)[0][index] for size, index in primitives)
         return float(candidates["gap"][k]), f"{first} and {second}{world}", nodes
 

@@ -17,7 +17,7 @@ from ddg_warp.solve.collision.broad_phase import BroadPhase
 from ddg_warp.solve.collision.contact_set import ContactSet
 from ddg_warp.solve.collision.friction_set import FrictionSet
 from ddg_warp.solve.collision.hessian_product import PairProduct
-from ddg_warp.solve.collision.parameter_tables import at_own_rate, law_tables, table
+from ddg_warp.solve.collision.parameter_tables import at_island_rate, law_tables, table
 from ddg_warp.solve.collision.surface_rotation import RotatingSurfaces
 from ddg_warp.solve.collision.world_sums import WorldSums
 
@@ -101,7 +101,7 @@ class ContactPotential:
         }
         self.law, rubs = law_tables(search, inputs, groups, shared or {})
         self.heavy = inertia is not None and bool(np.any(inertia))
-        self.lag_law, self._law_before = self.law, at_own_rate(self.law, self.real) if self.heavy and rubs else None
+        self.lag_law, self._law_before = self.law, at_island_rate(self.law, self.real) if self.heavy and rubs else None
         nodes = len(search.shapes.points) * search.worlds
         self.gap = wp.zeros(search.worlds, dtype=self.real, device=self.device)
         self._no_rate = wp.zeros_like(self.gap)
@@ -278,7 +278,7 @@ class ContactPotential:
         """Write the contributions of pairs to `product` at nodes, for `settle`."""
         self.products.place(v, x, wanted)
 
-    def settle(self, v: wp.array, out: wp.array, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
+    def settle(self, v: wp.array, out: wp.array, inactive_mask: wp.array, busy: wp.array, dots: wp.array) -> None:
         """Gather the `product` written by `place` on active dofs, in worlds that are `busy` (1), and v . out for nodes in pairs.
 
         Requires `meet`.
@@ -286,7 +286,7 @@ class ContactPotential:
         Args:
             `barred`: bits of inactive dofs of each node; dots: (worlds, nodes).
         """
-        self.products.settle(v, out, barred, busy, dots)
+        self.products.settle(v, out, inactive_mask, busy, dots)
 
     def join(self) -> None:
         """Write `between` and `turned` of the last `evaluate`."""

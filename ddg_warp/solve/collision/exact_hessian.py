@@ -5,10 +5,10 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.collision.contact.assembly import SLOTS
+from ddg_warp.kernels.collision.contact.assembly import PAIR_NODES
 from ddg_warp.kernels.collision.contact.pair_evaluation import columns_kernel
 
-COLUMNS = 3 * SLOTS
+COLUMNS = 3 * PAIR_NODES
 
 
 def hessian(terms, x: wp.array) -> sparse.csc_matrix:
@@ -29,7 +29,7 @@ def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.nda
     number = int(elements.count.numpy()[0])
     if not number:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-    out = device_arrays.allocate((COLUMNS, SLOTS, number), wp.types.vector(3, elements.linear), x.device)
+    out = device_arrays.allocate((COLUMNS, PAIR_NODES, number), wp.types.vector(3, elements.linear), x.device)
     threads, every = (
         device_arrays.takers(COLUMNS * number, x.device),
         wp.array(np.arange(number), dtype=int, device=x.device),

@@ -55,9 +55,9 @@ class PairProduct:
         """Add the products of `place` to nodes."""
         self._sweep(self._gather, len(out), [self.sets], [out])
 
-    def settle(self, v, out, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
+    def settle(self, v, out, inactive_mask: wp.array, busy: wp.array, dots: wp.array) -> None:
         """Add the products to active dofs in `busy` worlds, and write v . out of the nodes in pairs."""
-        self._sweep(self._settle, len(out), [self.sets, self._met, v, barred, busy], [out, dots])
+        self._sweep(self._settle, len(out), [self.sets, self._met, v, inactive_mask, busy], [out, dots])
 
     def place(self, v, x=None, wanted=None) -> None:
         """Write the contributions of pairs to a product; arguments as of `__call__`."""

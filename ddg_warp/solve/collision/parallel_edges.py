@@ -3,7 +3,7 @@
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.collision.contact.assembly import SLOTS
+from ddg_warp.kernels.collision.contact.assembly import PAIR_NODES
 from ddg_warp.kernels.collision.contact.pair_evaluation import columns_kernel, exact_product_kernel, mark_kernel
 from ddg_warp.kernels.collision.primitives import EDGES
 from ddg_warp.kernels.core.prefix_sum import choose
@@ -43,7 +43,7 @@ class NearParallelEdges:
         self.starts = self._running.starts
         self._chosen = wp.zeros(room, dtype=int, device=elements.device)
         vector = wp.types.vector(3, elements.linear)
-        self.columns = device_arrays.allocate((3 * SLOTS, SLOTS, room), vector, elements.device)
+        self.columns = device_arrays.allocate((3 * PAIR_NODES, PAIR_NODES, room), vector, elements.device)
 
     def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
         """Find near-parallel pairs at positions x and differentiate, in `wanted` worlds."""
@@ -53,7 +53,7 @@ class NearParallelEdges:
         self._running()
         chosen = [self._chosen, self._number]
         self._sweep(choose, len(self.marks), [elements.count, self.marks, self.starts], chosen)
-        threads = device_arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), elements.device)
+        threads = device_arrays.takers(min(3 * PAIR_NODES * len(self._chosen), MOST), elements.device)
         inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, *chosen, threads]
         wp.launch(self._differentiate, threads, inputs, [self.columns], device=elements.device)
 

@@ -50,7 +50,7 @@ def law_tables(search, parameters: dict, groups, shared: dict[str, wp.array]) ->
     return law, bool(tables["friction"].any())
 
 
-def at_own_rate(law, real):
+def at_island_rate(law, real):
     """Return the same `law_struct` with separate rates, zero at first."""
     struct = law_struct(real)
     result = struct()

@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.collision.ccd.step_fractions import limit_kernels, share_kernels
+from ddg_warp.kernels.collision.ccd.step_fractions import fraction_kernels, limit_kernels
 
 
 class StepFilter:
@@ -24,7 +24,7 @@ class StepFilter:
         serial = device_arrays.serial(device)
         made = [limit_kernels(pairs.kind, real) for pairs in lists]
         self._picks, self._limits = zip(*made, strict=True)
-        self._start, self._turn, self._settle, self._finish, self._shorten = share_kernels(real, serial)
+        self._start, self._turn, self._settle, self._finish, self._shorten = fraction_kernels(real, serial)
         self.kernels = [*self._picks, *self._limits, self._start, self._turn, self._settle, self._finish, self._shorten]
         self._all = [wp.zeros(worlds * nodes, dtype=real, device=device) for _ in range(3)]
         self._earliest, self._later = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))

@@ -2,7 +2,7 @@
 
 CCD moves nodes straight. A node at the distance R from an axis that rotates by an angle a moves along an arc, which is off its chord
 by the sagitta R (1 - cos(a / 2)). A step, or an increment of a static load, is therefore cut into 2^k equal substeps. In each, the
-surfaces that a motion moves are off their chords by less than `PART` of the activation distance and of the thickness of possible
+surfaces that a motion moves are off their chords by less than `SEGMENT` of the activation distance and of the thickness of possible
 pairs.
 
 Motions given as functions of time are sampled at uneven times until they are resolved. Grips rotate at a constant rate; their
@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.forces.prescribed_motion import MOST_PARTS, SLACK
+from ddg_warp.kernels.forces.prescribed_motion import MAX_SUBSTEPS, SLACK
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.collision.swept_surfaces import Swept, swept_surfaces
-from ddg_warp.solve.forces.prescribed_motion import turns_between
+from ddg_warp.solve.forces.prescribed_motion import rotations_between
 
 PART = 0.125  # of the activation distance and the thickness: allowed sagitta
 TIMES = np.array([0.0, 0.13, 0.31, 0.52, 0.68, 0.87, 1.0])  # sampling times of an interval
@@ -61,7 +61,7 @@ class Arcs:
             return
         self._version = self.model.version
         self._allowed = [self._room(swept) for swept in self.moved]
-        self._largest = [_largest_turns(*each) for each in zip(self.moved, self._allowed, strict=True)]
+        self._largest = [_largest_rotations(*each) for each in zip(self.moved, self._allowed, strict=True)]
         if self._of_grip:
             allowed, most = np.full((2, self.model.worlds, len(self._of_grip)), np.inf)
             for g, i in enumerate(self._of_grip):
@@ -72,10 +72,10 @@ class Arcs:
 
     def _room(self, swept: Swept) -> np.ndarray:
         """Return the allowed sagitta of surfaces in every world (worlds,) [m], infinite if nothing can meet them."""
-        net, contact, worlds = self.model.net, self.model.net.host.touching, self.model.worlds
+        coupled, contact, worlds = self.model.coupled, self.model.coupled.host.touching, self.model.worlds
         count = len(contact.names)
-        within = net.touching["range"].numpy().reshape(worlds, count, count)
-        radii = net.touching["radius"].numpy().reshape(worlds, -1)
+        within = coupled.touching["range"].numpy().reshape(worlds, count, count)
+        radii = coupled.touching["radius"].numpy().reshape(worlds, -1)
         least = np.stack([radii[:, contact.group == g].min(1) for g in range(count)], 1)
         first, second = contact.meeting
         meets = np.isin(first, swept.groups) | np.isin(second, swept.groups)
@@ -91,7 +91,7 @@ class Arcs:
             load_steps: number of static load increments, one of which this is.
 
         Raises:
-            SolverError: more than `MOST_PARTS` would be needed; names the object, its rotation, and a step that is short enough.
+            SolverError: more than `MAX_SUBSTEPS` would be needed; names the object, its rotation, and a step that is short enough.
         """
         self._renew()
         result = np.zeros(self.model.worlds, int)
@@ -116,16 +116,16 @@ class Arcs:
         if ends is None:
             return load_steps * substeps
         begin = state.poses().reshape(self.model.worlds, -1, 6)
-        turns = turns_between(begin, np.broadcast_to(ends, begin.shape))
+        turns = rotations_between(begin, np.broadcast_to(ends, begin.shape))
         for w, g in np.argwhere(turns.any(-1)):
             if (i := self._of_grip[g]) < 0:
                 continue
             angle = float(np.linalg.norm(turns[w, g]))
             axis = Rotation.from_rotvec(begin[w, g, 3:]).inv().apply(turns[w, g] / angle)
-            needed = SLACK * angle / load_steps / largest_turn(self.moved[i], self._allowed[i][w], axis)
-            if needed > MOST_PARTS:
+            needed = SLACK * angle / load_steps / largest_rotation(self.moved[i], self._allowed[i][w], axis)
+            if needed > MAX_SUBSTEPS:
                 raise _refusal(
-                    self.moved[i], angle, f"load_steps = {math.ceil(load_steps * needed / MOST_PARTS)} or more"
+                    self.moved[i], angle, f"load_steps = {math.ceil(load_steps * needed / MAX_SUBSTEPS)} or more"
                 )
             substeps = max(substeps, 2 ** max(0, math.ceil(math.log2(needed))))
         return load_steps * substeps
@@ -133,15 +133,15 @@ class Arcs:
     def failure(self, world: int) -> str:
         """Return the remedy for a failed world with a grip that rotated too far."""
         self._renew()
-        turns = [(largest_turn(self.moved[i], self._allowed[i][world]), i) for i in self._of_grip if i >= 0]
+        turns = [(largest_rotation(self.moved[i], self._allowed[i][world]), i) for i in self._of_grip if i >= 0]
         turn, i = min(turns)
         return (
-            f"{self.moved[i].label} turns farther in a step than {MOST_PARTS} substeps resolve; turn its grip by at most "
-            f"{_rounded_down(MOST_PARTS * turn):g} rad in a step, or give contact a larger range"
+            f"{self.moved[i].label} turns farther in a step than {MAX_SUBSTEPS} substeps resolve; turn its grip by at most "
+            f"{_rounded_down(MAX_SUBSTEPS * turn):g} rad in a step, or give contact a larger range"
         )
 
 
-def largest_turn(swept: Swept, allowed: float, axis: np.ndarray | None = None) -> float:
+def largest_rotation(swept: Swept, allowed: float, axis: np.ndarray | None = None) -> float:
     """Return the largest rotation of a substep about an axis at rest (default: any) for an allowed sagitta [m]."""
     far = np.linalg.norm(swept.arms if axis is None else np.cross(axis, swept.arms), axis=-1).max()
     if 2.0 * far <= allowed:
@@ -149,11 +149,11 @@ def largest_turn(swept: Swept, allowed: float, axis: np.ndarray | None = None) -
     return min(swept.most, 4.0 * math.asin(math.sqrt(0.5 * min(1.0, allowed / far))))
 
 
-def _largest_turns(swept: Swept, allowed: np.ndarray) -> np.ndarray | None:
+def _largest_rotations(swept: Swept, allowed: np.ndarray) -> np.ndarray | None:
     """Return the largest rotation of a substep (worlds,) of a function of time; None for grips, or if nothing can meet the surface."""
     if isinstance(swept.motion, Grip) or not np.isfinite(allowed).any():
         return None
-    return np.array([largest_turn(swept, each, swept.motion.unit) for each in allowed])
+    return np.array([largest_rotation(swept, each, swept.motion.unit) for each in allowed])
 
 
 def _levels_of(
@@ -166,7 +166,7 @@ def _levels_of(
         coarse &= (off > allowed) | (SLACK * turn > largest)
         if not coarse.any():
             return result
-        if 2**level == MOST_PARTS:
+        if 2**level == MAX_SUBSTEPS:
             excess = float(np.maximum(turn / largest, np.sqrt(off / allowed)).max())
             remedy = f"dt = {_rounded_down(abs(t1 - t0) / excess):g} s or less"
             if load_steps:
@@ -182,9 +182,10 @@ def _levels_of(
 def _refusal(swept: Swept, turn: float, remedy: str) -> SolverError:
     move = f"turns by {turn / (2.0 * math.pi):.3g} turns" if turn else "moves along arcs"
     return SolverError(
-        f"turned_too_far: {swept.label} {move} in a step, farther than {MOST_PARTS} substeps resolve; take {remedy}, or give contact a "
+        f"turned_too_far: {swept.label} {move} in a step, farther than {MAX_SUBSTEPS} substeps resolve; take {remedy}, "
+        "or give contact a "
         "larger range",
-        outcome=outcome.NAMES[outcome.TURNED_TOO_FAR],
+        outcome=outcome.NAMES[outcome.ROTATED_TOO_FAR],
     )
 
 
@@ -209,7 +210,7 @@ def _chords(swept: Swept, t0: float, t1: float, level: int) -> tuple[float, floa
     shifts = np.array([motion.translation(t) for t in times], float).reshape(len(times), -1, 3)
     if motion.count is not None:
         shifts = shifts[:, swept.rows]
-    positions = shifts + _turned(motion.unit, angles, swept.arms) if turn else shifts
+    positions = shifts + _rotated(motion.unit, angles, swept.arms) if turn else shifts
     path = positions.reshape(count, len(TIMES), -1, 3)
     path = path - path[:, :1]
     chord = path[:, -1:]
@@ -220,7 +221,7 @@ def _chords(swept: Swept, t0: float, t1: float, level: int) -> tuple[float, floa
     return float(np.sqrt(np.square(path - weight * chord).sum(-1).max())), turn
 
 
-def _turned(axis: np.ndarray, angles: np.ndarray, arms: np.ndarray) -> np.ndarray:
+def _rotated(axis: np.ndarray, angles: np.ndarray, arms: np.ndarray) -> np.ndarray:
     """Return arms (P, 3) rotated about an axis by angles (n,): (n, P, 3)."""
     along = np.outer(arms @ axis, axis)
     cos, sin = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]

@@ -25,17 +25,17 @@ class RotatingSurfaces:
             places[number] = nodes
         self.places = wp.array(places, dtype=wp.vec4i, device=self.device)
         self.turned = wp.zeros((search.worlds, len(places)), dtype=wp.types.vector(3, real), device=self.device)
-        self._turn, self._pull = spin_kernels(real)
-        self.kernels = [self._turn, self._pull] if self.any else []
+        self._turn, self._vjp = spin_kernels(real)
+        self.kernels = [self._turn, self._vjp] if self.any else []
 
     def __call__(self, start: wp.array, x: wp.array) -> None:
         """Write the rotations from positions at the start to x."""
         if self.any:
             self._launch(self._turn, [start, x], [self.turned])
 
-    def pull(self, start: wp.array, x: wp.array, cotangent: wp.array, outputs: list[wp.array]) -> None:
+    def vjp(self, start: wp.array, x: wp.array, cotangent: wp.array, outputs: list[wp.array]) -> None:
         """Add cotangents of positions (start, x) and radii, given cotangents of `turned` and radii (4, worlds, objects)."""
-        self._launch(self._pull, [start, x, cotangent], outputs)
+        self._launch(self._vjp, [start, x, cotangent], outputs)
 
     def forces(self, x: wp.array, frictions: list) -> np.ndarray:
         """Return nodal forces (W N, 3) [N] at x with the torques of `FrictionSet`, as evaluated last. Reads from the device."""

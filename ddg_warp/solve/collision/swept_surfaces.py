@@ -41,7 +41,7 @@ class Swept:
 
 def swept_surfaces(model) -> list[Swept]:
     """Return the moved surfaces of every motion of a model with contact."""
-    host, starts, result = model.net.host, pose_starts(model.motions), []
+    host, starts, result = model.coupled.host, pose_starts(model.motions), []
     unit, units = number_bodies(host)
     unit, supported = unit[: host.nodes], host.holds[: host.nodes].any(1)
     for motion, first, stop in zip(model.motions, starts, starts[1:], strict=False):
@@ -69,7 +69,7 @@ def _swept(host, motion, numbers: tuple[int, ...], parts: tuple[np.ndarray, ...]
     """Return the surfaces of nodes of some bodies that a motion moves, by displacements `rows` of nodes."""
     bodies, nodes = [host.touching.bodies[b] for b in numbers], np.concatenate(parts)
     points, most = host.rest[nodes], np.inf
-    if host.touching.rubs and any(len(body.markers) for body in bodies):
+    if host.touching.has_friction and any(len(body.markers) for body in bodies):
         most = SPIN
     planes = [body for body in bodies if body.kind == PLANE]
     if planes:

@@ -159,7 +159,7 @@ class Corrector:
         Beyond the corner the tangent is nearly that of states on the straight extension of the path. In one sense along it the contact
         energy changes as on that extension; the other sense leads back.
         """
-        if not self.equilibrium.net:
+        if not self.equilibrium.coupled:
             return None
         energy = self._contact_energy(origin.state)
         for distance in CORNERS:
@@ -261,7 +261,7 @@ class Corrector:
 
         In contact the fraction also resolves the arcs of rotating supports and obstacles.
         """
-        taken, arcs = 1.0, self.equilibrium.net.arcs if self.equilibrium.net else None
+        taken, arcs = 1.0, self.equilibrium.coupled.arcs if self.equilibrium.coupled else None
         if arcs:
             taken = 0.5 ** int(arcs.levels(*sorted((load, load + move[-1]))).max())
         for _ in range(CUTS):

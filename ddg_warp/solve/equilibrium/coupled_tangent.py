@@ -23,14 +23,14 @@ class CoupledTangent(TangentBlock):
     """The part of the net. See `Tangent` for the methods."""
 
     def __init__(self, model, offset: int):
-        host, worlds = model.net.host, model.worlds
+        host, worlds = model.coupled.host, model.worlds
         kind = np.zeros((host.blocks, 3), bool)
         kind[host.nodes :] = True
         self.free, self.angle = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind))
-        super().__init__(model, model.net, offset, 3 * host.blocks * worlds)
-        self.net, self.block = model.net, 3
+        super().__init__(model, model.coupled, offset, 3 * host.blocks * worlds)
+        self.coupled, self.block = model.coupled, 3
         self.body_count, self.islands = host.bodies.count * worlds, worlds
-        self.rate = model.net.still  # over what strain-rate damping counts: at rest not
+        self.rate = model.coupled.still  # over what strain-rate damping counts: at rest not
         self.given_field = np.zeros((worlds, 3))  # of controls, over that of the scene [T]
         self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
@@ -44,9 +44,9 @@ class CoupledTangent(TangentBlock):
     def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
         """Of each set B and where the entries of its elements go in the Hessian, column by column; rows and starts of columns."""
         entries, local = [], []
-        for part in self.net.sets:
+        for part in self.coupled.sets:
             to_local, slot, component = _local(part.term.measure)
-            dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.net.worlds)[slot].T + component
+            dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.coupled.worlds)[slot].T + component
             entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())
             local.append(to_local)
         pattern, places = np.unique(np.concatenate(entries), return_inverse=True)
@@ -56,28 +56,28 @@ class CoupledTangent(TangentBlock):
 
     def energies(self, state):
         """(term's name, energies of its elements (worlds, elements))."""
-        for i, part in enumerate(self.net.sets):
-            out = wp.zeros(part.elements * self.net.worlds, dtype=self.net.real, device=self.net.device)
+        for i, part in enumerate(self.coupled.sets):
+            out = wp.zeros(part.elements * self.coupled.worlds, dtype=self.coupled.real, device=self.coupled.device)
             self._launch(state, i, 0, out, ())
             values = out.numpy().astype(np.float64)
-            yield part.term.name, values.reshape(self.net.worlds, -1)
+            yield part.term.name, values.reshape(self.coupled.worlds, -1)
         if self.model.touch:
-            self.model.touch.at(state.net.q, state.net.rate)
+            self.model.touch.at(state.coupled.q, state.coupled.rate)
             yield "contact", self.model.touch.terms.energy.numpy().astype(np.float64)[:, None]
 
     def gradient(self, state) -> np.ndarray:
         elastic = self.elastic_gradient(state)
         if not self.model.touch:
             return elastic
-        self.model.touch.at(state.net.q, state.net.rate)
+        self.model.touch.at(state.coupled.q, state.coupled.rate)
         return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
 
     def elastic_gradient(self, state) -> np.ndarray:
         """The same without what touches."""
         result = np.zeros((self.size // 3, 3))
-        for i, part in enumerate(self.net.sets):
+        for i, part in enumerate(self.coupled.sets):
             slots, forces = part.host.slots, self.forces(state, i)
-            index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
+            index = _tiled(slots, self.host.blocks, self.coupled.worlds).ravel()
             for d in range(3):
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
         return self.into(result.ravel())
@@ -94,9 +94,9 @@ class CoupledTangent(TangentBlock):
 
     def forces(self, state, index: int) -> np.ndarray:
         """Derivative of the energy of every element of a set with respect to the blocks of its slots (slots, elements, 3)."""
-        part = self.net.sets[index]
-        shape = (len(part.host.slots), part.elements * self.net.worlds)
-        out = wp.zeros(shape, dtype=self.net.vector, device=self.net.device)
+        part = self.coupled.sets[index]
+        shape = (len(part.host.slots), part.elements * self.coupled.worlds)
+        out = wp.zeros(shape, dtype=self.coupled.vector, device=self.coupled.device)
         self._launch(state, index, 1, out, ())
         return out.numpy().astype(np.float64)
 
@@ -108,13 +108,13 @@ class CoupledTangent(TangentBlock):
         """The same without friction, which has no potential, where there is some."""
         scatter, rows, starts = self._pattern
         total = np.zeros(len(rows))
-        for i, part in enumerate(self.net.sets):
-            size, count = part.term.measure.size, part.elements * self.net.worlds
-            out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
+        for i, part in enumerate(self.coupled.sets):
+            size, count = part.term.measure.size, part.elements * self.coupled.worlds
+            out = wp.zeros((count, size, size), dtype=self.coupled.real, device=self.coupled.device)
             extra = np.zeros((len(part.term.measure.strains), count))
             if stress is not None:
                 extra = stress[i] - self._stress(state, i)
-            extra = wp.array(extra, dtype=self.net.real, device=self.net.device)
+            extra = wp.array(extra, dtype=self.coupled.real, device=self.coupled.device)
             self._launch(state, i, 2, out.transpose((1, 2, 0)), (size,), extra)
             values = out.numpy().astype(np.float64)
             values = 0.5 * (values + values.transpose(0, 2, 1))
@@ -123,38 +123,38 @@ class CoupledTangent(TangentBlock):
             total += np.bincount(places, spread.ravel(), len(total))
         elastic = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
         if self.model.touch:
-            self.model.touch.at(state.net.q, state.net.rate)
-            elastic = elastic + exact_hessian.hessian(self.model.touch.terms, state.net.q)
+            self.model.touch.at(state.coupled.q, state.coupled.rate)
+            elastic = elastic + exact_hessian.hessian(self.model.touch.terms, state.coupled.q)
         return self.matrix(elastic)
 
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Stresses (strains, elements) of every set that the strains e + J step have."""
         result = []
-        change = wp.array(self.back(step).reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
-        for i, part in enumerate(self.net.sets):
-            shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
-            out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
-            given = self.net.elements(state.net, i, rate=self.rate)
-            kernel = linear_stress_kernel(part.term, self.net.real)
-            wp.launch(kernel, (self.net.worlds, part.elements), [given, change], [out], device=self.net.device)
+        change = wp.array(self.back(step).reshape(-1, 3), dtype=self.coupled.vector, device=self.coupled.device)
+        for i, part in enumerate(self.coupled.sets):
+            shape = (len(part.term.measure.strains), part.elements * self.coupled.worlds)
+            out = wp.zeros(shape, dtype=self.coupled.real, device=self.coupled.device)
+            given = self.coupled.elements(state.coupled, i, rate=self.rate)
+            kernel = linear_stress_kernel(part.term, self.coupled.real)
+            wp.launch(kernel, (self.coupled.worlds, part.elements), [given, change], [out], device=self.coupled.device)
             result.append(out.numpy().astype(np.float64))
         return result
 
     def _stress(self, state, index: int) -> np.ndarray:
-        part = self.net.sets[index]
-        shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
-        strain, stress = (wp.zeros(shape, dtype=self.net.real, device=self.net.device) for _ in range(2))
-        self.net.strains(state.net, index, strain, stress)
+        part = self.coupled.sets[index]
+        shape = (len(part.term.measure.strains), part.elements * self.coupled.worlds)
+        strain, stress = (wp.zeros(shape, dtype=self.coupled.real, device=self.coupled.device) for _ in range(2))
+        self.coupled.strains(state.coupled, index, strain, stress)
         return stress.numpy().astype(np.float64)
 
     def dofs(self, state) -> np.ndarray:
-        return self.into(state.net.q.numpy().astype(np.float64).ravel())
+        return self.into(state.coupled.q.numpy().astype(np.float64).ravel())
 
     def rates(self, state) -> np.ndarray:
-        return self.into(state.net.v.numpy().astype(np.float64).ravel())
+        return self.into(state.coupled.v.numpy().astype(np.float64).ravel())
 
     def assign(self, state, q: np.ndarray) -> None:
-        state.net.q.assign(self.back(q).reshape(-1, 3))
+        state.coupled.q.assign(self.back(q).reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
         """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.geometry.edge_rotation`.
@@ -163,9 +163,9 @@ class CoupledTangent(TangentBlock):
         """
         q, step = self.back(q), self.back(step)
         moved = q + step
-        x, dx, out = (v.reshape(self.net.worlds, -1, 3) for v in (q, step, moved))
-        order = [self.host.rods[i] for level in self.host.outwards.levels for i in level]
-        for world in range(self.net.worlds):
+        x, dx, out = (v.reshape(self.coupled.worlds, -1, 3) for v in (q, step, moved))
+        order = [self.host.rods[i] for level in self.host.rod_order.levels for i in level]
+        for world in range(self.coupled.worlds):
             excess = np.zeros((self.host.nodes, 3))
             placed = self._anchored.copy()
             for rod in order:
@@ -182,7 +182,7 @@ class CoupledTangent(TangentBlock):
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
-            self._motion.put(state, before, at, state.net.q, state.net.frame)
+            self._motion.put(state, before, at, state.coupled.q, state.coupled.frame)
         self.prescribe(state, at)
 
     def give(self, found: dict[str, np.ndarray]) -> None:
@@ -191,16 +191,16 @@ class CoupledTangent(TangentBlock):
 
     def prescribe(self, state, at: float) -> None:
         """Put the normals that supports turn, and the magnetic field, where they are at load parameter `at`."""
-        for index, data in state.net.data.items():
-            part = self.net.sets[index]
+        for index, data in state.coupled.data.items():
+            part = self.coupled.sets[index]
             values = data.numpy().astype(np.float64)
-            columns = np.arange(self.net.worlds)[:, None] * part.elements
+            columns = np.arange(self.coupled.worlds)[:, None] * part.elements
             for motion in np.unique(part.turning[:, 2]):
                 chosen = part.turning[:, 2] == motion
                 element, row, _ = part.turning[chosen].T
                 moved = self.model.motions[motion]
                 if isinstance(moved, Grip):  # which every world has elsewhere
-                    where = state.poses().reshape(self.net.worlds, -1, 6)[:, self.model.grips.index(moved)]
+                    where = state.poses().reshape(self.coupled.worlds, -1, 6)[:, self.model.grips.index(moved)]
                 else:
                     where = at
                 turned = moved.turn(where, part.turning_rest[chosen])
@@ -214,13 +214,13 @@ class CoupledTangent(TangentBlock):
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors (E, 3)."""
-        x = self.back(q).reshape(self.net.worlds, -1, 3)
+        x = self.back(q).reshape(self.coupled.worlds, -1, 3)
         first, second = self.host.edges.T
         return (x[:, second] - x[:, first]).reshape(-1, 3)
 
     def edge_dofs(self) -> np.ndarray:
         """Dofs of the positions of both ends of all edges (2, E, 3)."""
-        blocks = self.host.edges.T[:, None] + self.host.blocks * np.arange(self.net.worlds)[:, None]
+        blocks = self.host.edges.T[:, None] + self.host.blocks * np.arange(self.coupled.worlds)[:, None]
         return 3 * blocks.reshape(2, -1)[..., None] + np.arange(3)
 
     @cached_property
@@ -241,7 +241,7 @@ class CoupledTangent(TangentBlock):
 
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
-        bodies, shape = self.host.bodies, (self.net.worlds, self.host.blocks, 3)
+        bodies, shape = self.host.bodies, (self.coupled.worlds, self.host.blocks, 3)
         gradient = np.array(gradient).reshape(shape)
         gradient[:, self.host.of_obstacles] = 0.0
         gradient, result = gradient.ravel(), []
@@ -255,13 +255,13 @@ class CoupledTangent(TangentBlock):
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:
         """Residuals at rtol = 1 (size,) [N, N m] of bodies with such loads; see `ddg_warp.compile.residual_tolerance`."""
-        blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.net.worlds, -1)]
+        blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.coupled.worlds, -1)]
         return np.repeat(np.concatenate(blocks), 3)
 
     def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
         """Whether residuals add up to little, and the largest excess over rounding, world by world; see `tolerance.largest_excess`."""
-        by_world = loads.reshape(self.net.worlds, -1), residual.reshape(self.net.worlds, -1, 3)
-        floors = floor.reshape(self.net.worlds, -1, 3).max(2)
+        by_world = loads.reshape(self.coupled.worlds, -1), residual.reshape(self.coupled.worlds, -1, 3)
+        floors = floor.reshape(self.coupled.worlds, -1, 3).max(2)
         found = [
             largest_excess(self.host.bodies.levels, own, rtol, r, f)
             for own, r, f in zip(*by_world, floors, strict=True)
@@ -289,7 +289,7 @@ class CoupledTangent(TangentBlock):
             parts.append((rod.all_nodes, edges, ends, np.unique(np.concatenate([none, *spins]))))
         parts += [(body.nodes, none, np.zeros((0, 2), int), none) for body in (*host.shells, *host.meridians)]
         result = []
-        for world in range(self.net.worlds):
+        for world in range(self.coupled.worlds):
             dofs = self.offset + 3 * world * host.blocks
             for nodes, edges, ends, spins in parts:
                 places = (dofs + 3 * blocks[:, None] + np.arange(3) for blocks in (nodes, spins))
@@ -314,13 +314,13 @@ class CoupledTangent(TangentBlock):
         return f"joint {block - self.host.nodes - self.host.angles}"
 
     def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
-        part, real = self.net.sets[index], self.net.real
+        part, real = self.coupled.sets[index], self.coupled.real
         wp.launch(
             element_path.term_kernels(coupled_storage(part.term, real), 0, real)[which],
-            (self.net.worlds, part.elements, *columns),
-            [self.net.elements(state.net, index, rate=self.rate), *more],
+            (self.coupled.worlds, part.elements, *columns),
+            [self.coupled.elements(state.coupled, index, rate=self.rate), *more],
             [out],
-            device=self.net.device,
+            device=self.coupled.device,
         )
 
 

@@ -89,11 +89,11 @@ class FrictionNewton:
         return residual, float(np.linalg.norm(residuals.scaled(residual)[tangent.free])), excess, outcome
 
     def _matrix(self, state: State, load_factor: float) -> sparse.csc_matrix:
-        net, tangent_block, sliding = self.model.net, self.tangent.parts[-1], state.sliding
+        coupled, tangent_block, sliding = self.model.coupled, self.tangent.parts[-1], state.sliding
         if self._rubbing is None:
-            self._rubbing = FrictionJacobian(net, ExactContact(net))
-        rate = wp.full(net.worlds, 1.0 / sliding.increment, dtype=net.real, device=net.device)
-        rubbing = self._rubbing.matrix(state.net.q, sliding.begun(state.net.q), rate)
+            self._rubbing = FrictionJacobian(coupled, ExactContact(coupled))
+        rate = wp.full(coupled.worlds, 1.0 / sliding.increment, dtype=coupled.real, device=coupled.device)
+        rubbing = self._rubbing.matrix(state.coupled.q, sliding.begun(state.coupled.q), rate)
         matrix = tangent_block.potential_hessian(state) + tangent_block.matrix(rubbing)
         following = self.tangent.load_stiffness(load_factor, self.tangent.dofs(state))
         matrix = sparse.csc_matrix(matrix if following is None else matrix + following)

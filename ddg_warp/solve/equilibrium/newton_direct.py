@@ -90,7 +90,9 @@ class DirectNewton:
             SolverError: `max_iterations`, `line_search_failed`, `non_finite` or `lost_in_rounding`; carries the last state.
         """
         search = Search(self, state, load_factor)
-        rises = Rises(search) if self.tangent.model.net and not self.follows and not self.tangent.model.touch else None
+        rises = (
+            Rises(search) if self.tangent.model.coupled and not self.follows and not self.tangent.model.touch else None
+        )
         for _ in range(self.options.max_iterations):
             exact = self._stiffness(search.here, load_factor)
             if search.converged(exact):
@@ -128,11 +130,11 @@ class DirectNewton:
         if not np.isfinite(hessian.data).all():
             return None
         q = tangent.dofs(state)
-        right = tangent.loads(load_factor, q) - tangent.gradient(state) - hessian @ step
+        rhs = tangent.loads(load_factor, q) - tangent.gradient(state) - hessian @ step
         if self.follows:
-            return self.regular(hessian, right)
+            return self.regular(hessian, rhs)
         region = TrustRegion(tangent, q, np.inf)
-        return region.step(hessian, right, q, np.ones(region.count, bool), np.zeros(region.count))
+        return region.step(hessian, rhs, q, np.ones(region.count, bool), np.zeros(region.count))
 
     def regular(self, hessian, residual: np.ndarray) -> np.ndarray:
         """Return the Newton step on the free dofs (size,), with the tangent shifted until regular."""
@@ -289,7 +291,7 @@ class Search:
         moved = self.tangent.retract(self.here.q, step)
         if not self.tangent.model.touch:
             return moved, taken
-        share = self.owner.net.share(self.here.q, moved)
+        share = self.owner.coupled.share(self.here.q, moved)
         return self.here.q + share * (moved - self.here.q), share * taken
 
 
@@ -302,8 +304,8 @@ class Rises:
 
     def __init__(self, search: Search):
         self.search, self.tangent = search, search.tangent
-        coupled = self.tangent.parts[-1].islands
-        self.islands = np.arange(self.tangent.islands) >= self.tangent.islands - coupled
+        is_coupled = self.tangent.parts[-1].islands
+        self.islands = np.arange(self.tangent.islands) >= self.tangent.islands - is_coupled
         self.exhausted, self.begun, self.returns = False, self.tangent.shells_alone, 0
         self._mark(search.here, None)
 

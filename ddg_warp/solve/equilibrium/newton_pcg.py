@@ -30,7 +30,7 @@ from ddg_warp.model.state import Sliding, State
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.friction_newton import FrictionNewton
 from ddg_warp.solve.forces.loads import StaticLoads
-from ddg_warp.solve.linear.solver_selection import large_static, net_preconditioner
+from ddg_warp.solve.linear.solver_selection import coupled_preconditioner, large_static
 from ddg_warp.solve.newton.coupled_newton import CoupledNewton
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping.graph_cache import Graphs
@@ -56,16 +56,16 @@ class StaticNewton(CoupledNewton):
     banded = False  # products with fixed dofs are needed, too
 
     def __init__(self, model, options: NewtonOptions):
-        super().__init__(model, options, net_preconditioner(model.net), model.types.real)
+        super().__init__(model, options, coupled_preconditioner(model.coupled), model.types.real)
         self._whole = False  # True if directions are not cut at FAR step caps
         self.gravity.zero_()  # gravity is a load like others: `begin` scales all
-        self.loads = StaticLoads(model, self.net, midpoint=False) if self.net.host.followers else None
+        self.loads = StaticLoads(model, self.coupled, midpoint=False) if self.coupled.host.followers else None
         self._there, self._before = wp.zeros_like(self.load), wp.zeros_like(self.q)
-        self.islands.moved.fill_(1)
+        self.islands.substep_accepted.fill_(1)
         self._follow, self._less, self._far = coupled_newton.static_kernels(self.real, self.linear)
-        self.rubs = self.contact is not None and self.contact.rubs
-        if self.rubs:  # not the rate of strain-rate damping, which acts at rest
-            self.contact.rate = wp.zeros_like(self.islands.rate)
+        self.has_friction = self.contact is not None and self.contact.has_friction
+        if self.has_friction:  # not the rate of strain-rate damping, which acts at rest
+            self.contact.rate = wp.zeros_like(self.islands.inverse_step)
             self.slid = wp.zeros_like(self.q)
 
     @property
@@ -88,14 +88,22 @@ class StaticNewton(CoupledNewton):
         In contact, q is the proposed motion from dofs `before`. Friction counts slips from blocks `slid` over `rate`; zero means no
         friction.
         """
-        for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
+        for name in (
+            "status",
+            "iteration",
+            "backtracks",
+            "not_converged",
+            "below_rounding_floor",
+            "drop_compression",
+            "frames_outdated",
+        ):
             getattr(self.islands, name).zero_()
         self.q.assign(q.reshape(-1, 3))
         self.base.assign((q if before is None else before).reshape(-1, 3))
         if self.contact:
             wp.copy(self._before, self.base)
             self.contact.rest()
-        if self.rubs:
+        if self.has_friction:
             self.contact.rate.fill_(rate)
             if slid is not None:
                 self.slid.assign(slid)
@@ -104,19 +112,19 @@ class StaticNewton(CoupledNewton):
         if self.loads:
             self.loads.scale(dead.reshape(self.worlds, -1, 3), load_factor)
         wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
-        self.islands.active.fill_(1)
+        self.islands.any_active.fill_(1)
 
     def balance(self) -> None:
         """Assemble residuals under the loads on the iterate, which do their mean work along a step."""
         if self.loads:
             for q, load in ((self.here, self.load), (self.base, self._there)):
-                self.loads.apply(self.net.points(q), self.net.points(load), self.net.angles(load))
+                self.loads.apply(self.coupled.points(q), self.coupled.points(load), self.coupled.angles(load))
         super().balance()
         if self.loads:
             wp.launch(
                 self._follow,
                 self.all,
-                [self.here, self.base, self.load, self._there, self.islands.status, self.net.blocks],
+                [self.here, self.base, self.load, self._there, self.islands.status, self.coupled.blocks],
                 [self.change],
                 device=self.device,
             )
@@ -127,16 +135,16 @@ class StaticNewton(CoupledNewton):
             self.contact.renew(self._before)
             self.contact.place()
             self.contact.lag(self._before, again)
-            if self.rubs:
+            if self.has_friction:
                 wp.copy(self.contact.terms.start, self.slid)
         self.solve(state)
 
-    def outgrown(self) -> bool:
+    def has_overflow(self) -> bool:
         """Return True if lists of pairs overflowed: the solve repeats with larger lists or shorter motions. Reads from the device.
 
         Without inertia a free body moves without bound, past all others. Motions of time steps are bounded.
         """
-        return self.contact is not None and self.contact.outgrown(self._before, spare=True)
+        return self.contact is not None and self.contact.has_overflow(self._before, spare=True)
 
     def watch(self) -> None:
         """Stop PCG where the direction exceeds `FAR` step caps, since directions grow with every iteration.
@@ -148,12 +156,12 @@ class StaticNewton(CoupledNewton):
             return
         self.measure_turns()
         if self.planes:
-            self.planes.into(self.direction, self.islands.wanted)
+            self.planes.into(self.direction, self.islands.needs_direction)
         wp.launch(
             self._far,
             self.worlds,
             [self.turn, FAR * self.options.rotation_cap],
-            [self.islands.wanted],
+            [self.islands.needs_direction],
             device=self.device,
         )
 
@@ -170,7 +178,7 @@ class StaticNewton(CoupledNewton):
             self.resting.leave(self.contact.terms.products)
         self.assemble()
         self.krylov.multiply_matrix(step)
-        wp.launch(self._less, self.all, [self.krylov.product], [self.right], device=self.device)
+        wp.launch(self._less, self.all, [self.krylov.product], [self.rhs], device=self.device)
         self._whole = True
         self.direct()
         self._whole = False
@@ -212,8 +220,8 @@ class CoupledEquilibrium:
     """
 
     def __init__(self, owner):
-        model, options, touching = owner.model, owner.options, owner.model.net.host.touching
-        self.owner, self.model, self.net, self.tangent = owner, model, model.net, owner.tangent
+        model, options, touching = owner.model, owner.options, owner.model.coupled.host.touching
+        self.owner, self.model, self.coupled, self.tangent = owner, model, model.coupled, owner.tangent
         self.newton = StaticNewton(
             model,
             NewtonOptions(
@@ -227,13 +235,13 @@ class CoupledEquilibrium:
         )
         self.arcs = Arcs(model) if touching and model.motions else None
         self._rest = self.tangent.dofs(model.state())
-        self._size = float(np.ptp(model.net.host.rest[: model.net.host.nodes], axis=0).max())
-        self._start = model.net.empty()  # lagged data of a solve
-        self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
+        self._size = float(np.ptp(model.coupled.host.rest[: model.coupled.host.nodes], axis=0).max())
+        self._start = model.coupled.empty()  # lagged data of a solve
+        self._step = wp.zeros(self.newton.all, dtype=self.newton.rhs.dtype, device=model.wp_device)
         self._graphs = Graphs(model, lambda: device_arrays.load_kernels(self.newton.kernels, model.wp_device))
         self.wary = True
         self.polish = None
-        if self.newton.rubs and not large_static(model):
+        if self.newton.has_friction and not large_static(model):
             self.polish = FrictionNewton(model, owner.residuals, self.share, self.newton.contact.search.reach)
         self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
@@ -244,12 +252,12 @@ class CoupledEquilibrium:
     def count(self, state: State, increment: float) -> None:
         """Count contacts of an equilibrium, and its friction work over the time `increment`."""
         touch = self.model.touch
-        touch.at(state.net.q)
+        touch.at(state.coupled.q)
         gap = float(touch.terms.gap.numpy().min())
         self._least = min(self._least, gap if gap < touch.search.reach else math.inf)
         self._touching.append(int(touch.terms.touching.numpy().sum()))
-        if self.newton.rubs:
-            touch.rub(state.net.q, state.rubbing)
+        if self.newton.has_friction:
+            touch.rub(state.coupled.q, state.rubbing)
             self._friction_work += increment * float(touch.terms.dissipated.numpy().sum())
 
     def contact_statistics(self) -> dict:
@@ -263,14 +271,14 @@ class CoupledEquilibrium:
             "smallest_gap": self._least,
             "contacts": {"mean": float(np.mean(pairs)), "last": pairs[-1]},
         }
-        return result | ({"friction_work": self._friction_work} if self.newton.rubs else {})
+        return result | ({"friction_work": self._friction_work} if self.newton.has_friction else {})
 
     def following(self, state: State, step: np.ndarray, load_factor: float) -> np.ndarray | None:
         """Return the tangent displacement of free dofs for a `step` (size,) of fixed dofs; None if there is no answer."""
 
         def begin():
             self._begin(state, load_factor)
-            self.newton.islands.wanted.fill_(1)
+            self.newton.islands.needs_direction.fill_(1)
             self.newton.forcing.fill_(FORCING)
             self.newton.goal.fill_(math.inf)
 
@@ -287,7 +295,7 @@ class CoupledEquilibrium:
         Raises:
             SolverError: no equilibrium was found; names the outcome.
         """
-        if self.newton.rubs and self._untouched(before):
+        if self.newton.has_friction and self._untouched(before):
             with suppress(SolverError):  # contacts that can not stick
                 equilibrium, certain = self._search(state, load_factor, before, increment, sticking=True)
                 if certain:
@@ -295,7 +303,7 @@ class CoupledEquilibrium:
         try:
             equilibrium, certain = self._search(state, load_factor, before, increment)
         except SolverError:
-            if not (self.newton.rubs and self.wary):
+            if not (self.newton.has_friction and self.wary):
                 raise
         else:
             if certain or not self.wary:
@@ -322,13 +330,16 @@ class CoupledEquilibrium:
             consistent normal forces, to more than the rounding floor, and all contacts stick, or nodes have hardly moved.
         """
         state, owner, first = state.copy(), self.owner, before
-        rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
-        repeats = self.net.edges or self.model.motions  # test the result with its own frames and support forces
+        rubs, rate = self.newton.has_friction, 1.0 / increment if self.newton.has_friction else 0.0
+        repeats = self.coupled.edges or self.model.motions  # test the result with its own frames and support forces
         start = self.tangent.dofs(state)
-        relaxation, settled = AitkenRelaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
+        relaxation, settled = (
+            AitkenRelaxation(self.coupled.worlds) if rubs else None,
+            np.zeros(self.coupled.worlds, bool),
+        )
         if rubs:
             loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(load_factor, start)).reshape(
-                self.net.worlds, -1
+                self.coupled.worlds, -1
             )
             self.newton.contact.terms.more.assign(sticking * np.abs(loads).sum(1))
         later = 0  # next solve to polish
@@ -349,13 +360,13 @@ class CoupledEquilibrium:
             )
             before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
             owner.iterations += int(iterations.sum())
-            begun = state.net.q.numpy().copy()
-            wp.copy(state.net.q, self.newton.q)
+            begun = state.coupled.q.numpy().copy()
+            wp.copy(state.coupled.q, self.newton.q)
             near = on and self.arrived and self._near(begun, state)
             if on:
                 self._relax(relaxation, state, begun)
-            for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
-                wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # the solve may have updated these
+            for name in ("frame", *(f"lag_{i}" for i in range(len(self.coupled.sets)))):
+                wp.copy(state.coupled.arrays()[name], self._start.arrays()[name])  # the solve may have updated these
             self.model.carry_frames(state)
             # Converged with the friction of its own normal forces; later solves move such a world within rounding.
             settled |= on and iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)
@@ -392,34 +403,36 @@ class CoupledEquilibrium:
                 np.abs(forces).sum() for forces in (outer[free & points], (outer - residual)[~free & points])
             )
             certain = unbalanced <= SETTLED * loads
-            certain &= self._near(first.net.q.numpy(), state) or not self.model.touch.slides()
+            certain &= self._near(first.coupled.q.numpy(), state) or not self.model.touch.slides()
             if warily and unbalanced > SETTLED * (loads + supports):
                 name = UNSETTLED
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
-            remedy = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
+            remedy = self.newton.contact.closest_pair(state.coupled.q, status) if self.newton.contact else ""
             if rubs:
                 remedy += "what slides may come to no rest"
             message = owner.residuals.where(name, residual, load_factor, remedy)
             raise SolverError(message, state=state, outcome=name, gaining=name == "max_iterations")
         # In contact the last matrix may be projected without a trial of the exact one, which is no sign of instability.
-        indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
+        indefinite = self.newton.contact is None and self.newton.islands.drop_compression.numpy().any()
         state.stable = False if indefinite else None
         small = (ends == outcome.CONVERGED) | (status == outcome.CONVERGED)
         return owner.found(state, outer, residual, load_factor, small), certain
 
     def _near(self, begun: np.ndarray, state: State) -> bool:
         """Return True if nodes moved so little from blocks (W N, 3) that normal forces hardly changed."""
-        displacement = np.abs(state.net.q.numpy() - begun).reshape(self.net.worlds, -1, 3)[:, : self.net.host.nodes]
+        displacement = np.abs(state.coupled.q.numpy() - begun).reshape(self.coupled.worlds, -1, 3)[
+            :, : self.coupled.host.nodes
+        ]
         return bool(displacement.max() <= NEAR * self.newton.contact.search.reach)
 
     def _slides(self, first: State, increment: float, state: State) -> None:
         """Write the slip of a state since the first one."""
-        velocity = (state.net.q.numpy() - self._slid(first, state)) / increment
-        state.sliding = Sliding(wp.array(velocity, dtype=self.net.vector, device=self.net.device), increment)
+        velocity = (state.coupled.q.numpy() - self._slid(first, state)) / increment
+        state.sliding = Sliding(wp.array(velocity, dtype=self.coupled.vector, device=self.coupled.device), increment)
 
     def _untouched(self, before: State) -> bool:
         """Return True if the previous equilibrium had no contact forces, so that normal forces are unknown."""
-        self.model.touch.at(before.net.q)
+        self.model.touch.at(before.coupled.q)
         return not self.model.touch.terms.touching.numpy().any()
 
     def _slid(self, first: State, state: State) -> np.ndarray:
@@ -427,14 +440,14 @@ class CoupledEquilibrium:
 
         Frames were transported by way of iterates, and so rotated about their tangents against directly transported ones.
         """
-        q, net = first.net.q.numpy().copy(), self.net
+        q, coupled = first.coupled.q.numpy().copy(), self.coupled
         if self.newton.contact.terms.rolls:
             (u, t), (v, end) = (
-                np.split(np.moveaxis(each.net.frame.numpy().reshape(6, net.worlds, -1), 0, -1), 2, axis=-1)
+                np.split(np.moveaxis(each.coupled.frame.numpy().reshape(6, coupled.worlds, -1), 0, -1), 2, axis=-1)
                 for each in (first, state)
             )
             turned = polyline.signed_angle(polyline.transport(u, t, end), v, end)
-            q.reshape(net.worlds, -1, 3)[:, net.angle_start :][:, : net.edges, 0] -= turned
+            q.reshape(coupled.worlds, -1, 3)[:, coupled.angle_start :][:, : coupled.edges, 0] -= turned
         return q
 
     def _refuse_drifting(self, state: State, q: np.ndarray, load_factor: float) -> None:
@@ -454,18 +467,18 @@ class CoupledEquilibrium:
 
         The full displacement is kept if the relaxed one would collide: iterates do not move straight.
         """
-        displacement = (state.net.q.numpy() - begun).reshape(self.net.worlds, -1)
-        fixed = ~self.tangent.free.reshape(self.net.worlds, -1)
+        displacement = (state.coupled.q.numpy() - begun).reshape(self.coupled.worlds, -1)
+        fixed = ~self.tangent.free.reshape(self.coupled.worlds, -1)
         factor = relaxation(displacement, (displacement * fixed).any(1))
         if (factor < 1.0).any():
             relaxed = begun + (factor[:, None] * displacement).reshape(begun.shape)
             if self.newton.contact.share(begun, relaxed) == 1.0:
-                state.net.q.assign(relaxed)
+                state.coupled.q.assign(relaxed)
 
     @property
     def arrived(self) -> bool:
         """True if all supports have arrived at the end of the prescribed motion."""
-        return not self.newton.islands.driven.numpy().any()
+        return not self.newton.islands.support_motion_pending.numpy().any()
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the CCD step fraction of the motion from dofs `before` to `after`."""
@@ -476,7 +489,7 @@ class CoupledEquilibrium:
         while True:
             begin()
             self._graphs.replay(name, launch)
-            if not self.newton.outgrown():
+            if not self.newton.has_overflow():
                 return
             self._graphs.clear()
 
@@ -492,7 +505,7 @@ class CoupledEquilibrium:
             tangent.back(q), tangent_block.dead_loads(load_factor), load_factor, scale, tangent.back(start), slid, rate
         )
         for name, array in self._start.arrays().items():
-            wp.copy(array, state.net.arrays()[name])
+            wp.copy(array, state.coupled.arrays()[name])
 
     def _beside(self, q: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return dofs q with the positions of `source`; twist angles, which are about other frames, stay."""

@@ -5,7 +5,7 @@ import numpy as np
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.linear.solver_selection import large_static
 
-PUSHED = 1e-6  # relative residual along an unresisted motion above which loads drive it
+LOADED = 1e-6  # relative residual along an unresisted motion above which loads drive it
 LIMP = 1e-3  # bending stiffness over load times length squared below which it only hinders the search
 IN_TIME = "step the scene in time (Integrator, with mass_damping) and begin from where it comes to rest"
 
@@ -29,7 +29,7 @@ def of_search(equilibrium, error, before, load_factor: float) -> str:
 
 
 def _factored(model) -> bool:
-    return model.touch is None and not (model.net is not None and large_static(model))
+    return model.touch is None and not (model.coupled is not None and large_static(model))
 
 
 def unresisted(tangent, state, load_factor: float) -> str:
@@ -40,7 +40,7 @@ def unresisted(tangent, state, load_factor: float) -> str:
     if not np.isfinite(stiffness.data).all() or not np.isfinite(residual).all():
         return ""
     for mode in rigid_modes(tangent, state, stiffness).T:
-        if abs(mode @ residual) > PUSHED * np.linalg.norm(mode) * np.linalg.norm(residual):
+        if abs(mode @ residual) > LOADED * np.linalg.norm(mode) * np.linalg.norm(residual):
             return f"hold {tangent.where(int(np.argmax(np.abs(mode))))}, which nothing keeps from moving"
     return ""
 

@@ -71,7 +71,7 @@ class RestPath:
         return [batch.name for batch in self.model.scene.batches for _ in range(batch.rods)]
 
     def _add_shell(self, key, shell: int, changes: Mapping) -> None:
-        shell_host = self.model.net.host.shells[shell]
+        shell_host = self.model.coupled.host.shells[shell]
         before = shell_host.plate
         try:
             set_rest(self.model, shell, **changes)
@@ -121,7 +121,7 @@ class RestPath:
                         0 if group.kind.closed else term.measure.span
                     )
                     yield _of_group(model, group, term, columns, count)
-        for part in model.net.sets if model.net is not None else ():
+        for part in model.coupled.sets if model.coupled is not None else ():
             if part.term.rest and hasattr(part.host, "owner") and len(part.host.owner):
                 elements = np.flatnonzero(part.host.owner[0] == rod)
                 if elements.size and not part.term.measure.spins:

@@ -45,7 +45,7 @@ DESCENTS = 8  # descents from saddles in one solve
 # where supports compress everything.
 UNFINISHED = ("max_iterations", "line_search_failed", "no_room")
 LOST = 1e-3  # fraction of the loads that supports and obstacles may miss by rounding
-FIRST_TURN = 0.1  # rotation by which a search leaves a saddle [rad]
+FIRST_ROTATION = 0.1  # rotation by which a search leaves a saddle [rad]
 
 
 @argument_checks.called
@@ -160,10 +160,10 @@ class Equilibrium:
         lost_in_rounding(model)
         scene_validate.warn_of_massless(model)
         self._descends = self._solver() == "direct"
-        self.net = None if self._descends and not model.touch else CoupledEquilibrium(self)
-        self._rubs = model.touch is not None and model.net.host.touching.rubs
+        self.coupled = None if self._descends and not model.touch else CoupledEquilibrium(self)
+        self._rubs = model.touch is not None and model.coupled.host.touching.has_friction
         self.factors = self._descends or (model.touch is not None and not self._rubs and not large_static(model))
-        self.mixed = self.tangent.shells_alone and self.net is None
+        self.mixed = self.tangent.shells_alone and self.coupled is None
         self.descent = DirectNewton(self)
         self.iterations = 0
         self.outcome, self.stiffness = "", None
@@ -171,7 +171,7 @@ class Equilibrium:
     @property
     def pcg_iterations(self) -> int:
         """Iterations of conjugate gradients so far."""
-        return 0 if self._descends else self.net.pcg_iterations()
+        return 0 if self._descends else self.coupled.pcg_iterations()
 
     def _solver(self) -> str:
         """Return the solver of the options; refuse one that does not support the model."""
@@ -224,18 +224,18 @@ class Equilibrium:
                 "there is none; give start other than end, or friction=0"
             )
         inputs = checked(controls, self.model, "statics")
-        if self.net and self.net.newton.outdated:
-            self.net = CoupledEquilibrium(self)
+        if self.coupled and self.coupled.newton.outdated:
+            self.coupled = CoupledEquilibrium(self)
         self.check_apart(state)
         self.tangent.give(inputs)
         self.tangent.poses = poses_between(state, inputs["poses"], start, end) if "poses" in inputs else None
         state = state.copy()
         state.stop()
         shapes = RestPath(self.model, rest if rest is not None else {})
-        if self.net and self.net.arcs:
-            load_steps = self.net.arcs.increments(state, inputs.get("poses"), start, end, load_steps)
-        if state.net is not None:
-            state.net.rate.zero_()  # contact has no inertia in equilibria
+        if self.coupled and self.coupled.arcs:
+            load_steps = self.coupled.arcs.increments(state, inputs.get("poses"), start, end, load_steps)
+        if state.coupled is not None:
+            state.coupled.rate.zero_()  # contact has no inertia in equilibria
         if start == end:
             shapes.to(1.0)
             try:
@@ -248,7 +248,7 @@ class Equilibrium:
             return state
         current, whole, cuts = start, (end - start) / load_steps, 0
         if self._rubs:
-            self.net.wary = True
+            self.coupled.wary = True
         balanced = self._rubs or self._balanced(state, start)
         while current != end:
             increment = whole * 0.5**cuts
@@ -272,8 +272,8 @@ class Equilibrium:
                         state = self.solve(state, start, start)
                         continue
                 cuts += 1
-                if cuts > self.options.max_cuts and self._rubs and self.net.wary:
-                    self.net.wary, cuts = False, 0  # the structure may have to slide
+                if cuts > self.options.max_cuts and self._rubs and self.coupled.wary:
+                    self.coupled.wary, cuts = False, 0  # the structure may have to slide
                 elif cuts > self.options.max_cuts:
                     advice = jump_between(self.model, current, target)
                     details = f" (load parameter {current:g} of {end:g} reached, {cuts - 1} increments halved)"
@@ -304,29 +304,29 @@ class Equilibrium:
     def check_apart(self, state: State) -> None:
         """Refuse a start with overlapping surfaces, except for a penalty."""
         if self.model.touch and self.model.touch.keep:
-            self.net.newton.contact.check(state.net.q)
+            self.coupled.newton.contact.check(state.coupled.q)
 
     def _blocked(self, state: State, start: float, end: float) -> str:
         """Return the remedy for two fixed objects driven into each other by motions; empty without."""
         if not self.model.touch:
             return ""
-        return self.net.newton.contact.blocked(self.tangent, state, start, end).rstrip(", ")
+        return self.coupled.newton.contact.blocked(self.tangent, state, start, end).rstrip(", ")
 
     def share(self, before: State, after: State) -> float:
         """Return the CCD step fraction of the straight path between two states."""
-        return self.net.share(*map(self.tangent.dofs, (before, after))) if self.model.touch else 1.0
+        return self.coupled.share(*map(self.tangent.dofs, (before, after))) if self.model.touch else 1.0
 
     def count(self, state: State, increment: float) -> None:
         """Add an equilibrium to the contact statistics, one load increment after the last."""
         if self.model.touch:
-            self.net.count(state, increment)
+            self.coupled.count(state, increment)
 
     def statistics(self) -> dict:
         """Return contact statistics of the counted equilibria under "contact"; `load` counts.
 
         See `CoupledEquilibrium.contact_statistics`.
         """
-        return {"contact": self.net.contact_statistics()} if self.model.touch else {}
+        return {"contact": self.coupled.contact_statistics()} if self.model.touch else {}
 
     def solve(self, state: State, before: float, load_factor: float) -> State:
         """Return the equilibrium at `load_factor` from a state at load parameter `before`, with the last controls.
@@ -388,10 +388,10 @@ class Equilibrium:
                 )
             return self.descent.solve(state, load_factor)
         try:
-            state = self.net.solve(state, load_factor, before, increment)
+            state = self.coupled.solve(state, load_factor, before, increment)
         except SolverError as error:
             goes_on = not self._rubs and (self.factors or self.model.touch is None)
-            if not (goes_on and error.outcome in UNFINISHED and self.net.arrived):
+            if not (goes_on and error.outcome in UNFINISHED and self.coupled.arrived):
                 raise
             return self.descent.solve(error.state, load_factor)  # with second derivatives that conjugate gradients omit
         self.stiffness = self.tangent.stiffness(state, load_factor) if self.factors else None
@@ -410,7 +410,7 @@ class Equilibrium:
         tangent = self.tangent
         island, q, energies = tangent.island, tangent.dofs(state), tangent.element_energies(state)
         rotations = tangent.rotations(q, modes)
-        length = np.divide(FIRST_TURN, rotations, out=np.zeros_like(rotations), where=rotations > 0.0)
+        length = np.divide(FIRST_ROTATION, rotations, out=np.zeros_like(rotations), where=rotations > 0.0)
         noise = 64 * self.model.types.eps * tangent.island_energies(np.abs(energies))
         wanted = length > 0.0
 
@@ -479,7 +479,7 @@ class Equilibrium:
         if not step.any():
             return alone
         state = tangent.with_prescribed(state, load_factor)
-        direction = (self.descent if self._descends else self.net).following(state, step, load_factor)
+        direction = (self.descent if self._descends else self.coupled).following(state, step, load_factor)
         if direction is None:
             return alone
         q = tangent.dofs(state)

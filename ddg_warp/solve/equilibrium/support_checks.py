@@ -17,8 +17,8 @@ def require_supports(model) -> None:
                     f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
                     "add scene.clamp(...) or scene.fix(...)"
                 )
-    if model.net is not None:
-        host = model.net.host
+    if model.coupled is not None:
+        host = model.coupled.host
         for i, shell in enumerate(host.meridians):
             if not host.fixed[shell.nodes, 2].any():
                 raise SceneError(

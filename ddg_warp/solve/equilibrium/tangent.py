@@ -31,7 +31,7 @@ class Tangent:
         for group in model.groups:
             self.parts.append(RodTangent(model, group, offset))
             offset += self.parts[-1].size
-        if model.net is not None:
+        if model.coupled is not None:
             from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 
             self.parts.append(CoupledTangent(model, offset))
@@ -90,7 +90,7 @@ class Tangent:
     @property
     def shells_alone(self) -> bool:
         """True if the model consists of shells alone."""
-        return not self.model.groups and not self.model.net.edges
+        return not self.model.groups and not self.model.coupled.edges
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
         """Return the exact Hessian of the elastic energy (size, size), for the coupled system with `stress` if given."""
@@ -156,15 +156,17 @@ class Tangent:
         """Return friction forces by `state.rubbing` (size,) [N], which are not in the gradient; zero without friction."""
         result, touch = np.zeros(self.size), self.model.touch
         if touch and touch.terms.frictions:
-            net = self.parts[-1]
-            self.of(net, result)[:] = net.into(touch.friction(state.net.q, state.rubbing, state.net.rate).ravel())
+            coupled = self.parts[-1]
+            self.of(coupled, result)[:] = coupled.into(
+                touch.friction(state.coupled.q, state.rubbing, state.coupled.rate).ravel()
+            )
         return result
 
     @property
     def prescribes(self) -> bool:
         """True if states prescribe more than dofs: shell normals of supports, or a magnetic field."""
-        return self.model.net is not None and any(
-            len(part.turning) or part.term.measure.field for part in self.model.net.sets
+        return self.model.coupled is not None and any(
+            len(part.turning) or part.term.measure.field for part in self.model.coupled.sets
         )
 
     def with_prescribed(self, state, load_factor: float):

@@ -31,7 +31,7 @@ class TangentBlock:
     @property
     def mass(self) -> np.ndarray:
         """Mass and rotary inertia of every dof (size,) [kg, kg m^2]."""
-        return self.part.dof_masses() if self.part.weighed else self._usual_mass
+        return self.part.dof_masses() if self.part.has_custom_mass else self._usual_mass
 
     @cached_property
     def _usual_mass(self) -> np.ndarray:

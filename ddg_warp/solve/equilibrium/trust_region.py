@@ -125,11 +125,11 @@ class TrustRegion:
         step[rows] = Factorisation(self.metric[rows][:, rows]).solve(residual[rows])
         return self.tangent.rotations(q, step) / np.minimum(self.radius, self.cap)
 
-    def _solved(self, hessian, right, shift, islands) -> tuple[np.ndarray, np.ndarray]:
+    def _solved(self, hessian, rhs, shift, islands) -> tuple[np.ndarray, np.ndarray]:
         """Return the mask of islands with definite shifted matrix (count,), and solutions (size,), zero in others."""
         definite, solution = np.zeros(self.count, bool), np.zeros(self.tangent.size)
         for rows, factors in self._factors(hessian, shift, islands):
-            values = factors.solve(right[rows])
+            values = factors.solve(rhs[rows])
             indefinite = np.bincount(self.island[rows], factors.negative_rows, self.count) > 0
             present = np.bincount(self.island[rows], minlength=self.count) > 0
             definite |= present & ~indefinite

@@ -162,7 +162,7 @@ class CoupledScale(_Scale):
         bodies = part.host.bodies
         super().__init__(model, part.worlds, bodies.owner, bodies.count)
         real, self._scale = model.types.real, solver.outer
-        self._share, self._limit = kernels.share_kernel(real), kernels.limit_kernel(real)
+        self._share, self._limit = kernels.scale_kernel(real), kernels.limit_kernel(real)
         self.kernels += [self._share, self._limit]
         order = np.argsort(bodies.components, kind="stable")
         count = int(bodies.components.max()) + 1
@@ -196,7 +196,7 @@ class CoupledScale(_Scale):
 def loaded_rows(model, part) -> tuple[np.ndarray, np.ndarray]:
     """Return loadable dof blocks, and the user's row of each: points for nodes, edges for angles."""
     order, host = model.order, part.host
-    if part is model.net:
+    if part is model.coupled:
         rows, blocks = order.net_rows
         edges = [order.edge_starts[rod.rod] + np.arange(len(rod.edges)) for rod in host.rods]
         return np.concatenate([blocks, *(rod.edges for rod in host.rods)]), np.concatenate([rows, *edges])

@@ -38,19 +38,19 @@ class Drag:
     def _over_a_second(self) -> Islands:
         """Return islands with the inertia and drag coefficients of a step of one second."""
         islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
-        islands.coefficient.fill_(1.0)
-        islands.rate.fill_(1.0)
+        islands.inertia_coefficient.fill_(1.0)
+        islands.inverse_step.fill_(1.0)
         return islands
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
 
 
-class ChainDrag(Drag):
+class RodGroupDrag(Drag):
     """Drag on a rod group in a flowing fluid."""
 
     def __init__(self, model, group, midpoint: bool = False):
-        super().__init__(model, group, drag.chain_kernels(group.kind, model.types.real), midpoint)
+        super().__init__(model, group, drag.rod_kernels(group.kind, model.types.real), midpoint)
 
     def resist(self, before, newton, islands) -> None:
         """Write inertia and drag of a solve from the state `before`, after the predictor."""
@@ -104,8 +104,8 @@ class CoupledDrag(Drag):
     """Drag on the coupled rods in a flowing fluid."""
 
     def __init__(self, model, midpoint: bool = False):
-        net, host, device = model.net, model.net.host, model.wp_device
-        super().__init__(model, net, drag.net_kernels(model.types.real), midpoint)
+        coupled, host, device = model.coupled, model.coupled.host, model.wp_device
+        super().__init__(model, coupled, drag.coupled_kernels(model.types.real), midpoint)
         ends, angles, _ = host.drag
         places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
         starts, items = lists(places, host.blocks + 1)
@@ -116,35 +116,35 @@ class CoupledDrag(Drag):
 
     def resist(self, before, solver, islands) -> None:
         """Write inertia and drag of a solve from the state `before`, after the predictor."""
-        net = self.part
+        coupled = self.part
         self._launch(
             self._resist,
-            net.worlds * net.blocks,
-            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, net.mass, self.ends]
-            + [net.drag, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
-            + [net.blocks, net.host.nodes],
+            coupled.worlds * coupled.blocks,
+            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, coupled.mass, self.ends]
+            + [coupled.drag, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
+            + [coupled.blocks, coupled.host.nodes],
             [solver.mass],
         )
 
     def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return inertia and drag (world, block) of a state at t over a second, and the flow (blocks, 3)."""
-        net, device = self.part, self.model.wp_device
-        mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
+        coupled, device = self.part, self.model.wp_device
+        mass = wp.zeros((coupled.worlds, coupled.blocks), dtype=drag.block_inertia(coupled.real), device=device)
         self.upload(t, t)
-        self.resist(state, SimpleNamespace(q=state.q, outer=net.still, mass=mass), self._over_a_second())
-        flow = np.zeros((net.blocks, 3))
-        flow[: net.host.nodes] = self.flow.numpy()[0]
+        self.resist(state, SimpleNamespace(q=state.q, outer=coupled.still, mass=mass), self._over_a_second())
+        flow = np.zeros((coupled.blocks, 3))
+        flow[: coupled.host.nodes] = self.flow.numpy()[0]
         return mass.numpy(), flow
 
     def rates(self, state, lead: float) -> np.ndarray:
         """Return rates of dof blocks (world, block), of massless dofs extrapolated by `lead` [s]."""
-        net = self.part
-        v, a = (array.numpy().astype(float).reshape(net.worlds, -1, 3) for array in (state.v, state.a))
-        return v + lead * np.where((net.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
+        coupled = self.part
+        v, a = (array.numpy().astype(float).reshape(coupled.worlds, -1, 3) for array in (state.v, state.a))
+        return v + lead * np.where((coupled.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
 
     def settle(self, before, after, solver, islands) -> None:
         """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
-        net = self.part
+        coupled = self.part
         if self.midpoint:
-            inputs = [solver.q, solver.mass, *islands.arrays, net.blocks, after.q, before.v]
-            self._launch(self._settle, net.worlds * net.blocks, inputs, [after.v, after.a])
+            inputs = [solver.q, solver.mass, *islands.arrays, coupled.blocks, after.q, before.v]
+            self._launch(self._settle, coupled.worlds * coupled.blocks, inputs, [after.v, after.a])

@@ -24,13 +24,16 @@ class Gyroscope:
         self._parts = [
             _Part(model, group, dt) if spins else None for group, spins in zip(model.groups, heavy, strict=True)
         ]
-        heavy = model.net is not None and model.net.host.mass[model.net.angle_start :][: model.net.edges].any()
-        self._net = _Part(model, model.net, dt) if heavy else None
+        heavy = (
+            model.coupled is not None
+            and model.coupled.host.mass[model.coupled.angle_start :][: model.coupled.edges].any()
+        )
+        self._coupled = _Part(model, model.coupled, dt) if heavy else None
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [part.kernel for part in (*self._parts, self._net) if part]
+        return [part.kernel for part in (*self._parts, self._coupled) if part]
 
     def begin(self, before: State, steps: list, net_step) -> State:
         """Return the state before a step with velocities after half of the couples; capturable."""
@@ -38,16 +41,16 @@ class Gyroscope:
             part.begin(state, step.islands) if part else state
             for part, state, step in zip(self._parts, before.groups, steps, strict=True)
         ]
-        net = self._net.begin(before.net, net_step.islands) if self._net else before.net
-        return State(self._model, groups, net, before.time, before.grips)
+        coupled = self._coupled.begin(before.coupled, net_step.islands) if self._coupled else before.coupled
+        return State(self._model, groups, coupled, before.time, before.grips)
 
     def finish(self, after: State, steps: list, net_step) -> None:
         """Apply the other half of the couples to the state after a step, in place; capturable."""
         for part, state, step in zip(self._parts, after.groups, steps, strict=True):
             if part:
                 part.kick(state, state.v, step.islands, True)
-        if self._net:
-            self._net.kick(after.net, after.net.v, net_step.islands, True)
+        if self._coupled:
+            self._coupled.kick(after.coupled, after.coupled.v, net_step.islands, True)
 
 
 class _Part:
@@ -67,7 +70,7 @@ class _Part:
         free = np.where(host.holding(np.arange(host.nodes)), 0.0, 1.0)
         free[list(getattr(host, "frames", ()))] = 0.0  # nodes on skew supports count as fixed
         self._free = wp.array(free, dtype=vector, device=device)
-        self._is_net = part is model.net
+        self._is_net = part is model.coupled
         shape = (part.worlds * part.blocks,) if self._is_net else (part.nodes, part.columns)
         self._v = device_arrays.allocate(shape, vector, device)
 

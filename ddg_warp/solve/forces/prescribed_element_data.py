@@ -17,11 +17,11 @@ class CoupledMotion(Motion):
     """
 
     def __init__(self, model, midpoint: bool = False):
-        super().__init__(model, model.net, midpoint)
+        super().__init__(model, model.coupled, midpoint)
         self._normals, self._turn = normal_kernels(model.types.real, midpoint)
-        start, self.normals, self.data = pose_starts(model.motions), {}, model.net.turning_data()
+        start, self.normals, self.data = pose_starts(model.motions), {}, model.coupled.turning_data()
         for i in self.data:
-            (element, row, index), rest = model.net.sets[i].turning.T, model.net.sets[i].turning_rest
+            (element, row, index), rest = model.coupled.sets[i].turning.T, model.coupled.sets[i].turning_rest
             self.normals[i] = self._list(element, row, start[index]), self._vectors(rest)
 
     @property
@@ -35,10 +35,10 @@ class CoupledMotion(Motion):
 
     def direct(self, islands, q: wp.array, frame: wp.array) -> None:
         """Set prescribed twist angles, among the blocks q, and normals."""
-        net = self.part
-        super().direct(islands, net.points(q), net.frames(frame), net.angles(q))
+        coupled = self.part
+        super().direct(islands, coupled.points(q), coupled.frames(frame), coupled.angles(q))
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, net.sets[index].elements]
+            inputs = [where, rest, self.pose, self.stride, self.rows, *islands.arrays, coupled.sets[index].elements]
             self._launch(self._normals, where, inputs, [self.data[index]])
 
     def turn(self, islands, before: CoupledState, after: CoupledState) -> None:
@@ -59,8 +59,8 @@ class CoupledField:
     """
 
     def __init__(self, model, midpoint: bool, control_field: wp.array | None):
-        self.model, self.net, self.midpoint, self.given = model, model.net, midpoint, control_field
-        self.data = model.net.field_data()
+        self.model, self.coupled, self.midpoint, self.given = model, model.coupled, midpoint, control_field
+        self.data = model.coupled.field_data()
         self._kernel = field_kernel(model.types.real)
         self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
 
@@ -77,7 +77,7 @@ class CoupledField:
         self._now.assign(field.at(0.5 * (t0 + t1) if self.midpoint else t1, 1.0))
         self._end.assign(field.at(t1, 1.0))
         for index, data in self.data.items():
-            self._launch(index, self._now, self.net.every, data, data)
+            self._launch(index, self._now, self.coupled.every, data, data)
 
     def finish(self, moved: wp.array, before: CoupledState, after: CoupledState) -> None:
         """Set the field at the end of the step, in worlds that `moved`."""
@@ -85,7 +85,7 @@ class CoupledField:
             self._launch(index, self._end, moved, before.data[index], after.data[index])
 
     def _launch(self, index: int, field: wp.array, moved: wp.array, before: wp.array, after: wp.array) -> None:
-        element_set, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
+        element_set, first = self.coupled.sets[index], self.coupled.sets[index].term.measure.data_size - FIELD
         inputs = [field, self.given, first, element_set.elements, moved, before]
         dim = element_set.elements * self.model.worlds
         wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)

@@ -44,12 +44,12 @@ def jump_between(model, t0: float, t1: float) -> str:
     return ""
 
 
-def counts_turns(poses: np.ndarray) -> bool:
+def counts_revolutions(poses: np.ndarray) -> bool:
     """Return True if a rotation vector of poses (..., 6) exceeds the range of orientations."""
     return bool((np.square(poses[..., 3:]).sum(-1) > COUNTED**2).any())
 
 
-def turns_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
+def rotations_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Return the shorter rotation vectors (..., 3) of grips between poses (..., 6); see `Grip`.
 
     Raises:
@@ -67,7 +67,7 @@ def turns_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
             f"turned_too_far: poses of grip {long[0] % grips}{world} differ by {turns:.3g} turns, from the rotation vector "
             f"{np.round(first[long[0]], 6).tolist()} to {np.round(last[long[0]], 6).tolist()}, and a grip takes the shorter way, half "
             f"a turn at most; go in {int(np.ceil(2.0 * turns))} steps or more, or give the rotation vector of the shorter way",
-            outcome=outcome.NAMES[outcome.TURNED_TOO_FAR],
+            outcome=outcome.NAMES[outcome.ROTATED_TOO_FAR],
         )
     turn = (Rotation.from_rotvec(last) * Rotation.from_rotvec(first).inv()).as_rotvec()
     half = np.linalg.norm(turn, axis=-1) > np.pi - 2.0 * HALF
@@ -79,13 +79,13 @@ def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> C
     """Return poses of grips (worlds, grips, 6) as a function of the load parameter, from the state to `ends`.
 
     Raises:
-        SolverError: as `turns_between`.
+        SolverError: as `rotations_between`.
     """
     from scipy.spatial.transform import Rotation
 
     begin = state.poses().reshape(state.model.worlds, -1, 6)
     ends = np.array(np.broadcast_to(ends, begin.shape))
-    first, turn = Rotation.from_rotvec(begin[..., 3:].reshape(-1, 3)), turns_between(begin, ends).reshape(-1, 3)
+    first, turn = Rotation.from_rotvec(begin[..., 3:].reshape(-1, 3)), rotations_between(begin, ends).reshape(-1, 3)
 
     def poses(load_factor: float) -> np.ndarray:
         if load_factor == end:
@@ -231,7 +231,7 @@ class Motion:
         self.upload(t0, t1)
         self.follow(state, state)
         islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
-        islands.portion.fill_(1.0)
+        islands.substep_fraction.fill_(1.0)
         self.apply(islands, *arrays)
 
     def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:

@@ -38,15 +38,15 @@ class Bordered:
         except RuntimeError as error:
             raise SingularError("the path of equilibria has no single tangent here") from error
 
-    def particular(self, right: np.ndarray) -> np.ndarray:
+    def particular(self, rhs: np.ndarray) -> np.ndarray:
         """Return (dq, dl) (n + 1,) of K dq - f dl = right, with zero change of the unknown k."""
-        return self._unscaled(self._lu.solve(np.append(self._scale * right, 0.0)))
+        return self._unscaled(self._lu.solve(np.append(self._scale * rhs, 0.0)))
 
     def tangent(self) -> np.ndarray:
         """Return (dq, dl) (n + 1,) of K dq - f dl = 0, with unit change of the unknown k."""
-        right = np.zeros(len(self._scale) + 1)
-        right[-1] = 1.0 / self._unknown_scale
-        return self._unscaled(self._lu.solve(right))
+        rhs = np.zeros(len(self._scale) + 1)
+        rhs[-1] = 1.0 / self._unknown_scale
+        return self._unscaled(self._lu.solve(rhs))
 
     def _unscaled(self, z: np.ndarray) -> np.ndarray:
         return z * np.append(self._scale, self._load_scale)

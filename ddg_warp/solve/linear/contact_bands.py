@@ -16,8 +16,8 @@ class ContactBands:
 
     def __init__(self, chains, shapes):
         self.chains, self._edges = chains, len(shapes.things(2)[0])
-        next_edge = _edges_ahead(shapes, chains.plan, chains.net.blocks)
-        angle_edge = _turning(shapes, chains.plan, chains.net.blocks)
+        next_edge = _following_edges(shapes, chains.plan, chains.coupled.blocks)
+        angle_edge = _turning(shapes, chains.plan, chains.coupled.blocks)
         self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.dtype, bool((angle_edge >= 0).any()))
         self.kernels = [self._stiffen]
         self._ahead, self._turning = (
@@ -29,7 +29,7 @@ class ContactBands:
         direction.
         """
         chains = self.chains
-        inputs = [chains.bands, chains.layout, self._ahead, self._edges, flags, chains.net.blocks]
+        inputs = [chains.bands, chains.layout, self._ahead, self._edges, flags, chains.coupled.blocks]
         inputs += [terms.diagonal, terms.between, self._turning, *terms.turned]
         dim = chains.longest, chains.columns
         wp.launch(self._stiffen, dim, inputs, [chains.eliminated], device=chains.device)
@@ -43,7 +43,7 @@ def _turning(shapes, plan, blocks: int) -> np.ndarray:
     return edge[plan.places[1]] if plan.twist else np.full(plan.places[0].shape, -1, np.int32)
 
 
-def _edges_ahead(shapes, plan, blocks: int) -> np.ndarray:
+def _following_edges(shapes, plan, blocks: int) -> np.ndarray:
     """Return the collision edge from the node of each path node to the next one; -1 for none."""
     ends, *_ = shapes.things(2)
     node = plan.places[0]

@@ -68,7 +68,7 @@ class CyclicReduction:
             return [*reducing, self._pack, (self._again, self._threads)]
         return [*reducing, (self._last, 32), self._expand]
 
-    def solve(self, matrix, right, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
+    def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
         """Solve the wanted columns from the blocks of nodes; count lost pivots in `lost`.
 
         `again` solves a further right-hand side of the same matrix. The solution may overwrite the right-hand side.
@@ -76,16 +76,16 @@ class CyclicReduction:
         if self.repeats:
             if not again:
                 self.factorise(matrix, count, wanted, lost)
-            self.again(right, count, wanted, 1, solution)
+            self.again(rhs, count, wanted, 1, solution)
             return
         for level, kernel in enumerate(self._reduce):
             outputs = [self.matrices[level], self.rights[level], self.kept[level]]
-            self._eliminate(level, kernel, 2 * self.dofs + 1, [matrix, right, count, wanted], 0, outputs, lost)
-            matrix, right = outputs[:2]
+            self._eliminate(level, kernel, 2 * self.dofs + 1, [matrix, rhs, count, wanted], 0, outputs, lost)
+            matrix, rhs = outputs[:2]
         wp.launch(
             self._last,
             self.columns,
-            [matrix, right, count, wanted],
+            [matrix, rhs, count, wanted],
             [solution, lost],
             device=self.device,
             block_dim=32,
@@ -125,12 +125,12 @@ class CyclicReduction:
 
     def again_kernel_at_places(self, twist: bool):
         """Return the kernel of `again_at_places` and the block size."""
-        return cyclic_reduction_solve.again_at_places_kernel(twist, self._linear), self._threads
+        return cyclic_reduction_solve.solve_at_path_nodes_kernel(twist, self._linear), self._threads
 
     def again_at_places(
         self, twist: bool, residual, places, fixed, count, inactive, wanted, blocks: int, z, dots
     ) -> None:
-        """Solve rod paths of the coupled system with kept factors, see `cyclic_reduction_solve.again_at_places_kernel`."""
+        """Solve rod paths of the coupled system with kept factors, see `cyclic_reduction_solve.solve_at_path_nodes_kernel`."""
         kernel, threads = self.again_kernel_at_places(twist)
         wp.launch(
             kernel,
@@ -141,12 +141,12 @@ class CyclicReduction:
             block_dim=threads,
         )
 
-    def again(self, right, count, wanted: wp.array, width: int, solution: wp.array) -> None:
+    def again(self, rhs, count, wanted: wp.array, width: int, solution: wp.array) -> None:
         """Solve columns with kept factors; `wanted` has one flag for every `width` columns."""
         wp.launch(
             self._again,
             self.columns * self._threads,
-            [self._packed, right, count, wanted, width, self.blocks[0], self._threads],
+            [self._packed, rhs, count, wanted, width, self.blocks[0], self._threads],
             [self._rest, self._found, solution],
             device=self.device,
             block_dim=self._threads,
@@ -171,11 +171,11 @@ class Elimination:
         """Kernels to load before a capture."""
         return [(self._factor, THREADS), (self._direct, THREADS)]
 
-    def solve(self, matrix, right, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
+    def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
         """Solve the wanted columns; see `CyclicReduction.solve`."""
         if not again:
             self._launch(self._factor, [matrix, count, wanted, self._first, 0], [self._factors, lost])
-        self._launch(self._direct, [self._factors, right, count, wanted], [solution])
+        self._launch(self._direct, [self._factors, rhs, count, wanted], [solution])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.columns, inputs, outputs, device=self.device, block_dim=THREADS)
@@ -191,7 +191,7 @@ class TensionReduction:
         self.levels = CyclicReduction(size, group.nodes, columns, linear, device, mixed_pairs.TENSIONS)
         matrix_rows, right_rows, _ = cyclic_reduction.level_rows(size)
         pairs = self.levels.blocks[0]
-        self.matrix, self.right = (
+        self.matrix, self.rhs = (
             device_arrays.allocate((rows, pairs, columns), linear, device) for rows in (matrix_rows, right_rows)
         )
         self.solution = device_arrays.allocate((size, group.nodes, columns), linear, device)
@@ -203,17 +203,19 @@ class TensionReduction:
         """Kernels to load before a capture."""
         return [self._pair, self._unpair, *self.levels.kernels]
 
-    def solve(self, blocks, factor, right, x, islands, direction: wp.array) -> None:
+    def solve(self, blocks, factor, rhs, x, islands, direction: wp.array) -> None:
         """Solve for directions and edge elongations of wanted rods, from dof blocks and Gauss-Newton factors."""
         group = self.group
         wp.launch(
             self._pair,
-            self.right.shape,
-            [blocks, factor, group.fixed, right, group.count, islands.wanted],
-            [self.matrix, self.right],
+            self.rhs.shape,
+            [blocks, factor, group.fixed, rhs, group.count, islands.needs_direction],
+            [self.matrix, self.rhs],
             device=self.device,
         )
-        self.levels.solve(self.matrix, self.right, group.count, islands.wanted, self.solution, islands.bad)
+        self.levels.solve(
+            self.matrix, self.rhs, group.count, islands.needs_direction, self.solution, islands.lost_pivots
+        )
         wp.launch(
             self._unpair,
             self.solution.shape[1:],

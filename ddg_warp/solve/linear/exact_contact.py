@@ -16,10 +16,12 @@ class ExactContact:
         diagonal: (W N,) diagonal blocks, for preconditioners.
     """
 
-    def __init__(self, net):
-        self.net, contact = net, net.host.touching
-        obstacle_nodes = net.host.of_obstacles  # their rows of H do not count
-        self.touch = ContactModel(net, wp.float64, net.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True)
+    def __init__(self, coupled):
+        self.coupled, contact = coupled, coupled.host.touching
+        obstacle_nodes = coupled.host.of_obstacles  # their rows of H do not count
+        self.touch = ContactModel(
+            coupled, wp.float64, coupled.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True
+        )
         self.search, self.terms = self.touch.search, self.touch.terms
         self.diagonal = self.terms.diagonal
         self._q = self._bands = None
@@ -52,7 +54,7 @@ class ExactContact:
         search.search(q)
         terms.evaluate(q, rate if terms.frictions else None, before)
         terms.meet()
-        terms.prepare(q, self.net.every)
+        terms.prepare(q, self.coupled.every)
         self._q = q
 
     def assemble(self) -> None:
@@ -63,14 +65,14 @@ class ExactContact:
 
     def spread(self, p: wp.array) -> None:
         """Write the contributions of pairs to H p."""
-        self.terms.place(p, self._q, self.net.every)
+        self.terms.place(p, self._q, self.coupled.every)
 
     def settle(self, p: wp.array, product: wp.array) -> None:
         """Add the contributions of pairs to the product, and write p . H p block by block."""
         system = self._system
-        self.terms.settle(p, product, system.barred, system.islands.wanted, system.krylov_dots)
+        self.terms.settle(p, product, system.inactive_mask, system.islands.needs_direction, system.krylov_dots)
 
-    def outgrown(self, q: wp.array) -> bool:
+    def has_overflow(self, q: wp.array) -> bool:
         """Return True if lists of pairs overflowed and have grown. Reads from the device."""
         grown = self.search.fit(q)
         return self.terms.fit() or grown

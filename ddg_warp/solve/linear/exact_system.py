@@ -13,7 +13,7 @@ from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.solve.linear.pcg import PCG
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.skew_supports import SkewSupports
-from ddg_warp.solve.linear.solver_selection import net_preconditioner
+from ddg_warp.solve.linear.solver_selection import coupled_preconditioner
 from ddg_warp.solve.linear.sparse_system import SparseSystem
 
 
@@ -42,25 +42,25 @@ class ExactSystem:
 
     def __init__(self, model, inertia: wp.array | None = None, contact=None):
         self.contact = contact
-        net, real = model.net, model.types.real
-        self.net, self.device, self.real, self.linear = net, net.device, real, wp.float64
-        worlds, host, device = net.worlds, net.host, net.device
-        self.worlds, self.all = worlds, worlds * net.blocks
+        coupled, real = model.coupled, model.types.real
+        self.coupled, self.device, self.real, self.linear = coupled, coupled.device, real, wp.float64
+        worlds, host, device = coupled.worlds, coupled.host, coupled.device
+        self.worlds, self.all = worlds, worlds * coupled.blocks
         H = wp.types.vector(3, self.linear)
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        preconditioner = net_preconditioner(net)
-        self.chains = RodSubstructuring.of(net, preconditioner, banded=False)
-        self.system = SparseSystem(net)
-        self.planes = SkewSupports(net, self.system, real, self.linear) if host.frames else None
+        preconditioner = coupled_preconditioner(coupled)
+        self.chains = RodSubstructuring.of(coupled, preconditioner, banded=False)
+        self.system = SparseSystem(coupled)
+        self.planes = SkewSupports(coupled, self.system, real, self.linear) if host.frames else None
         self.fixed = self.bits(host.fixed)
-        self.barred = wp.array(np.tile(self.fixed.numpy(), worlds), dtype=wp.uint8, device=device)
-        self.mass = net.mass if inertia is None else inertia
-        self.right, self.direction = (make(self.all, H) for _ in range(2))
+        self.inactive_mask = wp.array(np.tile(self.fixed.numpy(), worlds), dtype=wp.uint8, device=device)
+        self.mass = coupled.mass if inertia is None else inertia
+        self.rhs, self.direction = (make(self.all, H) for _ in range(2))
         self.matrix = make((9, worlds * self.system.positions), self.linear)
-        self.krylov_dots = make((worlds, net.blocks), self.linear)
+        self.krylov_dots = make((worlds, coupled.blocks), self.linear)
         self.iterations, self.indefinite, self.failed = (make(worlds, int) for _ in range(3))
         self.forcing = make(worlds, self.linear)
         self.islands = self.anew = Islands(worlds, real, device)
@@ -72,13 +72,15 @@ class ExactSystem:
         self._begin, self._add = exact_kernels(real, self.linear, drag, device_arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
         self._rest, self._check = check_kernels(self.linear)
-        self._hessians = [element_path.term_kernels(coupled_storage(part.term, real), 0, real)[2] for part in net.sets]
-        sizes = [part.term.measure.size for part in net.sets]
-        largest = max(part.elements * size**2 for part, size in zip(net.sets, sizes, strict=True))
-        hessians, count = make(worlds * largest, real), [worlds * part.elements for part in net.sets]
+        self._hessians = [
+            element_path.term_kernels(coupled_storage(part.term, real), 0, real)[2] for part in coupled.sets
+        ]
+        sizes = [part.term.measure.size for part in coupled.sets]
+        largest = max(part.elements * size**2 for part, size in zip(coupled.sets, sizes, strict=True))
+        hessians, count = make(worlds * largest, real), [worlds * part.elements for part in coupled.sets]
         self._written = [hessians[: n * size**2].reshape((n, size, size)) for n, size in zip(count, sizes, strict=True)]
         self._no_stress = make((0, 0), real)
-        self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in net.sets]
+        self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in coupled.sets]
         self.krylov = PCG(self, preconditioner.endswith("multilevel"), indefinite=True)
 
     def bits(self, dofs: np.ndarray) -> wp.array:
@@ -92,7 +94,7 @@ class ExactSystem:
         own = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
         return [*own, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
-    def solve(self, state: CoupledState, coefficient: float, rate: wp.array, right: wp.array, w: wp.array) -> None:
+    def solve(self, state: CoupledState, coefficient: float, rate: wp.array, rhs: wp.array, w: wp.array) -> None:
         """Write w (W N,), zero at held dofs; what g (W N,) has there is left out. Launches alone.
 
         Args:
@@ -100,13 +102,13 @@ class ExactSystem:
             coefficient: c [1/s^2].
             rate: of every world, over which strain-rate damping counts [1/s].
         """
-        self.islands.wanted.fill_(1)
-        self.islands.coefficient.fill_(coefficient)
+        self.islands.needs_direction.fill_(1)
+        self.islands.inertia_coefficient.fill_(coefficient)
         self.assemble(state, rate)
-        self._launch(self._into, self.all, [right], [self.right])
+        self._launch(self._into, self.all, [rhs], [self.rhs])
         if self.planes:
-            self.planes.into(self.right, self.islands.wanted)
-        self._launch(self._keep, self.all, [self.fixed, self.net.blocks], [self.right])
+            self.planes.into(self.rhs, self.islands.needs_direction)
+        self._launch(self._keep, self.all, [self.fixed, self.coupled.blocks], [self.rhs])
         self.forcing.fill_(self.tolerance)
         self.krylov.solve()
         self.check()
@@ -114,11 +116,11 @@ class ExactSystem:
 
     def part(self, values: wp.array, left_out: wp.array, out: wp.array) -> None:
         """Write `values` (W N,) without their components at dofs whose bits are set, in the frames of planes where there are some."""
-        self._launch(self._into, self.all, [values], [self.right])
+        self._launch(self._into, self.all, [values], [self.rhs])
         if self.planes:
-            self.planes.into(self.right, self.net.every)
-        self._launch(self._keep, self.all, [left_out, self.net.blocks], [self.right])
-        self._give(self.right, out)
+            self.planes.into(self.rhs, self.coupled.every)
+        self._launch(self._keep, self.all, [left_out, self.coupled.blocks], [self.rhs])
+        self._give(self.rhs, out)
 
     def assemble(self, state: CoupledState, rate: wp.array) -> None:
         """H of all worlds."""
@@ -127,13 +129,20 @@ class ExactSystem:
         read = [self.mass, *self.islands.arrays, table.rows, table.columns, table.positions]
         self._launch(self._begin, every, read, [self.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
-            given = self.net.elements(state, i, rate=rate)
-            grid = self.net.worlds, self.net.sets[i].elements, hessian.shape[1]
+            given = self.coupled.elements(state, i, rate=rate)
+            grid = self.coupled.worlds, self.coupled.sets[i].elements, hessian.shape[1]
             self._launch(kernel, grid, [given, self._no_stress], [hessian.transpose((1, 2, 0))])
-            read = [hessian, *table.adds[i], self._ends[i], self.net.sets[i].term.measure.slots, flags, table.positions]
+            read = [
+                hessian,
+                *table.adds[i],
+                self._ends[i],
+                self.coupled.sets[i].term.measure.slots,
+                flags,
+                table.positions,
+            ]
             self._launch(self._add, every, read, [self.matrix])
         if self.planes:
-            self.planes.matrix(self.matrix, self.islands.wanted)
+            self.planes.matrix(self.matrix, self.islands.needs_direction)
         if self.chains:
             self.chains.assemble(self.matrix, self.mass, self.islands)
         if self.contact:
@@ -141,10 +150,10 @@ class ExactSystem:
 
     def check(self) -> None:
         """`failed`, by the residual that the solution leaves."""
-        krylov, wanted = self.krylov, self.islands.wanted
+        krylov, wanted = self.krylov, self.islands.needs_direction
         wanted.fill_(1)
         krylov.multiply(self.direction)
-        read = [self.right, krylov.product, krylov.inverse, self.net.blocks]
+        read = [self.rhs, krylov.product, krylov.inverse, self.coupled.blocks]
         self._launch(self._rest, self.all, read, [krylov.rest, krylov.z, self.krylov_dots])
         krylov.precondition(krylov.z)
         krylov.sum(self.krylov_dots, krylov.total)
@@ -153,7 +162,7 @@ class ExactSystem:
     def _give(self, values: wp.array, out: wp.array) -> None:
         """Write blocks in the precision of the model, in space."""
         if self.planes:
-            self.planes.back(values, self.net.every)
+            self.planes.back(values, self.coupled.every)
         self._launch(self._back, self.all, [values], [out])
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:

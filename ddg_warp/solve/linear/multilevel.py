@@ -14,12 +14,12 @@ class Multilevel:
         `net`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
     """
 
-    def __init__(self, net, table, linear):
-        self.net, self.table, self.device = net, table, net.device
+    def __init__(self, coupled, table, linear):
+        self.coupled, self.table, self.device = coupled, table, coupled.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
-        nodes, worlds = net.host.nodes, net.worlds
-        order = curve_order(net.host.rest[:nodes])
-        rank = np.full(net.blocks, -1)
+        nodes, worlds = coupled.host.nodes, coupled.worlds
+        order = curve_order(coupled.host.rest[:nodes])
+        rank = np.full(coupled.blocks, -1)
         rank[order] = np.arange(nodes)
         self.counts = [nodes]
         while self.counts[-1] > GROUP:
@@ -60,7 +60,7 @@ class Multilevel:
         def put(values):
             return wp.array(values.astype(np.int32), dtype=int, device=self.device)
 
-        sums = wp.zeros(self.net.worlds * max(1, int(first[-1])), dtype=M, device=self.device)
+        sums = wp.zeros(self.coupled.worlds * max(1, int(first[-1])), dtype=M, device=self.device)
         return put(items), put(starts), put(first), sums
 
     @property
@@ -71,7 +71,7 @@ class Multilevel:
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array) -> None:
         """Sum and invert the diagonal blocks of all levels, in worlds that need a direction."""
         table, members, count = self.table, self._no_members, 0
-        worlds = self.net.worlds
+        worlds = self.coupled.worlds
         for groups, pieces_of_level, block, inverse in zip(
             self.counts, self.lists, self.blocks, self.inverses, strict=True
         ):
@@ -93,9 +93,9 @@ class Multilevel:
             )
             members, count = block, groups
 
-    def apply(self, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
+    def apply(self, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """Add the corrections of coarse levels to z, which has the finest one, and write r . z block by block."""
-        worlds, nodes, blocks = self.net.worlds, self.net.host.nodes, self.net.blocks
+        worlds, nodes, blocks = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks
         values, order, count, stride = residual, self.order, nodes, blocks
         for groups, sums in zip(self.counts, self.sums, strict=True):
             wp.launch(
@@ -119,7 +119,7 @@ class Multilevel:
         wp.launch(
             self._finish,
             worlds * blocks,
-            [residual, self.corrections[0], self.group, barred, self.counts[0], blocks, wanted],
+            [residual, self.corrections[0], self.group, inactive_mask, self.counts[0], blocks, wanted],
             [z, dots],
             device=self.device,
         )

@@ -15,7 +15,7 @@ from ddg_warp.solve.linear.sparse_system import Sums
 SPARE = 0.5  # safety factor of the last linear solve of a step: of the tolerance, and of the bodies that may exceed it
 
 
-def natural_scale(net) -> float:
+def natural_scale(coupled) -> float:
     """Return the power of two that scales products of forces and displacements to the order of one.
 
     Stretching an element of the coupled system by its length takes w k, measure times stiffness [J]. At lengths of 1e-9 m that is
@@ -23,7 +23,7 @@ def natural_scale(net) -> float:
     """
     energies = [
         float(np.median(part.parameters["measure"])) * float(np.median(part.parameters["stiffness"]))
-        for part in net.sets
+        for part in coupled.sets
         if part.term.name.endswith("_stretch") and {"measure", "stiffness"} <= set(part.parameters.values)
     ]
     largest = max(energies, default=1.0)
@@ -50,7 +50,7 @@ class PCG:
 
     def __init__(self, newton, multilevel: bool, indefinite: bool = False, scale: float = 1.0):
         self._scale, self._unit = newton.linear(scale), newton.linear(1.0 / scale)
-        self.newton, net, linear, device = newton, newton.net, newton.linear, newton.device
+        self.newton, coupled, linear, device = newton, newton.coupled, newton.linear, newton.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.rest, self.z, self.p, self.product = (wp.zeros(newton.all, dtype=H, device=device) for _ in range(4))
         self.inverse = wp.zeros(newton.all, dtype=M, device=device)
@@ -59,11 +59,11 @@ class PCG:
         )
         self.busy = wp.zeros(1, dtype=int, device=device)
         self._unread = [wp.zeros(newton.worlds, dtype=int, device=device) for _ in range(2)]
-        self.sum = Sums(newton.worlds, net.blocks, linear, device)
+        self.sum = Sums(newton.worlds, coupled.blocks, linear, device)
         self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(linear, indefinite)
         self._more = newton.contact.diagonal if newton.contact else wp.zeros(0, dtype=M, device=device)
-        self.levels = Multilevel(net, newton.system, linear) if multilevel else None
-        self._limit = max(200, 100 * math.isqrt(net.blocks))
+        self.levels = Multilevel(coupled, newton.system, linear) if multilevel else None
+        self._limit = max(200, 100 * math.isqrt(coupled.blocks))
 
     @property
     def kernels(self) -> list:
@@ -74,15 +74,20 @@ class PCG:
     def solve(self) -> None:
         """Compute directions. Worlds with an indefinite H or preconditioner are marked and keep the present approximation."""
         newton = self.newton
-        table, blocks, wanted, outdated = newton.system, newton.net.blocks, newton.islands.wanted, newton.anew.wanted
+        table, blocks, wanted, outdated = (
+            newton.system,
+            newton.coupled.blocks,
+            newton.islands.needs_direction,
+            newton.anew.needs_direction,
+        )
         self._launch(
             self._invert,
-            [newton.matrix, table.diagonal, newton.barred, outdated, blocks, table.positions, self._more],
+            [newton.matrix, table.diagonal, newton.inactive_mask, outdated, blocks, table.positions, self._more],
             [self.inverse],
         )
         self._launch(
             self._start,
-            [newton.right, self.inverse, table.diagonal, newton.barred, wanted, blocks, self._scale],
+            [newton.rhs, self.inverse, table.diagonal, newton.inactive_mask, wanted, blocks, self._scale],
             [self.rest, newton.direction, self.p, newton.krylov_dots],
         )
         if newton.chains:
@@ -108,28 +113,28 @@ class PCG:
     def precondition(self, z: wp.array) -> None:
         """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
         newton = self.newton
-        wanted, dots = newton.islands.wanted, newton.krylov_dots
+        wanted, dots = newton.islands.needs_direction, newton.krylov_dots
         if newton.chains:
-            newton.chains.apply(newton.matrix, self.rest, newton.barred, wanted, z, dots)
+            newton.chains.apply(newton.matrix, self.rest, newton.inactive_mask, wanted, z, dots)
         if self.levels:
-            self.levels.apply(self.rest, newton.barred, wanted, z, dots)
+            self.levels.apply(self.rest, newton.inactive_mask, wanted, z, dots)
 
     def cycle(self) -> None:
         """Run one iteration."""
         newton = self.newton
-        blocks, wanted, dots = newton.net.blocks, newton.islands.wanted, newton.krylov_dots
+        blocks, wanted, dots = newton.coupled.blocks, newton.islands.needs_direction, newton.krylov_dots
         _, advance, turn, test = self._cycle
         self.multiply(self.p)
         self.sum(dots, self.curvature)
         self._launch(
             advance,
-            [self.p, self.product, self.inverse, newton.system.diagonal, newton.barred, self.rho, self.curvature]
+            [self.p, self.product, self.inverse, newton.system.diagonal, newton.inactive_mask, self.rho, self.curvature]
             + [newton.iterations, wanted, blocks, self._unit],
             [newton.direction, self.rest, self.z, dots, self.busy],
         )
         self.precondition(self.z)
         self.sum(dots, self.total)
-        self._launch(turn, [self.z, self.total, self.rho, newton.barred, wanted, blocks], [self.p])
+        self._launch(turn, [self.z, self.total, self.rho, newton.inactive_mask, wanted, blocks], [self.p])
         wp.launch(
             test,
             newton.worlds,
@@ -151,16 +156,25 @@ class PCG:
     def multiply_bands(self, p: wp.array) -> None:
         """Write the product without contact, with elements along rods stored in bands."""
         newton = self.newton
-        wanted, dots = newton.islands.wanted, newton.krylov_dots
-        newton.chains.product(newton.matrix, p, newton.barred, wanted, self.product, dots)
+        wanted, dots = newton.islands.needs_direction, newton.krylov_dots
+        newton.chains.product(newton.matrix, p, newton.inactive_mask, wanted, self.product, dots)
 
     def multiply_matrix(self, p: wp.array) -> None:
         """Write the product without contact, with all of H in the sparse matrix."""
         newton = self.newton
-        table, wanted = newton.system, newton.islands.wanted
+        table, wanted = newton.system, newton.islands.needs_direction
         self._launch(
             self._cycle[0],
-            [newton.matrix, table.columns, table.slices, newton.barred, p, wanted, newton.net.blocks, table.positions],
+            [
+                newton.matrix,
+                table.columns,
+                table.slices,
+                newton.inactive_mask,
+                p,
+                wanted,
+                newton.coupled.blocks,
+                table.positions,
+            ],
             [self.product, newton.krylov_dots],
         )
 
@@ -173,7 +187,7 @@ class NewtonPCG(PCG):
     """Directions of a `CoupledNewton` to the accuracy of `forcing` and `goal`; `scale` as of `PCG`."""
 
     def __init__(self, newton, multilevel: bool):
-        self.scale = natural_scale(newton.net)
+        self.scale = natural_scale(newton.coupled)
         super().__init__(newton, multilevel, scale=self.scale)
         real = newton.real
         self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], real, newton.device, largest=True)
@@ -201,14 +215,14 @@ class NewtonPCG(PCG):
             self._confirm,
             newton.worlds,
             [newton.worst, newton.goal, number, most, FARTHEST, newton.limit],
-            [newton.forcing, newton.islands.wanted, self.busy],
+            [newton.forcing, newton.islands.needs_direction, self.busy],
             device=newton.device,
         )
 
     def compare(self) -> None:
         """Write ratios of `CoupledNewton.allowed` for linear residuals, in worlds with a finished solve."""
         newton, allowed = self.newton, self.newton.allowed
-        inputs = [self.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks, self._unit]
+        inputs = [self.rest, allowed.blocks, newton.islands.needs_direction, newton.coupled.blocks, self._unit]
         self._launch(self._compare, inputs, [self.z, allowed.ratio])  # worlds that continue overwrite z
         allowed.sum_up(self.z, newton.options.rtol, newton.islands, *self._unread)
 

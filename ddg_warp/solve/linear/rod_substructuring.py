@@ -12,7 +12,7 @@ from ddg_warp.kernels.linear.rod_band_assembly import layout_type
 from ddg_warp.kernels.linear.rod_matrix import TILE
 from ddg_warp.kernels.linear.rod_substructuring_serial import walk_kernel
 from ddg_warp.kernels.linear.sliced_ell import SETS
-from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type, place_kernel
+from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type, path_node_kernel
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction
 from ddg_warp.solve.linear.solver_selection import long_and_few
 from ddg_warp.solve.linear.substructuring_plan import SubstructuringPlan
@@ -38,22 +38,22 @@ class RodSubstructuring:
         SceneError: the net has no rods.
     """
 
-    def __init__(self, net, banded: bool, split: bool = False):
-        if not net.host.rods:
+    def __init__(self, coupled, banded: bool, split: bool = False):
+        if not coupled.host.rods:
             raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
-        self.net, self.device, self.split = net, net.device, split
-        self.plan = SubstructuringPlan(net.host, split)
-        self.along = [i for i, part in enumerate(net.sets) if part.host.along]
+        self.coupled, self.device, self.split = coupled, coupled.device, split
+        self.plan = SubstructuringPlan(coupled.host, split)
+        self.along = [i for i, part in enumerate(coupled.sets) if part.host.along]
         self.banded = banded and len(self.along) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
-        self._contact = net.host.touching is not None
+        self._contact = coupled.host.touching is not None
 
     @classmethod
-    def of(cls, net, preconditioner: str, banded: bool = True, split: bool = False) -> "RodSubstructuring | None":
+    def of(cls, coupled, preconditioner: str, banded: bool = True, split: bool = False) -> "RodSubstructuring | None":
         """The chains of a preconditioner, in bands where these serve it; None of one without chains."""
         if preconditioner not in ("chain", "chain_multilevel"):
             return None
-        return cls(net, banded and preconditioner == "chain" and not net.host.frames, split)
+        return cls(coupled, banded and preconditioner == "chain" and not coupled.host.frames, split)
 
     @property
     def splits(self) -> bool:
@@ -63,7 +63,7 @@ class RodSubstructuring:
         CPU core (gridshells of 8 edges, EA L^2 / EI = 1e8, and hair with twigs, where 1/60 s took 11 iterations instead of 7).
         """
         longest, width = self.plan.chain.shape
-        few = long_and_few(longest, self.net.worlds * width, wp.get_device(self.device))
+        few = long_and_few(longest, self.coupled.worlds * width, wp.get_device(self.device))
         return self.split or (self.banded and self.plan.alone and not (few or self._contact))
 
     def bind(
@@ -74,10 +74,10 @@ class RodSubstructuring:
         With `reuse` one matrix serves several directions. In contact there is more to H than is here, which goes into `eliminated`
         before `prepare`.
         """
-        self.table, net, plan = table, self.net, self.plan
-        plan.bind(net.host, table.rows.numpy(), table.columns.numpy(), self.kept)
+        self.table, coupled, plan = table, self.coupled, self.plan
+        plan.bind(coupled.host, table.rows.numpy(), table.columns.numpy(), self.kept)
         self.exact = self.banded and plan.complete and not self._contact
-        worlds, device, serial = net.worlds, net.device, device_arrays.serial(net.device)
+        worlds, device, serial = coupled.worlds, coupled.device, device_arrays.serial(coupled.device)
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
 
         def put(values):
@@ -86,7 +86,7 @@ class RodSubstructuring:
         self.places = device_arrays.upload(plan.places.astype(np.int32), int, device)
         self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
         self._at_none = put(np.flatnonzero(plan.where < 0))  # blocks without a place
-        self.held = device_arrays.upload(plan.held(net.host), wp.uint8, device)
+        self.held = device_arrays.upload(plan.held(coupled.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
         self.idle = wp.zeros(self.columns, dtype=int, device=device)
@@ -108,7 +108,7 @@ class RodSubstructuring:
             self.eliminated = device_arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
         self.values = device_arrays.allocate((block, self.longest, self.columns), linear, device)
         self.responses = device_arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
-        self.coupled = len(plan.of_places[1]) > 0
+        self.has_links = len(plan.of_places[1]) > 0
         # whether chains and what is at their places are all that there is to further right-hand sides
         self._at_places = self.reduction is not None and self.reduction.repeats and not len(plan.pairs)
         self.met = None if plan.met is None else device_arrays.upload(plan.met.astype(np.int32), int, device)
@@ -122,7 +122,7 @@ class RodSubstructuring:
         self.units = wp.array(np.repeat(plan.units, worlds, axis=1).reshape(-1, 3), dtype=H, device=device)
         self.parts = wp.zeros((3, max(1, worlds * self.joints)), dtype=M, device=device)
         sets = self.along if self.banded else []
-        terms = tuple(net.sets[i].term for i in sets)
+        terms = tuple(coupled.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
         self._assemble, self._clear, self._product = rod_bands.band_kernels(
             terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
@@ -137,16 +137,16 @@ class RodSubstructuring:
         self._of_sets = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
         self._own = wp.array(self._of_sets, dtype=along_type(real, linear), device=device)
         if self.banded:
-            self._balance = place_kernel(terms, plan.twist, real, linear, drag, self._contact, serial)
-            apart = np.zeros(net.blocks, np.uint8)
+            self._balance = path_node_kernel(terms, plan.twist, real, linear, drag, self._contact, serial)
+            apart = np.zeros(coupled.blocks, np.uint8)
             apart[self.elsewhere] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
-        made = rod_substructuring.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
+        made = rod_substructuring.path_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joint_schur.joint_kernels(linear) if self.joints else (None, None)
         self._walk = self._walk_places = self._both = None
         if serial and not (self.joints or self.reduction):
-            self._walk_places = rod_substructuring.walk_places_kernel(plan.twist, plan.span, linear, self.split)
+            self._walk_places = rod_substructuring.serial_path_nodes_kernel(plan.twist, plan.span, linear, self.split)
         if not (serial or self.joints or self.reduction or self.split):
             self._both = TwistedFactorisation(plan, self.columns, linear, device, SERIAL)
         if self.split:
@@ -164,14 +164,14 @@ class RodSubstructuring:
         elif self._walk_places:
             own += [] if self._walk else [(self._walk_places, SERIAL)]
         else:
-            own += [self._load] if self.coupled or not self._walk else []
+            own += [self._load] if self.has_links or not self._walk else []
             own += [self._finish] if self.joints or not self._walk else []
         if self.reduction:
             own += [*self._columns, *self.reduction.kernels]
             own += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
         elif not self._both:
             own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
-            own += [(self._solve_all, SERIAL)] if self.coupled else []
+            own += [(self._solve_all, SERIAL)] if self.has_links else []
         own += [self._balance] if self.banded else []
         own += [self._lengthen] if self.split else []
         own += [self._clear] if self._clears else []
@@ -183,7 +183,7 @@ class RodSubstructuring:
     def elsewhere(self) -> np.ndarray:
         """Blocks that are not at a place, or at which elements meet that do not run along rods."""
         found = self.plan.where < 0
-        for part in self.net.sets:
+        for part in self.coupled.sets:
             if not part.host.along:
                 found[part.host.slots.ravel()] = True
         return np.flatnonzero(found)
@@ -206,29 +206,29 @@ class RodSubstructuring:
             [self.bands],
         )
         if self._clears:
-            inputs = [self.taken, islands.wanted, self.table.positions]
-            self._launch(self._clear, (self.taken.size, self.net.worlds), inputs, [matrix])
+            inputs = [self.taken, islands.needs_direction, self.table.positions]
+            self._launch(self._clear, (self.taken.size, self.coupled.worlds), inputs, [matrix])
 
-    def product(self, matrix, p: wp.array, barred, wanted, product: wp.array, dots: wp.array) -> None:
+    def product(self, matrix, p: wp.array, inactive_mask, wanted, product: wp.array, dots: wp.array) -> None:
         """H p with what the bands make of p, and p . H p block by block."""
-        table, net, threads = self.table, self.net, 1
-        inputs = [matrix, table.columns, table.slices, barred, p, wanted, net.blocks, table.positions]
+        table, coupled, threads = self.table, self.coupled, 1
+        inputs = [matrix, table.columns, table.slices, inactive_mask, p, wanted, coupled.blocks, table.positions]
         inputs += [self.bands, self.places, self.count, self.idle]
         if not device_arrays.serial(self.device):
             of_places = -(-self.columns // TILE) * TILE * self.longest
             inputs += [of_places, self._at_none]
-            threads = of_places + net.worlds * len(self._at_none)
+            threads = of_places + coupled.worlds * len(self._at_none)
         self._launch(self._product, threads, inputs, [product, dots])
 
-    def direct(self, matrix, mass, islands, anew, fixed, barred, right, lost: wp.array, z: wp.array, dots) -> None:
+    def direct(self, matrix, mass, islands, anew, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots) -> None:
         """H^-1 r of the worlds that want a direction, where this is exact; raises `lost` where H is indefinite.
 
         H is new in the islands `anew`.
         """
         if not self._walk:
             self.assemble(matrix, mass, anew)
-            self.prepare(matrix, fixed, anew.wanted, lost)
-            self.apply(matrix, right, barred, islands.wanted, z, dots)
+            self.prepare(matrix, fixed, anew.needs_direction, lost)
+            self.apply(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
             if self.split:
                 inputs = [*islands.arrays, self.layout, self._own, self.values]
                 self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
@@ -236,12 +236,12 @@ class RodSubstructuring:
         self._launch(
             self._walk,
             self.columns,
-            [matrix, mass, *islands.arrays, self.layout, self._own, right, self.net.blocks],
+            [matrix, mass, *islands.arrays, self.layout, self._own, rhs, self.coupled.blocks],
             [self.factors, self.values, lost, z],
         )
         if self.joints:
-            self._prepare_joints(matrix, fixed, islands.wanted, lost)
-            self._apply_joints(matrix, right, barred, islands.wanted, z, dots)
+            self._prepare_joints(matrix, fixed, islands.needs_direction, lost)
+            self._apply_joints(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
 
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
         """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
@@ -263,12 +263,12 @@ class RodSubstructuring:
         if self.joints:
             self._prepare_joints(matrix, fixed, wanted, lost)
 
-    def apply(self, matrix, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
+    def apply(self, matrix, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block.
 
         Blocks that are barred (W N,), with all bits set, keep theirs.
         """
-        at = residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks
+        at = residual, self.places, self.held, self.count, self.idle, wanted, self.coupled.blocks
         if self._walk_places:
             self._launch(self._walk_places, self.columns, [self.factors, *at], [self.values, z, dots], SERIAL)
             return
@@ -279,28 +279,28 @@ class RodSubstructuring:
             self.reduction.again_at_places(self.plan.twist, *at, z, dots)
             return
         self._eliminate(matrix, wanted, self.values, residual, None)
-        self._apply_joints(matrix, residual, barred, wanted, z, dots)
+        self._apply_joints(matrix, residual, inactive_mask, wanted, z, dots)
 
     def _prepare_joints(self, matrix, fixed, wanted, lost: wp.array) -> None:
         """Factors of joints, once those of chains are there."""
-        if self.coupled:
+        if self.has_links:
             self._eliminate(matrix, wanted, self.responses, None, self.units)
         self._launch(
             self._measure,
-            self.net.worlds * self.joints,
+            self.coupled.worlds * self.joints,
             [matrix, *self._joint_inputs(self.responses), self.own, self.colour, self.plan.size, fixed, wanted]
             + [self.table.positions],
             [self.parts, lost],
         )
 
-    def _apply_joints(self, matrix, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
+    def _apply_joints(self, matrix, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """z from what chains make of the residual on their own."""
-        net = self.net
+        coupled = self.coupled
         if self.joints:
             self._launch(
                 self._meet,
-                net.worlds * self.joints,
-                [matrix, *self._joint_inputs(self.values), self.parts, residual, wanted, net.blocks]
+                coupled.worlds * self.joints,
+                [matrix, *self._joint_inputs(self.values), self.parts, residual, wanted, coupled.blocks]
                 + [self.table.positions],
                 [self.moved],
             )
@@ -311,28 +311,38 @@ class RodSubstructuring:
                 [self.met, self.count, wanted, self.responses, self.moved, self.joint_rows],
                 [self.values],
             )
-        elif self.coupled:
+        elif self.has_links:
             self._eliminate(matrix, wanted, self.values, residual, self.moved)
         self._launch(
             self._finish,
-            device_arrays.takers(net.worlds * net.blocks, self.device),
-            [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, barred, wanted]
-            + [net.blocks, net.host.nodes],
+            device_arrays.takers(coupled.worlds * coupled.blocks, self.device),
+            [
+                residual,
+                self.values,
+                self.where,
+                self.width,
+                self.joint_row,
+                self.joint_rows,
+                self.moved,
+                inactive_mask,
+                wanted,
+            ]
+            + [coupled.blocks, coupled.host.nodes],
             [z, dots],
         )
 
     def _joint_inputs(self, values: wp.array) -> list:
-        chains = [self.joint_starts, self.joint_items, values, self.where, self.width, self.net.host.nodes]
+        chains = [self.joint_starts, self.joint_items, values, self.where, self.width, self.coupled.host.nodes]
         return [self.table.columns, *chains, self.pairs]
 
     def _eliminate(self, matrix, wanted, values: wp.array, residual, moved) -> None:
         """H_II^-1 (r_I - H_IJ z_J), of movements one by one or all at once; without `residual` or `moved` that one is zero."""
-        table, net, solves = self.table, self.net, values.shape[2] // self.columns
+        table, coupled, solves = self.table, self.coupled, values.shape[2] // self.columns
         self._launch(
             self._load,
             (device_arrays.takers(self.longest, self.device), solves * self.columns),
             [matrix, table.columns, self.places, self.count, self.idle, self.held, self.starts, self.items]
-            + [self.joint_row, self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
+            + [self.joint_row, self.joint_rows, wanted, coupled.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
             + [self.moved if moved is None else moved],
             [values],
@@ -365,10 +375,12 @@ class RodSubstructuring:
 
     def _elements(self, index: int, written: dict, real, linear):
         """What the elements of a set write, and where they are."""
-        part, own = self.net.sets[index], along_type(real, linear)()
+        part, own = self.coupled.sets[index], along_type(real, linear)()
         for name, array in written.items():
             setattr(own, name, array)
-        own.at = device_arrays.upload(self.plan.elements(self.net.host, part.host).astype(np.int32), int, self.device)
+        own.at = device_arrays.upload(
+            self.plan.elements(self.coupled.host, part.host).astype(np.int32), int, self.device
+        )
         own.elements = part.elements
         return own
 

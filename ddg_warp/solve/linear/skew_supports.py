@@ -9,12 +9,12 @@ from ddg_warp.kernels.linear import skew_supports
 class HostPlanes:
     """Nodal frames of the coupled system as one orthogonal matrix, for all worlds."""
 
-    def __init__(self, net, worlds: int):
+    def __init__(self, coupled, worlds: int):
         from scipy import sparse
 
-        index, blocks = np.array(list(net.frames)), net.blocks
+        index, blocks = np.array(list(coupled.frames)), coupled.blocks
         frames = np.tile(np.eye(3), (blocks, 1, 1))
-        frames[index] = list(net.frames.values())
+        frames[index] = list(coupled.frames.values())
         of_world = sparse.bsr_matrix((frames, np.arange(blocks), np.arange(blocks + 1)))
         self._turn = sparse.block_diag([of_world] * worlds, format="csr")
 
@@ -34,9 +34,9 @@ class HostPlanes:
 class SkewSupports:
     """Nodal frames on the device, for the linear algebra of `CoupledNewton`."""
 
-    def __init__(self, net, table, real, linear):
-        host, device = net.host, net.device
-        self.net, self.positions = net, table.positions
+    def __init__(self, coupled, table, real, linear):
+        host, device = coupled.host, coupled.device
+        self.coupled, self.positions = coupled, table.positions
         index = np.array(list(host.frames))
         frames = np.array(list(host.frames.values()))
         rows, columns = table.rows.numpy(), table.columns.numpy()
@@ -52,7 +52,7 @@ class SkewSupports:
         self.of_blocks = put(frame[:-1].astype(np.int32), int)
         self.frames = {kind: put(frames, wp.types.matrix((3, 3), kind)) for kind in {real, linear}}
         self._matrix = skew_supports.matrix_kernel(linear)
-        self._into, self._back = (skew_supports.turn_kernel(linear, back) for back in (False, True))
+        self._into, self._back = (skew_supports.rotate_kernel(linear, back) for back in (False, True))
         self.real, self.linear = real, linear
 
     @property
@@ -71,9 +71,9 @@ class SkewSupports:
     def matrix(self, matrix: wp.array, wanted: wp.array) -> None:
         """Rotate H into the frames, in worlds that need it."""
         inputs = [self.entries, self.frames[self.linear], wanted, self.positions]
-        dim = (len(self.entries), self.net.worlds)
-        wp.launch(self._matrix, dim, inputs, [matrix], device=self.net.device)
+        dim = (len(self.entries), self.coupled.worlds)
+        wp.launch(self._matrix, dim, inputs, [matrix], device=self.coupled.device)
 
     def _turn(self, kernel, kind, wanted: wp.array, vectors: wp.array) -> None:
-        inputs = [self.where, self.frames[kind], wanted, self.net.blocks]
-        wp.launch(kernel, (len(self.where), self.net.worlds), inputs, [vectors], device=self.net.device)
+        inputs = [self.where, self.frames[kind], wanted, self.coupled.blocks]
+        wp.launch(kernel, (len(self.where), self.coupled.worlds), inputs, [vectors], device=self.coupled.device)

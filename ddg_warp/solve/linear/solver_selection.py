@@ -21,15 +21,15 @@ LONGEST_REPEATED = 8192
 
 LARGE = 4096  # nodes of the coupled system outside rods from which fewer, longer iterations of PCG pay
 
-# Substructuring of rods (preconditioner `"chain"`) against block Jacobi, see `net_preconditioner`. BETWEEN: nodes of a rod between
-# joints from which substructuring pays. The time unit is a block Jacobi iteration on a GPU: a path node takes 1 / `PLACES`, the
+# Substructuring of rods (preconditioner `"chain"`) against block Jacobi, see `coupled_preconditioner`. BETWEEN: nodes of a rod between
+# joints from which substructuring pays. The time unit is a block Jacobi iteration on a GPU: a path node takes 1 / `PATH_NODES`, the
 # remaining launches `LAUNCHES`. A cyclic reduction of few, long paths takes as much as REDUCED path nodes.
 #
 # Measured: iterations of block Jacobi grow with the square of the edges between joints (gridshell, residual 1e-3: 250 at 8 edges, 2378
 # at 32). Substructuring takes 16 at any number, at about twice the time each on the CPU. On a GPU a rod path is serial: an iteration of
 # block Jacobi takes 41 us on an H200, with rod paths of 8, 32 and 128 nodes 84, 144 and 330 us (tools/results/nets_cuda.csv).
 BETWEEN = 4
-PLACES = 20
+PATH_NODES = 20
 REDUCED = 240
 LAUNCHES = 1
 
@@ -61,29 +61,29 @@ LARGE_STATIC = {False: 50_000, True: 4_000}
 
 def static_solver(model) -> str:
     """Return the static solver: "pcg" for contact and for large supported coupled systems, else "direct"."""
-    net = model.net
-    if net is not None and net.host.touching:
+    coupled = model.coupled
+    if coupled is not None and coupled.host.touching:
         return "pcg"
-    if net is None or why_not_pcg(model):
+    if coupled is None or why_not_pcg(model):
         return "direct"
     return "pcg" if large_static(model) else "direct"
 
 
 def large_static(model) -> bool:
     """Return True if the coupled system is too large for a factorised tangent."""
-    return model.net.host.nodes * model.net.worlds >= LARGE_STATIC[model.wp_device.is_cuda]
+    return model.coupled.host.nodes * model.coupled.worlds >= LARGE_STATIC[model.wp_device.is_cuda]
 
 
 def why_not_pcg(model) -> str:
     """Return the reason against equilibria by conjugate gradients; empty without."""
-    if model.net is None or model.groups:
+    if model.coupled is None or model.groups:
         return "it is for shells and joined rods alone, and the model has rods on their own"
     return ""
 
 
-def net_preconditioner(net) -> str:
+def coupled_preconditioner(coupled) -> str:
     """Return the preconditioner: `"chain"` for rods long between joints, `"multilevel"` for large systems, both, or block Jacobi."""
-    host = net.host
+    host = coupled.host
     if not host.rods:
         return "multilevel" if host.nodes >= LARGE else "block_jacobi"
     rod_nodes = np.concatenate([rod.all_nodes for rod in host.rods])
@@ -94,9 +94,9 @@ def net_preconditioner(net) -> str:
             rigid[part.slots[0]] = True
     between, places = (max(_longest_run(~cuts[rod.all_nodes]) for rod in host.rods) for cuts in (joints | rigid, rigid))
     pays = between >= BETWEEN
-    if pays and net.device.is_cuda:
-        reduced = long_and_few(places, len(host.rods) * net.worlds, net.device)
-        pays = 0.25 * between**2 > LAUNCHES + (min(places, REDUCED) if reduced else places) / PLACES
+    if pays and coupled.device.is_cuda:
+        reduced = long_and_few(places, len(host.rods) * coupled.worlds, coupled.device)
+        pays = 0.25 * between**2 > LAUNCHES + (min(places, REDUCED) if reduced else places) / PATH_NODES
     rest = host.nodes - len(np.unique(rod_nodes)) if pays else host.nodes
     names = ["chain"] * pays + ["multilevel"] * (rest >= LARGE)
     return "_".join(names) or "block_jacobi"

@@ -96,7 +96,7 @@ def regular(matrix: csc_matrix, mass: np.ndarray) -> tuple[Factorisation, float]
     raise SingularError("the tangent is singular whatever is added to it: it is not finite")
 
 
-def shortest(matrix: csr_matrix, right: np.ndarray) -> np.ndarray:
+def shortest(matrix: csr_matrix, rhs: np.ndarray) -> np.ndarray:
     """Return the least-norm y with A y = b by the augmented system [1, A^T; A, 0].
 
     See Bjorck, Numerical methods for least squares problems, 1996. Equations may be repeated; contradictory ones leave a residual for
@@ -104,13 +104,13 @@ def shortest(matrix: csr_matrix, right: np.ndarray) -> np.ndarray:
     """
     size = norm(matrix, axis=1)
     scaling = diags(1.0 / np.where(size > 0.0, size, 1.0))
-    matrix, right = scaling @ matrix, scaling @ right
+    matrix, rhs = scaling @ matrix, scaling @ rhs
     rows, columns = matrix.shape
     factors = splu(bmat([[identity(columns), matrix.T], [matrix, -REPEATED * identity(rows)]], format="csc"))
-    solution, remaining = np.zeros(columns), right
+    solution, remaining = np.zeros(columns), rhs
     for _ in range(CORRECTIONS):
         tried = solution + factors.solve(np.concatenate([np.zeros(columns), remaining]))[:columns]
-        residual = right - matrix @ tried
+        residual = rhs - matrix @ tried
         if not np.linalg.norm(residual) < 0.5 * np.linalg.norm(remaining):
             break
         solution, remaining = tried, residual

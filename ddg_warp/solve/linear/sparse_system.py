@@ -26,10 +26,10 @@ class SparseSystem:
         `meets`, `adds`: incidence lists (offsets, items) of each element set, by blocks and by positions.
     """
 
-    def __init__(self, net, kept: np.ndarray | None = None):
-        blocks, device = net.blocks, net.device
-        out = None if kept is None else net.host.fixed.all(1)
-        pairs = [_pairs(element_set.host, kept, out) for element_set in net.sets]
+    def __init__(self, coupled, kept: np.ndarray | None = None):
+        blocks, device = coupled.blocks, coupled.device
+        out = None if kept is None else coupled.host.fixed.all(1)
+        pairs = [_pairs(element_set.host, kept, out) for element_set in coupled.sets]
         diagonal_blocks = np.arange(blocks) if kept is None else np.flatnonzero(~(kept | out))
         row = np.concatenate([*(rows for rows, *_ in pairs), diagonal_blocks]).astype(np.int32)
         column = np.concatenate([*(columns for _, columns, _ in pairs), diagonal_blocks]).astype(np.int32)
@@ -47,7 +47,7 @@ class SparseSystem:
         rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
         position = slices[row // SLICE] + rank * SLICE + row % SLICE
         self.positions = int(slices[-1])
-        if self.positions * net.worlds >= 2**31:
+        if self.positions * coupled.worlds >= 2**31:
             raise SceneError("the net is too large: its matrix has more than 2^31 entries; build fewer worlds at once")
         rows, columns = np.full(self.positions, -1), np.full(self.positions, -1)
         rows[position], columns[position] = row, column
@@ -60,7 +60,7 @@ class SparseSystem:
         diagonal[row[row == column]] = position[row == column]
         self.diagonal, self.entries = put(diagonal), len(row)
         begin, self.adds, self.meets = 0, [], []
-        for element_set, (rows, _, pair_indices) in zip(net.sets, pairs, strict=True):
+        for element_set, (rows, _, pair_indices) in zip(coupled.sets, pairs, strict=True):
             targets, begin = position[inverse[begin : begin + len(rows)]], begin + len(rows)
             starts, items = lists(targets, self.positions)
             self.adds.append((put(starts), put(items if pair_indices is None else pair_indices[items])))
@@ -141,7 +141,7 @@ class MatrixAssembly:
 
     def __init__(
         self,
-        net,
+        coupled,
         table: SparseSystem,
         written: list[dict],
         real,
@@ -150,11 +150,11 @@ class MatrixAssembly:
         local: tuple,
         drag: bool,
     ):
-        serial = device_arrays.serial(net.device)
-        self.net, self.table, self.kernels, self._own = net, table, [], []
-        for first in range(0, len(net.sets), sliced_ell.SETS):
+        serial = device_arrays.serial(coupled.device)
+        self.coupled, self.table, self.kernels, self._own = coupled, table, [], []
+        for first in range(0, len(coupled.sets), sliced_ell.SETS):
             sets, from_iteration, local_dofs = (
-                each[first : first + sliced_ell.SETS] for each in (net.sets, exact_from, local)
+                each[first : first + sliced_ell.SETS] for each in (coupled.sets, exact_from, local)
             )
             terms = tuple(part.term for part in sets)
             self.kernels.append(
@@ -165,7 +165,7 @@ class MatrixAssembly:
                 data = sliced_ell.contributions(linear, local[i])()
                 data.factor, data.tension, data.second = (written[i][name] for name in ("factor", "tension", "second"))
                 data.starts, data.items = table.adds[i]
-                data.elements = net.sets[i].elements
+                data.elements = coupled.sets[i].elements
                 set_data.append(data)
             self._own.append(set_data + [set_data[-1]] * (sliced_ell.SETS - len(set_data)))
 
@@ -175,8 +175,8 @@ class MatrixAssembly:
         for kernel, set_data in zip(self.kernels, self._own, strict=True):
             device_arrays.sweep(
                 kernel,
-                self.net.worlds * table.positions,
+                self.coupled.worlds * table.positions,
                 [mass, *islands.arrays, table.rows, table.columns, table.positions, *set_data],
                 [matrix],
-                self.net.device,
+                self.coupled.device,
             )

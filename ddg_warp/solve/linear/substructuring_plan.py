@@ -3,7 +3,7 @@
 import numpy as np
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.linear.rod_dof_map import place_dofs
+from ddg_warp.kernels.linear.rod_dof_map import path_node_dofs
 from ddg_warp.solve.linear.sparse_system import lists
 
 
@@ -70,7 +70,7 @@ class SubstructuringPlan:
     @property
     def block(self) -> int:
         """Number of dofs of a path node."""
-        return place_dofs(self.twist, self.split)
+        return path_node_dofs(self.twist, self.split)
 
     @property
     def alone(self) -> bool:
@@ -216,13 +216,13 @@ class SubstructuringPlan:
         """Find the couplings of free dofs between paths and joints."""
         real = (rows >= 0) & ~(self._held[rows] | self._held[columns])
         inside, joint = (np.where(real, table[b], -1) for b, table in ((rows, self.where), (columns, self.joint_row)))
-        coupled = np.flatnonzero((inside >= 0) & (joint >= 0))
-        starts, items = lists(rows[coupled], host.blocks)
-        self.of_places = starts, coupled[items]
+        is_coupled = np.flatnonzero((inside >= 0) & (joint >= 0))
+        starts, items = lists(rows[is_coupled], host.blocks)
+        self.of_places = starts, is_coupled[items]
         inside, joint = (np.where(real, table[b], -1) for b, table in ((columns, self.where), (rows, self.joint_row)))
-        coupled = np.flatnonzero((inside >= 0) & (joint >= 0))
-        starts, items = lists(joint[coupled], 2 * len(self.pairs))
-        self.of_joints = starts, coupled[items]
+        is_coupled = np.flatnonzero((inside >= 0) & (joint >= 0))
+        starts, items = lists(joint[is_coupled], 2 * len(self.pairs))
+        self.of_joints = starts, is_coupled[items]
         a, b = self.pairs.T
         self.own = np.column_stack([self.find(a, a), self.find(b, b), self.find(a, b)])
 

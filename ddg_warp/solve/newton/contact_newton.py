@@ -20,7 +20,7 @@ from ddg_warp.solve.collision.contact_model import ContactModel
 from ddg_warp.solve.collision.statistics import ContactStatistics
 from ddg_warp.solve.linear.contact_bands import ContactBands
 from ddg_warp.solve.linear.sparse_system import Sums
-from ddg_warp.solve.newton.rod_newton import EARLY
+from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION
 
 FAR = 16.0  # margins that a node moves, from which on a world has a single step fraction: candidates of longer motions are too many
 # Where candidates still do not fit, motions are limited to LONGEST margins, then to a fraction SHORTER until they do.
@@ -49,9 +49,15 @@ class NewtonContact:
     """
 
     def __init__(self, newton, model):
-        self.newton, self.net, self._scene = newton, newton.net, model.scene
+        self.newton, self.coupled, self._scene = newton, newton.coupled, model.scene
         self._moves = bool(model.motions)
-        net, host, real, linear, device = newton.net, newton.net.host, newton.real, newton.linear, newton.device
+        coupled, host, real, linear, device = (
+            newton.coupled,
+            newton.coupled.host,
+            newton.real,
+            newton.linear,
+            newton.device,
+        )
         if host.frames:
             raise SceneError(
                 "contact: a support on an oblique plane of symmetry does not go with it; use an axis of space"
@@ -60,23 +66,23 @@ class NewtonContact:
             raise SceneError(
                 "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
             )
-        newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
+        newton.q.assign(np.tile(host.rest, (coupled.worlds, 1)))
         # forces on obstacles are post-processing of states
-        self.touch = ContactModel(net, linear, newton.q, host.of_obstacles)
+        self.touch = ContactModel(coupled, linear, newton.q, host.of_obstacles)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
-        self.rubs, self.rate = host.touching.rubs, newton.islands.rate
-        worlds, updates = net.worlds, self.touch.law.lags - 1 if self.rubs else 0
+        self.has_friction, self.rate = host.touching.has_friction, newton.islands.inverse_step
+        worlds, updates = coupled.worlds, self.touch.law.lags - 1 if self.has_friction else 0
         self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
         self._modes, self._curved, self._projected = (make(worlds, int) for _ in range(3))
-        self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
+        self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else FIRST_EXACT_ITERATION
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
-        self.solutions = [make(newton.all, net.vector) for _ in range(updates)]
-        self._move = make(newton.all, net.vector)
-        self.bound = make(newton.all, net.vector)
+        self.solutions = [make(newton.all, coupled.vector) for _ in range(updates)]
+        self._move = make(newton.all, coupled.vector)
+        self.bound = make(newton.all, coupled.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
         self._going = make(1, int)
         self._longest, self.farthest = make(worlds, real), math.inf
@@ -89,7 +95,7 @@ class NewtonContact:
         self._unit = wp.array(unit, dtype=int, device=device)
         support_blocks = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
         self._nodes = wp.array(support_blocks.astype(np.int32), dtype=int, device=device)
-        self._aims = make((max(1, len(support_blocks)), worlds), net.vector)
+        self._aims = make((max(1, len(support_blocks)), worlds), coupled.vector)
         built = kernels.world_kernels(real)
         (
             self._account,
@@ -156,44 +162,46 @@ class NewtonContact:
         Slips restart, unless the update is made `again` within a step. At the start of a step, `rate` is the previous step's; see
         `ContactPotential.lag`.
         """
-        if self.rubs:
+        if self.has_friction:
             self.terms.lag(x, again, rate)
 
     def rest(self) -> None:
         """Clear all pending motion: the target is the iterate itself."""
         wp.copy(self.bound, self.newton.q)
-        self.newton.islands.driven.zero_()
+        self.newton.islands.support_motion_pending.zero_()
         self._going.zero_()
 
     def lag_again(self, solution: wp.array) -> None:
         """Update the friction lag at the iterate of converged worlds, and keep that in one of `solutions`."""
         newton = self.newton
-        self._sweep(self._keep_solution, [newton.q, newton.islands.moved, self.net.blocks], [solution])
+        self._sweep(self._keep_solution, [newton.q, newton.islands.substep_accepted, self.coupled.blocks], [solution])
         self.lag(newton.q, again=True)
-        self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
+        self._launch(self._again, self.coupled.worlds, [newton.islands.arrays[0]], [])
 
     def brace(self, dt: wp.array) -> None:
         """Add inertia to the contact stiffness where the last trial reached the minimum gap, in a step of dt (worlds,) [s]."""
         if self.terms.heavy:
             outputs = [self._braced, self.terms.law.rate]
-            self._launch(self._brace, self.net.worlds, [*self.newton.islands.arrays, dt], outputs)
+            self._launch(self._brace, self.coupled.worlds, [*self.newton.islands.arrays, dt], outputs)
 
     def place(self) -> None:
         """Limit the predictor by CCD, once supports are at their prescribed positions."""
         newton = self.newton
         if len(self._nodes):
-            inputs = [self._nodes, self.net.blocks, newton.q]
-            self._launch(self._aim, (len(self._nodes), self.net.worlds), inputs, [self._aims])
-        self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
+            inputs = [self._nodes, self.coupled.blocks, newton.q]
+            self._launch(self._aim, (len(self._nodes), self.coupled.worlds), inputs, [self._aims])
+        self._launch(
+            self._find_predicted, self.coupled.worlds, [newton.islands.arrays[0]], [self._modes, self._longest]
+        )
         self._cut()
-        self._launch(self._find_short, self.net.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
+        self._launch(self._find_short, self.coupled.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
         self._let_go()
 
     def evaluate(self) -> None:
         """Evaluate energies, forces and factors of contact at the limited iterate."""
         q, islands = self.newton.q, self.newton.islands
-        if self.rubs:
-            self.terms.evaluate(q, self.rate, iterates=(islands.slot, islands.iteration))
+        if self.has_friction:
+            self.terms.evaluate(q, self.rate, iterates=(islands.energy_buffer, islands.iteration))
         else:
             self.terms.evaluate(q)
 
@@ -201,13 +209,13 @@ class NewtonContact:
         """Add the energy change of contact to worlds, and the rounding floor."""
         inputs = [self.terms.energy, self.terms.gap, self._least, self.search.overflow]
         inputs += [self.newton.islands.arrays[0], self._kept, change, noise]
-        self._launch(self._account, self.net.worlds, inputs, [])
+        self._launch(self._account, self.coupled.worlds, inputs, [])
 
     def assemble(self) -> None:
         """Prepare the data that products and the preconditioner take from the last evaluation."""
         newton = self.newton
         outputs = [self._curved, self._projected]
-        self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
+        self._launch(self._find_curved, self.coupled.worlds, [newton.islands.arrays[0], self._late], outputs)
         self.terms.meet()
         if self.bends:
             self.terms.prepare(newton.q, self._curved)
@@ -227,19 +235,19 @@ class NewtonContact:
 
     def _approach(self) -> None:
         """Subtract the resistance of contact against the remaining motion from the residual."""
-        newton, blocks = self.newton, self.net.blocks
-        busy = newton.islands.wanted
+        newton, blocks = self.newton, self.coupled.blocks
+        busy = newton.islands.needs_direction
         self._sweep(self._find_way, [newton.q, self.bound, busy, blocks], [self._way])
         if len(self._nodes):
             inputs = [self._nodes, self._aims, newton.q, newton.fixed, busy, blocks]
-            self._launch(self._push, (len(self._nodes), self.net.worlds), inputs, [self._way])
+            self._launch(self._push, (len(self._nodes), self.coupled.worlds), inputs, [self._way])
         self._pushed.zero_()
         self.terms.product(self._way, self._pushed)
-        self._sweep(self._lessen, [self._pushed, newton.fixed, busy, blocks], [newton.right])
+        self._sweep(self._lessen, [self._pushed, newton.fixed, busy, blocks], [newton.rhs])
 
     def _follow(self) -> None:
         newton = self.newton
-        self._sweep(self._add, [self._way, newton.islands.wanted, self.net.blocks], [newton.direction])
+        self._sweep(self._add, [self._way, newton.islands.needs_direction, self.coupled.blocks], [newton.direction])
 
     def spread(self, p: wp.array) -> None:
         """Write the contributions of pairs to H p."""
@@ -248,52 +256,54 @@ class NewtonContact:
     def settle(self, p: wp.array, product: wp.array) -> None:
         """Add the contributions of pairs to the product, and write p . H p block by block."""
         newton = self.newton
-        self.terms.settle(p, product, newton.barred, newton.islands.wanted, newton.krylov_dots)
+        self.terms.settle(p, product, newton.inactive_mask, newton.islands.needs_direction, newton.krylov_dots)
 
     def hold(self) -> None:
         """Limit the trial step by CCD, and write its predicted decrease."""
         newton = self.newton
-        self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
-        self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
+        self._launch(self._find_modes, self.coupled.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
+        self._launch(self._depart, self.coupled.worlds, [self._modes], [newton.islands.arrays[0]])
         if len(self._nodes):
-            inputs = [self._nodes, self._aims, newton.fixed, self._modes, *newton.islands.arrays, self.net.blocks]
-            self._launch(self._land, (len(self._nodes), self.net.worlds), inputs, [newton.q])
+            inputs = [self._nodes, self._aims, newton.fixed, self._modes, *newton.islands.arrays, self.coupled.blocks]
+            self._launch(self._land, (len(self._nodes), self.coupled.worlds), inputs, [newton.q])
         self._cut()
         self._let_go()
-        inputs = [newton.right, newton.q, newton.base, self._modes, self.net.blocks]
+        inputs = [newton.rhs, newton.q, newton.base, self._modes, self.coupled.blocks]
         self._sweep(self._differ_gain, inputs, [newton.dots])
         self._sum(newton.dots, self._gain)
         inputs = [self._modes, self.search.time, self._gain]
         outputs = [*newton.islands.arrays, newton.stalled, self._projected]
-        self._launch(self._expect, self.net.worlds, inputs, outputs)
+        self._launch(self._expect, self.coupled.worlds, inputs, outputs)
 
     def _cut(self) -> None:
         """Limit the proposed motion by CCD; `bound` keeps the proposed target."""
         newton = self.newton
         far = FAR * self.search.margin
-        inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
+        inputs = [newton.q, newton.base, self._unit, self.coupled.host.nodes, far, self.coupled.blocks]
         self._sweep(self._stay, inputs, [self._move, self._modes, self.bound, self._longest])
         shorter = [self._modes, self._longest, self.farthest]
         if self.farthest < math.inf:
-            self._sweep(self._near, [self._move, self._unit, *shorter, self.net.blocks], [newton.q])
+            self._sweep(self._near, [self._move, self._unit, *shorter, self.coupled.blocks], [newton.q])
         self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
         if self.farthest < math.inf:
-            self._launch(self._less, self.net.worlds, shorter, [self.search.time])
+            self._launch(self._less, self.coupled.worlds, shorter, [self.search.time])
         if len(self._nodes):
             eps = ROUNDING * newton.eps
-            inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
-            self._launch(self._arrive, (len(self._nodes), self.net.worlds), inputs, [newton.islands.arrays[0]])
+            inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.coupled.blocks, newton.q]
+            self._launch(self._arrive, (len(self._nodes), self.coupled.worlds), inputs, [newton.islands.arrays[0]])
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the CCD step fraction of a motion (3 W N,) that all worlds have in common. Not in a capture."""
-        base = wp.array(before.reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
-        self._modes.fill_(kernels.WHOLE)
+        base = wp.array(before.reshape(-1, 3), dtype=self.coupled.vector, device=self.newton.device)
+        self._modes.fill_(kernels.SINGLE_FRACTION)
         move = after - before
         longest = float(np.abs(move).max())
         self.search.fit(base)
         while True:
             fraction = min(1.0, self.farthest / longest) if longest > 0.0 else 1.0
-            q = wp.array((before + fraction * move).reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
+            q = wp.array(
+                (before + fraction * move).reshape(-1, 3), dtype=self.coupled.vector, device=self.newton.device
+            )
             self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
             if not self.search.fit(base, lambda: self._shorten(longest)):  # else the filter moved nothing
                 return fraction * float(self.search.time.numpy().min())
@@ -301,7 +311,7 @@ class NewtonContact:
     def _let_go(self) -> None:
         """Reset the target to the iterate in worlds without pending motion."""
         self._going.zero_()
-        inputs = [self.newton.q, self.newton.islands.arrays[0], self.net.blocks]
+        inputs = [self.newton.q, self.newton.islands.arrays[0], self.coupled.blocks]
         self._sweep(self._part, inputs, [self.bound, self._going])
 
     def finish(self, before: wp.array) -> None:
@@ -309,7 +319,7 @@ class NewtonContact:
         newton = self.newton
         self.search.check_crossings(before, newton.q)
         inputs = [self.search.crossed, self.terms.gap, self.search.overflow, *newton.islands.arrays]
-        self._launch(self._refuse, self.net.worlds, inputs, [self.crossed, self.least])
+        self._launch(self._refuse, self.coupled.worlds, inputs, [self.crossed, self.least])
         self.tally(newton.islands.arrays[0])
 
     def statistics(self) -> dict:
@@ -344,11 +354,11 @@ class NewtonContact:
             if gap > 0.0:
                 meet = f"are {gap:.3g} m apart, too close for a barrier, which needs {least:.3g} m,"
             raise SceneError(
-                f"contact: {pair} {meet} at the start; move them apart, as model.pushed_apart(state) does, give "
+                f"contact: {pair} {meet} at the start; move them apart, as model.resolve_overlaps(state) does, give "
                 "them a smaller radius, or let them pass by contact_between(..., ignore=True)"
             )
 
-    def tightest(self, x: wp.array, reason: int) -> str:
+    def closest_pair(self, x: wp.array, reason: int) -> str:
         """Return a message on the closest pair at positions x, a likely cause of the failed `reason`, with a remedy.
 
         Empty where no pair is within range. Reads from the device.
@@ -356,9 +366,7 @@ class NewtonContact:
         gap, pair = self.touch.closest(x)
         if gap >= self.search.reach:
             return ""
-        return (
-            f"the smallest gap, {gap:.3g} m, is between {pair}; {self._widen(gap) if reason == outcome.NO_ROOM else ''}"
-        )
+        return f"the smallest gap, {gap:.3g} m, is between {pair}; {self._widen(gap) if reason == outcome.MINIMUM_GAP else ''}"
 
     def blocked(self, tangent, state, start: float, end: float) -> str:
         """Return the remedy for two fixed objects that motions drive into each other from `start` to `end`.
@@ -368,14 +376,14 @@ class NewtonContact:
         for fraction in LOOKS if self._moves else ():
             moved_state = state.copy()
             tangent.move_supports(moved_state, start, start + fraction * (end - start))
-            if remedy := self._driven(moved_state.net.q):
+            if remedy := self._driven(moved_state.coupled.q):
                 return remedy
         return ""
 
     def _driven(self, x: wp.array) -> str:
         """Return the remedy for two overlapping fixed objects at positions x, at least one of them moved; else empty."""
         gap, pair, nodes = self.touch.closest_nodes(x)
-        host, scene = self.net.host, self._scene
+        host, scene = self.coupled.host, self._scene
         if gap > max(self._least, 0.0) or not all(host.fixed[pair_nodes].all() for pair_nodes in nodes):
             return ""
         supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
@@ -395,7 +403,7 @@ class NewtonContact:
     def _widen(self, gap: float) -> str:
         """Return remedies for a minimum gap reached, the best first; `gap` [m] is the smallest before the step."""
         if gap < self._least:
-            return "move them apart, as model.pushed_apart(state) does, "
+            return "move them apart, as model.resolve_overlaps(state) does, "
         if self.terms.heavy:
             return f"give their contact a larger stiffness, such as {STIFFER * self._stiffest:.3g} N/m, or a larger range, "
         return (
@@ -411,7 +419,7 @@ class NewtonContact:
         self.farthest = max(least, min(longest * SHORTER, LONGEST * self.search.margin))
         return True
 
-    def outgrown(self, x: wp.array, spare: bool = False) -> bool:
+    def has_overflow(self, x: wp.array, spare: bool = False) -> bool:
         """Return True if lists of pairs overflowed and have grown. Reads from the device.
 
         With `spare`, long motions are limited instead, so that fewer candidates are needed.
@@ -427,7 +435,9 @@ class NewtonContact:
         return grown
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        device_arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.newton.device, worlds=self.net.worlds)
+        device_arrays.sweep(
+            kernel, self.coupled.blocks, inputs, outputs, self.newton.device, worlds=self.coupled.worlds
+        )
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)

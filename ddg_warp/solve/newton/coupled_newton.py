@@ -26,7 +26,7 @@ from ddg_warp.solve.newton.frozen_hessian import FrozenHessian
 from ddg_warp.solve.newton.relaxed_convergence import RelaxedConvergence
 from ddg_warp.solve.newton.residual import ResidualAssembler
 from ddg_warp.solve.newton.residual_tolerance import ResidualTolerances
-from ddg_warp.solve.newton.rod_newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
@@ -66,16 +66,16 @@ class CoupledNewton:
             raise SceneError(FROZEN_ONLY.format(options.psd))
         if preconditioner not in PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
-        net = model.net
-        self.net, self.options, self.device = net, options, net.device
+        coupled = model.coupled
+        self.coupled, self.options, self.device = coupled, options, coupled.device
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
-        worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
+        worlds, blocks, host, device = coupled.worlds, coupled.blocks, coupled.host, coupled.device
         serial = device_arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
-        V, H = net.vector, wp.types.vector(3, self.linear)
-        self.chains = RodSubstructuring.of(net, preconditioner, self.banded, split)
-        self.system = SparseSystem(net, self.chains and self.chains.kept)
+        V, H = coupled.vector, wp.types.vector(3, self.linear)
+        self.chains = RodSubstructuring.of(coupled, preconditioner, self.banded, split)
+        self.system = SparseSystem(coupled, self.chains and self.chains.kept)
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -85,18 +85,18 @@ class CoupledNewton:
         self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
         self.change, self.noise, self.square = (self._weights[i] for i in range(3))
         self.dots = make((worlds, device_arrays.takers(blocks, device)), self.real)
-        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else net.mass
+        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else coupled.mass
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
         self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
-        self.planes = SkewSupports(net, self.system, self.real, self.linear) if host.frames else None
-        self.barred = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
+        self.planes = SkewSupports(coupled, self.system, self.real, self.linear) if host.frames else None
+        self.inactive_mask = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
         if self.planes:
             bits[list(host.frames)] = 0
             self.held = wp.array(bits, dtype=wp.uint8, device=device)
         gravity = np.asarray(model.scene.gravity, float)
         self.gravity = wp.array(gravity[None], dtype=V, device=device)
-        self.right, self.direction = (make(self.all, H) for _ in range(2))
+        self.rhs, self.direction = (make(self.all, H) for _ in range(2))
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.islands = Islands(worlds, self.real, device)
@@ -112,12 +112,18 @@ class CoupledNewton:
         if self.psd == "none":
             self._require_exact()
         self.contact = NewtonContact(self, model) if host.touching else None
-        exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in net.sets]
-        self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
+        exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in coupled.sets]
+        self.exact_from = tuple(
+            (0 if self.psd == "none" else FIRST_EXACT_ITERATION) if wanted else None for wanted in exact
+        )
         banded = self.chains is not None and self.chains.banded
-        self.local = tuple(banded and part.host.along for part in net.sets)  # whether derivatives are of the local dofs
-        self.split = tuple(split and own and splits(part.term) for own, part in zip(self.local, net.sets, strict=True))
-        sets = zip(net.sets, exact, self.local, self.split, strict=True)
+        self.local = tuple(
+            banded and part.host.along for part in coupled.sets
+        )  # whether derivatives are of the local dofs
+        self.split = tuple(
+            split and own and splits(part.term) for own, part in zip(self.local, coupled.sets, strict=True)
+        )
+        sets = zip(coupled.sets, exact, self.local, self.split, strict=True)
         self.parts = [self._part(*given, make, H) for given in sets]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
@@ -137,7 +143,7 @@ class CoupledNewton:
             element_path.evaluate_kernel(
                 coupled_storage(part.term, self.real, not local, serial), self.real, self.linear, late, own
             )
-            for part, late, local, own in zip(net.sets, self.exact_from, self.local, self.split, strict=True)
+            for part, late, local, own in zip(coupled.sets, self.exact_from, self.local, self.split, strict=True)
         ]
         if self.chains:
             self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
@@ -150,14 +156,14 @@ class CoupledNewton:
         self._repeat = rod_pcg.repeat_kernel(self.real, fails, curved) if repeats else None
         self.negative = make(worlds, int)
         self._assembly = MatrixAssembly(
-            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
+            coupled, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
         self.turns = EdgeRotations(self) if host.rods else None
         most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
         self._judge, self._measure, self._rotate, self._take, self._move = coupled_newton.search_kernels(
-            self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None, most > 0
+            self.real, self.linear, serial, bool(host.rods), bool(coupled.edges), self.contact is not None, most > 0
         )
-        self.allowed = ResidualTolerances(net, self.real, self.linear)
+        self.allowed = ResidualTolerances(coupled, self.real, self.linear)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self.resting = SleepingIslands(self, *self.contact.bodies) if self.contact else None
@@ -169,7 +175,7 @@ class CoupledNewton:
 
     def _require_exact(self) -> None:
         """Refuse the exact Hessian where it leaves out what a measure has no second derivatives for."""
-        for part in self.net.sets:
+        for part in self.coupled.sets:
             if not (part.term.measure.packed or part.term.measure.tensions):
                 raise SceneError(
                     f"psd 'none': second derivatives of {part.term.name} are left out of the matrix of a net; "
@@ -181,9 +187,9 @@ class CoupledNewton:
 
         What touches turns about what it touches, and bends: without second derivatives the last digits take tens of iterations.
         """
-        if self.net.host.touching:
+        if self.coupled.host.touching:
             return "progressive"
-        bending = [part for part in self.net.sets if part.term.measure.packed and not self.frozen]
+        bending = [part for part in self.coupled.sets if part.term.measure.packed and not self.frozen]
         if any(part.parameters.foreign.intersection(part.term.rest) for part in bending):
             return "progressive"
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
@@ -194,13 +200,13 @@ class CoupledNewton:
         """As of `RodNewton`; or stretching is stiffer or softer by so much that conjugate gradients need another scale."""
         if self.options.psd == "auto" and self.psd != self.automatic_psd():
             return True
-        return not 1.0 / RESCALED < natural_scale(self.net) / self.krylov.scale < RESCALED
+        return not 1.0 / RESCALED < natural_scale(self.coupled) / self.krylov.scale < RESCALED
 
     def _part(self, part, exact: bool, local: bool, split: bool, make, H) -> dict:
         """What the elements of a set write."""
         measure, count = part.term.measure, self.worlds * part.elements
         rows, factor, gradient = (
-            (measure.size, self.linear, self.real) if local else (measure.slots, H, self.net.vector)
+            (measure.size, self.linear, self.real) if local else (measure.slots, H, self.coupled.vector)
         )
 
         def lay(rows, dtype):
@@ -222,7 +228,7 @@ class CoupledNewton:
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
         used += (self.outliers,)
-        parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
+        parts = [self._move, *self.coupled.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
         sums = [kernel for part in sums for kernel in part.kernels]
@@ -239,7 +245,7 @@ class CoupledNewton:
             self.frozen.begin()
         if self.resting:
             self.resting.wake()
-        wp.capture_while(self.islands.active, lambda: self.iterate(state))
+        wp.capture_while(self.islands.any_active, lambda: self.iterate(state))
 
     def iterate(self, state) -> None:
         """One iteration of every active world."""
@@ -247,14 +253,14 @@ class CoupledNewton:
         self.evaluate(state)
         self.balance()
         self.judge()
-        wp.capture_if(self.islands.active, lambda: self._step(state))
+        wp.capture_if(self.islands.any_active, lambda: self._step(state))
 
     def _step(self, state) -> None:
         """The next iterate of active worlds."""
-        wp.capture_if(self.islands.wanting, self._aim)
+        wp.capture_if(self.islands.any_needs_direction, self._aim)
         self.move()
         if self.turns:
-            wp.capture_if(self.islands.turning, lambda: self.turns.turn(state))
+            wp.capture_if(self.islands.any_edge_rotation, lambda: self.turns.turn(state))
         if self.contact:
             self.contact.hold()
 
@@ -268,7 +274,7 @@ class CoupledNewton:
 
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate, `here`."""
-        parts = [partial(self._evaluate_set, state, index) for index in range(len(self.net.sets))]
+        parts = [partial(self._evaluate_set, state, index) for index in range(len(self.coupled.sets))]
         device_arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
 
     def _evaluate_set(self, state, index: int) -> None:
@@ -277,8 +283,8 @@ class CoupledNewton:
             setattr(results, name, values)
         wp.launch(
             self._evaluate[index],
-            (self.worlds, device_arrays.takers(self.net.sets[index].elements, self.device)),
-            [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
+            (self.worlds, device_arrays.takers(self.coupled.sets[index].elements, self.device)),
+            [self.coupled.elements(state, index, self.here, self.islands.inverse_step), *self.islands.arrays],
             [results],
             device=self.device,
             block_dim=128,
@@ -288,8 +294,8 @@ class CoupledNewton:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
         islands = self.islands
         self._balance()
-        flags = islands.unbalanced, islands.drowned
-        self.allowed.sum_up(self.right, self.options.rtol, islands, *flags, self._direct and not self.frozen)
+        flags = islands.not_converged, islands.below_rounding_floor
+        self.allowed.sum_up(self.rhs, self.options.rtol, islands, *flags, self._direct and not self.frozen)
 
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or ask for a direction."""
@@ -326,7 +332,7 @@ class CoupledNewton:
         anew = self.anew
         self._assembly(self.mass, anew, self.matrix)
         if self.planes:
-            self.planes.matrix(self.matrix, anew.wanted)
+            self.planes.matrix(self.matrix, anew.needs_direction)
         if self.chains and not self._direct:
             self.chains.assemble(self.matrix, self.mass, anew)
 
@@ -341,8 +347,8 @@ class CoupledNewton:
                 self.islands,
                 self.anew,
                 self.fixed,
-                self.barred,
-                self.right,
+                self.inactive_mask,
+                self.rhs,
                 self.negative,
                 self.direction,
                 self.krylov_dots,
@@ -367,15 +373,15 @@ class CoupledNewton:
     @property
     def indefinite(self) -> wp.array:
         """Where conjugate gradients note what is not definite: the iterate comes again, or the next one leaves out compression."""
-        return self.negative if self._repeat else self.islands.clamped
+        return self.negative if self._repeat else self.islands.drop_compression
 
     def watch(self) -> None:
         """What is looked at after every iteration of conjugate gradients."""
 
     def take(self) -> None:
         """Lengths of the steps along the directions."""
-        blocks = self.net.blocks
-        inputs = [self.right, self.direction, self.islands.wanted, blocks]
+        blocks = self.coupled.blocks
+        inputs = [self.rhs, self.direction, self.islands.needs_direction, blocks]
         device_arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
         self._sum(self.dots, self.decrease)
         self.measure_turns()
@@ -390,11 +396,11 @@ class CoupledNewton:
     def measure_turns(self) -> None:
         """Largest turn that the directions make, squared; these are in space then."""
         if self.planes:
-            self.planes.back(self.direction, self.islands.wanted)
+            self.planes.back(self.direction, self.islands.needs_direction)
         device_arrays.sweep(
             self._rotate,
             len(self.ends) + len(self.spins),
-            [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
+            [self.q, self.direction, self.ends, self.spins, self.islands.needs_direction, self.coupled.blocks],
             [self.squares],
             self.device,
             worlds=self.worlds,
@@ -406,8 +412,8 @@ class CoupledNewton:
         islands = self.islands
         device_arrays.sweep(
             self._move,
-            self.net.blocks,
-            [self.direction, islands.step_length, islands.todo, islands.halvings, self.net.blocks],
+            self.coupled.blocks,
+            [self.direction, islands.step_length, islands.iterate_action, islands.backtracks, self.coupled.blocks],
             [self.base, self.q],
             self.device,
             worlds=self.worlds,

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import WANTED, Islands
+from ddg_warp.kernels.core.islands import NEEDS_DIRECTION, Islands
 from ddg_warp.kernels.newton.coupled_newton import freeze_kernel
 
 
@@ -18,14 +18,14 @@ class FrozenHessian:
     def __init__(self, islands: Islands):
         self._islands = islands
         self._flags, scalars = wp.zeros_like(islands.arrays[0]), islands.arrays[1]
-        self.arrays, self.wanted = [self._flags, scalars], self._flags[WANTED]
-        self._done = wp.zeros_like(islands.wanted)
+        self.arrays, self.needs_direction = [self._flags, scalars], self._flags[NEEDS_DIRECTION]
+        self._done = wp.zeros_like(islands.needs_direction)
         self.kernels = [freeze_kernel()]
 
     def begin(self) -> None:
         """Discard the matrix of the last solve."""
         self._done.zero_()
-        self._islands.clamped.fill_(1)
+        self._islands.drop_compression.fill_(1)
 
     def update(self) -> None:
         """Find the worlds that need a direction and have no matrix yet; mark the matrix as made."""

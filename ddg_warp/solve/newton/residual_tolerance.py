@@ -18,9 +18,9 @@ class ResidualTolerances:
         `ratio`: residuals over tolerances, of blocks, then of cluster sums.
     """
 
-    def __init__(self, net, real, linear):
-        self.net, self.bodies, self._real = net, net.host.bodies, real
-        worlds, device = net.worlds, net.device
+    def __init__(self, coupled, real, linear):
+        self.coupled, self.bodies, self._real = coupled, coupled.host.bodies, real
+        worlds, device = coupled.worlds, coupled.device
 
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
@@ -28,10 +28,10 @@ class ResidualTolerances:
         def make(shape, dtype=real):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
-        self.ratio = make((worlds, net.blocks + sum(len(level.weight) for level in self.bodies.levels)))
+        self.blocks, self.least = make(worlds * coupled.blocks), make(worlds * coupled.blocks)
+        self.ratio = make((worlds, coupled.blocks + sum(len(level.weight) for level in self.bodies.levels)))
         self.kernels = [
-            residual_sums.part_kernel(real, linear, leaf, device_arrays.serial(device)) for leaf in (True, False)
+            residual_sums.cluster_kernel(real, linear, leaf, device_arrays.serial(device)) for leaf in (True, False)
         ]
         self._levels = []
         for level in self.bodies.levels:
@@ -40,7 +40,7 @@ class ResidualTolerances:
                 put(level.starts),
                 put(level.items),
                 make((worlds, n)),
-                make(worlds * n, net.vector),
+                make(worlds * n, coupled.vector),
                 make(worlds * n),
             )
             self._levels.append(buffers)
@@ -49,26 +49,26 @@ class ResidualTolerances:
 
     def assign(self, loads: np.ndarray) -> wp.array:
         """Set the loads of bodies (worlds or 1, bodies) [N]; return load scales of worlds: 1, or 0 without loads."""
-        loads = np.broadcast_to(loads, (self.net.worlds, self.bodies.count))
+        loads = np.broadcast_to(loads, (self.coupled.worlds, self.bodies.count))
         loaded = (loads > 0.0).any(1)
         loads = np.where(loaded[:, None], loads, 1.0)
         self.total.assign(loads.sum(1))
         self.blocks.assign(np.concatenate([self.bodies.limits(of_world) for of_world in loads]))
         for level, limit in zip(self.bodies.levels, self.limits, strict=True):
             limit.assign(loads[:, level.body] * level.weight)
-        return wp.array(loaded.astype(float), dtype=self._real, device=self.net.device)
+        return wp.array(loaded.astype(float), dtype=self._real, device=self.coupled.device)
 
-    def sum_up(self, right, rtol: float, islands, unbalanced, drowned, exact: bool = False) -> None:
+    def sum_up(self, rhs, rtol: float, islands, unbalanced, drowned, exact: bool = False) -> None:
         """Raise the flags of worlds with a cluster sum above the tolerance; `exact`: directions are exact."""
-        value, rounding, below, kernel = right, self.least, self.net.blocks, self.kernels[0]
+        value, rounding, below, kernel = rhs, self.least, self.coupled.blocks, self.kernels[0]
         first_ratio = below
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
-                (device_arrays.takers(limit.shape[1], self.net.device), self.net.worlds),
+                (device_arrays.takers(limit.shape[1], self.coupled.device), self.coupled.worlds),
                 [value, rounding, starts, items, below, limit, first_ratio, rtol, int(exact), *islands.arrays],
                 [sums, squares, self.ratio, unbalanced, drowned],
-                device=self.net.device,
+                device=self.coupled.device,
             )
             first_ratio += limit.shape[1]
             value, rounding, below, kernel = sums, squares, limit.shape[1], self.kernels[1]

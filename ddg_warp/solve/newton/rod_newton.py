@@ -14,7 +14,9 @@ from ddg_warp.kernels.newton import rod_sweep as sweep
 from ddg_warp.kernels.residual import rod_residual
 from ddg_warp.kernels.stepping import rod_step, rod_warm_start
 
-EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
+FIRST_EXACT_ITERATION = (
+    2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
+)
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
 FROZEN = ("auto", "gauss_newton")  # modes of the matrix that serves a whole step
 FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_newton'"
@@ -39,8 +41,8 @@ class NewtonOptions:
             compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian, and
             in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or compressed rods
             and long steps, where Gauss-Newton takes many iterations. Where many iterations are such, a time step is tried again
-            with a shorter one (outcome `indefinite`; see `kernels.core.islands.patience_function`). "project": the exact one with
-            every element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
+            with a shorter one (outcome `indefinite`; see `kernels.core.islands.projected_limit_function`). "project": the exact one
+            with every element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
             exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again with a
             shorter one. "auto": "progressive" for rods that are curved or twisted at rest, or stiff over a time step
             (`compile.precision.stiff`), on their own or in nets, else "gauss_newton". Nets take all but "project". Their exact
@@ -117,15 +119,13 @@ class RodNewton:
         self.stiffness = make(*nodes, dtype=self.linear)
         kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if split else 0)
         self.elimination = make(kept, *nodes, dtype=self.linear) if not kind.closed else None
-        self.right, self.direction = (
-            make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + split)
-        )
+        self.rhs, self.direction = (make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + split))
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
         self.islands = Islands(columns, self.real, device)
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
         rows = kind.geometric_rows if self.exact else 1
-        self.exact_from = (EARLY if self.psd == "progressive" else 0) if self.exact else None
+        self.exact_from = (FIRST_EXACT_ITERATION if self.psd == "progressive" else 0) if self.exact else None
         self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
         self._project = None
         if self.psd == "project" and self.exact:
@@ -217,7 +217,7 @@ class RodNewton:
 
     def solve(self, last: wp.array) -> None:
         """Iterate until no rod is active; can be captured. `last` holds the strains of the last step."""
-        wp.capture_while(self.islands.active, lambda: self.iterate(last))
+        wp.capture_while(self.islands.any_active, lambda: self.iterate(last))
 
     def iterate(self, last: wp.array) -> None:
         """One iteration of every active rod."""
@@ -231,7 +231,7 @@ class RodNewton:
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [group.element_inputs(self, last, self.islands.rate), *self.islands.arrays],
+            [group.element_inputs(self, last, self.islands.inverse_step), *self.islands.arrays],
             [self._results],
             device=self.device,
             block_dim=128,
@@ -255,7 +255,7 @@ class RodNewton:
             + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
             + [group.gravity, self.load, self.load_angle, int(self.loaded), group.fixed, group.length]
             + [options.rtol, options.floor_factor * self.eps],
-            [self.right, self.energy_change, self.energy_noise],
+            [self.rhs, self.energy_change, self.energy_noise],
             device=self.device,
         )
 
@@ -277,7 +277,7 @@ class RodNewton:
         wp.launch(
             self._sweep,
             group.columns,
-            [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
+            [self.factor, self.geometric, self.rhs, self.energy_change, self.energy_noise, group.count]
             + [self.mass, self.rotary, *self.islands.arrays, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]

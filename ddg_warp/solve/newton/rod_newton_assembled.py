@@ -30,7 +30,7 @@ class AssembledNewton(RodNewton):
         super().__init__(model, group, options, linear, midpoint, split)
         kind, self.stored = group.kind, stored or self.linear
         self.blocks = self.vectors(3 * kind.block**2)
-        self.islands.placed.fill_(1)  # `base` holds where every step comes from
+        self.islands.edges_rotated.fill_(1)  # `base` holds where every step comes from
         self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
 
     def vectors(self, rows: int | None = None) -> wp.array:

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.newton import line_search_parallel, rod_iterate_parallel
-from ddg_warp.kernels.newton.edge_rotation import FURTHER, ON
+from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, REPEAT_ROTATION
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, TensionReduction
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
@@ -33,7 +33,7 @@ class RodNewtonParallel(AssembledNewton):
         self.sums = device_arrays.allocate((2, self.ranges, columns), vector, device)
         self.prefix = device_arrays.allocate((group.nodes, columns), vector, device)
         self.mean = wp.zeros(columns, dtype=vector, device=device)
-        self.held = device_arrays.upload(_held_neighbours(group), int, device)
+        self.held = device_arrays.upload(_fixed_neighbours(group), int, device)
         self.new_frame = device_arrays.allocate(self.frame.shape, real, device)
         if split:
             self.reduction = TensionReduction(group, real, self.linear, device)
@@ -65,7 +65,7 @@ class RodNewtonParallel(AssembledNewton):
             [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.x],
             [self.base, self.direction],
         )
-        self.move(0 if self.midpoint else ON)
+        self.move(0 if self.midpoint else REPEAT_ROTATION)
         if self.midpoint and group.kind.twist:
             wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
             self.move()
@@ -73,7 +73,7 @@ class RodNewtonParallel(AssembledNewton):
     def go_further(self, before, predicted: wp.array) -> None:
         """As of `RodNewton`."""
         wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
-        self.move(FURTHER, base=predicted, now=before.x)
+        self.move(EXTRAPOLATE_ROTATED, base=predicted, now=before.x)
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
@@ -89,7 +89,7 @@ class RodNewtonParallel(AssembledNewton):
         self._launch(
             self._weigh,
             self.ranges,
-            [self.right, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
+            [self.rhs, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
             [self.partial],
         )
         wp.launch(
@@ -104,9 +104,11 @@ class RodNewtonParallel(AssembledNewton):
         """Directions by cyclic reduction."""
         islands = self.islands
         if self.split:
-            self.reduction.solve(self.blocks, self.factor, self.right, self.x, islands, self.direction)
+            self.reduction.solve(self.blocks, self.factor, self.rhs, self.x, islands, self.direction)
         else:
-            self.reduction.solve(self.blocks, self.right, self.group.count, islands.wanted, self.direction, islands.bad)
+            self.reduction.solve(
+                self.blocks, self.rhs, self.group.count, islands.needs_direction, self.direction, islands.lost_pivots
+            )
 
     def take(self) -> None:
         """Lengths of the steps along the directions."""
@@ -114,7 +116,7 @@ class RodNewtonParallel(AssembledNewton):
         self._launch(
             self._gauge,
             self.ranges,
-            [self.right, self.direction, self.x, group.count, self.islands.wanted, self.ranges],
+            [self.rhs, self.direction, self.x, group.count, self.islands.needs_direction, self.ranges],
             [self.base, self.partial],
         )
         wp.launch(
@@ -137,15 +139,15 @@ class RodNewtonParallel(AssembledNewton):
         self._launch(
             turn if onward is None else self._turn_ahead,
             group.nodes,
-            [group.count, islands.todo, self.direction, islands.step_length, islands.turn]
+            [group.count, islands.iterate_action, self.direction, islands.step_length, islands.straight_rotation_limit]
             + [onward or 0, base, base if now is None else now, self.x, self.frame],
             [self.prefix, self.new_frame],
         )
-        self._launch(scan, self.ranges, [group.count, islands.todo, self.width, self.prefix], [self.sums])
+        self._launch(scan, self.ranges, [group.count, islands.iterate_action, self.width, self.prefix], [self.sums])
         wp.launch(
             offset,
             group.columns,
-            [group.count, islands.todo, self.width, self.ranges, self.sums],
+            [group.count, islands.iterate_action, self.width, self.ranges, self.sums],
             [self.mean],
             device=self.device,
         )
@@ -162,7 +164,7 @@ class RodNewtonParallel(AssembledNewton):
         wp.launch(kernel, (size, self.group.columns), inputs, outputs, device=self.device)
 
 
-def _held_neighbours(group) -> np.ndarray:
+def _fixed_neighbours(group) -> np.ndarray:
     """The held nodes next to every node, itself included: (before or after, node, column), -1 where there is none."""
     k, held = np.arange(group.nodes)[:, None], group.host.anchored
     before = np.maximum.accumulate(np.where(held, k, -1), axis=0)

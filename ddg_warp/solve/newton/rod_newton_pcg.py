@@ -37,7 +37,7 @@ class PcgNewton(AssembledNewton):
         self.iterations, self.negative = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
         self.busy = wp.zeros(1, dtype=int, device=device)
         self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
-        self._judge = line_search.judge_kernel(kind, self.real, self.linear)
+        self._judge = line_search.line_search_kernel(kind, self.real, self.linear)
         self._factor = rod_matrix.factor_kernel(kind, self.linear) if by_chain else None
         self._start, self._product, self._advance = rod_pcg.solver_kernels(kind, self.linear, preconditioner)
         self._repeat = rod_pcg.repeat_kernel(self.real, self.psd == "none") if self._repeats else None
@@ -69,7 +69,7 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._take,
             group.columns,
-            [self.right, self.iterations, group.count, self.options.rotation_cap],
+            [self.rhs, self.iterations, group.count, self.options.rotation_cap],
             [
                 self.direction,
                 group.fixed,
@@ -100,7 +100,7 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._judge,
             group.columns,
-            [self.right, self.energy_change, self.energy_noise, group.count, options.floor_factor * self.eps]
+            [self.rhs, self.energy_change, self.energy_noise, group.count, options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, self.direction, group.fixed, group.anchor, self.base]
             + [self.x, self.theta, self.frame, *self.islands.arrays],
             device=device,
@@ -114,8 +114,8 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._factor,
             group.columns,
-            [self.blocks, group.count, islands.wanted, islands.iteration, int(self.reuse)],
-            [self.factors, self.negative if self._repeat else islands.lost],
+            [self.blocks, group.count, islands.needs_direction, islands.iteration, int(self.reuse)],
+            [self.factors, self.negative if self._repeat else islands.lost_pivots_total],
             device=self.device,
         )
 
@@ -126,7 +126,7 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._start,
             group.columns,
-            [self.blocks, self.factors, group.count, self.islands.wanted, self.right],
+            [self.blocks, self.factors, group.count, self.islands.needs_direction, self.rhs],
             [self.rest, self.direction, self.z, self.p, self.rho, self.rho_first, self.iterations, self.busy],
             device=self.device,
         )
@@ -137,7 +137,7 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._product,
             (group.nodes, group.columns),
-            [self.blocks, self.p, group.count, self.islands.wanted],
+            [self.blocks, self.p, group.count, self.islands.needs_direction],
             [self.q, self.busy],
             device=device,
         )
@@ -146,7 +146,7 @@ class PcgNewton(AssembledNewton):
             group.columns,
             [self.blocks, self.factors, group.count, self.options.linear_rtol, self._limit],
             [self.q, self.rest, self.direction, self.z, self.p, self.rho, self.rho_first]
-            + [self.iterations, self.islands.wanted, self.busy, self.negative],
+            + [self.iterations, self.islands.needs_direction, self.busy, self.negative],
             device=device,
         )
 
@@ -180,7 +180,7 @@ class RodModifiedNewton(PcgNewton):
         wp.launch(
             self._direct,
             self.group.columns,
-            [self.factors, self.right, self.group.count, self.islands.wanted],
+            [self.factors, self.rhs, self.group.count, self.islands.needs_direction],
             [self.direction],
             device=self.device,
         )

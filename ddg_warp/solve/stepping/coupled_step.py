@@ -20,9 +20,9 @@ from ddg_warp.solve.forces.control_loads import ControlledLoads, CoupledScale
 from ddg_warp.solve.forces.drag import CoupledDrag
 from ddg_warp.solve.forces.loads import Loads
 from ddg_warp.solve.forces.prescribed_element_data import CoupledField, CoupledMotion
-from ddg_warp.solve.linear.solver_selection import net_preconditioner
+from ddg_warp.solve.linear.solver_selection import coupled_preconditioner
 from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS, CoupledNewton
-from ddg_warp.solve.stepping.decoupled_step import DecoupledStep, rods_of, suits, uncoupled
+from ddg_warp.solve.stepping.decoupled_step import DecoupledStep, is_decoupled, rods_of, uncoupled
 from ddg_warp.solve.stepping.energy_drift import CoupledEnergy
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 from ddg_warp.solve.stepping.warm_start import WarmStart
@@ -37,8 +37,8 @@ class CoupledStep(StepDriver):
     """Steps a model's net in all worlds, each an island. Arguments as of `RodStep`."""
 
     def __init__(self, integrator, model, means=USUAL, counts_of=None):
-        self.net = model.net
-        host, real = model.net.host, model.types.real
+        self.coupled = model.coupled
+        host, real = model.coupled.host, model.types.real
         options = integrator.options
         for name, value, only in (
             ("linear", integrator.linear, ("auto", *PRECONDITIONERS)),
@@ -56,7 +56,7 @@ class CoupledStep(StepDriver):
                 f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
                 "give the material a density, the section a mass_per_length, or the rod drag along and across"
             )
-        preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
+        preconditioner = coupled_preconditioner(model.coupled) if integrator.linear == "auto" else integrator.linear
         reuse = integrator.solver == "projective"
         if options.psd == "auto" and means.stiff and not reuse:
             options = replace(options, psd="progressive")
@@ -80,16 +80,16 @@ class CoupledStep(StepDriver):
             raise SceneError(
                 "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
             )
-        self._lagged = model.net.lagged() if model.net.edges else None
+        self._lagged = model.coupled.lagged() if model.coupled.edges else None
         self._take = coupled_frames.take_kernel(real)
         self.drag = CoupledDrag(model, self.midpoint) if host.drag else None
         self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = CoupledMotion(model, self.midpoint) if host.moves else None
         if (given := integrator.given) is not None:
-            scale = CoupledScale(model, self.net, solver)
-            self.loads = ControlledLoads(model, self.net, self.midpoint, given, scale)
+            scale = CoupledScale(model, self.coupled, solver)
+            self.loads = ControlledLoads(model, self.coupled, self.midpoint, given, scale)
         elif host.timed or host.followers:
-            self.loads = Loads(model, self.net, self.midpoint)
+            self.loads = Loads(model, self.coupled, self.midpoint)
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
@@ -136,7 +136,7 @@ class CoupledStep(StepDriver):
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another."""
-        if self.alone is None or self.net.worlds > 1:
+        if self.alone is None or self.coupled.worlds > 1:
             self._keep()
         if len(before.rate):
             wp.copy(after.rate, before.rate)
@@ -155,10 +155,10 @@ class CoupledStep(StepDriver):
 
     def go_on(self, before, after) -> None:
         """Step the worlds that `alone` has left to the net; those that are done rest as they are."""
-        if self.net.worlds == 1:  # of which nothing was counted yet
+        if self.coupled.worlds == 1:  # of which nothing was counted yet
             self._keep()
         else:
-            self.integrator._worlds.take_part(self.alone.left, before, after, self.net.worlds)
+            self.integrator._worlds.take_part(self.alone.left, before, after, self.coupled.worlds)
             wp.copy(self.newton.q, after.q)
             before = after
         self._try(before, after)
@@ -192,7 +192,7 @@ class CoupledStep(StepDriver):
         device_arrays.load_kernels(self.alone.kernels, self.model.wp_device)
         for chain in self._rods:
             chain.load_modules()
-        if self.net.worlds > 1:
+        if self.coupled.worlds > 1:
             self.integrator._worlds.load_modules()
 
     @property
@@ -203,22 +203,22 @@ class CoupledStep(StepDriver):
     def adapt(self, s: float, anew: bool = False) -> bool:
         """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before.
 
-        `anew` as of `StepDriver.suited`.
+        `anew` as of `StepDriver.choose_solver`.
         """
         before = self.alone
-        if not (uncoupled(self.model) and suits(self.integrator)):
+        if not (uncoupled(self.model) and is_decoupled(self.integrator)):
             self.alone = None
         elif self.alone is None:
             self._groups = self._groups or rods_of(self.model)
             self.alone = DecoupledStep(self, self._groups)
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s, anew))
 
-    def outgrown(self, before) -> bool:
+    def has_overflow(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
 
         Then there is room, and all is as it was before that step. Reads from the device where there is contact.
         """
-        if self.newton.contact is None or not self.newton.contact.outgrown(before.q):
+        if self.newton.contact is None or not self.newton.contact.has_overflow(before.q):
             return False
         for kept, array in zip(self._kept, self._counts, strict=True):
             wp.copy(array, kept)
@@ -231,13 +231,13 @@ class CoupledStep(StepDriver):
 
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
-        net, solver, islands = self.net, self.newton, self.islands
-        blocks = net.blocks
+        coupled, solver, islands = self.coupled, self.newton, self.islands
+        blocks = coupled.blocks
         if solver.contact:
             solver.contact.brace(self.integrator._dt)
         self._sweep(
             self._begin,
-            [before.q, before.v, solver.held, net.moves]
+            [before.q, before.v, solver.held, coupled.moves]
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
         )
@@ -249,7 +249,7 @@ class CoupledStep(StepDriver):
         if self.motion:
             self.motion.direct(islands, solver.q, start.frame)
         if self.loads:
-            self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
+            self.loads.apply(coupled.points(solver.q), coupled.points(solver.load), coupled.angles(solver.load))
         if self.drag:
             self.drag.resist(before, solver, islands)
         if not self.midpoint:
@@ -271,15 +271,17 @@ class CoupledStep(StepDriver):
         self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a, after.rate])
         if self.drag:
             self.drag.settle(before, after, solver, islands)
-        self.net.carry(start, after, kept=before, moved=islands.moved)
+        self.coupled.carry(start, after, kept=before, moved=islands.substep_accepted)
         if self.motion:
             self.motion.turn(islands, before, after)
-        self.field.finish(islands.moved, before, after)
-        self.net.update_strains(after)
+        self.field.finish(islands.substep_accepted, before, after)
+        self.coupled.update_strains(after)
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
         """Over the blocks of every world."""
-        device_arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.model.wp_device, worlds=self.net.worlds)
+        device_arrays.sweep(
+            kernel, self.coupled.blocks, inputs, outputs, self.model.wp_device, worlds=self.coupled.worlds
+        )
 
     def _start_frames(self, before):
         """The state whose lagged data serve the solve, which may renew them: for the midpoint rule carried to the predicted midpoint.
@@ -289,16 +291,16 @@ class CoupledStep(StepDriver):
         found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
         Worlds that have finished keep the frames of their solve, by which gradients tell whether these were renewed.
         """
-        if not self.net.edges:
+        if not self.coupled.edges:
             return replace(before, data=self._data)
         frame, lag = self._lagged
         start = CoupledState(self.newton.q, before.v, before.a, frame, lag, before.last, self._data)
         if self.midpoint:
-            self.net.carry(before, start, kept=start, moved=self.islands.moved)
+            self.coupled.carry(before, start, kept=start, moved=self.islands.substep_accepted)
             return start
-        inputs = [self.islands.moved, self.net.edges, before.frame]
+        inputs = [self.islands.substep_accepted, self.coupled.edges, before.frame]
         wp.launch(self._take, frame.shape[1], inputs, [frame], device=self.model.wp_device)
-        for part, own, given in zip(self.net.sets, lag, before.lag, strict=True):
+        for part, own, given in zip(self.coupled.sets, lag, before.lag, strict=True):
             if part.term.measure.advance:
                 wp.copy(own, given)
         return start
@@ -306,9 +308,9 @@ class CoupledStep(StepDriver):
     @property
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
-        real, net = self.model.types.real, self.net
+        real, coupled = self.model.types.real, self.coupled
         kernels = [self._begin, self._finish, self._take, *([] if self.midpoint else self._foresight.kernels)]
-        for part in net.sets:
+        for part in coupled.sets:
             if part.term.density.lagged:
                 kernels.append(element_path.strain_kernel(coupled_storage(part.term, real), real))
         return kernels
@@ -316,18 +318,18 @@ class CoupledStep(StepDriver):
     @property
     def stiffness_version(self) -> int:
         """As of `StepDriver`."""
-        return self.net.version
+        return self.coupled.version
 
     def float32_errors(self, s: float) -> np.ndarray:
         """The largest of a rod (1,); see `precision.float32_error`."""
-        return self.net.rod_errors(s).max(initial=0.0, keepdims=True)
+        return self.coupled.rod_errors(s).max(initial=0.0, keepdims=True)
 
     def split_errors(self, s: float) -> np.ndarray:
         """The same with tensions as unknowns; infinite where they cannot be."""
         chains = self.newton.chains
         if not (chains and chains.splits) or self.newton.frozen:
             return super().split_errors(s)
-        return self.net.split_errors(s).max(initial=0.0, keepdims=True)
+        return self.coupled.split_errors(s).max(initial=0.0, keepdims=True)
 
     def limit(self, s: float) -> None:
         """As of `StepDriver`."""
@@ -339,11 +341,11 @@ class CoupledStep(StepDriver):
         """As of `StepDriver`; and what float32 matrices carry, of the rod that is the softest."""
         found = super()._find_limits(s)
         if any(self.newton.split):
-            softest = self.net.rod_stiffnesses(s)[2].min()
-            found["carried"] = np.full(len(self.islands), largest_carried(softest))
+            softest = self.coupled.rod_stiffnesses(s)[2].min()
+            found["max_edge_stiffness"] = np.full(len(self.islands), largest_carried(softest))
         return found
 
-    def who(self, world: int) -> str:
+    def island_label(self, world: int) -> str:
         """The net of a world."""
         return f"the net (world {world})"
 
@@ -353,21 +355,23 @@ class CoupledStep(StepDriver):
 
     def failure(self, state, island: int) -> tuple[str, str]:
         """As of `StepDriver`."""
-        if int(self.islands.reason.numpy()[island]) == outcome.TURNED_TOO_FAR:
-            return outcome.NAMES[outcome.TURNED_TOO_FAR], self.arcs.failure(island)
+        if int(self.islands.failure_status.numpy()[island]) == outcome.ROTATED_TOO_FAR:
+            return outcome.NAMES[outcome.ROTATED_TOO_FAR], self.arcs.failure(island)
         return super().failure(state, island)
 
     def where(self, state, world: int) -> str:
         """Where the largest residual was, and what to do."""
-        sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
+        sizes = np.abs(self.newton.rhs.numpy().reshape(self.model.worlds, -1))[world]
         worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
         place = Tangent(self.model).parts[-1].where(worst)
         return f"largest residual {sizes[worst]:.3g} N at {place}; {self._remedy(state, world)}"
 
     def _remedy(self, state, world: int) -> str:
         """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
-        x = state.net.q.numpy().reshape(self.model.worlds, -1, 3)[world]
-        found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
+        x = state.coupled.q.numpy().reshape(self.model.worlds, -1, 3)[world]
+        found = (
+            self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.coupled.host.rods
+        )
         return next(filter(None, found), "") or self._tightest(state, world)
 
     def _tightest(self, state, world: int) -> str:
@@ -377,9 +381,9 @@ class CoupledStep(StepDriver):
         """
         if not self.newton.contact:
             return self.advice(state)
-        reason = int(self.islands.reason.numpy()[world])
+        reason = int(self.islands.failure_status.numpy()[world])
         begin = state.time - self.integrator._dt_host
         told = self.newton.contact.blocked(Tangent(self.model), state, begin, state.time)
-        told = told or self.newton.contact.tightest(state.net.q, reason)
+        told = told or self.newton.contact.closest_pair(state.coupled.q, reason)
         helped = told.endswith(", ")
         return told + ("or check its loads and supports" if helped else self.advice(state))

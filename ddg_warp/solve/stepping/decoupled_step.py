@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.compile.rod_groups import RodGroupData, compile_chains
-from ddg_warp.compile.rods import net_rods
+from ddg_warp.compile.rod_groups import RodGroupData, compile_rod_groups
+from ddg_warp.compile.rods import coupled_rods
 from ddg_warp.kernels.collision.broad_phase.rod_culling import KNOWN
 from ddg_warp.kernels.stepping import decoupled_rods as kernels
 from ddg_warp.model.rod_elements import RodElements
@@ -33,11 +33,11 @@ class DecoupledStep:
     """
 
     def __init__(self, step, groups: list[RodGroup]):
-        self.step_of, self.model, self.net = step, step.model, step.net
-        real, device, worlds = self.model.types.real, self.model.wp_device, self.net.worlds
+        self.step_of, self.model, self.coupled = step, step.model, step.coupled
+        real, device, worlds = self.model.types.real, self.model.wp_device, self.coupled.worlds
         self.chains = [self._chain(group) for group in groups]
         self._states = [self.model.group_state(group) for group in groups]
-        self._places = [Places(self.net, group) for group in groups]
+        self._places = [Places(self.coupled, group) for group in groups]
         self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
         self._search = step.newton.contact.search
         self.runs = RodCulling(self._search) if len(self._search.lists) == 1 else None
@@ -45,10 +45,10 @@ class DecoupledStep:
         self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
         self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
         self._wait, self._stay, self._follow = kernels.place_kernels(real, device_arrays.serial(device))
-        self._told = wp.zeros((kernels.TOLD, worlds), dtype=int, device=device)
+        self._told = wp.zeros((kernels.REPORTED, worlds), dtype=int, device=device)
         self.left, self._tried = (self._told[row] for row in (kernels.LEFT, kernels.TRIED))
         self._any_tried, self._some, self._again = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
-        obstacles = np.concatenate([np.zeros(0, int), *self.net.host.obstacles]).astype(np.int32)
+        obstacles = np.concatenate([np.zeros(0, int), *self.coupled.host.obstacles]).astype(np.int32)
         self._obstacles = wp.array(obstacles, dtype=int, device=device)
         self._mixed = not all(places.whole for places in self._places)
 
@@ -69,14 +69,14 @@ class DecoupledStep:
             *(kernel for each in self._kernels for kernel in each),
         ]
         loaded += self.runs.kernels if self.runs else []
-        loaded += [self._wait] if self.net.worlds > 1 else []
+        loaded += [self._wait] if self.coupled.worlds > 1 else []
         return loaded + ([self._stay, self._follow] if len(self._obstacles) else [])
 
     def adapt(self, s: float, parameters_changed: bool = False) -> bool:
         """Update parameters and solver selection for a step of s [s], as `CoupledStep.adapt`; return True if graphs are outdated."""
         changed = any([places.take_parameters() for places in self._places])
         for i, chain in enumerate(self.chains):
-            if (means := chain.suited(s, parameters_changed)) != chain.means or (
+            if (means := chain.choose_solver(s, parameters_changed)) != chain.means or (
                 parameters_changed and chain.newton.outdated
             ):
                 self.chains[i], changed = self._chain(chain.group, means=means, counts_of=chain), True
@@ -91,7 +91,7 @@ class DecoupledStep:
         """Launch the step; worlds with pairs in range are solved by the coupled system."""
         step = self.step_of
         inputs = [*step.islands.arrays, self._told, self._known]
-        self._launch(self._begin, self.net.worlds, inputs, [step.remaining, self._again])
+        self._launch(self._begin, self.coupled.worlds, inputs, [step.remaining, self._again])
         if self.runs is None:
             self._by_pairs(before, after)
             wp.capture_if(step.remaining, lambda: step.go_on(before, after))
@@ -120,15 +120,15 @@ class DecoupledStep:
         search.update(before.q)
         search.measure(before.q, enough=search.reach)
         inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1], self._told]
-        self._launch(self._hope, self.net.worlds, inputs, [self._any_tried, step.remaining])
+        self._launch(self._hope, self.coupled.worlds, inputs, [self._any_tried, step.remaining])
         wp.capture_if(self._any_tried, lambda: self._try_and_search(before, after))
 
     def _try_and_search(self, before, after) -> None:
-        worlds, blocks, search = self.net.worlds, self.net.blocks, self._search
+        worlds, blocks, search = self.coupled.worlds, self.coupled.blocks, self._search
         self._try(before, after)
         if worlds > 1:
             device_arrays.sweep(
-                self._wait, blocks, [self._told, blocks, before.q], [after.q], self.net.device, worlds=worlds
+                self._wait, blocks, [self._told, blocks, before.q], [after.q], self.coupled.device, worlds=worlds
             )
         search.update(before.q, after.q, search.every)
         for pairs in search.lists:
@@ -151,7 +151,7 @@ class DecoupledStep:
 
         device_arrays.side_by_side([test_runs, complete] if test_runs else [complete], self.model.wp_device)
         if self._mixed:
-            self.net.update_strains(after)
+            self.coupled.update_strains(after)
 
     def _solve(self, before, after, chain, state, places, rod_kernels) -> None:
         """Solve the rods of a group once, and write their positions."""
@@ -163,7 +163,7 @@ class DecoupledStep:
             *lists,
             world_status,
             places.sizes,
-            self.net.host.nodes,
+            self.coupled.host.nodes,
             before.q,
             before.v,
             before.a,
@@ -178,16 +178,16 @@ class DecoupledStep:
         """Write all results of a rod group but positions."""
         *_, scatter = rod_kernels
         chain.complete(state, state)
-        group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.net.host.nodes]
+        group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.coupled.host.nodes]
         inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
         self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])
 
     def _move(self, before, after) -> None:
         """Move obstacles to the end of the step."""
-        step, blocks = self.step_of, self.net.blocks
+        step, blocks = self.step_of, self.coupled.blocks
         if not len(self._obstacles):
             return
-        dim, inputs = (len(self._obstacles), self.net.worlds), [self._obstacles, self._told, blocks, before.q]
+        dim, inputs = (len(self._obstacles), self.coupled.worlds), [self._obstacles, self._told, blocks, before.q]
         self._launch(self._stay, dim, inputs, [after.q])
         if step.motion:
             step.motion.place(step.islands, after.q)
@@ -199,7 +199,7 @@ class DecoupledStep:
         inputs = [searched, self._some, search.gap, search.reach, search.crossed, search.overflow, step.rounded]
         inputs += [self._known, self._told, *step.islands.arrays, step.newton.contact.tally.counts]
         outputs = [step.tally, step.work, step.remaining, self._again]
-        self._launch(self._judge, self.net.worlds, inputs, outputs)
+        self._launch(self._judge, self.coupled.worlds, inputs, outputs)
 
     def _measure(self, before, after) -> None:
         self._search.passing(before.q, self.step_of.newton.contact.touch.keep)
@@ -218,21 +218,22 @@ class Places:
         whole: True if the coupled system lags the same strains of these rods as the group.
     """
 
-    def __init__(self, net, group: RodGroup):
-        host, kind = net.host, group.kind
+    def __init__(self, coupled, group: RodGroup):
+        host, kind = coupled.host, group.kind
         self._group, self._taken = group, {}
         by_rod = {rod.rod: rod for rod in host.rods}
         rods = [by_rod[rod] for rod in group.host.rods.tolist()]
-        self._elements = RodElements(net, kind, group.host.rods, group.nodes)
+        self._elements = RodElements(coupled, kind, group.host.rods, group.nodes)
         self._sets, elements = self._elements.sets, self._elements.lists
         none = [np.zeros(0, int)] * len(rods)
         lists = [rod.all_nodes for rod in rods], [rod.all_edges for rod in rods], elements.get(2, none), elements[1]
         rows = np.concatenate([np.transpose([_evenly(places) for places in each]) for each in lists])
-        self.rows = wp.array(np.ascontiguousarray(rows, np.int32), dtype=int, device=net.device)
-        sizes = [net.sets[self._sets[span]].elements if span in self._sets else 0 for span in (2, 1)]
-        self.sizes = wp.vec4i(net.blocks, net.edges, *sizes)
+        self.rows = wp.array(np.ascontiguousarray(rows, np.int32), dtype=int, device=coupled.device)
+        sizes = [coupled.sets[self._sets[span]].elements if span in self._sets else 0 for span in (2, 1)]
+        self.sizes = wp.vec4i(coupled.blocks, coupled.edges, *sizes)
         self.whole = all(
-            net.sets[self._sets[term.measure.span]].term.density.lagged == term.density.lagged for term in kind.terms
+            coupled.sets[self._sets[term.measure.span]].term.density.lagged == term.density.lagged
+            for term in kind.terms
         )
 
     def take_parameters(self) -> bool:
@@ -248,13 +249,13 @@ class Places:
 
 def uncoupled(model) -> bool:
     """Return True if only contact couples the rods of a model, and all rods are open."""
-    host, scene = model.net.host, model.scene
+    host, scene = model.coupled.host, model.scene
     if not host.touching or not host.rods or any(rod.piece.kind.closed for rod in host.rods):
         return False
     return not any((scene.shells, scene.axisymmetric_shells, scene.joints, scene.attachments, scene.magnets))
 
 
-def suits(integrator) -> bool:
+def is_decoupled(integrator) -> bool:
     """Return True if an integrator allows decoupled steps: default solver, implicit Euler, no control loads."""
     usual = integrator.solver == "newton" and integrator.linear == "auto" and integrator.scheme == "implicit_euler"
     return usual and integrator.given is None and not integrator.whole
@@ -263,7 +264,7 @@ def suits(integrator) -> bool:
 def rods_of(model) -> list[RodGroup]:
     """Return the rods of the coupled system as uncoupled rod groups."""
     real, device = model.types.real, model.wp_device
-    chains: list[RodGroupData] = compile_chains(model.scene, net_rods(model.scene))
+    chains: list[RodGroupData] = compile_rod_groups(model.scene, coupled_rods(model.scene))
     return [RodGroup(chain, model.scene, model.worlds, device, real) for chain in chains]
 
 

@@ -62,7 +62,7 @@ class _Energy:
         self.sums = make(rows, rod_energy_drift.ROWS, count)
         self.rows = self.sums.transpose((1, 0, 2))
         self.floor = step.newton.options.floor_factor * self.model.types.eps
-        self._judge = rod_energy_drift.judge_kernel(real)
+        self._judge = rod_energy_drift.drift_kernel(real)
 
     def _enter(self) -> None:
         """Update the energy balance, or mark steps as failed."""
@@ -95,7 +95,7 @@ class RodEnergy(_Energy):
         self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
-        self._measure = rod_energy_drift.chain_kernel(group.kind, self.model.types.real, step.newton.linear)
+        self._measure = rod_energy_drift.rod_kernel(group.kind, self.model.types.real, step.newton.linear)
 
     @property
     def kernels(self) -> list:
@@ -110,7 +110,7 @@ class RodEnergy(_Energy):
         wp.launch(
             self._measure,
             (self.ranges, group.columns),
-            [group.element_inputs(state, before.last, step.islands.rate) for state in (before, newton)]
+            [group.element_inputs(state, before.last, step.islands.inverse_step) for state in (before, newton)]
             + [before.v, before.omega, *step.islands.arrays, newton.mass, group.rotary]
             + [
                 *self._loads,
@@ -132,15 +132,17 @@ class CoupledEnergy(_Energy):
     """Energy balance of the coupled system."""
 
     def __init__(self, step, kept=None):
-        net, worlds = step.net, step.model.worlds
-        super().__init__(step, worlds, len(net.sets) + 1, kept)
+        coupled, worlds = step.coupled, step.model.worlds
+        super().__init__(step, worlds, len(coupled.sets) + 1, kept)
         real = self.model.types.real
-        counts = [*(part.elements for part in net.sets), net.blocks]
+        counts = [*(part.elements for part in coupled.sets), coupled.blocks]
         self._values = [wp.zeros((rod_energy_drift.ROWS * worlds, n), dtype=real, device=self.device) for n in counts]
         self._add = [Sums(rod_energy_drift.ROWS * worlds, n, real, self.device) for n in counts]
         self._out = [self.sums[i].flatten() for i in range(len(counts))]
-        self._elements = [coupled_energy_drift.element_kernel(part.term, real, step.newton.linear) for part in net.sets]
-        self._load = wp.clone(step.newton.load) if net.host.followers else step.newton.load
+        self._elements = [
+            coupled_energy_drift.element_kernel(part.term, real, step.newton.linear) for part in coupled.sets
+        ]
+        self._load = wp.clone(step.newton.load) if coupled.host.followers else step.newton.load
         self._blocks = coupled_energy_drift.block_kernel(real, step.drag is not None)
 
     @property
@@ -151,13 +153,13 @@ class CoupledEnergy(_Energy):
 
     def judge(self, before, middle) -> None:
         """Test the energy drift of the step from `before`, with the lagged data of `middle`."""
-        step, net, solver = self.step, self.step.net, self.step.newton
-        for i, (part, data, kernel) in enumerate(zip(net.sets, solver.parts, self._elements, strict=True)):
+        step, coupled, solver = self.step, self.step.coupled, self.step.newton
+        for i, (part, data, kernel) in enumerate(zip(coupled.sets, solver.parts, self._elements, strict=True)):
             wp.launch(
                 kernel,
                 (step.model.worlds, part.elements),
                 [
-                    net.elements(middle, i, q=solver.q, rate=step.islands.rate),
+                    coupled.elements(middle, i, q=solver.q, rate=step.islands.inverse_step),
                     before.q,
                     data["stiffness"],
                     self.floor,
@@ -166,8 +168,8 @@ class CoupledEnergy(_Energy):
                 [self._values[i]],
                 device=self.device,
             )
-        if net.host.followers:
-            step.loads.apply(net.points(solver.q), net.points(self._load), net.angles(self._load))
+        if coupled.host.followers:
+            step.loads.apply(coupled.points(solver.q), coupled.points(self._load), coupled.angles(self._load))
         wp.launch(
             self._blocks,
             solver.all,
@@ -182,7 +184,7 @@ class CoupledEnergy(_Energy):
                 solver.load,
                 self.floor,
             ]
-            + [net.blocks],
+            + [coupled.blocks],
             [self._values[-1]],
             device=self.device,
         )

@@ -15,13 +15,13 @@ from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.forces.control_loads import LOADS, Given
 from ddg_warp.solve.forces.gyroscopic import Gyroscope
-from ddg_warp.solve.forces.prescribed_motion import counts_turns, turns_between
+from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping import energy_drift
 from ddg_warp.solve.stepping.coupled_step import CoupledStep
 from ddg_warp.solve.stepping.graph_cache import Graphs
 from ddg_warp.solve.stepping.local_error import VelocityChange
-from ddg_warp.solve.stepping.rod_step import NET_ONLY, RodStep
+from ddg_warp.solve.stepping.rod_step import COUPLED_ONLY, RodStep
 from ddg_warp.solve.stepping.state_buffers import StateBuffer
 from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
 
@@ -102,7 +102,7 @@ class Integrator:
         check_model("Integrator", model)
         argument_checks.choice("scheme", scheme, SCHEMES)
         argument_checks.choice("solver", solver, SOLVERS)
-        if model.net is None and linear in NET_ONLY:
+        if model.coupled is None and linear in COUPLED_ONLY:
             raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
         self.failures = argument_checks.choice("failures", failures, FAILURES)
         self.gyroscopic = None if gyroscopic is None else argument_checks.flag("gyroscopic", gyroscopic)
@@ -125,7 +125,7 @@ class Integrator:
             self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
         with memory.named("Integrator", model.wp_device):
             self._chains = [RodStep(self, model, group) for group in model.groups]
-            self._net = CoupledStep(self, model) if model.net is not None else None
+            self._coupled = CoupledStep(self, model) if model.coupled is not None else None
             self._worlds, self._first = WorldReset(model), (None, None)
             self._buffers = [StateBuffer(model), StateBuffer(model)]
         self._graphs = Graphs(model, self._load_modules)
@@ -214,7 +214,7 @@ class Integrator:
             part.prescribe(start, start + dt)
 
         # with contact, a capacity overflow repeats the step, so it begins in a graph of its own
-        repeatable = anew and self._net is not None and self._net.newton.contact is not None
+        repeatable = anew and self._coupled is not None and self._coupled.newton.contact is not None
         controlled = self.given is not None and self.given.any
 
         def launch():
@@ -228,12 +228,12 @@ class Integrator:
         if repeatable:
             self._graphs.replay(("begin", source, controlled), lambda: self._begin(source))
 
-        net = self._buffers[source].own.net
+        coupled = self._buffers[source].own.coupled
         # a graph of its own: the step needs no capture with and without it
-        if self._net is not None and (trees := self._net.outdated(anew)):
-            self._graphs.replay(("renew", source, trees), lambda: self._net.renew(net, trees))
+        if self._coupled is not None and (trees := self._coupled.outdated(anew)):
+            self._graphs.replay(("renew", source, trees), lambda: self._coupled.renew(coupled, trees))
         replay()
-        while self._net is not None and self._net.outgrown(net):
+        while self._coupled is not None and self._coupled.has_overflow(coupled):
             self._graphs.clear()
             replay()
 
@@ -303,8 +303,8 @@ class Integrator:
             launch()
         following.state.time, following.state.lead, following.state.stable = state.time, state.lead, None
         following.state.spun = state.spun or to.spun
-        if self._net is not None:
-            self._net.arrive()
+        if self._coupled is not None:
+            self._coupled.arrive()
         return following.state
 
     def statistics(self) -> dict:
@@ -329,8 +329,8 @@ class Integrator:
         result = {}
         if self.energy_bound is not None:
             result["energy"] = energy_drift.summary([part.energy for part in self._parts])
-        if self._net is not None and self._net.newton.contact:
-            result["contact"] = self._net.newton.contact.statistics()
+        if self._coupled is not None and self._coupled.newton.contact:
+            result["contact"] = self._coupled.newton.contact.statistics()
         return result
 
     def _control(self, inputs: dict[str, np.ndarray], source: int) -> None:
@@ -346,9 +346,9 @@ class Integrator:
         if self.model.grips:
             current, following = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
             if "poses" in inputs:
-                if counts_turns(inputs["poses"]):
+                if counts_revolutions(inputs["poses"]):
                     begin = self._buffers[source].own.poses().reshape(self.model.worlds, -1, 6)
-                    turns_between(begin, np.broadcast_to(inputs["poses"], begin.shape))
+                    rotations_between(begin, np.broadcast_to(inputs["poses"], begin.shape))
                 poses = np.broadcast_to(inputs["poses"], (self.model.worlds, *inputs["poses"].shape[1:]))
                 following.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
             else:
@@ -357,14 +357,14 @@ class Integrator:
     def _remake(self) -> None:
         """Rebuild all steppers, keeping counters."""
         self._chains = [RodStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
-        if self._net is not None:
-            self._net = CoupledStep(self, self.model, self._net.means, counts_of=self._net)
+        if self._coupled is not None:
+            self._coupled = CoupledStep(self, self.model, self._coupled.means, counts_of=self._coupled)
         self._graphs.clear()
 
     @property
     def _parts(self) -> list:
         """Steppers of the rod groups and of the coupled system."""
-        return self._chains if self._net is None else [*self._chains, self._net]
+        return self._chains if self._coupled is None else [*self._chains, self._coupled]
 
     def _solved(self, dt: float) -> float:
         """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.rod_step`."""
@@ -378,7 +378,7 @@ class Integrator:
         s = self._solved(dt)
         if self.model.precision == "float32":
             lost = lost_in_rounding(self.model, s, state)
-            rounded = outcome.LOST_IN_ROUNDING if lost else outcome.CONVERGED_TO_ROUNDING
+            rounded = outcome.ROUNDING_DOMINATED if lost else outcome.CONVERGED_TO_ROUNDING
             for part in self._parts:
                 if part.rounded != rounded and (lost or changed):
                     part.rounded = rounded
@@ -389,14 +389,16 @@ class Integrator:
     def _adapt(self, s: float, changed: bool = False) -> None:
         """Select the solver for steps of s [s] and, unless parameters have `changed`, for earlier ones; see `LinearSolverChoice`."""
         for i, chain in enumerate(self._chains):
-            if (means := chain.suited(s, changed)) != chain.means or (changed and chain.newton.outdated):
+            if (means := chain.choose_solver(s, changed)) != chain.means or (changed and chain.newton.outdated):
                 self._chains[i] = RodStep(self, self.model, chain.group, means, counts_of=chain)
                 self._graphs.clear()
-        net = self._net
-        if net is not None and ((means := net.suited(s, changed)) != net.means or (changed and net.newton.outdated)):
-            self._net = CoupledStep(self, self.model, means, counts_of=self._net)
+        coupled = self._coupled
+        if coupled is not None and (
+            (means := coupled.choose_solver(s, changed)) != coupled.means or (changed and coupled.newton.outdated)
+        ):
+            self._coupled = CoupledStep(self, self.model, means, counts_of=self._coupled)
             self._graphs.clear()
-        if self._net is not None and self._net.adapt(s, changed):
+        if self._coupled is not None and self._coupled.adapt(s, changed):
             self._graphs.clear()
 
     def _own(self, state: State) -> int:
@@ -406,16 +408,16 @@ class Integrator:
         self._vacate(0)
         self._buffers[0].state.assign(state)
         self.forget()
-        if self._net is not None:
-            self._net.arrive()
-            if self._net.newton.contact:
-                self._net.newton.contact.check(self._buffers[0].own.net.q)
+        if self._coupled is not None:
+            self._coupled.arrive()
+            if self._coupled.newton.contact:
+                self._coupled.newton.contact.check(self._buffers[0].own.coupled.q)
         return 0
 
     def step_whole(self) -> None:
         """Solve rods out of contact in the coupled system, too: gradients read the data of its solves."""
         self.whole = True
-        if self._net is not None and self._net.adapt(self._longest):
+        if self._coupled is not None and self._coupled.adapt(self._longest):
             self._graphs.clear()
 
     def watch_changes(self) -> VelocityChange:
@@ -446,13 +448,13 @@ class Integrator:
                 part.motion.follow(before, after)
             if self.given is not None:
                 part.loads.give()
-        start = self._gyroscope.begin(before, self._chains, self._net) if self._spinning else before
+        start = self._gyroscope.begin(before, self._chains, self._coupled) if self._spinning else before
         for chain in self._chains:
             chain.step(start.groups[chain.index], after.groups[chain.index])
-        if self._net is not None:
-            self._net.step(start.net, after.net)
+        if self._coupled is not None:
+            self._coupled.step(start.coupled, after.coupled)
         if self._spinning:
-            self._gyroscope.finish(after, self._chains, self._net)
+            self._gyroscope.finish(after, self._chains, self._coupled)
         if self.failures == "flag":
             self._worlds.settle(self._parts, before, after)
         if self._changes:

@@ -14,7 +14,7 @@ class VelocityChange:
 
     def __init__(self, model):
         self._parts = [_Part(model, group) for group in model.groups]
-        self._parts += [] if model.net is None else [_Part(model, None)]
+        self._parts += [] if model.coupled is None else [_Part(model, None)]
         shape = len(self._parts), model.worlds
         totals = wp.zeros(shape, dtype=model.types.real, device=model.wp_device)
         self._totals, self._reading = [totals[i] for i in range(len(self._parts))], device_arrays.Reading(totals)
@@ -41,17 +41,19 @@ class VelocityChange:
 def _velocities(before: State, after: State):
     """Yield velocities at both ends of a step, of every rod group and of the coupled system."""
     yield from ((one.v, following.v) for one, following in zip(before.groups, after.groups, strict=True))
-    if before.net is not None:
-        net = before.model.net
-        yield net.points(before.net.v), net.points(after.net.v)
+    if before.coupled is not None:
+        coupled = before.model.coupled
+        yield coupled.points(before.coupled.v), coupled.points(after.coupled.v)
 
 
 class _Part:
     """Sums per world over a rod group, or over the nodes of the coupled system if that is None."""
 
     def __init__(self, model, group):
-        self._of, net, device, real = group or model.net, model.net, model.wp_device, model.types.real
-        self._rows, self._columns = (net.host.nodes, net.worlds) if group is None else (group.nodes, group.columns)
+        self._of, coupled, device, real = group or model.coupled, model.coupled, model.wp_device, model.types.real
+        self._rows, self._columns = (
+            (coupled.host.nodes, coupled.worlds) if group is None else (group.nodes, group.columns)
+        )
         self._width = self._columns // model.worlds
         self._threads = device_arrays.takers(self._rows, device) if group is None else 1
         self._kernel = differ_kernel(3 if group is None else group.dim, real)

@@ -14,7 +14,7 @@ from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step, rod_warm_start
 from ddg_warp.solve.forces.control_loads import ControlledLoads, RodScale
-from ddg_warp.solve.forces.drag import ChainDrag
+from ddg_warp.solve.forces.drag import RodGroupDrag
 from ddg_warp.solve.forces.loads import Loads
 from ddg_warp.solve.forces.prescribed_motion import Motion
 from ddg_warp.solve.linear.solver_selection import automatic
@@ -25,7 +25,7 @@ from ddg_warp.solve.stepping import energy_drift
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 
 DIRECT = {"sweep": RodNewton, "partitioned": RodNewtonParallel}  # solvers of open rods by their name
-NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
+COUPLED_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
 
 
 class RodStep(StepDriver):
@@ -41,7 +41,7 @@ class RodStep(StepDriver):
         self.group = group
         kind, real = group.kind, model.types.real
         self._begin = rod_step.begin_kernel(kind, real, self.midpoint)
-        self._foresee = rod_warm_start.foresee_kernel(kind, real, self.newton.linear)
+        self._foresee = rod_warm_start.warm_start_kernel(kind, real, self.newton.linear)
         predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
         self._predicted, self._predicted_angle = (device_arrays.allocate(*given) for given in predicted)
         self._nodes = rod_step.finish_nodes_kernel(kind, real, self.midpoint)
@@ -55,7 +55,7 @@ class RodStep(StepDriver):
             self.loads = Loads(model, group, self.midpoint)
         self.energy = energy_drift.RodEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
-        self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
+        self.drag = RodGroupDrag(model, group, self.midpoint) if kind.drag else None
 
     @property
     def index(self) -> int:
@@ -88,7 +88,7 @@ class RodStep(StepDriver):
             self.drag.resist(before, newton, self.islands)
         if not self.midpoint:
             self._start_further(before)
-        self.islands.bent.zero_()
+        self.islands.rotate_predictor.zero_()
         newton.solve(before.last)
         if self.energy:
             self.energy.judge(before)
@@ -109,7 +109,7 @@ class RodStep(StepDriver):
             self._launch(
                 self._frames,
                 group.element_threads,
-                [after.x, newton.frame, before.frame, group.count, self.islands.moved],
+                [after.x, newton.frame, before.frame, group.count, self.islands.substep_accepted],
                 [after.frame],
             )
         if group.kind.viscous:
@@ -151,9 +151,9 @@ class RodStep(StepDriver):
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
         """As of `StepDriver`; and what float32 matrices carry."""
-        return super()._find_limits(s) | {"carried": largest_carried(self.group.stiffnesses(s)[2])}
+        return super()._find_limits(s) | {"max_edge_stiffness": largest_carried(self.group.stiffnesses(s)[2])}
 
-    def who(self, column: int) -> str:
+    def island_label(self, column: int) -> str:
         """The rod of a column, and its world where there are several."""
         rod = self._rod(column)
         world = f" of world {column // self.group.rods}" if self.model.worlds > 1 else ""
@@ -165,7 +165,7 @@ class RodStep(StepDriver):
 
     def where(self, state, column: int) -> str:
         """Where the largest residual was, estimated by the element forces that meet there, and what to do."""
-        size = float(self.islands.residual.numpy()[column])
+        size = float(self.islands.max_residual.numpy()[column])
         direction = np.abs(device_arrays.download(self.newton.direction)[:, :, column]).max(0)
         largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
         node = largest - int(self.group.host.first[column % self.group.rods])
@@ -183,7 +183,7 @@ class RodStep(StepDriver):
 
 def _newton(model, group, integrator, means) -> RodNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
+    linear = automatic(group) if integrator.linear in ("auto", *COUPLED_ONLY) else integrator.linear
     options = integrator.options
     if options.psd == "auto" and means.stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
         options = replace(options, psd="progressive")

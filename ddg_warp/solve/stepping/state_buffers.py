@@ -25,11 +25,11 @@ class StateBuffer:
 
     def _allocate(self) -> None:
         self.own = self._model.empty_state()
-        *groups, net, grips = (
+        *groups, coupled, grips = (
             part and _mapped(part, lambda array: array[:] if array.size else array)
-            for part in (*self.own.groups, self.own.net, self.own.grips)
+            for part in (*self.own.groups, self.own.coupled, self.own.grips)
         )
-        self.state = State(self._model, groups, net, grips=grips)
+        self.state = State(self._model, groups, coupled, grips=grips)
         self._watch()
 
     def _watch(self) -> None:

@@ -11,12 +11,12 @@ from ddg_warp.compile.precision import FLOAT32_LIMIT, stiff, straight_turns
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import DETOURS_ALLOWED, LEAST
+from ddg_warp.kernels.core.islands import LEAST, MAX_PROJECTED_ITERATIONS
 from ddg_warp.kernels.newton.line_search import ROUNDED
 from ddg_warp.kernels.stepping import rod_step as step
 from ddg_warp.solve.forces.prescribed_motion import jump_between
 
-KEPT = 16  # number of step lengths with cached limits
+CACHED = 16  # number of step lengths with cached limits
 FOLDED = 1e-5  # angle to opposite edges [rad] that messages call folded
 
 
@@ -40,7 +40,7 @@ class LinearSolverChoice(NamedTuple):
 USUAL = LinearSolverChoice()
 
 
-def suited(precision: str, before: LinearSolverChoice, errors: float, split_errors: float) -> LinearSolverChoice:
+def choose_solver(precision: str, before: LinearSolverChoice, errors: float, split_errors: float) -> LinearSolverChoice:
     """Return the solver selection for float32 errors without and with the mixed formulation, and for `before`."""
     linear, was_stiff, split = before
     if precision == "mixed" and errors > FLOAT32_LIMIT:
@@ -85,7 +85,7 @@ class StepDriver:
             for target, source in zip(newton.islands.arrays, counts_of.newton.islands.arrays, strict=True):
                 wp.copy(target, source)  # solvers keep rows of these arrays
         if 0.5 ** (integrator.retry_limit // 2) < LEAST:
-            newton.islands.patience.fill_(DETOURS_ALLOWED)
+            newton.islands.max_projected_iterations.fill_(MAX_PROJECTED_ITERATIONS)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
         # cached limits by length of a solve, version of their stiffnesses, current limits of the islands
         self._limits, self._limited, self._set = {}, None, None
@@ -100,10 +100,10 @@ class StepDriver:
         """Number of islands in a world."""
         return len(self.islands) // self.model.worlds
 
-    def suited(self, s: float, parameters_changed: bool = False) -> LinearSolverChoice:
+    def choose_solver(self, s: float, parameters_changed: bool = False) -> LinearSolverChoice:
         """Return the solver selection for solves over s [s] and, unless `parameters_changed`, for earlier ones."""
         means = USUAL._replace(linear=self.model.types.linear) if parameters_changed else self.means
-        return suited(self.model.precision, means, self.float32_errors(s).max(), self.split_errors(s).max())
+        return choose_solver(self.model.precision, means, self.float32_errors(s).max(), self.split_errors(s).max())
 
     @property
     def stiffness_version(self) -> int:
@@ -133,13 +133,13 @@ class StepDriver:
         if self._limited != self.stiffness_version:
             self._limits, self._limited = {}, self.stiffness_version
         if s not in self._limits:
-            if len(self._limits) == KEPT:
+            if len(self._limits) == CACHED:
                 del self._limits[next(iter(self._limits))]
             self._limits[s] = self._find_limits(s)
         return self._limits[s]
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
-        return {"turn": np.resize(straight_turns(self.float32_errors(s)), len(self.islands))}
+        return {"straight_rotation_limit": np.resize(straight_turns(self.float32_errors(s)), len(self.islands))}
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Upload supports, loads, magnetic field and flow between t0 and t1."""
@@ -178,13 +178,13 @@ class StepDriver:
         """
         if not self._counted()[outcome.MAX_ITERATIONS :].any():
             return
-        failed = np.flatnonzero(self.islands.status.numpy() == outcome.GIVEN_UP)
+        failed = np.flatnonzero(self.islands.status.numpy() == outcome.STEP_FAILED)
         if not failed.size:
             return
         first = int(failed[0])
         name, text = self.failure(state, first)
         raise SolverError(
-            f"{self.who(first)} could not be stepped to t = {state.time:g} s: {text}",
+            f"{self.island_label(first)} could not be stepped to t = {state.time:g} s: {text}",
             state=state,
             outcome=name,
             rods=self.rods_of(failed),
@@ -195,7 +195,8 @@ class StepDriver:
         doubted = np.flatnonzero(self.islands.doubted.numpy())
         if doubted.size:
             warnings.warn(
-                f"{self.who(int(doubted[0]))}: in precision 'float32' rounding has ended steps (converged_to_rounding) with residuals "
+                f"{self.island_label(int(doubted[0]))}: in precision 'float32' rounding has ended steps (converged_to_rounding) "
+                "with residuals "
                 f"above {ROUNDED:g} of the loads and nodes that iterations still move; take 'mixed' or 'float64'",
                 stacklevel=5,
             )
@@ -207,7 +208,7 @@ class StepDriver:
 
     def failure(self, state, island: int) -> tuple[str, str]:
         """Return the outcome of a failed island, and the message."""
-        name = outcome.NAMES[int(self.islands.reason.numpy()[island])]
+        name = outcome.NAMES[int(self.islands.failure_status.numpy()[island])]
         if self.energy and name == "energy_drift":
             text = self.energy.failure(island)
         else:
@@ -216,10 +217,10 @@ class StepDriver:
 
     def failure_in(self, state, world: int) -> str:
         """Return the message on the first failed island of a world, empty without failure."""
-        flags = self.islands.status.numpy() == outcome.GIVEN_UP, self.islands.reason.numpy() != 0
+        flags = self.islands.status.numpy() == outcome.STEP_FAILED, self.islands.failure_status.numpy() != 0
         failed = np.flatnonzero(flags[0] & flags[1])
         failed = failed[failed // self.islands_each == world]
-        return f"{self.who(int(failed[0]))}: {self.failure(state, int(failed[0]))[1]}" if failed.size else ""
+        return f"{self.island_label(int(failed[0]))}: {self.failure(state, int(failed[0]))[1]}" if failed.size else ""
 
     @staticmethod
     def dead_end(x: np.ndarray, first: int, kind, suffix: str = "") -> str:
@@ -236,7 +237,7 @@ class StepDriver:
             return f"edge {k}{suffix} has no length in the last good state; move a node of the state it starts from"
         if kind.span < 2:
             return ""
-        before, after = polyline.ahead(edges / lengths[..., None], kind.closed)
+        before, after = polyline.next_edges(edges / lengths[..., None], kind.closed)
         k = int(np.argmin(np.sum(before * after, -1)[0]))
         if np.linalg.norm(before[0, k] + after[0, k]) >= FOLDED:
             return ""
@@ -250,6 +251,10 @@ class StepDriver:
         """Return the remedy for a failed step without a specific cause."""
         jump = jump_between(self.model, state.time - self.integrator._dt_host, state.time)
         grips = "move grips less in a step, " if self.model.grips else ""
-        if not jump and self.model.precision != "float64" and self.islands.reason.numpy().max() == outcome.NON_FINITE:
+        if (
+            not jump
+            and self.model.precision != "float64"
+            and self.islands.failure_status.numpy().max() == outcome.NON_FINITE
+        ):
             return f"take precision 'float64', or units in which numbers stay far from the ends of float32; or {grips}a smaller dt"
         return jump or f"{grips}take a smaller dt, a looser rtol, or check its loads and supports"

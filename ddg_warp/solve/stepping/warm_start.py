@@ -15,19 +15,19 @@ class WarmStart:
     """
 
     def __init__(self, newton):
-        net, device, serial = newton.net, newton.net.device, device_arrays.serial(newton.net.device)
+        coupled, device, serial = newton.coupled, newton.coupled.device, device_arrays.serial(newton.coupled.device)
         self.newton = newton
-        self._foresee, self._weigh, self._trust = coupled_warm_start.foresight_kernels(
+        self._foresee, self._weigh, self._trust = coupled_warm_start.warm_start_kernels(
             newton.real, newton.linear, serial
         )
         self.predicted = wp.zeros_like(newton.q)
-        self.trust = wp.ones(net.worlds, dtype=newton.real, device=device)
+        self.trust = wp.ones(coupled.worlds, dtype=newton.real, device=device)
         self._sum = None
         if newton.contact:
-            takers, rows = device_arrays.takers(net.host.nodes, device), coupled_warm_start.SUMS
-            self._weights = wp.zeros((rows, net.worlds, takers), dtype=newton.real, device=device)
-            self._sums = wp.zeros((rows, net.worlds), dtype=newton.real, device=device)
-            self._sum = Sums(rows * net.worlds, takers, newton.real, device)
+            takers, rows = device_arrays.takers(coupled.host.nodes, device), coupled_warm_start.SUMS
+            self._weights = wp.zeros((rows, coupled.worlds, takers), dtype=newton.real, device=device)
+            self._sums = wp.zeros((rows, coupled.worlds), dtype=newton.real, device=device)
+            self._sum = Sums(rows * coupled.worlds, takers, newton.real, device)
 
     @property
     def kernels(self) -> list:
@@ -38,15 +38,15 @@ class WarmStart:
 
     def start(self, before) -> None:
         """Extrapolate from the predictor of a step from a state `before`, and keep the predictor."""
-        newton, net = self.newton, self.newton.net
-        inputs = [before.a, newton.held, *newton.islands.arrays, net.blocks]
+        newton, coupled = self.newton, self.newton.coupled
+        inputs = [before.a, newton.held, *newton.islands.arrays, coupled.blocks]
         device_arrays.sweep(
             self._foresee,
-            net.blocks,
+            coupled.blocks,
             inputs,
             [newton.q, self.predicted, newton.direction],
-            net.device,
-            worlds=net.worlds,
+            coupled.device,
+            worlds=coupled.worlds,
         )
         if newton.turns:
             newton.turns.go_further(before, self.predicted)
@@ -55,19 +55,19 @@ class WarmStart:
         """Find the trusted fraction of the solve's correction, in systems with contact."""
         if not self._sum:
             return
-        newton, net, islands = self.newton, self.newton.net, self.newton.islands
-        nodes = net.host.nodes
+        newton, coupled, islands = self.newton, self.newton.coupled, self.newton.islands
+        nodes = coupled.host.nodes
         inputs = [
             newton.q,
             self.predicted,
             before.a,
-            net.mass.flatten(),
-            islands.moved,
-            islands.rate,
+            coupled.mass.flatten(),
+            islands.substep_accepted,
+            islands.inverse_step,
             nodes,
-            net.blocks,
+            coupled.blocks,
         ]
-        device_arrays.sweep(self._weigh, nodes, inputs, [self._weights], net.device, worlds=net.worlds)
-        self._sum(self._weights.reshape((coupled_warm_start.SUMS * net.worlds, -1)), self._sums.flatten())
+        device_arrays.sweep(self._weigh, nodes, inputs, [self._weights], coupled.device, worlds=coupled.worlds)
+        self._sum(self._weights.reshape((coupled_warm_start.SUMS * coupled.worlds, -1)), self._sums.flatten())
         inputs = [self._sums, newton.options.rtol, newton.allowed.total, islands.arrays[1]]
-        wp.launch(self._trust, net.worlds, inputs, [self.trust], device=net.device)
+        wp.launch(self._trust, coupled.worlds, inputs, [self.trust], device=coupled.device)

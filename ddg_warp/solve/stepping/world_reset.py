@@ -16,8 +16,10 @@ def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
     codes = resting.numpy()
     for part in parts:
         islands = part.islands
-        given_up = islands.status.numpy() == outcome.GIVEN_UP
-        codes = np.maximum(codes, np.where(given_up, islands.reason.numpy(), 0).reshape(model.worlds, -1).max(1))
+        given_up = islands.status.numpy() == outcome.STEP_FAILED
+        codes = np.maximum(
+            codes, np.where(given_up, islands.failure_status.numpy(), 0).reshape(model.worlds, -1).max(1)
+        )
     return np.array([outcome.NAMES[code or outcome.CONVERGED] for code in codes])
 
 
@@ -186,7 +188,7 @@ class WorldReset:
         self.resting.zero_()
         for part in parts:
             part.islands.status.fill_(outcome.CONVERGED)
-            part.islands.reason.zero_()
+            part.islands.failure_status.zero_()
 
     def load_modules(self) -> None:
         """Compile and load all kernels, once."""

@@ -30,7 +30,7 @@ class BvhPair:
     second_upper: wp.array(dtype=wp.vec3)
     bundle_lower: wp.array(dtype=wp.vec3)
     bundle_upper: wp.array(dtype=wp.vec3)
-    bundles: wp.array(dtype=int)
+    bvh_leaves: wp.array(dtype=int)
     leaves: wp.array(dtype=int)
     order: wp.array(dtype=int)
     tree: wp.uint64

@@ -87,7 +87,7 @@ def turns(tid: int, threads: int, num_met: wp.array(dtype=int), leaf_pairs: wp.a
 
 
 @cache
-def meet_kernel(alike: bool, inner: bool, grouped: bool):
+def overlap_kernel(alike: bool, inner: bool, grouped: bool):
     """Build the kernel of the broad phase.
 
     `meet`: list pairs of leaves whose AABBs overlap. If sides are `alike`, each pair is listed once, and with `inner` each leaf with
@@ -125,7 +125,7 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
             i = trees.order[i]
         root = int(-1)
         if wp.static(grouped):
-            root = wp.bvh_get_group_root(trees.tree, i / (trees.bundles.shape[0] - 1))
+            root = wp.bvh_get_group_root(trees.tree, i / (trees.bvh_leaves.shape[0] - 1))
         lower = trees.bundle_lower[i]
         upper = trees.bundle_upper[i]
         if wp.static(alike):
@@ -147,7 +147,7 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
 
 
 @cache
-def asked_functions(kind: Kind, real, single: bool):
+def query_functions(kind: Kind, real, single: bool):
     """Return the device functions `ranges_of`, `reaches` and `asked`.
 
     `ranges_of(trees, both) -> (w, start, end, first, last)`: world and primitives of two leaves.
@@ -161,11 +161,11 @@ def asked_functions(kind: Kind, real, single: bool):
 
     @wp.func
     def ranges_of(trees: BvhPair, both: wp.vec2i):
-        w = both[0] / (trees.bundles.shape[0] - 1)
-        first, second = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
+        w = both[0] / (trees.bvh_leaves.shape[0] - 1)
+        first, second = both[0] - w * (trees.bvh_leaves.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
         if wp.static(single):
             return w, first, first + 1, second, second + 1
-        return w, trees.bundles[first], trees.bundles[first + 1], trees.leaves[second], trees.leaves[second + 1]
+        return w, trees.bvh_leaves[first], trees.bvh_leaves[first + 1], trees.leaves[second], trees.leaves[second + 1]
 
     @wp.func
     def reaches(sides: Sides, trees: BvhPair, bundle: int, l: int, w: int):
@@ -194,11 +194,11 @@ def candidate_kernels(kind: Kind, real, single: bool):
     `judge`: link and count the candidates among primitives of leaf pairs.
     `fill`: write the candidate list.
 
-    `single`: see `asked_functions`.
+    `single`: see `query_functions`.
     """
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     pair_nodes, _, thickness, closest = pair_functions(kind, real)
-    ranges_of, reaches, asked = asked_functions(kind, real, single)
+    ranges_of, reaches, asked = query_functions(kind, real, single)
     corners, relative = corners_function(real), relative_function(kind, real)
     link_of = read_function(wp.vec2i)
     half, two = wp.constant(real(0.5)), wp.constant(real(2.0))

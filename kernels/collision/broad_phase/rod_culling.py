@@ -19,11 +19,11 @@ import warp as wp
 
 from ddg_warp.kernels.collision.broad_phase.aabb import FAR, outward_function
 from ddg_warp.kernels.collision.primitives import EDGES, pair_functions, sides_struct
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, share_function, until_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, items_function, until_function
 
 # Per world: whether primitives may be near; whether AABBs overlap. The multiple of the motion that the next AABBs cover. The age of the
 # AABBs in steps; the number of the step.
-DOUBT, MEET, AHEAD, STEPS, TICK = range(5)
+DOUBT, OVERLAP, AHEAD, STEPS, TICK = range(5)
 KNOWN = 5
 MOST = 16  # largest multiple of the motion; it is doubled each time, and quartered if AABBs overlap
 ROOM = 0.5  # margins by which AABBs are inflated, per multiple of the motion
@@ -48,7 +48,7 @@ def run_kernels(grouped: bool, real, serial: bool):
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     _, may_touch, thickness, _ = pair_functions(EDGES, real)
-    outward, share, until = outward_function(real), share_function(serial), until_function(serial)
+    outward, share, until = outward_function(real), items_function(serial), until_function(serial)
     half = wp.constant(real(0.5))
 
     @wp.func
@@ -128,7 +128,7 @@ def run_kernels(grouped: bool, real, serial: bool):
             b = q
             beyond = q - drift + multiple * (q - drift - p)
             if not (wp.isfinite(p) and wp.isfinite(beyond)):
-                wp.atomic_max(status, MEET, w, 1)
+                wp.atomic_max(status, OVERLAP, w, 1)
                 beyond = X()
             low = wp.min(
                 low, wp.min(corner(p, origin, reach, wp.float32(-1.0)), corner(q, drift, reach, wp.float32(-1.0)))
@@ -157,7 +157,7 @@ def run_kernels(grouped: bool, real, serial: bool):
         """Mark worlds if AABBs of two rods overlap that may form pairs; one thread a run."""
         i = wp.tid()
         w = i / runs.shape[0]
-        if not asked(tried, status, w) or status[MEET, w] != 0:
+        if not asked(tried, status, w) or status[OVERLAP, w] != 0:
             return
         root = int(-1)
         if wp.static(grouped):
@@ -168,7 +168,7 @@ def run_kernels(grouped: bool, real, serial: bool):
             l = runs[j - w * runs.shape[0], 0]
             if j > i and sides.first.object[k] != sides.first.object[l]:
                 if may_touch(sides, k, l):
-                    status[MEET, w] = 1
+                    status[OVERLAP, w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
@@ -187,8 +187,8 @@ def run_kernels(grouped: bool, real, serial: bool):
         if not asked(tried, status, w):
             return
         multiple = status[AHEAD, w]
-        if status[MEET, w] != 0:
-            status[MEET, w] = 0
+        if status[OVERLAP, w] != 0:
+            status[OVERLAP, w] = 0
             status[AHEAD, w] = multiple / 4
             if multiple > 0:
                 again[0] = 1

@@ -2,7 +2,7 @@
 
 Source: Li, Kaufman and Jiang, "Codimensional incremental potential contact", ACM ToG 40(4), 2021, algorithm 1. The distance of a
 pair decreases at most as fast as the fastest nodes of both sides approach, less their common motion. Time advances by the fraction
-of the gap that is safe at that speed. It ends when the gap is `REST` of its initial value or, within the search distance, `NEAR` of
+of the gap that is safe at that speed. It ends when the gap is `SLEEP` of its initial value or, within the search distance, `NEAR` of
 it or of the search distance. The time found is never late.
 """
 
@@ -12,15 +12,15 @@ import warp as wp
 
 from ddg_warp.kernels.collision.broad_phase.aabb import BvhPair
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function, relative_function
-from ddg_warp.kernels.collision.broad_phase.candidates import asked_functions, note_needed, turns
-from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct, things_function
+from ddg_warp.kernels.collision.broad_phase.candidates import note_needed, query_functions, turns
+from ddg_warp.kernels.collision.primitives import Kind, pair_functions, primitives_function, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 REST, NEAR = 0.1, 0.2  # remaining fraction of wide gaps; of narrow gaps, and of the search distance
 PARTS = 1000  # largest number of advances; the time reached by then is safe, too
-PATIENCE = 100_000  # largest number of advances of the crossing test
+MAX_STEPS = 100_000  # largest number of advances of the crossing test
 BESIDE = 0.1  # clearance that proves a pair separate, over the search distance
-TOUCHING = 1e-9  # distance at which a pair crosses, over its size
+IN_CONTACT = 1e-9  # distance at which a pair crosses, over its size
 
 
 @cache
@@ -33,7 +33,7 @@ def impact_functions(kind: Kind, real):
     *_, closest = pair_functions(kind, real)
     relative = relative_function(kind, real)
     # rounding of a distance in this precision
-    touching = TOUCHING if real is wp.float64 else 1e3 * TOUCHING
+    touching = IN_CONTACT if real is wp.float64 else 1e3 * IN_CONTACT
 
     @wp.func
     def distance(x: Y, q: Y, t: real):
@@ -73,7 +73,7 @@ def impact_functions(kind: Kind, real):
         else:
             size += wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
         least, t = thickness + real(touching) * size, real(0.0)
-        for _ in range(wp.static(PATIENCE)):
+        for _ in range(wp.static(MAX_STEPS)):
             separation = distance(x, q, t)
             if separation <= least:
                 return True
@@ -91,11 +91,11 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
 
     `impacts`: write the earliest time of impact of each world or, if `passing`, the number of crossing pairs and the first of them.
 
-    The key of a pair is i times the number of second primitives in all worlds, plus j. `single`: see `asked_functions`.
+    The key of a pair is i times the number of second primitives in all worlds, plus j. `single`: see `query_functions`.
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     pair_nodes, _, thickness, _ = pair_functions(kind, real)
-    ranges_of, reaches, asked = asked_functions(kind, real, single)
+    ranges_of, reaches, asked = query_functions(kind, real, single)
     impact, meet = impact_functions(kind, real)
     corners = corners_function(real)
 
@@ -147,13 +147,13 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
 def passing_kernel(kind: Kind, real):
     """Build the kernel of the crossing test.
 
-    `passing`: count the pairs of a list that cross or, with `keep`, whose distance falls below `keep` of the thickness plus `BESIDE` of
+    `passing`: count the pairs of a list that cross or, with `keep`, whose distance falls below `keep` of the thickness plus `OFFSET` of
     `reach` [m].
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     pair_nodes, _, thickness, _ = pair_functions(kind, real)
     _, meet = impact_functions(kind, real)
-    corners, locate = corners_function(real), things_function(real)
+    corners, locate = corners_function(real), primitives_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def passing(

@@ -17,7 +17,7 @@ import warp as wp
 
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function
 from ddg_warp.kernels.collision.ccd.additive_ccd import impact_functions
-from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct, things_function
+from ddg_warp.kernels.collision.primitives import Kind, pair_functions, primitives_function, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS, until_function
 
 ROUNDS = 50  # bodies that fall on stopped ones stop layer by layer, one layer a round
@@ -32,7 +32,7 @@ def limit_kernels(kind: Kind, real):
     """
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
     pair_nodes, _, thickness, _ = pair_functions(kind, real)
-    corners, (impact, _), locate = corners_function(real), impact_functions(kind, real), things_function(real)
+    corners, (impact, _), locate = corners_function(real), impact_functions(kind, real), primitives_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pick(
@@ -112,7 +112,7 @@ def limit_kernels(kind: Kind, real):
 
 
 @cache
-def share_kernels(real, serial: bool):
+def fraction_kernels(real, serial: bool):
     """Build the kernels of step fractions.
 
     `start`: initialise fractions with 1.

@@ -12,14 +12,14 @@ from ddg_warp.kernels.collision.primitives import surface_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.core.vectorised_access import read_function, write_function
 
-SLOTS, ANGLES = 4, 2  # nodes of a pair, and angles
-ITEMS = SLOTS + ANGLES
+PAIR_NODES, ANGLES = 4, 2  # nodes of a pair, and angles
+ITEMS = PAIR_NODES + ANGLES
 ROW, WEIGHT = 8, 4  # numbers of a factor row, and index of its first weight
 PLACED = 4  # numbers of a placed contribution, of which the last is unused
 
 
 @wp.func
-def taken_apart(item: int):
+def unpacked(item: int):
     """Return the pair and the local index of an item."""
     p = item / wp.static(ITEMS)
     return p, item - wp.static(ITEMS) * p
@@ -31,7 +31,7 @@ def row_functions(linear):
 
     A row has the size of a memory transaction of a GPU, 32 bytes in float32; two arrays would take twice that.
     """
-    R, V, W = (wp.types.vector(size, linear) for size in (ROW, 3, SLOTS))
+    R, V, W = (wp.types.vector(size, linear) for size in (ROW, 3, PAIR_NODES))
     row_of = read_function(R, 2)
 
     @wp.func
@@ -56,7 +56,7 @@ def lay_functions(real, linear):
 
     Measured: kernels that write all eight numbers at once take four times as long on the CPU.
     """
-    R, V, W = wp.types.vector(ROW, linear), wp.types.vector(3, real), wp.types.vector(SLOTS, real)
+    R, V, W = wp.types.vector(ROW, linear), wp.types.vector(3, real), wp.types.vector(PAIR_NODES, real)
 
     @wp.func
     def aim(rows: wp.array2d(dtype=R), k: int, p: int, v: V):
@@ -65,14 +65,14 @@ def lay_functions(real, linear):
 
     @wp.func
     def weigh(rows: wp.array2d(dtype=R), k: int, p: int, w: W):
-        for i in range(wp.static(SLOTS)):
+        for i in range(wp.static(PAIR_NODES)):
             rows[k, p][wp.static(WEIGHT) + i] = linear(w[i])
 
     return aim, weigh
 
 
 @cache
-def ahead_function(real, linear):
+def prefetch_function(real, linear):
     """Return the device function `prefetch(pair_set, p) -> (used, first, second)`: flags and first rows of a pair.
 
     A single row is returned twice. Rows are read at once, whether used or not.
@@ -207,7 +207,7 @@ def sum_kernel(real, serial: bool):
             if numbers[node] > 0:
                 total = V()
                 for k in range(starts[node], starts[node] + numbers[node]):
-                    p, local = taken_apart(items[k])
+                    p, local = unpacked(items[k])
                     if used[p] != 0:
                         total += values[local, p]
                 out[node] = out[node] + total
@@ -229,7 +229,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
     L, R, until = wp.types.vector(3, linear), wp.types.vector(ROW, linear), until_function(serial)
     row_of, direction_of, weight_of = row_functions(linear)
-    prefetch, slope_of, pair_of = ahead_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
+    prefetch, slope_of, pair_of = prefetch_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
 
     @wp.func
     def product(row: R, a: int, b: int):
@@ -255,11 +255,11 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
     def block_of(pair_set: PairSet, p: int, used: int, first: R, second: R, local: int):
         """Return the diagonal block of pair p at a node or, in xx alone, a twist angle."""
         if wp.static(rolls):
-            if local >= wp.static(SLOTS):
+            if local >= wp.static(PAIR_NODES):
                 m = B()
                 for k in range(pair_set.rows):
                     if (used >> (k + 1)) & 1 != 0:
-                        a = pair_set.lever[k, p][local - wp.static(SLOTS)]
+                        a = pair_set.lever[k, p][local - wp.static(PAIR_NODES)]
                         m[0] += a * a
                 return m
         return block(pair_set, p, used, first, second, local, local)
@@ -290,7 +290,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
             for p in range(pair_set.count[0]):
                 used, first, second = prefetch(pair_set, p)
                 if used != 0:
-                    for local in range(wp.static(SLOTS)):
+                    for local in range(wp.static(PAIR_NODES)):
                         if pair_set.ranks[p][local] >= 0:
                             node = pair_set.nodes[p][local]
                             forces[node] = forces[node] - pair_set.gradient[local, p]
@@ -302,7 +302,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                             for side in range(wp.static(ANGLES)):
                                 angle = pair_set.angles[p][side]
                                 if pair_set.angle_ranks[p][side] >= 0:
-                                    local = wp.static(SLOTS) + side
+                                    local = wp.static(PAIR_NODES) + side
                                     forces[angle] = forces[angle] - pair_set.gradient[local, p]
                                     diagonal[angle] = diagonal[angle] + whole(
                                         block_of(pair_set, p, used, first, second, local)
@@ -350,7 +350,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
             if number > 0:
                 pair_set = sets[s]
                 for k in range(pair_set.places[node], pair_set.places[node] + number):
-                    p, local = taken_apart(pair_set.items[k])
+                    p, local = unpacked(pair_set.items[k])
                     used, first, second = prefetch(pair_set, p)
                     slope = slope_of(pair_set.gradient, local, p)
                     if used != 0:
@@ -388,7 +388,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
             if number > 0:
                 pair_set = sets[s]
                 for k in range(pair_set.places[node], pair_set.places[node] + number):
-                    p, local = taken_apart(pair_set.items[k])
+                    p, local = unpacked(pair_set.items[k])
                     if local % 2 == 0 and local / 2 < pair_set.edges:
                         used, first, second = prefetch(pair_set, p)
                         pair = pair_of(pair_set.pairs, p)
@@ -416,8 +416,8 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                     if sets[s].numbers[block] > 0:
                         pair_set = sets[s]
                         for k in range(pair_set.places[block], pair_set.places[block] + pair_set.numbers[block]):
-                            p, local = taken_apart(pair_set.items[k])
-                            side = local - wp.static(SLOTS)
+                            p, local = unpacked(pair_set.items[k])
+                            side = local - wp.static(PAIR_NODES)
                             for m in range(pair_set.rows):
                                 if pair_set.used[p] != 0 and (pair_set.used[p] >> (m + 1)) & 1 != 0:
                                     row, lever = row_of(pair_set.row, m, p), pair_set.lever[m, p]

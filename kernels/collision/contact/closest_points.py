@@ -20,7 +20,7 @@ from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, Kind
 
 # Squared sine of the angle below which lines count as parallel.
 PARALLEL = {wp.float64: 1.0e-20, wp.float32: 1.0e-10}
-SHARE = 1.0e-3  # threshold of the mollifier over |a|^2 |b|^2 at rest
+MOLLIFIER_FRACTION = 1.0e-3  # threshold of the mollifier over |a|^2 |b|^2 at rest
 
 
 @cache

@@ -6,16 +6,16 @@ import warp as wp
 
 from ddg_warp.kernels.collision.contact.assembly import (
     ANGLES,
-    SLOTS,
-    ahead_function,
+    PAIR_NODES,
     place_functions,
+    prefetch_function,
     row_functions,
     set_struct,
 )
 from ddg_warp.kernels.collision.contact.geometric_stiffness import bend_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS, until_function
 from ddg_warp.kernels.core.vectorised_access import read_function
-from ddg_warp.kernels.linear.sliced_ell import BARRED, product_functions
+from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE, product_functions
 
 
 @cache
@@ -33,7 +33,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
     bend = bend_function(linear)
     row_of, direction_of, weight_of = row_functions(linear)
     store, placed_at = place_functions(linear)
-    prefetch, four_of = ahead_function(real, linear), read_function(wp.vec4i)
+    prefetch, four_of = prefetch_function(real, linear), read_function(wp.vec4i)
     _, free = product_functions(linear)
 
     @wp.func
@@ -55,7 +55,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
     def row(columns: wp.array3d(dtype=V), m: int, i: int, u: Y):
         """Return a row of a stored Hessian (a column, by symmetry) times the values at the nodes."""
         total = linear(0.0)
-        for k in range(wp.static(SLOTS)):
+        for k in range(wp.static(PAIR_NODES)):
             total += wp.dot(columns[i, k, m], u[k])
         return total
 
@@ -138,10 +138,10 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                                 V(), difference(x[n[1]], o), difference(x[n[2]], o), difference(x[n[3]], o)
                             )
                             y += bend(pair_set.kind, y0, weight_of(first), u) * c
-                    for local in range(wp.static(SLOTS)):
+                    for local in range(wp.static(PAIR_NODES)):
                         store(pair_set.placed, ranks[local], y[local])
                 else:  # nodes that list this pair read its entries
-                    for local in range(wp.static(SLOTS)):
+                    for local in range(wp.static(PAIR_NODES)):
                         store(pair_set.placed, ranks[local], V())
                     if wp.static(rolls):
                         store_angles(pair_set, p, A())
@@ -180,7 +180,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         sets: wp.array(dtype=PairSet),
         in_pairs: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=V),
-        barred: wp.array(dtype=wp.uint8),
+        inactive_mask: wp.array(dtype=wp.uint8),
         busy: wp.array(dtype=int),
         out: wp.array(dtype=V),
         dots_out: wp.array2d(dtype=linear),
@@ -189,8 +189,8 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
             w = node / dots_out.shape[1]
-            if in_pairs[node] != wp.uint8(0) and barred[node] != BARRED and busy[w] == 1:
-                y = out[node] + wp.cw_mul(total(sets, node), free(barred[node]))
+            if in_pairs[node] != wp.uint8(0) and inactive_mask[node] != ALL_INACTIVE and busy[w] == 1:
+                y = out[node] + wp.cw_mul(total(sets, node), free(inactive_mask[node]))
                 out[node] = y
                 dots_out[w, node - w * dots_out.shape[1]] = wp.dot(p[node], y)
 

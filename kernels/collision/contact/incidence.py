@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import ITEMS, SLOTS
+from ddg_warp.kernels.collision.contact.assembly import ITEMS, PAIR_NODES
 from ddg_warp.kernels.collision.primitives import Kind
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
@@ -40,8 +40,8 @@ def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
         if local < wp.static(size):
             node = nodes[p][local]
         if wp.static(rolls):
-            if local >= wp.static(SLOTS):
-                node = angles[p][local - wp.static(SLOTS)]
+            if local >= wp.static(PAIR_NODES):
+                node = angles[p][local - wp.static(PAIR_NODES)]
         if node >= 0:
             if silent[node % silent.shape[0]] != wp.uint8(0):
                 node = -1

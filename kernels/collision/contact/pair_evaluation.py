@@ -4,10 +4,16 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import PLACED, SLOTS, factor_struct, lay_functions, place_functions
-from ddg_warp.kernels.collision.contact.closest_points import SHARE, distance_function, node_types
+from ddg_warp.kernels.collision.contact.assembly import (
+    PAIR_NODES,
+    PLACED,
+    factor_struct,
+    lay_functions,
+    place_functions,
+)
+from ddg_warp.kernels.collision.contact.closest_points import MOLLIFIER_FRACTION, distance_function, node_types
 from ddg_warp.kernels.collision.contact.potential import bend_function, pair_energy_functions, rows_of
-from ddg_warp.kernels.collision.primitives import EDGES, Kind, pair_functions, sides_struct, things_function
+from ddg_warp.kernels.collision.primitives import EDGES, Kind, pair_functions, primitives_function, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS
 from ddg_warp.kernels.densities import Density
 
@@ -40,7 +46,7 @@ def law_struct(real):
 @cache
 def groups_function(real):
     """Return the device function `groups(law, sides, pair) -> (w, i, j, a, b)`: world, primitives in it and groups of a pair."""
-    Law, Sides, primitives = law_struct(real), sides_struct(real), things_function(real)
+    Law, Sides, primitives = law_struct(real), sides_struct(real), primitives_function(real)
 
     @wp.func
     def groups(law: Law, sides: Sides, pair: wp.vec2i):
@@ -89,7 +95,7 @@ def read_functions(kind: Kind, real):
         threshold = real(1.0)
         inner = W()
         if wp.static(kind == EDGES):
-            threshold = real(wp.static(SHARE)) * law.square[i] * law.square[j]
+            threshold = real(wp.static(MOLLIFIER_FRACTION)) * law.square[i] * law.square[j]
             one, two = law.inner[i], law.inner[j]
             inner = W(one[0], one[1], two[0], two[1])
         stiffness = wp.max(law.stiffness[w, a, b], law.inertia[a, b] * law.rate[w] * law.rate[w])
@@ -116,7 +122,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
     parameters_of, corners = read_functions(kind, real)
-    (slots, *_), primitives, rows = pair_functions(kind, real), things_function(real), rows_of(kind)
+    (slots, *_), primitives, rows = pair_functions(kind, real), primitives_function(real), rows_of(kind)
 
     @wp.func
     def nodes_of(sides: Sides, pair: wp.vec2i):
@@ -219,7 +225,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
             w, d, n = near(points)
             e, g, m = about(points, w, d, n, p, threshold, inner)
             energy[pair] = e
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(wp.static(PAIR_NODES)):
                 gradient[slot, pair] = g[slot]
             used = int(1)
             for k in range(wp.static(rows)):
@@ -268,11 +274,11 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
                 p, threshold, inner = parameters_of(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
                 move = X()
-                for slot in range(wp.static(SLOTS)):
+                for slot in range(wp.static(PAIR_NODES)):
                     for d in range(3):
                         move[slot, d] = real(v[nodes[slot]][d])
                 dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, nodes), move, p, threshold, inner)
-                for slot in range(wp.static(SLOTS)):
+                for slot in range(wp.static(PAIR_NODES)):
                     value = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
                     place(placed, ranks[pair][slot], value)
 
@@ -308,7 +314,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
             move = X()
             move[column / 3, column % 3] = real(1.0)
             dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, factor.nodes[pair]), move, p, threshold, inner)
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(wp.static(PAIR_NODES)):
                 columns[column, slot, m] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
 
     return differentiate

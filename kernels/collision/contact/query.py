@@ -5,19 +5,19 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function
-from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct, things_function
+from ddg_warp.kernels.collision.primitives import Kind, pair_functions, primitives_function, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 
 @cache
-def look_kernel(kind: Kind, real):
+def query_kernel(kind: Kind, real):
     """Build the kernel of gaps and contact points.
 
     `look`: write the gap [m] of each pair, and the midpoint of its closest points [m].
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     (pair_nodes, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
-    locate = things_function(real)
+    locate = primitives_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def look(
@@ -50,7 +50,7 @@ def closest_kernel(kind: Kind, real):
     """
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
     (pair_nodes, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
-    locate = things_function(real)
+    locate = primitives_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def closest_points(

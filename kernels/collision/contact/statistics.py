@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.islands import MOVED, STATUS
+from ddg_warp.kernels.core.islands import STATUS, SUBSTEP_ACCEPTED
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 SUM, PARTS, LAST = (
@@ -31,7 +31,7 @@ def take_kernel(real):
         work: wp.array(dtype=wp.float64),
     ):
         w = wp.tid()
-        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if flags[SUBSTEP_ACCEPTED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             counts[wp.static(SUM), w] = counts[wp.static(SUM), w] + wp.int64(touching[w])
             counts[wp.static(PARTS), w] = counts[wp.static(PARTS), w] + wp.int64(1)
             counts[wp.static(LAST), w] = wp.int64(touching[w])

@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 
-ENERGY, TOUCHING, WORK = range(3)
+ENERGY, ACTIVE_PAIRS, WORK = range(3)
 ROWS = 3
 
 
@@ -37,7 +37,7 @@ def total_kernels(real, serial: bool):
     `add`: sum over the pairs of each first primitive.
     `tell`: write the results of each world.
     """
-    Written, share, until = written_struct(real), share_function(serial), until_function(serial)
+    Written, share, until = written_struct(real), items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(lists: wp.array(dtype=Written), worlds: int, sums: wp.array2d(dtype=real)):
@@ -57,7 +57,7 @@ def total_kernels(real, serial: bool):
                             else:
                                 touching += 1
             sums[wp.static(ENERGY) * worlds + w, k] = energy
-            sums[wp.static(TOUCHING) * worlds + w, k] = real(touching)
+            sums[wp.static(ACTIVE_PAIRS) * worlds + w, k] = real(touching)
             sums[wp.static(WORK) * worlds + w, k] = work
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -71,7 +71,7 @@ def total_kernels(real, serial: bool):
         """Write the results of each world; energies are infinite if pairs overflowed."""
         w = wp.tid()
         energy[w] = wp.where(overflow[0] == 0, sums[wp.static(ENERGY), w], real(wp.inf))
-        touching[w] = int(sums[wp.static(TOUCHING), w])
+        touching[w] = int(sums[wp.static(ACTIVE_PAIRS), w])
         dissipated[w] = sums[wp.static(WORK), w]
 
     return add, tell

@@ -40,7 +40,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import ANGLES, SLOTS, factor_struct, lay_functions
+from ddg_warp.kernels.collision.contact.assembly import ANGLES, PAIR_NODES, factor_struct, lay_functions
 from ddg_warp.kernels.collision.contact.closest_points import tangents_function
 from ddg_warp.kernels.collision.contact.pair_evaluation import groups_function, law_struct
 from ddg_warp.kernels.collision.primitives import EDGES, Kind, sides_struct
@@ -60,7 +60,7 @@ def lagged_struct(real):
         over all worlds, negative
     for none. arm: its radius along the normal [m]. lever: slip by the angles of rolling rods (2, capacity) [m].
     """
-    V, W = wp.types.vector(3, real), wp.types.vector(SLOTS, real)
+    V, W = wp.types.vector(3, real), wp.types.vector(PAIR_NODES, real)
 
     @wp.struct
     class Lagged:
@@ -183,7 +183,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
     first_angles, second_angles (primitives,): see `CollisionMesh.angles`; read if rods roll, like x and rod_nodes.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
-    V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(SLOTS, real), lay_functions(real, linear)
+    V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(PAIR_NODES, real), lay_functions(real, linear)
     E = wp.types.vector(2, real)
     tangents, groups, size = tangents_function(real), groups_function(real), kind.first + kind.second
     along_rod, spun = directed_basis(real), spun_function(real)
@@ -341,7 +341,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
             if not (bound * inverse <= real(0.0)):
                 nodes, weight = factor.nodes[p], lagged.weight[p]
                 move = V()
-                for slot in range(wp.static(SLOTS)):
+                for slot in range(wp.static(PAIR_NODES)):
                     move += (x[nodes[slot]] - start[nodes[slot]]) * weight[slot]
                 if wp.static(spins):
                     if lagged.spinning[p] >= 0:
@@ -361,12 +361,12 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                 energy[p] = energy_of(u, parameters)
                 f = slope_of(u, parameters)
                 work[p] = wp.dot(f, u)
-                for slot in range(wp.static(SLOTS)):
+                for slot in range(wp.static(PAIR_NODES)):
                     gradient[slot, p] = (t1 * f[0] + t2 * f[1]) * weight[slot]
                 if wp.static(rolls):
                     for side in range(wp.static(ANGLES)):
                         couple = wp.dot(lagged.lever[side, p], t1 * f[0] + t2 * f[1])
-                        gradient[wp.static(SLOTS) + side, p] = V(couple, real(0.0), real(0.0))
+                        gradient[wp.static(PAIR_NODES) + side, p] = V(couple, real(0.0), real(0.0))
                 w = f / bound
                 if accepted.shape[0] > 0:
                     old = accepted[world]
