@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_controls import AXIS, GRAVITY, PIVOT, everything, joined, model_of, one_rod, sheet, some_rods
+from test_controls import AXIS, GRAVITY, PIVOT, joined, model_of, one_rod, sheet, some_rods
 
 import ddg_warp as ddg
 from ddg_warp import statics
@@ -24,6 +24,11 @@ def given(model, moments: bool = True) -> ddg.Controls:
     return ddg.Controls(forces=forces, moments=twisting, gravity=GRAVITY)
 
 
+def rod_and_sheet(scene, moved) -> None:
+    one_rod(scene, moved)
+    sheet(scene, moved)
+
+
 def push(scene, world: int) -> None:
     """The same loads in a scene of one world."""
     if not scene.shells:
@@ -36,12 +41,12 @@ def push(scene, world: int) -> None:
 @pytest.mark.parametrize(
     ("build", "solver"),
     [
-        (one_rod, "direct"),
+        pytest.param(one_rod, "direct", marks=pytest.mark.slow),
         (some_rods, "direct"),
-        (joined, "direct"),
+        pytest.param(joined, "direct", marks=pytest.mark.slow),
         (joined, "pcg"),
         (sheet, "direct"),
-        (sheet, "pcg"),
+        pytest.param(sheet, "pcg", marks=pytest.mark.slow),
     ],
     ids=lambda value: getattr(value, "__name__", value),
 )
@@ -74,7 +79,13 @@ def test_loads_that_follow_stay_beside_what_each_world_is_given(device, solver):
 
 @pytest.mark.parametrize(
     ("build", "solver"),
-    [(some_rods, "direct"), (joined, "direct"), (joined, "pcg"), (sheet, "direct"), (sheet, "pcg")],
+    [
+        (some_rods, "direct"),
+        pytest.param(joined, "direct", marks=pytest.mark.slow),
+        (joined, "pcg"),
+        (sheet, "direct"),
+        pytest.param(sheet, "pcg", marks=pytest.mark.slow),
+    ],
     ids=lambda value: getattr(value, "__name__", value),
 )
 def test_grips_end_where_motions_would(device, build, solver):
@@ -96,7 +107,7 @@ def test_grips_end_where_motions_would(device, build, solver):
 
 def test_controls_are_of_one_search(device):
     """A search with controls, then one without on the same solver: the bits of one that never had any, and the same twice."""
-    model = model_of(everything, None, device, worlds=3)
+    model = model_of(rod_and_sheet, None, device, worlds=3)
     solver = Equilibrium(model, StaticsOptions(rtol=1e-10))
     first = solver.load(model.state(), 1, controls=given(model)).snapshot()
     plain = solver.load(model.state(), 1).snapshot()
