@@ -13,6 +13,7 @@ from ddg_warp.kernels.contact.impact import NEAR, REST
 from ddg_warp.kernels.contact.shares import ROUNDS
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
+from tests.pairwise import covering
 
 
 def gone(gap: float) -> float:
@@ -29,9 +30,7 @@ def wish(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
     return size * move
 
 
-@pytest.mark.parametrize("kind", ["node", "object", "world"])
-@pytest.mark.parametrize("size", [0.01, 0.5])
-@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+@covering(dtype=(wp.vec3d, wp.vec3f), size=(0.01, 0.5), kind=("node", "object", "world"))
 def test_no_gap_closes_and_nothing_passes(device, kind, size, dtype):
     """Motions from once to fifty times the margin, three in a row."""
     shapes, points = tangle(5)

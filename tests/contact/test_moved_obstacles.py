@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from tests.pairwise import covering
 
 RADIUS = 2e-3
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -79,8 +80,7 @@ ROUND = {
 }
 
 
-@pytest.mark.parametrize("held", ["motion", "grip"])
-@pytest.mark.parametrize("shape", ROUND)
+@covering(1, shape=ROUND, held=("motion", "grip"))
 def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, held):
     """A rod across the top of what turns about the line in its middle slides with mu N / m until it is as fast as the surface, omega R.
 

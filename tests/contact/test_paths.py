@@ -12,11 +12,13 @@ from ddg_warp import statics
 from ddg_warp.geometry import meshes
 from ddg_warp.scene.path import Displacement, Stop
 from ddg_warp.solve.continuation import Continuation
+from tests.pairwise import covering
 
 LENGTH = 1.1  # m, of the bars of the truss
 HEIGHT = np.sqrt(LENGTH**2 - 1.0)  # m, of its apex
 THICK, BALL = 0.01, 0.3  # m, radii of the bars and of the ball below
 WALL, COLUMN = 0.02, 1e-3  # m, between the axis of a column and walls, and its radius
+FAST = ("barrier", 1e-2), ("penalty", 1e-6)  # laws and ranges of the fast tests of the truss
 each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
@@ -46,9 +48,13 @@ def pushes(model, state) -> float:
     return float(sum(reaction.force[2] for reaction in model.reactions(state)[-obstacles:]))
 
 
-@each_law
 @pytest.mark.parametrize(
-    ("reach", "stiffness"), [(1e-2, 10.0), pytest.param(1e-4, 1e3, marks=pytest.mark.slow), (1e-6, 1e5)]
+    ("law", "reach", "stiffness"),
+    [
+        pytest.param(law, reach, stiffness, marks=() if (law, reach) in FAST else pytest.mark.slow)
+        for law in ("barrier", "penalty")
+        for reach, stiffness in ((1e-2, 10.0), (1e-4, 1e3), (1e-6, 1e5))
+    ],
 )
 def test_a_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     """The load falls until bars and ball touch, and grows with what the ball takes; the way back is the same."""
@@ -222,8 +228,7 @@ def kind_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
     return scene
 
 
-@each_law
-@pytest.mark.parametrize("name", KINDS)
+@covering(1, name=KINDS, law=("barrier", "penalty"))
 def test_paths_lead_where_load_steps_do(device, name, law):
     """Weight grows with the load parameter, and obstacles move by it: the same state at its end, and the same pushes."""
     model = kind_of(name, law).build(device, "float64")

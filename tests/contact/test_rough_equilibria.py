@@ -149,7 +149,7 @@ def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
     return scene
 
 
-@pytest.mark.parametrize("law", ["barrier", "penalty"])
+@pytest.mark.parametrize("law", ["barrier", pytest.param("penalty", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mu", [0.3, pytest.param(0.6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "load_steps", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(8, marks=pytest.mark.slow)]
@@ -333,7 +333,7 @@ def test_less_of_a_way_leads_into_nothing(device):
         np.testing.assert_allclose(state.net.q.numpy()[5:10, 2] - begun[5:10, 2], gone, rtol=1e-12)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_pile_at_rest_is_in_equilibrium(device, seed):
     """What has come to rest in steps, all held by friction, moves on in an equilibrium as far as it creeps in that time."""
     random, rods = np.random.default_rng(seed), 12

@@ -91,7 +91,12 @@ def swarm(rng, nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("nodes", "dtype"), [(6, wp.vec3d), (6, wp.vec3f), (20, wp.vec3d), (20, wp.vec3f), (70, wp.vec3d)]
+    ("nodes", "dtype"),
+    [
+        (6, wp.vec3d),
+        (20, wp.vec3f),
+        *(pytest.param(*of, marks=pytest.mark.slow) for of in ((6, wp.vec3f), (20, wp.vec3d), (70, wp.vec3d))),
+    ],
 )
 def test_boxes_serve_step_after_step_and_tell_nothing_wrongly(device, nodes, dtype):
     """Nothing that is near is told to be apart, and many of the steps in which nothing is need no new boxes."""

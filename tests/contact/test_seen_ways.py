@@ -9,6 +9,7 @@ from motion_cases import MARGIN, REACH, Motion, tangle
 from ddg_warp.kernels.contact.motion import AHEAD
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
+from tests.pairwise import covering
 
 
 def beside(rng, count: int, most: float) -> np.ndarray:
@@ -37,8 +38,7 @@ def held(search: BroadPhase, x: np.ndarray) -> int:
     return count
 
 
-@pytest.mark.parametrize("kind", ["node", "object"])
-@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+@covering(1, dtype=(wp.vec3d, wp.vec3f), kind=("node", "object"))
 def test_a_motion_that_was_cut_goes_on_without_another_search(device, kind, dtype):
     """By ten margins, in pieces, with what was cut going on towards its end or beside it; nothing passes."""
     shapes, points = tangle(5)

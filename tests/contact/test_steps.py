@@ -175,7 +175,7 @@ def test_refusals(device):
             ddg.Integrator(model, **options)
 
 
-@pytest.mark.parametrize("name", ["noodles", "crossed_beams"])
+@pytest.mark.parametrize("name", [pytest.param("noodles", marks=pytest.mark.slow), "crossed_beams"])
 def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, name):
     """Contact's part of the bands is in both: the same iterations and the same motion but for rounding, by which one of hundreds of
     iterations may be more or less."""
