@@ -18,6 +18,7 @@ from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
+from tests.pairwise import covering  # noqa: E402
 
 STIFFNESS = {
     "twisted": "rod_bend_twist.stiffness_1",
@@ -286,8 +287,7 @@ def test_equilibria_are_those_of_a_new_simulator(name):
         torch.testing.assert_close(found, wanted, rtol=0.0, atol=0.0)
 
 
-@pytest.mark.parametrize("end", [1.0, 0.7])
-@pytest.mark.parametrize("name", STIFFNESS)
+@covering(1, name=STIFFNESS, end=(1.0, 0.7))
 def test_equilibria_under_controls(name, end):
     """Of two worlds under different loads, which the load parameter scales; along with a stiffness."""
     own, term = resting(name), STIFFNESS[name]
