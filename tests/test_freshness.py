@@ -1,5 +1,7 @@
 """Family "freshness": whatever is changed, by whatever route, the next step is that of a new model with these values, bit for bit."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -74,9 +76,14 @@ def same(one, other) -> None:
         np.testing.assert_array_equal(values, other[name], err_msg=name)
 
 
+@cache
+def recipe(name: str, device: str) -> Recipe:
+    return Recipe(built(name, device), WORLDS)
+
+
 def set_back(model, name: str) -> None:
     """Put back all parameters of the scene."""
-    Recipe(built(name, model.device), WORLDS).put(model)
+    recipe(name, model.device).put(model)
 
 
 @EVERY_KIND
