@@ -7,6 +7,7 @@ import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.geometry import meshes
 from ddg_warp.postprocess import quantities
+from tests.pairwise import covering
 
 RUBBER = ddg.Material(young=1e7, poisson=0.35, density=1000.0)
 SECTION = ddg.Rectangle(0.04, 0.02)
@@ -86,8 +87,7 @@ def run(model, steps: int = STEPS, scheme: str = "implicit_euler", controls=lamb
     return state, integrator
 
 
-@SCHEMES
-@KINDS
+@covering(1, build=(one_rod, some_rods, joined, sheet, everything), scheme=("implicit_euler", "implicit_midpoint"))
 def test_worlds_are_models_with_functions(device, build, scheme):
     """Grips, gravity, forces and moments of three worlds equal motions, gravity and loads of three single models."""
     model = model_of(build, ddg.Grip(PIVOT), device, worlds=3)

@@ -1,5 +1,7 @@
 """Parameter changes by any route: the next step equals a new model with these values, bit for bit."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -74,9 +76,14 @@ def same(state, expected) -> None:
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
+@cache
+def recipe(name: str, device: str) -> ModelBuilder:
+    return ModelBuilder(built(name, device), WORLDS)
+
+
 def set_back(model, name: str) -> None:
     """Restore all parameters of the scene."""
-    ModelBuilder(built(name, model.device), WORLDS).put(model)
+    recipe(name, model.device).put(model)
 
 
 @EVERY_KIND

@@ -10,7 +10,7 @@ import warp as wp
 
 import ddg_warp as ddg
 
-TWIST = ("transport", "reference_twist", "rotate", "relag", "atan2")
+TWIST = ("transport(", "reference_twist(", "rotate(", "relag", "atan2(")
 HEAVY = ("warp", "torch", "pxr", "h5py", "scipy", "matplotlib")
 
 

@@ -52,8 +52,12 @@ def test_commands(folder):
         if file:
             (folder / file).write_text(text)
     assert COMMANDS
+    lines = ["from ddg_warp.run.cli import main"]
     for command in COMMANDS:
         if not any(word in command for word in LONG) and ("gradients" not in command or find_spec("torch")):
-            words = [sys.executable, "-m", "ddg_warp", *shlex.split(command)[1:]]
-            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
-            assert done.returncode == 0, f"{command}: {done.stderr[-3000:]}"
+            words = shlex.split(command)[1:]
+            lines.append(f"assert main({words}) == 0, {command!r}")
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]

@@ -18,6 +18,7 @@ from ddg_warp.run.run_directory import RunDirectory
 from ddg_warp.run.scene_registry import InputError
 from ddg_warp.run.simulate import simulate
 from ddg_warp.run.summary import summary
+from tests.pairwise import covering
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 CLOCKS = ("wall_time", "compile_time", "ms_per_step")
@@ -63,8 +64,7 @@ def stepped(model, count: int):
     return states
 
 
-@pytest.mark.parametrize("worlds", [1, 3])
-@pytest.mark.parametrize("kind", ["rods", "net", "shell", "contact"])
+@covering(1, kind=("rods", "net", "shell", "contact"), worlds=(1, 3))
 def test_recorded_data_equal_the_states(kind, worlds, device, tmp_path):
     """Recorded data are bitwise equal with every option, over several blocks, the last of them partial."""
     model = scene_of(kind).build(device, worlds=worlds)
@@ -126,8 +126,7 @@ def observe(model, state) -> dict:
     return {"x": state.points().flat[0]}
 
 
-@pytest.mark.parametrize("worlds", [1, 3])
-@pytest.mark.parametrize("kind", ["rods", "net", "shell", "contact"])
+@covering(1, kind=("rods", "net", "shell", "contact"), worlds=(1, 3))
 def test_resumed_equals_straight_in_every_number(kind, worlds, device, tmp_path):
     """Summary and trajectory agree for runs in two segments and in three, one of them a single step."""
     scene, options = (

@@ -5,9 +5,9 @@ import pytest
 from test_controls import DT, PIVOT, SCHEMES, everything, joined, model_of, one_rod, poses, run, sheet, some_rods
 
 import ddg_warp as ddg
+from tests.pairwise import covering
 
 GRAVITY = np.array([(0.0, 0.0, -9.81), (0.0, 0.0, -1.0), (1.0, 2.0, -3.0)])
-KINDS = pytest.mark.parametrize("build", [some_rods, joined, sheet, everything], ids=lambda build: build.__name__)
 
 
 def controls(k: int, worlds=(0, 1, 2), whip: int | None = None) -> ddg.Controls:
@@ -33,8 +33,7 @@ def same(state, world: int, expected) -> None:
         np.testing.assert_array_equal(state.directors()[world], expected.directors())
 
 
-@SCHEMES
-@KINDS
+@covering(1, build=(some_rods, joined, sheet, everything), scheme=("implicit_euler", "implicit_midpoint"))
 def test_failed_world_is_frozen_until_reset(device, build, scheme):
     """World 1 fails in step 3 and keeps all rods as before; other worlds equal single builds bit for bit.
 

@@ -22,7 +22,7 @@ SMALL = {
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "crossed_beams": {"n": 20},
     "deep_arch": {},
-    "drawn_rod": {},
+    "drawn_rod": {"n": 25, "load_steps": 10},
     "entangled_worms": {"n": 30, "dt": 0.02},  # one bundle of seven worms in fifty stays too loose
     "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},
@@ -86,6 +86,8 @@ SMALL = {
     "woven_cylinder": {"strands": 8, "rings": 5, "turns": 0.08, "dt": 0.02},
 }
 LONG = (
+    "flag_on_pole",
+    "cable_on_table",
     "helical_flagellum",
     "sedimenting_rod",
     "cable_gripped_at_both_ends",
@@ -138,6 +140,7 @@ def test_small(device, name):
     checked(name, device, **SMALL[name])
 
 
+@pytest.mark.slow
 def test_hair_in_contact(device):
     checked("strands", device, count=16, contact=True)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_controls import AXIS, GRAVITY, PIVOT, everything, joined, model_of, one_rod, sheet, some_rods
+from test_controls import AXIS, GRAVITY, PIVOT, joined, model_of, one_rod, sheet, some_rods
 
 import ddg_warp as ddg
 from ddg_warp import statics
@@ -36,12 +36,12 @@ def add_loads(scene, world: int) -> None:
 @pytest.mark.parametrize(
     ("build", "solver"),
     [
-        (one_rod, "direct"),
+        pytest.param(one_rod, "direct", marks=pytest.mark.slow),
         (some_rods, "direct"),
-        (joined, "direct"),
+        pytest.param(joined, "direct", marks=pytest.mark.slow),
         (joined, "pcg"),
         (sheet, "direct"),
-        (sheet, "pcg"),
+        pytest.param(sheet, "pcg", marks=pytest.mark.slow),
     ],
     ids=lambda value: getattr(value, "__name__", value),
 )
@@ -76,7 +76,13 @@ def test_follower_loads_add_to_controls(device, solver):
 
 @pytest.mark.parametrize(
     ("build", "solver"),
-    [(some_rods, "direct"), (joined, "direct"), (joined, "pcg"), (sheet, "direct"), (sheet, "pcg")],
+    [
+        (some_rods, "direct"),
+        pytest.param(joined, "direct", marks=pytest.mark.slow),
+        (joined, "pcg"),
+        (sheet, "direct"),
+        pytest.param(sheet, "pcg", marks=pytest.mark.slow),
+    ],
     ids=lambda value: getattr(value, "__name__", value),
 )
 def test_grips_reach_the_end_of_motions(device, build, solver):
@@ -98,9 +104,15 @@ def test_grips_reach_the_end_of_motions(device, build, solver):
     np.testing.assert_allclose(kept.points(), equilibrium.points(), rtol=0.0, atol=1e-8)
 
 
+def rod_and_sheet(scene, moved) -> None:
+    """Add one rod and a sheet."""
+    one_rod(scene, moved)
+    sheet(scene, moved)
+
+
 def test_controls_apply_to_one_solve(device):
     """A solve without controls after one with controls equals a fresh solver bitwise, and repeats."""
-    model = model_of(everything, None, device, worlds=3)
+    model = model_of(rod_and_sheet, None, device, worlds=3)
     solver = Equilibrium(model, StaticsOptions(rtol=1e-10))
     first = solver.load(model.state(), 1, controls=controls_of(model)).snapshot()
     plain = solver.load(model.state(), 1).snapshot()

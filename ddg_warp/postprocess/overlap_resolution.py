@@ -60,7 +60,8 @@ def resolve_overlaps(model, state, gap: float | None = None):
     else:
         gap, pair = touch.closest(new.coupled.q)
         raise SolverError(
-            f"resolve_overlaps: {pair} are still {gap:.3g} m apart, less than {least:.3g} m, after {ROUNDS} rounds; move them apart, free "
+            f"resolve_overlaps: {pair} are still {gap:.3g} m apart, less than {least:.3g} m, after {ROUNDS} rounds; "
+            "move them apart, free "
             "what holds them, or give them a smaller radius",
             outcome="no_room",
         )

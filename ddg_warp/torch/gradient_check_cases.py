@@ -1,7 +1,7 @@
 """Gradient check cases: an object under an analysis, with inputs and a loss; see `ddg_warp.torch.gradient_check`."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -17,31 +17,33 @@ REAL = torch.float64
 
 
 @dataclass
+class Change:
+    """Tensors given to two worlds: of the first state (None: as it is), parameters and controls, by name."""
+
+    values: tuple | list | None = None
+    parameters: dict = field(default_factory=dict)
+    controls: dict = field(default_factory=dict)
+
+
+@dataclass
 class Input:
     """Input of steps, moved along a direction.
 
     Attributes:
         name: name of the input.
         size: size of a change as large as the input itself, for scaling x.
-        loss: x -> the loss with the input moved by x along the direction; x a tensor () or a number.
-        gradient: () -> the derivative at zero; by default by torch.
+        change: x -> the `Change` that moves the input by x along the direction, x a tensor (); None if the input is no tensor.
+        loss: x -> the loss with the input moved by a number x; None if differences use `change`.
+        gradient: () -> the derivative at zero, for an input without `change`.
+        start: True if the first state changes.
     """
 
     name: str
     size: float
-    loss: Callable
+    change: Callable | None = None
+    loss: Callable | None = None
     gradient: Callable | None = None
-
-    def found(self) -> float:
-        """Return the derivative at zero; zero if torch finds no dependence."""
-        if self.gradient:
-            return self.gradient()
-        x = torch.zeros((), dtype=REAL, requires_grad=True)
-        loss = self.loss(x)
-        if not loss.requires_grad:
-            return 0.0
-        (derivative,) = torch.autograd.grad(loss, x, allow_unused=True)
-        return 0.0 if derivative is None else float(derivative)
+    start: bool = False
 
 
 class Case:
@@ -72,12 +74,13 @@ class Case:
         # start poses of equilibria: angles are measured from frames transported to there
         self.poses = 1e-3 * self._normal(WORLDS, len(self.model.grips), 6)
         self.posed = {"poses": self.poses} if self.model.grips else {}
+        self.usual = {}  # controls of worlds in which others move
         self.state = self._first()
 
-    def built(self, dt: float = DT, **changes) -> Simulator:
+    def built(self, **changes) -> Simulator:
         """Return a simulator of the scene with changes; see `scene_of`."""
         model = scene_of(self.name, **changes).build(device=self.device, precision="float64")
-        return Simulator(model, dt, scheme="implicit_euler" if self.statics else self.analysis, **TIGHT)
+        return Simulator(model, DT, scheme="implicit_euler" if self.statics else self.analysis, **TIGHT)
 
     def _normal(self, *shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
@@ -112,16 +115,40 @@ class Case:
         return rates
 
     def loss(self, state: WorldState) -> torch.Tensor:
-        """Return the loss of a final state."""
-        terms = [(self.weights[0] * state.positions).sum()]
+        """Return the losses of a final state, one for every WORLDS worlds."""
+        pairs = [(self.weights[0], state.positions)]
         if not self.slides:  # with friction angles depend on the transport of frames
-            terms.append((self.weights[2] * state.angles).sum())
-        return sum(terms) + (0.0 if self.statics else (self.weights[1] * state.velocities).sum())
+            pairs.append((self.weights[2], state.angles))
+        if not self.statics:
+            pairs.append((self.weights[1], state.velocities))
+        copies = len(state.codes) // WORLDS
+        return sum((values.view(copies, *weights.shape) * weights).flatten(1).sum(1) for weights, values in pairs)
 
-    def end(self, simulator: Simulator, values=None, parameters=None, controls=None) -> WorldState:
-        """Return the final state for given tensors of the first one."""
-        state = replace(self.state, values=tuple(values or self.state.values), engine=simulator.engine(WORLDS))
-        controls = self.posed | (controls or {})
+    def losses(self, inputs: Sequence[Input], moved: torch.Tensor) -> torch.Tensor:
+        """Return the losses with each input moved alone, input i by `moved[i]`, in worlds of one batch."""
+        changes = [each.change(x) for each, x in zip(inputs, moved, strict=True)]
+        states = [change.values or self.state.values for change in changes]
+        like = self.simulator.engine(WORLDS * len(inputs)).target
+        values = [
+            torch.cat(alike, entry.axis) if alike[0].shape != wide.shape else alike[0]
+            for entry, wide, *alike in zip(self.engine.fields, like, *states, strict=True)
+        ]
+        parameters = {name: self.engine.tables.value(name) for change in changes for name in change.parameters}
+        parameters = _joined([parameters | change.parameters for change in changes])
+        controls = _joined([self.posed | self.usual | change.controls for change in changes])
+        return self.loss(self.end(self.simulator, values, parameters, controls, len(inputs)))
+
+    def derivatives(self, inputs: Sequence[Input]) -> list[float]:
+        """Return the derivatives of the loss by inputs with a `change`, at zero; zero if torch finds no dependence."""
+        moved = torch.zeros(len(inputs), dtype=REAL, device=self.place, requires_grad=True)
+        loss = self.losses(inputs, moved).sum()
+        return torch.autograd.grad(loss, moved)[0].tolist() if loss.requires_grad else [0.0] * len(inputs)
+
+    def end(self, simulator: Simulator, values=None, parameters=None, controls=None, copies: int = 1) -> WorldState:
+        """Return the final state of `copies` times WORLDS worlds for given tensors of the first one."""
+        engine = simulator.engine(WORLDS * copies)
+        state = WorldState.begun(values or self.state.values, self.state.time, engine)
+        controls = self.posed if controls is None else controls
         if self.statics:
             begin = {"start": 0.0, "load_steps": STEPS} if self.slides else {"start": 1.0}
             return simulator.equilibrium(parameters, controls, state=state, **begin, **TIGHT)
@@ -160,9 +187,8 @@ class Case:
         if self.model.magnetic:
             yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
         if not self.statics:
-            timed = self._without_step()
-            yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
-            yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})
+            yield self._shared("time step", DT, self._by_step, self._without_step())
+            yield self._shared("mass damping", 1.0, lambda x: self.end(self.built(mass_damping=0.7 + x)))
         yield self._density()
 
     def _moved(self, array: str, blocks: str, shift: torch.Tensor) -> list:
@@ -170,7 +196,7 @@ class Case:
         return self.engine.layout.put_points(self.state.values, array, blocks, points + shift)
 
     def _state(self, name: str, size: float, values: Callable) -> Input:
-        return Input(name, size, lambda x: self.loss(self.end(self.simulator, values(x))))
+        return Input(name, size, lambda x: Change(values(x)), start=True)
 
     def _parameter(self, name: str) -> Input:
         usual, values = self.engine.tables.value(name), None
@@ -182,7 +208,7 @@ class Case:
             usual = torch.where(usual > 0.0, usual, size)
         direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
 
-        return Input(name, size, lambda x: self.loss(self.end(self.simulator, values, {name: usual + x * direction})))
+        return Input(name, size, lambda x: Change(values, {name: usual + x * direction}))
 
     def _begun(self, name: str, value: torch.Tensor) -> tuple | None:
         """Return a start equilibrium with another parameter value, since angles depend on the path from the start."""
@@ -198,7 +224,8 @@ class Case:
         return max(float(self.engine.tables.value(member).abs().max()) for member in alike) or 1.0
 
     def _control(self, name: str, size: float, direction: torch.Tensor, usual=0.0) -> Input:
-        return Input(name, size, lambda x: self.loss(self.end(self.simulator, controls={name: usual + x * direction})))
+        self.usual[name] = usual + 0.0 * direction
+        return Input(name, size, lambda x: Change(controls={name: usual + x * direction}))
 
     def _density(self) -> Input:
         """Return the input that scales masses and inertia as parameters; differences rebuild the scene."""
@@ -210,11 +237,11 @@ class Case:
             inertia = {name: self.engine.tables.value(name) * (1.0 + x) for name in names.intersection(["rod.inertia"])}
             return more | inertia
 
-        base = Input("density", 1.0, lambda x: self.loss(self.end(self.simulator, None, scaled(x))))
-        return replace(
-            base,
-            loss=lambda x: self.loss(self.end(self.built(density=1.0 + float(x)))),
-            gradient=base.found,
+        return Input(
+            "density",
+            1.0,
+            lambda x: Change(parameters=scaled(x)),
+            lambda x: self.loss(self.end(self.built(density=1.0 + x))),
         )
 
     def _without_step(self) -> str:
@@ -227,15 +254,23 @@ class Case:
             return "the reverse does not differentiate motions, loads and fields that are functions of time"
         return ""
 
-    def _shared(self, name: str, size: float, changes: Callable, why: str = "") -> Input:
-        """Return an input that is no tensor; differences rebuild the scene. `why` is the reason if there is no derivative."""
+    def _by_step(self, x: float) -> WorldState:
+        """Return the final state of steps that are longer by x [s]."""
+        try:
+            self.simulator.dt = DT + x
+            return self.end(self.simulator)
+        finally:
+            self.simulator.dt = DT
+
+    def _shared(self, name: str, size: float, end: Callable, why: str = "") -> Input:
+        """Return an input that is no tensor; `end(x)` is the final state, `why` the reason if there is no derivative."""
 
         def gradient() -> float:
             if why:
                 raise SceneError(why)
             return float(self.reverse()[name])
 
-        return Input(name, size, lambda x: self.loss(self.end(self.built(**changes(x)))), gradient)
+        return Input(name, size, loss=lambda x: self.loss(end(x)), gradient=gradient)
 
     def reverse(self) -> dict[str, float]:
         """Return derivatives with respect to inputs that are no tensors, from the backward pass of every step."""
@@ -266,3 +301,8 @@ class Case:
             torch.zeros_like(leaf) if gradient is None else gradient
             for leaf, gradient in zip(leaves, gradients, strict=True)
         ]
+
+
+def _joined(tensors: list[dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """Return tensors of one batch from tensors of all pieces, by the same names."""
+    return {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]}

@@ -11,6 +11,7 @@ from ddg_warp.solve.collision import bvh
 from ddg_warp.solve.collision.broad_phase import BroadPhase
 from ddg_warp.solve.collision.candidate_list import RunningSums
 from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from tests.pairwise import covering
 
 REACH, MARGIN = 0.004, 0.01
 
@@ -24,8 +25,7 @@ def assert_complete(search: BroadPhase, x: np.ndarray, sides=SIDES) -> None:
         assert set(pairs) <= near_pairs(search.shapes, x, *side, REACH + 1.002 * MARGIN)
 
 
-@pytest.mark.parametrize("spread", [0.3, 1.0, 3.0])
-@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+@covering(1, dtype=(wp.vec3d, wp.vec3f), spread=(0.3, 1.0, 3.0))
 def test_candidates_equal_those_of_all_pairs(device, spread, dtype):
     shapes, points = scene(1, spread)
     search = BroadPhase(shapes, upload(points, device, dtype), reach=REACH, margin=MARGIN)

@@ -9,6 +9,7 @@ from motion_cases import MARGIN, REACH, Motion, tangle
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import AHEAD
 from ddg_warp.solve.collision.broad_phase import BroadPhase
 from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from tests.pairwise import covering
 
 
 def random_offsets(rng, count: int, most: float) -> np.ndarray:
@@ -37,8 +38,7 @@ def count_near_pairs(search: BroadPhase, x: np.ndarray) -> int:
     return count
 
 
-@pytest.mark.parametrize("kind", ["node", "object"])
-@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+@covering(1, dtype=(wp.vec3d, wp.vec3f), kind=("node", "object"))
 def test_cut_motion_continues_without_a_new_search(device, kind, dtype):
     """A motion of ten margins is cut, then continues in pieces towards the end or aside without a search; no pair crosses."""
     shapes, points = tangle(5)

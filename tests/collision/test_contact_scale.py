@@ -86,7 +86,18 @@ CASES += [(build, "mixed", 1e-6) for build in (rod_on_floor, rod_on_rod, shell_o
 CASES += [(shell_on_ball, "float64", 1e-6)]
 
 
-@pytest.mark.parametrize("build, precision, small", CASES)
+FAST = [
+    (rod_on_floor, "float64"),
+    (rod_on_mesh, "float64"),
+    *((build, "mixed") for build in (rod_on_rod, shell_on_ball)),
+]
+FAST += [(rod_on_capsule, "mixed")]
+
+
+@pytest.mark.parametrize(
+    "build, precision, small",
+    [pytest.param(*case, marks=() if case[:2] in FAST else pytest.mark.slow) for case in CASES],
+)
 def test_contact_is_the_same_at_every_scale(device, build, precision, small):
     points, force, gap = scaled_results(build, 1.0, device, precision)
     for length in (small, 1e5):

@@ -13,11 +13,13 @@ from ddg_warp import statics
 from ddg_warp.geometry import meshes
 from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
 from ddg_warp.solve.equilibrium.continuation import Continuation
+from tests.pairwise import covering
 
 LENGTH = 1.1  # m, of the bars of the truss
 HEIGHT = np.sqrt(LENGTH**2 - 1.0)  # m, of its apex
 THICK, BALL = 0.01, 0.3  # m, radii of the bars and of the ball below
 WALL, COLUMN = 0.02, 1e-3  # m, between the axis of a column and walls, and its radius
+FAST = ("barrier", 1e-2), ("penalty", 1e-6)  # laws and ranges of the fast tests of the truss
 each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
@@ -53,9 +55,13 @@ def upward_force(model, state) -> float:
     return float(sum(reaction.force[2] for reaction in model.reactions(state)[-obstacles:]))
 
 
-@each_law
 @pytest.mark.parametrize(
-    ("reach", "stiffness"), [(1e-2, 10.0), pytest.param(1e-4, 1e3, marks=pytest.mark.slow), (1e-6, 1e5)]
+    ("law", "reach", "stiffness"),
+    [
+        pytest.param(law, reach, stiffness, marks=() if (law, reach) in FAST else pytest.mark.slow)
+        for law in ("barrier", "penalty")
+        for reach, stiffness in ((1e-2, 10.0), (1e-4, 1e3), (1e-6, 1e5))
+    ],
 )
 def test_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     """The load falls until bars and ball are in contact, then grows with the force of the ball. The way back is the same."""
@@ -232,8 +238,7 @@ def scene_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
     return scene
 
 
-@each_law
-@pytest.mark.parametrize("name", KINDS)
+@covering(1, name=KINDS, law=("barrier", "penalty"))
 def test_paths_end_at_the_states_of_load_steps(device, name, law):
     """Weight and obstacle motions follow the load parameter: end states and reactions are the same."""
     model = scene_of(name, law).build(device, "float64")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from tests.pairwise import covering
 
 RADIUS = 2e-3
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -79,8 +80,7 @@ ROUND = {
 }
 
 
-@pytest.mark.parametrize("drive", ["motion", "grip"])
-@pytest.mark.parametrize("shape", ROUND)
+@covering(1, shape=ROUND, drive=("motion", "grip"))
 def test_rotating_surfaces_accelerate_a_rod_by_friction(device, shape, drive):
     """A rod across the top of a rotating body slides by mu N / m up to the surface speed omega R.
 

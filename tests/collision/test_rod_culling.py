@@ -91,7 +91,12 @@ def swarm(rng, nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("nodes", "dtype"), [(6, wp.vec3d), (6, wp.vec3f), (20, wp.vec3d), (20, wp.vec3f), (70, wp.vec3d)]
+    ("nodes", "dtype"),
+    [
+        (6, wp.vec3d),
+        (20, wp.vec3f),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((6, wp.vec3f), (20, wp.vec3d), (70, wp.vec3d))),
+    ],
 )
 def test_bounds_are_reused_and_never_wrong(device, nodes, dtype):
     """Near pairs always leave doubt, and many steps without near pairs need no new bounds."""

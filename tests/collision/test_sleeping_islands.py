@@ -1,13 +1,13 @@
 """Sleeping islands: recomputed for each direction; converged islands sleep while others iterate."""
 
 import numpy as np
-import pytest
 from eager_steps import step_without_capture
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from tests.pairwise import covering
 
 RADIUS, DT = 2e-3, 1 / 240
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -100,8 +100,11 @@ def test_islands_converge_independently(device):
         np.testing.assert_allclose(together[0, 18 * i : 18 * i + 18] - [APART * i, 0, 0], alone[0], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("linear", ["block_jacobi", "chain", "multilevel", "chain_multilevel"])
-@pytest.mark.parametrize("made", [joined_over_beam, sheet_over_beam, rod_on_ball])
+@covering(
+    1,
+    made=(joined_over_beam, sheet_over_beam, rod_on_ball),
+    linear=("block_jacobi", "chain", "multilevel", "chain_multilevel"),
+)
 def test_islands_of_joined_rods_sheets_and_balls(device, made, linear):
     """One of two objects flies as predicted and sleeps while the other meets an object below.
 

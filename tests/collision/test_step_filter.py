@@ -13,6 +13,7 @@ from ddg_warp.kernels.collision.ccd.additive_ccd import NEAR, REST
 from ddg_warp.kernels.collision.ccd.step_fractions import ROUNDS
 from ddg_warp.solve.collision.broad_phase import BroadPhase
 from ddg_warp.solve.collision.collision_mesh import CollisionMesh
+from tests.pairwise import covering
 
 
 def allowed_closing(gap: float) -> float:
@@ -29,9 +30,7 @@ def random_displacements(shapes: CollisionMesh, rng, size: float, kind: str) -> 
     return size * move
 
 
-@pytest.mark.parametrize("kind", ["node", "object", "world"])
-@pytest.mark.parametrize("size", [0.01, 0.5])
-@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+@covering(dtype=(wp.vec3d, wp.vec3f), size=(0.01, 0.5), kind=("node", "object", "world"))
 def test_limited_motions_close_no_gap_and_never_cross(device, kind, size, dtype):
     """Three motions follow each other, each once to fifty times the margin."""
     shapes, points = tangle(5)

@@ -178,7 +178,7 @@ def test_refusals(device):
             ddg.Integrator(model, **options)
 
 
-@pytest.mark.parametrize("name", ["noodles", "crossed_beams"])
+@pytest.mark.parametrize("name", [pytest.param("noodles", marks=pytest.mark.slow), "crossed_beams"])
 def test_substructuring_does_not_depend_on_the_thread_mapping(device, monkeypatch, name):
     """Two eliminations include the contact terms of the bands: motions agree to rounding, iterations to one of hundreds."""
     results = []

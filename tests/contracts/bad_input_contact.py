@@ -95,7 +95,8 @@ each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")]
 each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: build_pair("rod", "odd", stiffness=v),
      "'rod' and 'odd'", "stiffness")
 each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: build_pair("rod", "odd", range=v), "'rod' and 'odd'", "range")
-each("contact", "gap to push apart to", [0.0, -1.0, NAN, "far"], lambda v: separate(in_contact(), v), "resolve_overlaps: gap", "positive")
+GAPS = [0.0, -1.0, NAN, "far"]
+each("contact", "gap to push apart to", GAPS, lambda v: separate(in_contact(), v), "resolve_overlaps: gap", "positive")
 refuse("contact", {
     "pushed apart too far": (lambda: separate(in_contact(), 1e3), "resolve_overlaps: gap is 1000 m", "may not exceed"),
     "pushed apart without contact": (lambda: separate(scene(), None), "resolve_overlaps", "add scene.contact()"),

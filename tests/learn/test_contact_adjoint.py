@@ -23,6 +23,7 @@ from tests.learn.differences import (
     parameter_shifts,
     pulled,
 )
+from tests.pairwise import covering
 
 RUBBING = {"friction": 0.3, "velocity": 0.05}  # what slides does so at twice the velocity, what turns slower
 SLIDING = 0.1  # [m/s]
@@ -67,8 +68,7 @@ def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
     return shifts
 
 
-@each_law
-@each_scene
+@covering(1, name=SCENES, law=("barrier", "penalty"))
 def test_a_step_by_its_state_and_numbers(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 1)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius")))
@@ -84,18 +84,17 @@ def test_a_step_that_rubs(name, law, form):
     )
 
 
-@pytest.mark.parametrize(("lags", "law"), [(2, "penalty"), (3, "barrier")])
-@each_scene
-def test_friction_that_is_lagged_anew(name, law, lags):
+@covering(1, name=SCENES, lags=(2, 3))
+def test_friction_that_is_lagged_anew(name, lags):
     """Two steps of some solves each, which lag what is of the one before."""
+    law = "penalty" if lags == 2 else "barrier"
     model, gradient, inputs, difference = differentiated(name, law, 2, SLIDING, lags=lags, **RUBBING)
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
     )
 
 
-@lagged_once_or_twice
-@pytest.mark.parametrize("name", [name for name in SCENES if not name.startswith("sheet")])
+@covering(1, name=[name for name in SCENES if not name.startswith("sheet")], lags=(1, 2))
 def test_friction_that_rolls_rods(name, lags):
     """By angles, and by directions and radii of what rolls, too."""
     model, gradient, inputs, difference = differentiated(
@@ -126,18 +125,15 @@ def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):
         assert np.abs(right - wrong).max() > 0.1 * np.abs(right).max()
 
 
-@lagged_once_or_twice
+@covering(name=("rod on plane", "rod on ball", "rod on capsule", "rod on mesh"), speed=(SLIDING, -SLIDING), lags=(1, 2))
 @pytest.mark.parametrize("ways", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
-@pytest.mark.parametrize("speed", [SLIDING, -SLIDING])
-@pytest.mark.parametrize("name", ["rod on plane", "rod on ball", "rod on capsule", "rod on mesh"])
 def test_friction_by_direction(name, speed, ways, lags):
     """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
     model, gradient, inputs, difference = differentiated(name, "barrier", 2, speed, ways, lags=lags, **RUBBING)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
-@each_law
-@pytest.mark.parametrize("name", ["crossing rods", "rod on ball", "rod on mesh", "sheets"])
+@covering(1, name=("crossing rods", "rod on ball", "rod on mesh", "sheets"), law=("barrier", "penalty"))
 def test_eight_steps_of_sliding(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **RUBBING)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "radius", "friction")))

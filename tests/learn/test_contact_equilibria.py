@@ -15,6 +15,7 @@ from tests.learn.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
 from tests.learn.differences import built, check, cotangent, parameter_shifts
 from tests.learn.test_contact_adjoint import number_shifts
 from tests.learn.test_equilibrium_adjoint import RTOL, check_load, difference_of, position_weights
+from tests.pairwise import covering
 
 slow = pytest.mark.slow
 WAY = np.linspace(-0.05, 0.05, 7)
@@ -74,8 +75,7 @@ def solved(name: str, law: str):
     return model, inputs, difference_of(model, state, weights, start=1.0)
 
 
-@pytest.mark.parametrize("law", ["barrier", "penalty"])
-@pytest.mark.parametrize("name", CASES)
+@covering(1, name=CASES, law=("barrier", "penalty"))
 def test_an_equilibrium_in_contact_by_its_parameters(name, law):
     model, inputs, difference = solved(name, law)
     check(

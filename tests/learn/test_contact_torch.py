@@ -13,6 +13,7 @@ torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
 from ddg_warp.torch.contact_parameters import contact_elements  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
+from tests.pairwise import covering  # noqa: E402
 
 RUBBING = {"friction": 0.3, "velocity": 0.05}
 
@@ -70,10 +71,10 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize(("law", "lags"), [("barrier", 1), ("penalty", 1), ("barrier", 2), ("barrier", 3)])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_moved_obstacles(shape, law, lags):
+@covering(1, shape=SHAPES, solves=(("barrier", 1), ("penalty", 1), ("barrier", 2), ("barrier", 3)))
+def test_moved_obstacles(shape, solves):
     """Poses of a grip that lifts, shifts and turns what a rod lies on, over four steps, and one that keeps the last pose."""
+    law, lags = solves
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
     bar(scene, RADIUS + 0.8 * RANGE)
     scene.add_obstacle(SHAPES[shape], motion=ddg.Grip(pivot=(0.01, 0.0, -0.02)), name="obstacle")
