@@ -510,7 +510,7 @@ def test_results_do_not_depend_on_the_rod_numbering(device, monkeypatch):
     results = []
     for by_node in (False, True):
         monkeypatch.setattr(
-            builder, "compile_net", lambda scene, along, by_node=by_node: compile_coupled(scene, by_node)
+            builder, "compile_coupled", lambda scene, along, by_node=by_node: compile_coupled(scene, by_node)
         )
         (scene, *_), t = stiffened(), np.linspace(0.0, 1.0, 12, endpoint=False)
         circle = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), 0 * t], 1)

@@ -95,7 +95,7 @@ def test_recorded_data_equal_the_states(kind, worlds, device, tmp_path):
             if options["directors"]:
                 np.testing.assert_array_equal(reader.directors[frame], state.directors())
             for name in names:
-                values = (ddg.ask.fields.point_fields if name in TERMS else ddg.ask.fields.cell_fields)(
+                values = (ddg.postprocess.fields.point_fields if name in TERMS else ddg.postprocess.fields.cell_fields)(
                     model, state, [name]
                 )[name]
                 np.testing.assert_array_equal(reader.fields[name][frame][-values.size :], values.ravel())

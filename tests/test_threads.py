@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve import statics
+from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.equilibrium.stability import spectrum
 
 def scene(number):

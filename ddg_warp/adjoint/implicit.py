@@ -268,7 +268,8 @@ def _require_minimum(adjoint: RodStepAdjoint, part) -> None:
     saddles = np.flatnonzero(adjoint.solve.failed.numpy())
     if len(saddles):
         raise SolverError(
-            f"{part.who(int(saddles[0]))} ended the step at no minimum of its energy: no gradient goes through it; take a smaller dt",
+            f"{part.island_label(int(saddles[0]))} ended the step at no minimum of its energy: no gradient goes "
+            "through it; take a smaller dt",
             outcome="no_gradient",
         )
 
@@ -289,5 +290,5 @@ def _require_one_solve(
         ),
     ):
         if refused.any():
-            who = part.who(int(np.argmax(refused)))
+            who = part.island_label(int(np.argmax(refused)))
             raise SolverError(f"{who} {reason}: no gradient goes through it; take a smaller dt", outcome="no_gradient")

@@ -179,7 +179,7 @@ def solve_kernels(twist: bool, span: int, linear):
     load, _, vector, store_vector = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = block_ldlt.functions(nb, linear)
     gather, angle_of = gather_function(twist, linear), angle_function(twist)
-    rhs, hand = solve_functions(twist, linear)
+    rhs_of, hand = solve_functions(twist, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def inward(
@@ -210,7 +210,7 @@ def solve_kernels(twist: bool, span: int, linear):
         U, V = load(factors, 0, k, r), M()
         if wp.static(span == 2):
             V = load(factors, wp.static(nb2), k, r)
-        rhs = rhs(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
+        rhs = rhs_of(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
         k = index_of(wp.min(1, n - 1), n, side)
         node = places[0, k, c]
         angle = angle_of(places, k, c)
@@ -220,7 +220,7 @@ def solve_kernels(twist: bool, span: int, linear):
             U_ahead, V_ahead = load(factors, 0, k, r), M()
             if wp.static(span == 2):
                 V_ahead = load(factors, wp.static(nb2), k, r)
-            rhs_ahead = rhs(residual, node, angle, fixed, first)
+            rhs_ahead = rhs_of(residual, node, angle, fixed, first)
             k = index_of(wp.min(j + 2, n - 1), n, side)
             node = places[0, k, c]
             angle = angle_of(places, k, c)
@@ -271,10 +271,10 @@ def solve_kernels(twist: bool, span: int, linear):
         value = vector(values, 0, k, r)
         h = n / 2
         a, a_right, C = B(), B(), M()
-        b_right = rhs(residual, places[0, h, c], angle_of(places, h, c), fixed_dofs[h, c], first)
+        b_right = rhs_of(residual, places[0, h, c], angle_of(places, h, c), fixed_dofs[h, c], first)
         b = b_right - vector(taken, 0, 1, r) - vector(taken, wp.static(nb), 0, r)
         if h > 0:
-            a_right = rhs(residual, places[0, h - 1, c], angle_of(places, h - 1, c), fixed_dofs[h - 1, c], first)
+            a_right = rhs_of(residual, places[0, h - 1, c], angle_of(places, h - 1, c), fixed_dofs[h - 1, c], first)
             a = a_right - vector(taken, 0, 0, r) - vector(taken, wp.static(nb), 1, r)
             C = load(factors, 0, h - 1, r)
             b -= a * C

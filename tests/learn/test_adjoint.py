@@ -252,7 +252,7 @@ SCENES |= TURNING
 @pytest.mark.parametrize("name", ["twisted", "joined", "stiffened", "turned_clamp", "turned_joined", *TURNING])
 def test_the_midpoint_rule_with_predictors_that_turn_edges(name, monkeypatch):
     """As those of stiff rods do, whose frames are carried to where turned edges lie."""
-    monkeypatch.setattr(precision, "TURNED", 1e-3)
+    monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, _, difference = differentiated(name, "implicit_midpoint", 1)
     check_state(model, gradient, difference)
 
@@ -305,7 +305,7 @@ SCENES |= LAGGED
 @pytest.mark.parametrize("name", LAGGED)
 def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
     """Both are found at the start of a solve, by velocities there, and by nodes there or where the step is predicted to lead."""
-    monkeypatch.setattr(precision, "TURNED", 1e-3)
+    monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, inputs, difference = differentiated(name, scheme, 2)
     check_state(model, gradient, difference, *parameter_shifts(model, inputs))
 

@@ -163,8 +163,8 @@ import itertools, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
 from test_episodes import record
-from ddg_warp.learn import episodes
-episodes.SHARE = float("inf")  # the index is saved with every episode, however busy the machine is
+from ddg_warp.data import episodes
+episodes.FRACTION = float("inf")  # the index is saved with every episode, however busy the machine is
 with episodes.EpisodeWriter({folder!r}) as writer:
     for index in itertools.count():
         with writer.episode(f"run_{{index}}") as directory:

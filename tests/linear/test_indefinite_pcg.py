@@ -47,7 +47,7 @@ def test_lost_direction_drops_second_derivatives(device, monkeypatch):
 
     exact, _ = advanced("float64", rtol=1e-10)
     monkeypatch.setattr(
-        step_driver, "suited", lambda *_: step_driver.LinearSolverChoice(wp.float32, True, False)
+        step_driver, "choose_solver", lambda *_: step_driver.LinearSolverChoice(wp.float32, True, False)
     )  # instead of the solver selection
     points, mixed = advanced("mixed")
     assert mixed["linear"] == ["float32"]
