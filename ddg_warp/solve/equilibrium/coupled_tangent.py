@@ -1,4 +1,4 @@
-"""What a net contributes to a model's energy and tangent on the host; dofs are its blocks, three each, world by world."""
+"""Energy and tangent of the coupled system on the host; dofs are its blocks, three each, world by world."""
 
 from functools import cached_property
 
@@ -20,7 +20,7 @@ from ddg_warp.solve.linear.skew_supports import HostPlanes
 
 
 class CoupledTangent(TangentBlock):
-    """The part of the net. See `Tangent` for the methods."""
+    """Tangent block of the coupled system. See `Tangent` for the methods."""
 
     def __init__(self, model, offset: int):
         host, worlds = model.coupled.host, model.worlds
@@ -30,8 +30,8 @@ class CoupledTangent(TangentBlock):
         super().__init__(model, model.coupled, offset, 3 * host.blocks * worlds)
         self.coupled, self.block = model.coupled, 3
         self.body_count, self.islands = host.bodies.count * worlds, worlds
-        self.rate = model.coupled.still  # over what strain-rate damping counts: at rest not
-        self.given_field = np.zeros((worlds, 3))  # of controls, over that of the scene [T]
+        self.rate = model.coupled.still  # inverse time of strain-rate damping: zero at rest
+        self.given_field = np.zeros((worlds, 3))  # field of controls, added to the scene's [T]
         self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
@@ -42,7 +42,7 @@ class CoupledTangent(TangentBlock):
 
     @cached_property
     def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
-        """Of each set B and where the entries of its elements go in the Hessian, column by column; rows and starts of columns."""
+        """Sparsity pattern: (B, positions of element entries) of each set; rows and column starts of the Hessian (CSC)."""
         entries, local = [], []
         for part in self.coupled.sets:
             to_local, slot, component = _local(part.term.measure)
@@ -55,7 +55,7 @@ class CoupledTangent(TangentBlock):
         return list(zip(local, places, strict=True)), rows, np.searchsorted(columns, np.arange(self.size + 1))
 
     def energies(self, state):
-        """(term's name, energies of its elements (worlds, elements))."""
+        """Yield (term's name, energies of its elements (worlds, elements))."""
         for i, part in enumerate(self.coupled.sets):
             out = wp.zeros(part.elements * self.coupled.worlds, dtype=self.coupled.real, device=self.coupled.device)
             self._launch(state, i, 0, out, ())
@@ -73,7 +73,7 @@ class CoupledTangent(TangentBlock):
         return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
 
     def elastic_gradient(self, state) -> np.ndarray:
-        """The same without what touches."""
+        """Return the energy gradient without contact."""
         result = np.zeros((self.size // 3, 3))
         for i, part in enumerate(self.coupled.sets):
             slots, forces = part.host.slots, self.forces(state, i)
@@ -83,7 +83,7 @@ class CoupledTangent(TangentBlock):
         return self.into(result.ravel())
 
     def into(self, values: np.ndarray) -> np.ndarray:
-        """In the frames of oblique planes where there are any."""
+        """Return values in the nodal frames of skew supports, if any."""
         return self.planes.into(values) if self.planes else values
 
     def back(self, values: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ class CoupledTangent(TangentBlock):
         return self.planes.matrix(values) if self.planes else values
 
     def forces(self, state, index: int) -> np.ndarray:
-        """Derivative of the energy of every element of a set with respect to the blocks of its slots (slots, elements, 3)."""
+        """Return the energy derivatives of a set's elements by the blocks of their local nodes (local nodes, elements, 3)."""
         part = self.coupled.sets[index]
         shape = (len(part.host.slots), part.elements * self.coupled.worlds)
         out = wp.zeros(shape, dtype=self.coupled.vector, device=self.coupled.device)
@@ -105,7 +105,7 @@ class CoupledTangent(TangentBlock):
         return self.potential_hessian(state, stress)
 
     def potential_hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
-        """The same without friction, which has no potential, where there is some."""
+        """Return the Hessian without friction, which has no potential."""
         scatter, rows, starts = self._pattern
         total = np.zeros(len(rows))
         for i, part in enumerate(self.coupled.sets):
@@ -128,15 +128,15 @@ class CoupledTangent(TangentBlock):
         return self.matrix(elastic)
 
     def linear_stress(self, state, step: np.ndarray) -> list:
-        """Stresses (strains, elements) of every set that the strains e + J step have."""
+        """Return the stresses (strains, elements) of every set at the strains e + J step."""
         result = []
         change = wp.array(self.back(step).reshape(-1, 3), dtype=self.coupled.vector, device=self.coupled.device)
         for i, part in enumerate(self.coupled.sets):
             shape = (len(part.term.measure.strains), part.elements * self.coupled.worlds)
             out = wp.zeros(shape, dtype=self.coupled.real, device=self.coupled.device)
-            given = self.coupled.elements(state.coupled, i, rate=self.rate)
+            inputs = self.coupled.elements(state.coupled, i, rate=self.rate)
             kernel = linear_stress_kernel(part.term, self.coupled.real)
-            wp.launch(kernel, (self.coupled.worlds, part.elements), [given, change], [out], device=self.coupled.device)
+            wp.launch(kernel, (self.coupled.worlds, part.elements), [inputs, change], [out], device=self.coupled.device)
             result.append(out.numpy().astype(np.float64))
         return result
 
@@ -157,9 +157,9 @@ class CoupledTangent(TangentBlock):
         state.coupled.q.assign(self.back(q).reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.geometry.edge_rotation`.
+        """Return q moved along `step` by rotating edges of rods; see `ddg_warp.geometry.edge_rotation`.
 
-        Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
+        Rods are processed in rod order, from their supports: a rod is anchored where it meets processed rods or a shell.
         """
         q, step = self.back(q), self.back(step)
         moved = q + step
@@ -169,9 +169,9 @@ class CoupledTangent(TangentBlock):
             excess = np.zeros((self.host.nodes, 3))
             placed = self._anchored.copy()
             for rod in order:
-                at, closed = rod.all_nodes, rod.piece.kind.closed
-                excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
-                placed[at] = True
+                nodes, closed = rod.all_nodes, rod.piece.kind.closed
+                excess[nodes] = turned(x[world][nodes], dx[world][nodes], placed[nodes], excess[nodes], closed)
+                placed[nodes] = True
             out[world][: self.host.nodes] += excess
         return self.into(moved)
 
@@ -179,18 +179,18 @@ class CoupledTangent(TangentBlock):
     def _motion(self) -> CoupledMotion:
         return CoupledMotion(self.model)
 
-    def move_supports(self, state, before: float, at: float) -> None:
-        """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
+    def move_supports(self, state, before: float, load_factor: float) -> None:
+        """Move supports of a state at load parameter `before` to load parameter `load_factor`."""
         if self.host.moves:
-            self._motion.put(state, before, at, state.coupled.q, state.coupled.frame)
-        self.prescribe(state, at)
+            self._motion.put(state, before, load_factor, state.coupled.q, state.coupled.frame)
+        self.prescribe(state, load_factor)
 
-    def give(self, found: dict[str, np.ndarray]) -> None:
-        super().give(found)
-        self.given_field[:] = found.get("field", 0.0)
+    def give(self, inputs: dict[str, np.ndarray]) -> None:
+        super().give(inputs)
+        self.given_field[:] = inputs.get("field", 0.0)
 
-    def prescribe(self, state, at: float) -> None:
-        """Put the normals that supports turn, and the magnetic field, where they are at load parameter `at`."""
+    def prescribe(self, state, load_factor: float) -> None:
+        """Set rotating support normals and the magnetic field to load parameter `load_factor`."""
         for index, data in state.coupled.data.items():
             part = self.coupled.sets[index]
             values = data.numpy().astype(np.float64)
@@ -199,33 +199,33 @@ class CoupledTangent(TangentBlock):
                 chosen = part.turning[:, 2] == motion
                 element, row, _ = part.turning[chosen].T
                 moved = self.model.motions[motion]
-                if isinstance(moved, Grip):  # which every world has elsewhere
+                if isinstance(moved, Grip):  # posed by world
                     where = state.poses().reshape(self.coupled.worlds, -1, 6)[:, self.model.grips.index(moved)]
                 else:
-                    where = at
+                    where = load_factor
                 turned = moved.turn(where, part.turning_rest[chosen])
                 for d in range(3):
                     values[row + d, element + columns] = turned[..., d]
             if part.term.measure.field:
                 first = part.term.measure.data_size - part.term.measure.field
-                values[first:] = self.model.scene.applied_field.at(at, at)[:, None]
-                values[first : first + 3] += np.repeat(at * self.given_field, part.elements, axis=0).T
+                values[first:] = self.model.scene.applied_field.at(load_factor, load_factor)[:, None]
+                values[first : first + 3] += np.repeat(load_factor * self.given_field, part.elements, axis=0).T
             data.assign(values)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
-        """Edge vectors (E, 3)."""
+        """Return the edge vectors (E, 3)."""
         x = self.back(q).reshape(self.coupled.worlds, -1, 3)
         first, second = self.host.edges.T
         return (x[:, second] - x[:, first]).reshape(-1, 3)
 
     def edge_dofs(self) -> np.ndarray:
-        """Dofs of the positions of both ends of all edges (2, E, 3)."""
+        """Return the position dofs of both ends of all edges (2, E, 3)."""
         blocks = self.host.edges.T[:, None] + self.host.blocks * np.arange(self.coupled.worlds)[:, None]
         return 3 * blocks.reshape(2, -1)[..., None] + np.arange(3)
 
     @cached_property
     def balances(self) -> np.ndarray:
-        """Which dofs have forces that add up to nothing over a free piece (size,) bool: radial ones of revolution do not."""
+        """Mask of dofs whose forces sum to zero over a free body (size,); false for radial dofs of bodies of revolution."""
         result = np.repeat(np.arange(self.host.blocks)[:, None] < self.host.nodes, 3, axis=1)
         for shell in self.host.meridians:
             result[shell.nodes, :2] = False
@@ -233,52 +233,52 @@ class CoupledTangent(TangentBlock):
 
     @cached_property
     def component(self) -> np.ndarray:
-        """Index of the connected component of every dof (size,); what touches may connect all of a world."""
+        """Index of the connected component of every dof (size,); one component a world with contact."""
         bodies = self.host.bodies
-        own = np.zeros(self.host.blocks, int) if self.model.touch else bodies.components[bodies.owner]
-        worlds = np.arange(self.worlds)[:, None] * (own.max() + 1)
-        return np.repeat((worlds + own).ravel(), 3)
+        components = np.zeros(self.host.blocks, int) if self.model.touch else bodies.components[bodies.owner]
+        worlds = np.arange(self.worlds)[:, None] * (components.max() + 1)
+        return np.repeat((worlds + components).ravel(), 3)
 
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
+        """Return the sum of the outer forces on every body, or its largest support force if larger (worlds bodies,) [N]."""
         bodies, shape = self.host.bodies, (self.coupled.worlds, self.host.blocks, 3)
         gradient = np.array(gradient).reshape(shape)
         gradient[:, self.host.of_obstacles] = 0.0
         gradient, result = gradient.ravel(), []
-        for own, force in zip(
+        for applied, force in zip(
             np.where(self.free & ~self.angle, np.abs(outer), 0.0).reshape(shape),
             np.where(~self.free & ~self.angle, gradient, 0.0).reshape(shape),
             strict=True,
         ):
-            result.append(bodies.loads(own.sum(1), bodies.support(force)))
+            result.append(bodies.loads(applied.sum(1), bodies.support(force)))
         return np.concatenate(result)
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:
-        """Residuals at rtol = 1 (size,) [N, N m] of bodies with such loads; see `ddg_warp.compile.residual_tolerance`."""
-        blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.coupled.worlds, -1)]
+        """Return the residual tolerance at rtol = 1 (size,) [N, N m] from body loads; see `ddg_warp.compile.residual_tolerance`."""
+        blocks = [self.host.bodies.limits(body_loads) for body_loads in loads.reshape(self.coupled.worlds, -1)]
         return np.repeat(np.concatenate(blocks), 3)
 
     def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
-        """Whether residuals add up to little, and the largest excess over rounding, world by world; see `tolerance.largest_excess`."""
+        """Return the subset residual test and the largest excess over rounding by world; see `residual_tolerance.largest_excess`."""
         by_world = loads.reshape(self.coupled.worlds, -1), residual.reshape(self.coupled.worlds, -1, 3)
         floors = floor.reshape(self.coupled.worlds, -1, 3).max(2)
-        found = [
-            largest_excess(self.host.bodies.levels, own, rtol, r, f)
-            for own, r, f in zip(*by_world, floors, strict=True)
+        tests = [
+            largest_excess(self.host.bodies.levels, body_loads, rtol, r, f)
+            for body_loads, r, f in zip(*by_world, floors, strict=True)
         ]
-        return tuple(np.array(values) for values in zip(*found, strict=True))
+        return tuple(np.array(values) for values in zip(*tests, strict=True))
 
     def edge_length(self) -> float:
-        """Mean rest length of edges [m]."""
+        """Return the mean rest length of edges [m]."""
         return float(self.host.edge_lengths.mean())
 
     def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of `State.points`, and the dofs (rows, 3) of the first world."""
+        """Return the rows of `State.points`, and the dofs (rows, 3) of the first world."""
         rows, blocks = self.model.order.net_rows
         return rows, self.host.dofs(blocks)
 
     def bodies(self) -> list[Body]:
-        """Rods with the rotations of their rigid joints, shells, and shells of revolution, of every world."""
+        """Return rods with the rotations of rigid joints, shells, and shells of revolution, of every world."""
         host, none = self.host, np.zeros(0, int)
         joints = [part for part in host.sets if part.term.measure.spins]
         parts = []
@@ -298,25 +298,25 @@ class CoupledTangent(TangentBlock):
         return result
 
     def where(self, dof: int) -> str:
-        """Name of a dof's place."""
+        """Return the label of the node, edge or joint of a dof."""
         block = dof // 3 % self.host.blocks
         for rod in self.host.rods:
-            for what, blocks in (("node", rod.nodes), ("edge", rod.edges)):
+            for label, blocks in (("node", rod.nodes), ("edge", rod.edges)):
                 if block in blocks:
-                    return f"{what} {int(np.flatnonzero(blocks == block)[0])} of rod {rod.rod}"
+                    return f"{label} {int(np.flatnonzero(blocks == block)[0])} of rod {rod.rod}"
         for i, shell in enumerate(self.host.shells):
-            for what, blocks in (("vertex", shell.nodes), ("mesh edge", shell.edges)):
+            for label, blocks in (("vertex", shell.nodes), ("mesh edge", shell.edges)):
                 if block in blocks:
-                    return f"{what} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
+                    return f"{label} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
         for i, meridian in enumerate(self.host.meridians):
             if block in meridian.nodes:
                 return f"node {int(np.flatnonzero(meridian.nodes == block)[0])} of axisymmetric shell {i}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
-    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
+    def _launch(self, state, index: int, kernel: int, out: wp.array, columns: tuple, *more) -> None:
         part, real = self.coupled.sets[index], self.coupled.real
         wp.launch(
-            element_path.term_kernels(coupled_storage(part.term, real), 0, real)[which],
+            element_path.term_kernels(coupled_storage(part.term, real), 0, real)[kernel],
             (self.coupled.worlds, part.elements, *columns),
             [self.coupled.elements(state.coupled, index, rate=self.rate), *more],
             [out],
@@ -325,24 +325,24 @@ class CoupledTangent(TangentBlock):
 
 
 def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
-    """Slots (n, W E) of all worlds."""
+    """Return the blocks of local nodes (n, W E) of all worlds."""
     return np.concatenate([slots + world * blocks for world in range(worlds)], axis=1)
 
 
 def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """B of an element: (local dofs, dofs of its slots that they depend on); and slot and component of these."""
+    """Return B of an element (local dofs, block dofs), and the local node and component of its columns."""
     full = np.zeros((measure.size, measure.slots, 3))
     for i, (a, b) in enumerate(measure.edges):
         full[3 * i : 3 * i + 3, b] += np.eye(3)
         full[3 * i : 3 * i + 3, a] -= np.eye(3)
-    at = 3 * len(measure.edges)
+    row = 3 * len(measure.edges)
     for i in range(measure.angles):
-        full[at + i, measure.nodes + i, 0] = 1.0
+        full[row + i, measure.nodes + i, 0] = 1.0
     for i in range(measure.spins):
-        rows = at + measure.angles + 3 * i
+        rows = row + measure.angles + 3 * i
         full[rows : rows + 3, measure.nodes + measure.angles + i] = np.eye(3)
-    at += measure.angles + 3 * measure.spins
+    row += measure.angles + 3 * measure.spins
     for i in range(measure.points):
-        full[at + 3 * i : at + 3 * i + 3, i] = np.eye(3)
+        full[row + 3 * i : row + 3 * i + 3, i] = np.eye(3)
     slot, component = np.nonzero(full.any(0))
     return full[:, slot, component], slot, component

@@ -1,4 +1,4 @@
-"""The chain preconditioner of a net on a device; see `kernels.linear.rod_substructuring` and `joint_schur`."""
+"""Substructuring preconditioner of the coupled system; see `kernels.linear.rod_substructuring` and `joint_schur`."""
 
 from functools import cached_property
 
@@ -18,24 +18,24 @@ from ddg_warp.solve.linear.solver_selection import long_and_few
 from ddg_warp.solve.linear.substructuring_plan import SubstructuringPlan
 from ddg_warp.solve.linear.twisted_factorisation import TwistedFactorisation
 
-SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
+SERIAL = 32  # block size of sweeps with one thread a rod path: few paths spread over the multiprocessors
 
 
 class RodSubstructuring:
-    """The rods of a net as chains between their joints, and the preconditioner they make.
+    """Rod paths between joints, eliminated as the preconditioner of the coupled system.
 
     Args:
-        net: its `CoupledModel`.
-        banded: whether blocks of H between their places are kept here, in bands, and not among the positions of a `SparseSystem`.
-        split: whether tensions of edges are unknowns, see `kernels.linear.mixed_axial_force`; where `splits` says that they can be.
+        coupled: the `CoupledModel`.
+        banded: True to store blocks of H between path nodes in bands here, instead of among the positions of a `SparseSystem`.
+        split: True for edge tensions as unknowns, see `kernels.linear.mixed_axial_force`; allowed if `splits`.
 
     Attributes:
-        idle: chains of all worlds (columns,) that take no part in a direction are not zero, see `SleepingIslands`; zero without it.
-        exact: whether the preconditioner is the inverse of H, so that a direction takes no conjugate gradients; see `bind`.
-        longer (2, longest, columns): if `split`, slack and lengthening of the edges behind places by the last direction.
+        idle: rod paths of all worlds (columns,), nonzero where inactive in a direction, see `SleepingIslands`; otherwise zero.
+        exact: True if the preconditioner is the inverse of H, so that directions need no conjugate gradients. See `bind`.
+        longer (2, longest, columns): if `split`, slack and lengthening of the edges behind path nodes by the last direction.
 
     Raises:
-        SceneError: the net has no rods.
+        SceneError: the coupled system has no rods.
     """
 
     def __init__(self, coupled, banded: bool, split: bool = False):
@@ -50,17 +50,19 @@ class RodSubstructuring:
 
     @classmethod
     def of(cls, coupled, preconditioner: str, banded: bool = True, split: bool = False) -> "RodSubstructuring | None":
-        """The chains of a preconditioner, in bands where these serve it; None of one without chains."""
+        """Return the substructuring of a preconditioner, in bands if possible; None for preconditioners without substructuring."""
         if preconditioner not in ("chain", "chain_multilevel"):
             return None
         return cls(coupled, banded and preconditioner == "chain" and not coupled.host.frames, split)
 
     @property
     def splits(self) -> bool:
-        """Whether tensions of edges may be unknowns, once the plan is bound: of chains alone, each walked along by a thread.
+        """True if edge tensions may be unknowns, once the plan is bound: only rod paths without joints, one thread a path.
 
-        Between joints that move they were tried, too: as right as float64, 5 to 17 % slower than it on an H200 and 1.2 to 2 times on a
-        CPU core (gridshells of 8 edges, EA L^2 / EI = 1e8, and hair with twigs, where 1/60 s took 11 iterations instead of 7).
+        Alternative: edge tensions as unknowns between moving joints.
+
+        Measured: as accurate as float64, 5 to 17 % slower on an H200 and 1.2 to 2 times slower on a CPU core.
+        Scenes: gridshells of 8 edges, EA L^2 / EI = 1e8, and hair with twigs, where 1/60 s took 11 iterations instead of 7.
         """
         longest, width = self.plan.chain.shape
         few = long_and_few(longest, self.coupled.worlds * width, wp.get_device(self.device))
@@ -69,10 +71,9 @@ class RodSubstructuring:
     def bind(
         self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
     ) -> None:
-        """Take the `SparseSystem` of the net, without what bands keep, and what the elements of all sets write; see `MatrixAssembly`.
+        """Bind the `SparseSystem`, without entries stored in bands, and the element outputs of all sets; see `MatrixAssembly`.
 
-        With `reuse` one matrix serves several directions. In contact there is more to H than is here, which goes into `eliminated`
-        before `prepare`.
+        With `reuse` one matrix serves several directions. Contact blocks of H are added to `eliminated` before `prepare`.
         """
         self.table, coupled, plan = table, self.coupled, self.plan
         plan.bind(coupled.host, table.rows.numpy(), table.columns.numpy(), self.kept)
@@ -85,7 +86,7 @@ class RodSubstructuring:
 
         self.places = device_arrays.upload(plan.places.astype(np.int32), int, device)
         self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
-        self._at_none = put(np.flatnonzero(plan.where < 0))  # blocks without a place
+        self._at_none = put(np.flatnonzero(plan.where < 0))  # blocks outside rod paths
         self.held = device_arrays.upload(plan.held(coupled.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
@@ -99,23 +100,23 @@ class RodSubstructuring:
             self._all = put(np.tile(plan.count, worlds))
             self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
             self.bands = self.factors
-        elif not self.banded or self.exact:  # nobody asks for the blocks once they are factored
+        elif not self.banded or self.exact:  # the blocks are not needed after factorisation
             self.bands = self.factors
         else:
             self.bands = device_arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
-        self.eliminated = self.bands  # what is factored
+        self.eliminated = self.bands  # blocks to factorise
         if self._contact and self.banded:
             self.eliminated = device_arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
         self.values = device_arrays.allocate((block, self.longest, self.columns), linear, device)
         self.responses = device_arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
         self.has_links = len(plan.of_places[1]) > 0
-        # whether chains and what is at their places are all that there is to further right-hand sides
+        # True if further right-hand sides involve rod paths alone
         self._at_places = self.reduction is not None and self.reduction.repeats and not len(plan.pairs)
         self.met = None if plan.met is None else device_arrays.upload(plan.met.astype(np.int32), int, device)
         self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
         self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
         self.colour, self.taken = put(plan.colour), put(plan.taken)
-        self._clears = self.banded and not self.exact and plan.taken.size > 0  # for products, which are of all of H
+        self._clears = self.banded and not self.exact and plan.taken.size > 0  # for products with all of H
         self.starts, self.items = map(put, plan.of_places)
         self.joint_starts, self.joint_items = map(put, plan.of_joints)
         self.moved = wp.zeros(max(1, worlds * self.joint_rows), dtype=H, device=device)
@@ -123,9 +124,9 @@ class RodSubstructuring:
         self.parts = wp.zeros((3, max(1, worlds * self.joints)), dtype=M, device=device)
         sets = self.along if self.banded else []
         terms = tuple(coupled.sets[i].term for i in sets)
-        late = tuple(exact_from[i] for i in sets)
+        exact_iterations = tuple(exact_from[i] for i in sets)
         self._assemble, self._clear, self._product = rod_bands.band_kernels(
-            terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
+            terms, plan.twist, plan.span, real, linear, exact_iterations, drag, serial, self.split
         )
         if serial:
             self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, self.split)
@@ -133,14 +134,14 @@ class RodSubstructuring:
         for name in ("places", "chain", "count", "held", "idle"):
             setattr(self.layout, name, getattr(self, name))
         self.layout.diagonal, self.layout.positions = table.diagonal, table.positions
-        # structs on the host keep arrays alive that those on the device point to
+        # structs on the host keep the arrays alive that device structs point to
         self._of_sets = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
         self._own = wp.array(self._of_sets, dtype=along_type(real, linear), device=device)
         if self.banded:
             self._balance = path_node_kernel(terms, plan.twist, real, linear, drag, self._contact, serial)
-            apart = np.zeros(coupled.blocks, np.uint8)
-            apart[self.elsewhere] = 1
-            self._apart = wp.array(apart, dtype=wp.uint8, device=device)
+            outside = np.zeros(coupled.blocks, np.uint8)
+            outside[self.elsewhere] = 1
+            self._apart = wp.array(outside, dtype=wp.uint8, device=device)
         made = rod_substructuring.path_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joint_schur.joint_kernels(linear) if self.joints else (None, None)
@@ -153,52 +154,52 @@ class RodSubstructuring:
             self.longer = device_arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = rod_bands.lengthen_kernel(terms, real, linear)
         if self.exact and serial and not (self.reduction or reuse or self.split):
-            self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
+            self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, exact_iterations, drag, self.joints > 0)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._walk] if self._walk else [self._assemble]
+        result = [self._walk] if self._walk else [self._assemble]
         if self._both:
-            own += self._both.kernels
+            result += self._both.kernels
         elif self._walk_places:
-            own += [] if self._walk else [(self._walk_places, SERIAL)]
+            result += [] if self._walk else [(self._walk_places, SERIAL)]
         else:
-            own += [self._load] if self.has_links or not self._walk else []
-            own += [self._finish] if self.joints or not self._walk else []
+            result += [self._load] if self.has_links or not self._walk else []
+            result += [self._finish] if self.joints or not self._walk else []
         if self.reduction:
-            own += [*self._columns, *self.reduction.kernels]
-            own += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
+            result += [*self._columns, *self.reduction.kernels]
+            result += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
         elif not self._both:
-            own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
-            own += [(self._solve_all, SERIAL)] if self.has_links else []
-        own += [self._balance] if self.banded else []
-        own += [self._lengthen] if self.split else []
-        own += [self._clear] if self._clears else []
-        own += [self._product] if self.banded and not self.exact else []
-        own += [self._follow] if self.met is not None else []
-        return own + ([self._measure, self._meet] if self.joints else [])
+            result += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
+            result += [(self._solve_all, SERIAL)] if self.has_links else []
+        result += [self._balance] if self.banded else []
+        result += [self._lengthen] if self.split else []
+        result += [self._clear] if self._clears else []
+        result += [self._product] if self.banded and not self.exact else []
+        result += [self._follow] if self.met is not None else []
+        return result + ([self._measure, self._meet] if self.joints else [])
 
     @cached_property
     def elsewhere(self) -> np.ndarray:
-        """Blocks that are not at a place, or at which elements meet that do not run along rods."""
-        found = self.plan.where < 0
+        """Blocks outside rod paths, or with elements that do not run along rods."""
+        outside = self.plan.where < 0
         for part in self.coupled.sets:
             if not part.host.along:
-                found[part.host.slots.ravel()] = True
-        return np.flatnonzero(found)
+                outside[part.host.slots.ravel()] = True
+        return np.flatnonzero(outside)
 
-    def balance(self, given, islands, found) -> None:
-        """Residuals of all blocks but those `elsewhere`."""
+    def balance(self, inputs, islands, residual) -> None:
+        """Compute the residuals of all blocks except `elsewhere`."""
         self._launch(
             self._balance,
             (device_arrays.takers(self.longest, self.device), self.columns),
-            [given, self.places, self.count, self._apart, *islands.arrays, self._own],
-            [found],
+            [inputs, self.places, self.count, self._apart, *islands.arrays, self._own],
+            [residual],
         )
 
     def assemble(self, matrix: wp.array, mass: wp.array, islands) -> None:
-        """Blocks of the chains of the worlds that want a direction."""
+        """Assemble the rod-path blocks of the worlds that need a direction."""
         self._launch(
             self._assemble,
             (device_arrays.takers(self.longest, self.device), self.columns),
@@ -210,7 +211,7 @@ class RodSubstructuring:
             self._launch(self._clear, (self.taken.size, self.coupled.worlds), inputs, [matrix])
 
     def product(self, matrix, p: wp.array, inactive_mask, wanted, product: wp.array, dots: wp.array) -> None:
-        """H p with what the bands make of p, and p . H p block by block."""
+        """Write H p, bands included, and p . H p block by block."""
         table, coupled, threads = self.table, self.coupled, 1
         inputs = [matrix, table.columns, table.slices, inactive_mask, p, wanted, coupled.blocks, table.positions]
         inputs += [self.bands, self.places, self.count, self.idle]
@@ -220,14 +221,14 @@ class RodSubstructuring:
             threads = of_places + coupled.worlds * len(self._at_none)
         self._launch(self._product, threads, inputs, [product, dots])
 
-    def direct(self, matrix, mass, islands, anew, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots) -> None:
-        """H^-1 r of the worlds that want a direction, where this is exact; raises `lost` where H is indefinite.
+    def direct(self, matrix, mass, islands, updated_islands, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots) -> None:
+        """Write H^-1 r of the worlds that need a direction, if `exact`; raise `lost` where H is indefinite.
 
-        H is new in the islands `anew`.
+        `updated_islands` are the islands whose H is new.
         """
         if not self._walk:
-            self.assemble(matrix, mass, anew)
-            self.prepare(matrix, fixed, anew.needs_direction, lost)
+            self.assemble(matrix, mass, updated_islands)
+            self.prepare(matrix, fixed, updated_islands.needs_direction, lost)
             self.apply(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
             if self.split:
                 inputs = [*islands.arrays, self.layout, self._own, self.values]
@@ -244,7 +245,7 @@ class RodSubstructuring:
             self._apply_joints(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
 
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
-        """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
+        """Factorise rod paths and joints of the worlds that need a direction; raise `lost` where one is indefinite."""
         self._lost = lost
         if self.reduction and self.reduction.repeats:
             self._spread(wanted)
@@ -264,25 +265,25 @@ class RodSubstructuring:
             self._prepare_joints(matrix, fixed, wanted, lost)
 
     def apply(self, matrix, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
-        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block.
+        """Write z of rod and joint blocks from the residual, and r . z block by block; other blocks keep block Jacobi's z.
 
-        Blocks that are barred (W N,), with all bits set, keep theirs.
+        Blocks whose dofs are all set in `inactive_mask` (W N,) keep their z.
         """
-        at = residual, self.places, self.held, self.count, self.idle, wanted, self.coupled.blocks
+        inputs = residual, self.places, self.held, self.count, self.idle, wanted, self.coupled.blocks
         if self._walk_places:
-            self._launch(self._walk_places, self.columns, [self.factors, *at], [self.values, z, dots], SERIAL)
+            self._launch(self._walk_places, self.columns, [self.factors, *inputs], [self.values, z, dots], SERIAL)
             return
         if self._both:
-            self._both.solve(self.factors, at, self.values, z, dots)
+            self._both.solve(self.factors, inputs, self.values, z, dots)
             return
         if self._at_places:
-            self.reduction.again_at_places(self.plan.twist, *at, z, dots)
+            self.reduction.again_at_places(self.plan.twist, *inputs, z, dots)
             return
         self._eliminate(matrix, wanted, self.values, residual, None)
         self._apply_joints(matrix, residual, inactive_mask, wanted, z, dots)
 
     def _prepare_joints(self, matrix, fixed, wanted, lost: wp.array) -> None:
-        """Factors of joints, once those of chains are there."""
+        """Factorise the joints, after the rod paths."""
         if self.has_links:
             self._eliminate(matrix, wanted, self.responses, None, self.units)
         self._launch(
@@ -294,7 +295,7 @@ class RodSubstructuring:
         )
 
     def _apply_joints(self, matrix, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
-        """z from what chains make of the residual on their own."""
+        """Complete z from the residual eliminated along rod paths."""
         coupled = self.coupled
         if self.joints:
             self._launch(
@@ -336,7 +337,7 @@ class RodSubstructuring:
         return [self.table.columns, *chains, self.pairs]
 
     def _eliminate(self, matrix, wanted, values: wp.array, residual, moved) -> None:
-        """H_II^-1 (r_I - H_IJ z_J), of movements one by one or all at once; without `residual` or `moved` that one is zero."""
+        """Write H_II^-1 (r_I - H_IJ z_J), for one joint movement or all; None for `residual` or `moved` means zero."""
         table, coupled, solves = self.table, self.coupled, values.shape[2] // self.columns
         self._launch(
             self._load,
@@ -355,7 +356,7 @@ class RodSubstructuring:
         self._launch(kernel, solves // sides * self.columns, inputs, [values], SERIAL)
 
     def _reduce(self, values: wp.array, wanted: wp.array) -> None:
-        """H_II^-1 of values by cyclic reduction, which eliminates long chains anew every time."""
+        """Write H_II^-1 values by block cyclic reduction, which repeats the elimination for every right-hand side."""
         for first in range(0, values.shape[2], self.columns):
             part = values[:, :, first : first + self.columns]
             if self.reduction.repeats:
@@ -366,23 +367,23 @@ class RodSubstructuring:
             self._note()
 
     def _spread(self, wanted: wp.array) -> None:
-        """Which chains are wanted, of the worlds that are."""
+        """Mark the rod paths of the wanted worlds."""
         self._launch(self._columns[0], self.columns, [wanted, self.idle, self.width], [self._wanted])
 
     def _note(self) -> None:
-        """Raise what is lost of worlds by what their chains lose."""
+        """Raise `lost` of worlds whose rod paths lost a pivot."""
         self._launch(self._columns[1], self.columns, [self.width], [self._bad, self._lost])
 
     def _elements(self, index: int, written: dict, real, linear):
-        """What the elements of a set write, and where they are."""
-        part, own = self.coupled.sets[index], along_type(real, linear)()
+        """Return the output arrays of an element set with the path nodes of its elements."""
+        part, struct = self.coupled.sets[index], along_type(real, linear)()
         for name, array in written.items():
-            setattr(own, name, array)
-        own.at = device_arrays.upload(
+            setattr(struct, name, array)
+        struct.at = device_arrays.upload(
             self.plan.elements(self.coupled.host, part.host).astype(np.int32), int, self.device
         )
-        own.elements = part.elements
-        return own
+        struct.elements = part.elements
+        return struct
 
     def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = device_arrays.THREADS) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)

@@ -1,4 +1,4 @@
-"""Newton on a net by preconditioned conjugate gradients; every world has its own loop, all on the device."""
+"""Newton's method on the coupled system by preconditioned conjugate gradients; one device-side loop a world."""
 
 import math
 from functools import cached_property, partial
@@ -30,27 +30,27 @@ from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION, FROZEN, FROZ
 from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
-STRAIGHT = 1e-9  # turn between edges of a rod at rest that may be rounding [rad]
-RESCALED = 2.0**12  # change of the natural scale that conjugate gradients take as it is
-LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
+STRAIGHT = 1e-9  # rest turning angle between edges that may be rounding [rad]
+RESCALED = 2.0**12  # change of the natural scale that conjugate gradients tolerate
+LOOSEST = 0.1  # largest forcing term (Eisenstat and Walker): relative tolerance of a direction
 
 
 class CoupledNewton:
-    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `RodNewton`.
+    """Newton's method on all worlds of the coupled system, with the buffers of a solve. Attributes: see also `RodNewton`.
 
     Args:
-        preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
-            `kernels.linear.rod_substructuring`), "multilevel" (see `kernels.linear.multilevel`), or "chain_multilevel", both.
-        linear: scalar type of the linear algebra; that of the model by default.
-        drag: whether a block has more than a mass; see `kernels.forces.drag`.
-        reuse: whether the matrix of a step's first iterate serves the whole step.
-        split: whether edges may be stiffer than the matrix carries, where that can be; see `RodSubstructuring.splits`.
+        preconditioner: of conjugate gradients: "block_jacobi", "chain" (substructuring, see `kernels.linear.rod_substructuring`),
+            "multilevel" (see `kernels.linear.multilevel`), or "chain_multilevel", both.
+        linear: scalar type of the linear algebra; default: the model's.
+        drag: True if blocks have more than a mass; see `kernels.forces.drag`.
+        reuse: True if the matrix of a step's first iterate serves the whole step.
+        split: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.splits`.
 
     Attributes:
-        barred: (W N,) bits of dofs that a direction leaves where they are: held ones and, in contact, those of what rests.
+        inactive_mask: (W N,) bits of dofs that a direction leaves unchanged: fixed dofs and, in contact, dofs of sleeping islands.
     """
 
-    banded = True  # whether chains keep their part of H, which holds on free dofs alone
+    banded = True  # True if substructuring stores its blocks of H, which are valid on free dofs alone
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class CoupledNewton:
         self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else coupled.mass
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
-        self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
+        self.held = self.fixed  # spatial components, for predictors: rates along skew supports stay in their planes
         self.planes = SkewSupports(coupled, self.system, self.real, self.linear) if host.frames else None
         self.inactive_mask = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
         if self.planes:
@@ -119,15 +119,15 @@ class CoupledNewton:
         banded = self.chains is not None and self.chains.banded
         self.local = tuple(
             banded and part.host.along for part in coupled.sets
-        )  # whether derivatives are of the local dofs
+        )  # True if derivatives are of the local dofs
         self.split = tuple(
-            split and own and splits(part.term) for own, part in zip(self.local, coupled.sets, strict=True)
+split and is_local and splits(part.term) for is_local, part in zip(self.local, coupled.sets, strict=True)
         )
         sets = zip(coupled.sets, exact, self.local, self.split, strict=True)
-        self.parts = [self._part(*given, make, H) for given in sets]
+        self.parts = [self._part(*inputs, make, H) for inputs in sets]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
-        # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
+        # curvature is linear in the angles of mesh edges: no cap, which would shorten the steps of all other dofs
         capless = np.concatenate([np.zeros(0, int), *(shell.edges for shell in host.shells)])
         spins = np.arange(host.nodes, blocks)
         spins = spins[~np.isin(spins, capless)]
@@ -141,9 +141,11 @@ class CoupledNewton:
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [
             element_path.evaluate_kernel(
-                coupled_storage(part.term, self.real, not local, serial), self.real, self.linear, late, own
+                coupled_storage(part.term, self.real, not local, serial), self.real, self.linear, iteration, is_split
             )
-            for part, late, local, own in zip(coupled.sets, self.exact_from, self.local, self.split, strict=True)
+            for part, iteration, local, is_split in zip(
+                coupled.sets, self.exact_from, self.local, self.split, strict=True
+            )
         ]
         if self.chains:
             self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
@@ -174,7 +176,7 @@ class CoupledNewton:
         self._multilevel = preconditioner in ("multilevel", "chain_multilevel")
 
     def _require_exact(self) -> None:
-        """Refuse the exact Hessian where it leaves out what a measure has no second derivatives for."""
+        """Refuse the exact Hessian for measures without second derivatives."""
         for part in self.coupled.sets:
             if not (part.term.measure.packed or part.term.measure.tensions):
                 raise SceneError(
@@ -183,9 +185,9 @@ class CoupledNewton:
                 )
 
     def automatic_psd(self) -> str:
-        """The mode that suits the rods; see `RodNewton.automatic_psd`. Curvature that is rounding counts as none.
+        """Return the `psd` mode that suits the rods; see `RodNewton.automatic_psd`. Rest curvature within rounding counts as none.
 
-        What touches turns about what it touches, and bends: without second derivatives the last digits take tens of iterations.
+        Bodies in contact rotate and bend: without second derivatives the last digits take tens of iterations.
         """
         if self.coupled.host.touching:
             return "progressive"
@@ -197,13 +199,15 @@ class CoupledNewton:
 
     @property
     def outdated(self) -> bool:
-        """As of `RodNewton`; or stretching is stiffer or softer by so much that conjugate gradients need another scale."""
+        """True if another `psd` mode suits the parameters, or a changed stretching stiffness needs another scale in conjugate
+        gradients.
+        """
         if self.options.psd == "auto" and self.psd != self.automatic_psd():
             return True
         return not 1.0 / RESCALED < natural_scale(self.coupled) / self.krylov.scale < RESCALED
 
     def _part(self, part, exact: bool, local: bool, split: bool, make, H) -> dict:
-        """What the elements of a set write."""
+        """Return the output arrays of an element set."""
         measure, count = part.term.measure, self.worlds * part.elements
         rows, factor, gradient = (
             (measure.size, self.linear, self.real) if local else (measure.slots, H, self.coupled.vector)
@@ -224,19 +228,19 @@ class CoupledNewton:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
-        own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
+        result = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
+        result += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
         used += (self.unconverged_fraction,)
         parts = [self._move, *self.coupled.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
         sums = [kernel for part in sums for kernel in part.kernels]
-        own += self.frozen.kernels if self.frozen else []
-        return [*own, *evaluate, *self._assembly.kernels, *parts, *sums]
+        result += self.frozen.kernels if self.frozen else []
+        return [*result, *evaluate, *self._assembly.kernels, *parts, *sums]
 
     def pcg_iterations(self) -> int:
-        """Iterations of all solves so far."""
+        """Return the iterations of all solves so far."""
         return int(self.pcg_work.numpy()[0])
 
     def solve(self, state) -> None:
@@ -248,7 +252,7 @@ class CoupledNewton:
         wp.capture_while(self.islands.any_active, lambda: self.iterate(state))
 
     def iterate(self, state) -> None:
-        """One iteration of every active world."""
+        """Perform one iteration of every active world."""
         self.islands.signals.zero_()
         self.evaluate(state)
         self.balance()
@@ -256,7 +260,7 @@ class CoupledNewton:
         wp.capture_if(self.islands.any_active, lambda: self._step(state))
 
     def _step(self, state) -> None:
-        """The next iterate of active worlds."""
+        """Advance active worlds to the next iterate."""
         wp.capture_if(self.islands.any_needs_direction, self._aim)
         self.move()
         if self.turns:
@@ -265,7 +269,7 @@ class CoupledNewton:
             self.contact.hold()
 
     def _aim(self) -> None:
-        """Directions, and how far along them, of worlds that do not shorten a step."""
+        """Compute search directions and step lengths of worlds that do not backtrack."""
         if self.resting:
             self.resting(self.contact.terms.products)
         self.assemble()
@@ -273,7 +277,7 @@ class CoupledNewton:
         self.take()
 
     def evaluate(self, state) -> None:
-        """Energies, gradients and factors of all elements at the iterate, `here`."""
+        """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate, `here`."""
         parts = [partial(self._evaluate_set, state, index) for index in range(len(self.coupled.sets))]
         device_arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
 
@@ -291,14 +295,14 @@ class CoupledNewton:
         )
 
     def balance(self) -> None:
-        """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
+        """Compute residuals, the change of the energy, and the worlds that are out of equilibrium."""
         islands = self.islands
         self._balance()
         flags = islands.not_converged, islands.below_rounding_floor
         self.allowed.sum_up(self.rhs, self.options.rtol, islands, *flags, self._direct and not self.frozen)
 
     def judge(self) -> None:
-        """Stop worlds, reject their iterates, or ask for a direction."""
+        """Stop worlds, reject their iterates, or request a direction."""
         options = self.options
         weights = self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten()
         sums = [partial(self._sum_weights, *weights), partial(self._worst, self.allowed.ratio, self.worst)]
@@ -319,7 +323,7 @@ class CoupledNewton:
         )
 
     def assemble(self) -> None:
-        """H of the worlds that want a direction."""
+        """Assemble H of the worlds that need a direction."""
         if self.frozen:
             self.frozen.update()
         if not self.contact:
@@ -329,18 +333,18 @@ class CoupledNewton:
         self.contact.join()
 
     def _assemble_own(self) -> None:
-        anew = self.anew
-        self._assembly(self.mass, anew, self.matrix)
+        updated_islands = self.anew
+        self._assembly(self.mass, updated_islands, self.matrix)
         if self.planes:
-            self.planes.matrix(self.matrix, anew.needs_direction)
+            self.planes.matrix(self.matrix, updated_islands.needs_direction)
         if self.chains and not self._direct:
-            self.chains.assemble(self.matrix, self.mass, anew)
+            self.chains.assemble(self.matrix, self.mass, updated_islands)
 
     def direct(self) -> None:
-        """Directions: by elimination where that is exact, else by conjugate gradients."""
+        """Compute directions: by elimination if exact, otherwise by conjugate gradients."""
         if self._direct:
             self.negative.zero_()
-            self.forcing.zero_()  # what is left is rounding
+            self.forcing.zero_()  # only rounding is left
             self.chains.direct(
                 self.matrix,
                 self.mass,
@@ -357,29 +361,29 @@ class CoupledNewton:
             self.contact.direct()
         else:
             self.krylov.solve()
-        if self._repeat:  # what was indefinite comes again, without second derivatives and compression
+        if self._repeat:  # repeat indefinite iterates without second derivatives and compression
             wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
     @cached_property
     def krylov(self) -> NewtonPCG:
-        """What finds directions where elimination is not exact."""
+        """Solver of directions if elimination is not exact."""
         return NewtonPCG(self, self._multilevel)
 
     @property
     def anew(self) -> Islands | FrozenHessian:
-        """Those whose matrix is new."""
+        """Islands with a new matrix."""
         return self.frozen or self.islands
 
     @property
     def indefinite(self) -> wp.array:
-        """Where conjugate gradients note what is not definite: the iterate comes again, or the next one leaves out compression."""
+        """Target of conjugate gradients' flags of indefiniteness: repeat the iterate, or drop compression in the next one."""
         return self.negative if self._repeat else self.islands.drop_compression
 
     def watch(self) -> None:
-        """What is looked at after every iteration of conjugate gradients."""
+        """Do nothing: hook that runs after every iteration of conjugate gradients."""
 
     def take(self) -> None:
-        """Lengths of the steps along the directions."""
+        """Compute the step lengths along the directions."""
         blocks = self.coupled.blocks
         inputs = [self.rhs, self.direction, self.islands.needs_direction, blocks]
         device_arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
@@ -394,7 +398,7 @@ class CoupledNewton:
         )
 
     def measure_turns(self) -> None:
-        """Largest turn that the directions make, squared; these are in space then."""
+        """Compute the largest squared rotation of the directions, transformed to spatial components."""
         if self.planes:
             self.planes.back(self.direction, self.islands.needs_direction)
         device_arrays.sweep(
@@ -408,7 +412,7 @@ class CoupledNewton:
         self._largest(self.squares, self.turn)
 
     def move(self) -> None:
-        """Take the step that is to be taken, or the part of it that the search has left."""
+        """Move the iterates by the step, or by the fraction that the line search has left."""
         islands = self.islands
         device_arrays.sweep(
             self._move,

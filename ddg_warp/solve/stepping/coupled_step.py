@@ -1,4 +1,4 @@
-"""A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.stepping.rod_step`."""
+"""Time step of the coupled system: predictor, prescribed motion, loads, Newton, retries. See `kernels.stepping.rod_step`."""
 
 from dataclasses import replace
 
@@ -27,14 +27,14 @@ from ddg_warp.solve.stepping.energy_drift import CoupledEnergy
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 from ddg_warp.solve.stepping.warm_start import WarmStart
 
-RUNS, TREES = 1, 2  # what is made anew before some steps
-# Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
-# step in which they touch nothing. So many looks trees of runs serve, which are refitted by these alone.
+RUNS, TREES = 1, 2  # rebuilt before some steps: BVHs of rod culling alone, or all BVHs
+# Steps between rebuilds of BVHs on CUDA, with refits in between; also the culling queries between rebuilds of the culling BVHs.
+# Measured: rebuilding the broad-phase BVHs of 100 rods takes a tenth of a step without contact.
 RENEWAL = 8
 
 
 class CoupledStep(StepDriver):
-    """Steps a model's net in all worlds, each an island. Arguments as of `RodStep`."""
+    """Time step of a model's coupled system in all worlds, one island each. Arguments: see `RodStep`."""
 
     def __init__(self, integrator, model, means=USUAL, counts_of=None):
         self.coupled = model.coupled
@@ -67,9 +67,9 @@ class CoupledStep(StepDriver):
             if solver.contact:
                 solver.contact.go_on(counts_of.newton.contact)
         if solver.contact:
-            own = solver.contact.search.more[: len(self.tally)]
-            wp.copy(own, self.tally)
-            self.tally = own
+            tally = solver.contact.search.more[: len(self.tally)]
+            wp.copy(tally, self.tally)
+            self.tally = tally
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._foresight = WarmStart(solver)
@@ -85,20 +85,20 @@ class CoupledStep(StepDriver):
         self.drag = CoupledDrag(model, self.midpoint) if host.drag else None
         self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = CoupledMotion(model, self.midpoint) if host.moves else None
-        if (given := integrator.given) is not None:
+        if (controls := integrator.given) is not None:
             scale = CoupledScale(model, self.coupled, solver)
-            self.loads = ControlledLoads(model, self.coupled, self.midpoint, given, scale)
+            self.loads = ControlledLoads(model, self.coupled, self.midpoint, controls, scale)
         elif host.timed or host.followers:
             self.loads = Loads(model, self.coupled, self.midpoint)
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
         self.alone, self._groups = None, counts_of and counts_of._groups
-        # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
+        # steps since the last outside state; broad-phase and culling queries until the last rebuild of their BVHs
         self._since_renewal, self._sought = 0, (0, 0)
 
     def _resolve_arcs(self) -> Arcs | None:
-        """What finds the substeps in which contact sees prescribed motions; None where these move no surface."""
+        """Return the substep resolution of prescribed motions for contact; None if no surface is prescribed."""
         arcs = Arcs(self.model) if self.newton.contact and self.motion else None
         if not (arcs and arcs.moved):
             return None
@@ -108,11 +108,13 @@ class CoupledStep(StepDriver):
         return arcs
 
     def arrive(self) -> None:
-        """The next step begins from a state that comes from elsewhere."""
+        """Note that the next step begins from an outside state."""
         self._since_renewal = 0
 
     def outdated(self, anew: bool) -> int:
-        """What is made anew before a step, see `renew`: trees that were used since, every few steps or looks."""
+        """Return the BVHs to rebuild before a step, see `renew`: those used since the last rebuild, every `RENEWAL` steps or
+        queries.
+        """
         if self.newton.contact is None or self.model.wp_device.is_cpu:
             return 0  # on the CPU every search makes its own
         due = anew or self._since_renewal % RENEWAL == 0
@@ -127,9 +129,9 @@ class CoupledStep(StepDriver):
             return RUNS
         return 0
 
-    def renew(self, before, what: int) -> None:
-        """Make trees of searches anew from a state, `TREES`, or those of `RUNS` alone; launches alone."""
-        if what == TREES:
+    def renew(self, before, level: int) -> None:
+        """Rebuild all BVHs from a state for `TREES`, or the culling BVHs alone for `RUNS`; launches only."""
+        if level == TREES:
             self.newton.contact.renew(before.q)
         if self.alone:
             self.alone.renew()
@@ -146,7 +148,7 @@ class CoupledStep(StepDriver):
         self.alone.step(before, after)
 
     def _keep(self) -> None:
-        """Remember what is counted before a step that may have to be done again."""
+        """Save the counts before a step that may be repeated."""
         if not self.newton.contact:
             return
         for kept, array in zip(self._kept, self._counts, strict=True):
@@ -154,8 +156,8 @@ class CoupledStep(StepDriver):
         self.newton.contact.tally.begin()
 
     def go_on(self, before, after) -> None:
-        """Step the worlds that `alone` has left to the net; those that are done rest as they are."""
-        if self.coupled.worlds == 1:  # of which nothing was counted yet
+        """Step the worlds that `alone` left to the coupled system; finished worlds stay unchanged."""
+        if self.coupled.worlds == 1:  # nothing is counted yet
             self._keep()
         else:
             self.integrator._worlds.take_part(self.alone.left, before, after, self.coupled.worlds)
@@ -165,7 +167,7 @@ class CoupledStep(StepDriver):
         wp.capture_while(self.remaining, lambda: self._try(after, after))
 
     def prescribe(self, t0: float, t1: float) -> None:
-        """As of `StepDriver`."""
+        """Upload supports, loads, magnetic field and flow between t0 and t1."""
         super().prescribe(t0, t1)
         for chain in self._rods:
             chain.prescribe(t0, t1)
@@ -173,7 +175,7 @@ class CoupledStep(StepDriver):
             self._cut(self.arcs.levels(t0, t1), t0, t1)
 
     def _cut(self, levels: np.ndarray, t0: float, t1: float) -> None:
-        """Take the step in 2^levels substeps (worlds,); those of grips may be shorter."""
+        """Divide the step into 2^levels substeps (worlds,); grips may require shorter ones."""
         if not (levels.any() or self.motion.levels.any()):
             return
         if self.motion.divide(levels, t0, t1):
@@ -185,7 +187,7 @@ class CoupledStep(StepDriver):
         self.islands.substep.assign(0.5**levels)
 
     def load_modules(self) -> None:
-        """As of `StepDriver`."""
+        """Compile and load every kernel before a capture."""
         super().load_modules()
         if self.alone is None:
             return
@@ -197,13 +199,13 @@ class CoupledStep(StepDriver):
 
     @property
     def _rods(self) -> list:
-        """Steps of its rods on their own, where there are any."""
+        """Uncoupled steps of the rods; empty without `alone`."""
         return self.alone.chains if self.alone else []
 
     def adapt(self, s: float, anew: bool = False) -> bool:
-        """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before.
+        """Select uncoupled stepping of rods out of contact and its solvers for s [s]; return True if the selection changed.
 
-        `anew` as of `StepDriver.choose_solver`.
+        `anew`: see `parameters_changed` of `StepDriver.choose_solver`.
         """
         before = self.alone
         if not (uncoupled(self.model) and is_decoupled(self.integrator)):
@@ -214,9 +216,9 @@ class CoupledStep(StepDriver):
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s, anew))
 
     def has_overflow(self, before) -> bool:
-        """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
+        """Return True if the last step, from the state `before`, overflowed the pair lists and must be repeated.
 
-        Then there is room, and all is as it was before that step. Reads from the device where there is contact.
+        The lists are then enlarged, and all counts restored. Reads from the device with contact.
         """
         if self.newton.contact is None or not self.newton.contact.has_overflow(before.q):
             return False
@@ -225,12 +227,12 @@ class CoupledStep(StepDriver):
         return True
 
     def _counted(self) -> np.ndarray:
-        """As of `StepDriver`; where there is contact as `outgrown` has read it."""
+        """`tally` after the last step; with contact, as read by `has_overflow`."""
         contact = self.newton.contact
         return contact.search.more_read[: len(self.tally)] if contact else super()._counted()
 
     def attempt(self, before, after) -> None:
-        """One solve of every world that has not finished the step, from state `before` to `after`."""
+        """Launch one solve of every world that has not finished the step, from state `before` to `after`."""
         coupled, solver, islands = self.coupled, self.newton, self.islands
         blocks = coupled.blocks
         if solver.contact:
@@ -278,18 +280,21 @@ class CoupledStep(StepDriver):
         self.coupled.update_strains(after)
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        """Over the blocks of every world."""
+        """Launch over the blocks of every world."""
         device_arrays.sweep(
             kernel, self.coupled.blocks, inputs, outputs, self.model.wp_device, worlds=self.coupled.worlds
         )
 
     def _start_frames(self, before):
-        """The state whose lagged data serve the solve, which may renew them: for the midpoint rule carried to the predicted midpoint.
+        """Return the state with the time-lagged data of the solve, carried to the predicted midpoint for the midpoint rule.
 
-        Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
-        inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
-        found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
-        Worlds that have finished keep the frames of their solve, by which gradients tell whether these were renewed.
+        Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary inertia:
+        the rule
+        would be of first order. Joint rotations have no inertia and are not predicted: the solve finds their change over the whole
+        half step.
+        Rotating support normals and the magnetic field belong to the solve. Finished worlds keep the frames of their solve, from
+        which
+        gradients detect a frame update.
         """
         if not self.coupled.edges:
             return replace(before, data=self._data)
@@ -300,14 +305,14 @@ class CoupledStep(StepDriver):
             return start
         inputs = [self.islands.substep_accepted, self.coupled.edges, before.frame]
         wp.launch(self._take, frame.shape[1], inputs, [frame], device=self.model.wp_device)
-        for part, own, given in zip(self.coupled.sets, lag, before.lag, strict=True):
+        for part, target, source in zip(self.coupled.sets, lag, before.lag, strict=True):
             if part.term.measure.advance:
-                wp.copy(own, given)
+                wp.copy(target, source)
         return start
 
     @property
     def own_kernels(self) -> list:
-        """Kernels of an attempt, without those of the solver."""
+        """Kernels of an attempt, without the solver's."""
         real, coupled = self.model.types.real, self.coupled
         kernels = [self._begin, self._finish, self._take, *([] if self.midpoint else self._foresight.kernels)]
         for part in coupled.sets:
@@ -317,73 +322,74 @@ class CoupledStep(StepDriver):
 
     @property
     def stiffness_version(self) -> int:
-        """As of `StepDriver`."""
+        """Version of the stiffnesses behind `limits` and float32 errors; zero for the stiffnesses of the scene."""
         return self.coupled.version
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """The largest of a rod (1,); see `precision.float32_error`."""
+        """Return the largest float32 error of a rod (1,); see `precision.float32_error`."""
         return self.coupled.rod_errors(s).max(initial=0.0, keepdims=True)
 
     def split_errors(self, s: float) -> np.ndarray:
-        """The same with tensions as unknowns; infinite where they cannot be."""
+        """Return float32 errors over s [s] in the mixed axial-force formulation; infinite if unavailable."""
         chains = self.newton.chains
         if not (chains and chains.splits) or self.newton.frozen:
             return super().split_errors(s)
         return self.coupled.split_errors(s).max(initial=0.0, keepdims=True)
 
     def limit(self, s: float) -> None:
-        """As of `StepDriver`."""
+        """Set the limits of the islands for solves over s [s]."""
         super().limit(s)
         for chain in self._rods:
             chain.limit(s)
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
-        """As of `StepDriver`; and what float32 matrices carry, of the rod that is the softest."""
-        found = super()._find_limits(s)
+        """Return the limits of islands by name, with the largest edge stiffness that float32 carries for the softest rod."""
+        limits = super()._find_limits(s)
         if any(self.newton.split):
             softest = self.coupled.rod_stiffnesses(s)[2].min()
-            found["max_edge_stiffness"] = np.full(len(self.islands), largest_carried(softest))
-        return found
+            limits["max_edge_stiffness"] = np.full(len(self.islands), largest_carried(softest))
+        return limits
 
     def island_label(self, world: int) -> str:
-        """The net of a world."""
+        """Return the label of the coupled system of a world."""
         return f"the net (world {world})"
 
     def rods_of(self, worlds: np.ndarray) -> list[int]:
-        """None: what failed is not one rod's."""
+        """Return an empty list: a failure belongs to no single rod."""
         return []
 
     def failure(self, state, island: int) -> tuple[str, str]:
-        """As of `StepDriver`."""
+        """Return the outcome of a failed island, and the message."""
         if int(self.islands.failure_status.numpy()[island]) == outcome.ROTATED_TOO_FAR:
             return outcome.NAMES[outcome.ROTATED_TOO_FAR], self.arcs.failure(island)
         return super().failure(state, island)
 
     def where(self, state, world: int) -> str:
-        """Where the largest residual was, and what to do."""
+        """Return the location of the largest residual, and the remedy."""
         sizes = np.abs(self.newton.rhs.numpy().reshape(self.model.worlds, -1))[world]
         worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
         place = Tangent(self.model).parts[-1].where(worst)
         return f"largest residual {sizes[worst]:.3g} N at {place}; {self._remedy(state, world)}"
 
     def _remedy(self, state, world: int) -> str:
-        """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
+        """Return the remedy for a failed world: degenerate edges of its last good state, or advice."""
         x = state.coupled.q.numpy().reshape(self.model.worlds, -1, 3)[world]
-        found = (
+        dead_ends = (
             self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.coupled.host.rods
         )
-        return next(filter(None, found), "") or self._tightest(state, world)
+        return next(filter(None, dead_ends), "") or self._tightest(state, world)
 
     def _tightest(self, state, world: int) -> str:
-        """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart; and advice.
+        """Return the closest pair of the last good state if it may be the cause, with its remedy; and advice.
 
-        Where there is no room, or a motion drives two held things into each other, a smaller dt or a looser rtol makes none.
+        Without room, or with a motion that drives two prescribed bodies into each other, a smaller dt or a looser rtol does not
+        help.
         """
         if not self.newton.contact:
             return self.advice(state)
         reason = int(self.islands.failure_status.numpy()[world])
         begin = state.time - self.integrator._dt_host
-        told = self.newton.contact.blocked(Tangent(self.model), state, begin, state.time)
-        told = told or self.newton.contact.closest_pair(state.coupled.q, reason)
-        helped = told.endswith(", ")
-        return told + ("or check its loads and supports" if helped else self.advice(state))
+        message = self.newton.contact.blocked(Tangent(self.model), state, begin, state.time)
+        message = message or self.newton.contact.closest_pair(state.coupled.q, reason)
+        helped = message.endswith(", ")
+        return message + ("or check its loads and supports" if helped else self.advice(state))
