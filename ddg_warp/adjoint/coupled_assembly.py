@@ -1,4 +1,4 @@
-"""What elements of a net bring in the reverse of a step, and what it belongs to; see `ddg_warp.kernels.adjoint.coupled_assembly`."""
+"""Assembly of element contributions in the reverse of a coupled step; see `ddg_warp.kernels.adjoint.coupled_assembly`."""
 
 import numpy as np
 import warp as wp
@@ -10,11 +10,11 @@ from ddg_warp.solve.linear.sparse_system import lists
 
 
 class CoupledAssembly:
-    """Of all element sets; in memory that stays.
+    """Assembly of all element sets, with persistent buffers.
 
     Attributes:
-        slots, lags: what slots (slots, W E) and lagged and constant data (rows, W E) of every set bring.
-        gather: kernel that adds what slots bring to blocks.
+        slots, lags: contributions by local nodes (local nodes, W E), and by lagged and constant data (rows, W E), of every set.
+        gather: kernel that adds contributions by local nodes to blocks.
     """
 
     def __init__(self, model):
@@ -25,7 +25,7 @@ class CoupledAssembly:
         self._lags = [coupled_step.lag_kernel(p.term, real) if p.term.measure.advance else None for p in coupled.sets]
         self._meets = [self._list(part.host.slots, coupled.blocks) for part in coupled.sets]
         self._edges = self._list(np.reshape(coupled.host.ends, (-1, 2)).T, coupled.blocks) if coupled.edges else None
-        self._framed, self.slots, self.friction_iterations = [], [], []  # the first: of the frames that elements read
+        self._framed, self.slots, self.lags = [], [], []  # the first: incidence lists of frames
         for part in coupled.sets:
             measure = part.term.measure
             angles = part.host.slots[measure.nodes : measure.nodes + measure.frames] - coupled.host.nodes
@@ -42,26 +42,26 @@ class CoupledAssembly:
         return [self.gather, self._frames, self._rows, *frame, *(kernel for kernel in self._lags if kernel)]
 
     def make(self, rows: int, elements: int) -> wp.array:
-        """Zeros of elements of all worlds."""
+        """Return zeros for elements of all worlds."""
         shape = max(1, rows), max(1, elements * self.coupled.worlds)
         return wp.zeros(shape, dtype=self.real, device=self.device)
 
     def make_own(self) -> list[wp.array]:
-        """Zeros of the own lagged rows of every set."""
+        """Return zeros for the own lagged rows of every set."""
         result = []
         for part in self.coupled.sets:
             measure = part.term.measure
-            own = (measure.lag_size - FRAME * measure.frames, part.elements) if measure.advance else (1, 0)
-            result.append(self.make(*own))
+            shape = (measure.lag_size - FRAME * measure.frames, part.elements) if measure.advance else (1, 0)
+            result.append(self.make(*shape))
         return result
 
     def clear(self) -> None:
-        """Nothing is brought yet."""
-        for array in (*self.slots, *self.friction_iterations):
+        """Zero all contributions."""
+        for array in (*self.slots, *self.lags):
             array.zero_()
 
     def collect(self, grad_q: wp.array, frame: wp.array, by_data: list[wp.array]) -> None:
-        """Add shares to the blocks, frames and constant data that they belong to."""
+        """Add contributions to the gradients by blocks, frames and constant data."""
         coupled = self.coupled
         for i, (part, slot, lag) in enumerate(zip(coupled.sets, self.slots, self.friction_iterations, strict=True)):
             starts, items, count = self._meets[i]
@@ -75,8 +75,8 @@ class CoupledAssembly:
                 self._launch(self._rows, by_data[i].shape, [lag, part.term.measure.lag_size], [by_data[i]])
 
     def add_own(self, out: list[wp.array]) -> None:
-        """Add what is brought of own lagged rows."""
-        for part, lag, rows in zip(self.coupled.sets, self.friction_iterations, out, strict=True):
+        """Add contributions to the gradients by own lagged rows."""
+        for part, lag, rows in zip(self.coupled.sets, self.lags, out, strict=True):
             if part.term.measure.advance:
                 self._launch(self._rows, rows.shape, [lag, FRAME * part.term.measure.frames], [rows])
 
@@ -86,27 +86,28 @@ class CoupledAssembly:
         after: CoupledState,
         q: wp.array,
         frame: wp.array,
-        own: list[wp.array],
+        own_rows: list[wp.array],
         grad_q: wp.array,
         by_data: list[wp.array],
         by_frame: wp.array,
         by_own: list[wp.array],
     ) -> None:
-        """Reverse of `CoupledModel.carry`: from derivatives by lagged data of `after`, to those by the data of `before`, by the
-        blocks q and by constant data, which are added.
+        """Reverse `CoupledModel.carry`: from gradients by lagged data of `after` to gradients by the data of `before`.
+
+        Gradients by the blocks q and by constant data are accumulated.
 
         Args:
-            frame, own: by the frames, added to, and own lagged rows of `after`.
-            by_frame, by_own: by those of `before`.
+            frame, own_rows: gradients by the frames, accumulated, and by own lagged rows of `after`.
+            by_frame, by_own: gradients by the frames and own lagged rows of `before`.
         """
         coupled = self.coupled
         self.clear()
         for i, kernel in enumerate(self._lags):
             if kernel:
-                at = coupled.elements(after, i, q)
-                at.lag = before.lag[i]
+                elements = coupled.elements(after, i, q)
+                elements.lag = before.lag[i]
                 count = coupled.sets[i].elements * coupled.worlds
-                self._launch(kernel, count, [at, own[i]], [self.slots[i], self.friction_iterations[i]])
+                self._launch(kernel, count, [elements, own_rows[i]], [self.slots[i], self.lags[i]])
         self.collect(grad_q, frame, by_data)
         if coupled.edges:
             read = [q, coupled.ends, coupled.blocks, before.frame, frame]
@@ -116,7 +117,7 @@ class CoupledAssembly:
         self.add_own(by_own)
 
     def _list(self, targets: np.ndarray, count: int) -> tuple[wp.array, wp.array, int]:
-        """Starts and items of what comes to each of `count` targets, and how many elements there are."""
+        """Return the incidence list (starts, items) of `count` targets, and the number of elements."""
         starts, items = lists(targets.ravel(), count)
         upload = (wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=self.device) for v in (starts, items))
         return *upload, targets.shape[1]

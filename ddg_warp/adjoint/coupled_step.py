@@ -1,4 +1,4 @@
-"""Reverse of a step of a net; see `ddg_warp.adjoint.implicit`."""
+"""Reverse of a step of the coupled system; see `ddg_warp.adjoint.implicit`."""
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -21,10 +21,11 @@ from ddg_warp.model.coupled_model import CoupledState
 
 @dataclass
 class CoupledSavedStep:
-    """What the reverse of a step reads of it: the state `before`, and the solution of its solve with its lagged data.
+    """Data of a step for its reverse: the state `before`, and the solution of its solve with its time-lagged data.
 
-    `lagged` are the solutions where friction was taken anew (W N,), in this order; what else is lagged stays. Of an equilibrium with
-    friction `before` is the one that slips count from, and `rubbing` over the increment of the load parameter since then.
+    `lagged` are the solutions at the friction lags (W N,), in this order; all other lagged data stay. For an equilibrium with
+    friction,
+    `before` is the state that slips are measured from, and `rubbing` is the inverse increment of the load parameter since then.
     """
 
     before: CoupledState
@@ -43,17 +44,18 @@ class CoupledSavedStep:
 
 @dataclass
 class CoupledInputs:
-    """Derivatives by what a step of a net read beside its state.
+    """Gradients by the inputs of a step of the coupled system, other than its state.
 
     Attributes:
-        parameters: of every element set (parameters, W E); data, end_data: by its constant data in the solve and at the end of the step
-            (rows, W E).
-        mass: by the masses of the dofs of blocks (W N,); load: by the forces on them, zero at held dofs.
-        held: by where held dofs are at the solution (W N,).
-        drag: by coefficients of drag (rows, W edges that feel it); None without any.
-        rate, damping, gravity: by what all blocks share, the share of each (W N,); elements_rate: by the rate, of every set (W E,), and
-            of friction.
-        touching, radius: by the numbers of contact, as of `ContactAdjoint`; None without.
+        parameters: of every element set (parameters, W E).
+        data, end_data: by the constant data of every set in the solve and at the end of the step (rows, W E).
+        mass: by the masses of the dofs of blocks (W N,).
+        load: by the forces on them, zero at fixed dofs.
+        held: by the prescribed positions of fixed dofs at the solution (W N,).
+        drag: by drag coefficients (rows, W edges with drag); None without drag.
+        rate, damping, gravity: by the quantities common to all blocks, one entry per block (W N,).
+        elements_rate: by the rate, of every set (W E,), and of friction.
+        touching, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
     """
 
     parameters: list[wp.array]
@@ -72,10 +74,10 @@ class CoupledInputs:
 
 
 class CoupledStepAdjoint:
-    """Reverse of the steps of a model's net, and of its equilibria; `gravity` and `axes` as of `RodStepAdjoint`.
+    """Reverse of the steps and equilibria of a model's coupled system; `gravity` and `axes`: see `RodStepAdjoint`.
 
     Args:
-        scheme, posed: as of `RodStepAdjoint`.
+        scheme, posed: see `RodStepAdjoint`.
 
     Raises:
         SceneError: a motion has no gradient, or contact; see `Supports` and `ContactAdjoint`.
@@ -119,7 +121,7 @@ class CoupledStepAdjoint:
         self._by_end, self._by_q, self._w, self._end, self._stays = (make() for _ in range(5))
         self._by_lagged = make() if self.contact and self.contact.friction_iterations > 1 else None
         self._given_frame = self._shares.make(FRAME, coupled.edges)
-        # of frames and own lagged rows: of what the step ends in, of its solve, and of where it starts
+        # gradients by frames and own lagged rows: of the end state, of the solve, and of the start state
         self._by_frame = [self._shares.make(FRAME, coupled.edges) for _ in range(2)]
         self._by_own = [self._shares.make_own() for _ in range(3)]
         self._start_state = coupled.empty()
@@ -145,22 +147,22 @@ class CoupledStepAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._vjp, *(kernel for kernel in self._strains if kernel)]
-        own += [self._solution, self._inert, self._start, self._ended]
+        result = [*self._vjp, *(kernel for kernel in self._strains if kernel)]
+        result += [self._solution, self._inert, self._start, self._ended]
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
-        return own + [kernel for part in parts if part for kernel in part.kernels]
+        return result + [kernel for part in parts if part for kernel in part.kernels]
 
-    def suit(self, step, s: float, given: bool = False) -> bool:
-        """As of `RodStepAdjoint`, of a `CoupledStep`."""
+    def suit(self, step, s: float, parameters_changed: bool = False) -> bool:
+        """Select the solvers of reverse solves of a `CoupledStep` over s [s]; return True if the selection changed."""
         return self.predictor is not None and self.predictor.suit(step, s)
 
     def upload(self, t0: float, t1: float) -> None:
-        """As of `RodStepAdjoint`."""
+        """Upload supports, follower loads and flow between t0 and t1, the step to reverse."""
         for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
             part.upload(t0, t1)
 
     def lagged(self, before: CoupledState, states=None) -> wp.array:
-        """As of `RodStepAdjoint`."""
+        """Return the lagged frames of a step's solve before any frame update."""
         if self.predictor is None:
             return before.frame
         if self.supports:
@@ -169,7 +171,7 @@ class CoupledStepAdjoint:
         return self.predictor.state.frame
 
     def keep(self, step, before: CoupledState) -> CoupledSavedStep:
-        """What the step that a `CoupledStep` has just made leaves for its reverse; `before` has to stay as it is."""
+        """Return the data of the last step of a `CoupledStep` for its reverse; `before` must stay unchanged."""
         coupled, q = self.coupled, wp.clone(step.newton.q)
         data = {index: wp.clone(values) for index, values in step._data.items()}
         solved = replace(before, q=q, data=data)
@@ -186,26 +188,29 @@ class CoupledStepAdjoint:
         self,
         kept: CoupledSavedStep,
         after: CoupledState,
-        given: CoupledState,
+        cotangent: CoupledState,
         s: float,
         states=None,
         factors: bool = False,
     ) -> tuple[CoupledState, CoupledInputs]:
-        """As `RodStepAdjoint.vjp`; `factors`: as of `CoupledLinearSolve`."""
+        """Return gradients by the start of a step and by its inputs; see `RodStepAdjoint.vjp`.
+
+        `factors`: see `CoupledLinearSolve`.
+        """
         coupled, solved, before, shares = self.coupled, kept.solved, kept.before, self._shares
         rate, last = 1.0 / s, coupled.blocks - coupled.host.spins
         start, inputs, by_end, grad_q, w = self._start_state, self._inputs, self._by_end, self._by_q, self._w
         self._clear()
         frame, carried = self._given_frame, self._by_frame[0]
-        of_end, own, first = self._by_own
-        wp.copy(frame, given.frame)
-        # strains of the end, which the next step is damped from
+        of_end, own_rows, first = self._by_own
+        wp.copy(frame, cotangent.frame)
+        # strains of the end state, the reference of the next step's damping
         for i, kernel in enumerate(self._strains):
             if kernel:
-                read = [coupled.elements(after, i), given.last[i]]
-                self._over(i, kernel, read, [shares.slots[i], shares.friction_iterations[i], inputs.parameters[i]])
+                read = [coupled.elements(after, i), cotangent.last[i]]
+                self._over(i, kernel, read, [shares.slots[i], shares.lags[i], inputs.parameters[i]])
         shares.collect(by_end, frame, inputs.end_data)
-        for part, rows, lag in zip(coupled.sets, of_end, given.lag, strict=True):
+        for part, rows, lag in zip(coupled.sets, of_end, cotangent.lag, strict=True):
             if part.term.measure.advance:
                 wp.copy(rows, lag)
         shares.add_own(of_end)
@@ -219,23 +224,23 @@ class CoupledStepAdjoint:
         if self._midpoint:
             ended = self._end
             self._launch(self._ended, len(ended), [solved.q, before.q], [ended])
-        shares.uncarry(solved, after, ended, frame, of_end, by_end, inputs.end_data, carried, own)
+        shares.uncarry(solved, after, ended, frame, of_end, by_end, inputs.end_data, carried, own_rows)
         # the solve
         if self.drag:
             self.drag.resist(before, tangents, rate)
-        read = [given.q, given.v, by_end, self._inertia, rate, last, coupled.blocks]
+        read = [cotangent.q, cotangent.v, by_end, self._inertia, rate, last, coupled.blocks]
         self._launch(self._solution, len(grad_q), read, [grad_q])
         self._rates.fill_(rate)
         self._rubbing.fill_(kept.rubbing or rate)
-        rough, ways = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
-        if kept.rubbing:  # normal forces are those of the equilibrium
-            rough, ways = self.contact.matrix(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
+        rough, lag_pairs = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
+        if kept.rubbing:  # normal forces of the equilibrium
+            rough, lag_pairs = self.contact.matrix(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
         by_tangents = by_predicted if self._midpoint else start.q
-        for at, q in ways:  # friction lagged there, and the solution
+        for lag_q, q in lag_pairs:  # lag positions of friction, and the solution
             damped = replace(solved, q=q, last=before.last)
             if self.contact:
-                rates = after.rate, before.rate if at is before.q else None
-                self.contact.system.find(at, before.q, q, self._rubbing, rates)
+                rates = after.rate, before.rate if lag_q is before.q else None
+                self.contact.system.find(lag_q, before.q, q, self._rubbing, rates)
             self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._vjp):
@@ -243,7 +248,7 @@ class CoupledStepAdjoint:
                 written += [start.last[i], inputs.elements_rate[i]]
                 self._over(i, kernel, [coupled.elements(damped, i, rate=self._rates), w], written)
             shares.collect(grad_q, carried, inputs.data)
-            shares.add_own(own)
+            shares.add_own(own_rows)
             if self.drag:
                 self.drag.vjp(before, tangents, q, w, rate, grad_q, start, inputs.rate, by_tangents)
             read = [
@@ -261,52 +266,67 @@ class CoupledStepAdjoint:
             written = [start.q, start.v, inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity]
             self._launch(self._inert, len(q), [*read, self._damping], written)
             if self.contact:
-                by_lagged = next(by for of, by in ((before.q, start.q), (q, grad_q), (at, self._by_lagged)) if of is at)
-                self.contact.vjp((at, before.q, q), w, self._rubbing, (by_lagged, start.q, grad_q))
+                by_lagged = next(
+                    gradient
+                    for source, gradient in ((before.q, start.q), (q, grad_q), (lag_q, self._by_lagged))
+                    if source is lag_q
+                )
+                self.contact.vjp((lag_q, before.q, q), w, self._rubbing, (by_lagged, start.q, grad_q))
                 if kept.rubbing:
                     self.contact.roll(q, before.q, start.q, grad_q)
-            if at is not before.q and at is not q:
+            if lag_q is not before.q and lag_q is not q:
                 self.solve.chain(self._by_lagged, grad_q)
         if self.solve.held is not None:
             wp.map(wp.add, grad_q, self.solve.held, out=grad_q)
         if self.supports:
             self.supports.follow(*states)
             frame, by_frame = (coupled.frames(array) for array in (solved.frame, carried))
-            held, angle = coupled.components(grad_q), coupled.angles(grad_q)
-            self.supports.vjp(coupled.points(solved.q), frame, held, angle, by_frame)
+            force, angle = coupled.components(grad_q), coupled.angles(grad_q)
+            self.supports.vjp(coupled.points(solved.q), frame, force, angle, by_frame)
         if self.followers:
-            of = coupled.components(inputs.load), coupled.angles(inputs.load), coupled.components(by_predicted)
-            self.followers.vjp(coupled.points(lagged.q), *of)
+            gradients = coupled.components(inputs.load), coupled.angles(inputs.load), coupled.components(by_predicted)
+            self.followers.vjp(coupled.points(lagged.q), *gradients)
         if predictor:
             if predictor.carries:
                 written = by_predicted, inputs.data, self._by_frame[1], first
-                shares.uncarry(before, lagged, lagged.q, carried, own, *written)
-                carried, own = self._by_frame[1], first
+                shares.uncarry(before, lagged, lagged.q, carried, own_rows, *written)
+                carried, own_rows = self._by_frame[1], first
             predictor.vjp(before, grad_q, start, inputs.rate)
-        start.frame, start.lag = carried, own
+        start.frame, start.lag = carried, own_rows
         if s < np.inf:
             self.solve.stays(grad_q, self._stays)
         self._launch(
             self._start,
             len(grad_q),
-            [given.q, given.v, by_end, solved.q, before.q, self._stays, self._inertia, last, coupled.blocks, rate],
+            [
+                cotangent.q,
+                cotangent.v,
+                by_end,
+                solved.q,
+                before.q,
+                self._stays,
+                self._inertia,
+                last,
+                coupled.blocks,
+                rate,
+            ],
             [start.q, start.v, inputs.rate],
         )
         return start, inputs
 
     def has_overflow(self, q: wp.array) -> bool:
-        """Whether the last `pull`, to a solution q, had more pairs in contact than there was room for, and is to be done again.
+        """Return True if the last `vjp`, to a solution q, overflowed the pair lists and must be repeated.
 
-        Reads from the device where there is contact.
+        Reads from the device with contact.
         """
         return self.contact is not None and self.contact.has_overflow(q)
 
     def _clear(self) -> None:
-        """Zero what is added to."""
+        """Zero the accumulated gradients."""
         inputs, start = self._inputs, self._start_state
-        own = [array for arrays in self._by_own for array in arrays]
+        own_rows = [array for arrays in self._by_own for array in arrays]
         for array in (
-            *(self._by_end, start.q, start.v, *start.last, *self._by_frame, *own),
+            *(self._by_end, start.q, start.v, *start.last, *self._by_frame, *own_rows),
             *(inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity, *inputs.elements_rate),
             *(*inputs.parameters, *inputs.data, *inputs.end_data),
             *([inputs.drag] if self.drag else []),

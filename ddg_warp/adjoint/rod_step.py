@@ -1,4 +1,4 @@
-"""Reverse of a step of a group of rods on their own; see `ddg_warp.adjoint.implicit`."""
+"""Reverse of a step of a rod group; see `ddg_warp.adjoint.implicit`."""
 
 from dataclasses import dataclass, replace
 
@@ -20,12 +20,14 @@ from ddg_warp.model.state import RodGroupState
 
 @dataclass
 class SavedStep:
-    """What the reverse of a step reads of it.
+    """Data of a step for its reverse.
 
     Attributes:
-        before: the state that it started from.
-        x, theta: the solution of its solve; frame: the lagged frames at it.
-        whole: of every rod, the part of the step that its last solve was about; retries: how often that was tried again.
+        before: the start state.
+        x, theta: the solution of its solve.
+        frame: the lagged frames at the solution.
+        whole: fraction of the step that the last solve of every rod covered.
+        retries: number of retries of that fraction.
         time: load parameter of an equilibrium.
     """
 
@@ -40,15 +42,16 @@ class SavedStep:
 
 @dataclass
 class RodInputs:
-    """Derivatives by what a step of a group read beside its state, of every element, node or rod.
+    """Gradients by the inputs of a step of a rod group, other than its state, per element, node or rod.
 
     Attributes:
-        parameters: (rows of the parameter table, n, R); mass, rotary: of nodes and edges (n, R).
-        load: by the forces on nodes and the moments on angles (block, n, R); zero at held dofs.
-        held: by where held dofs are at the solution (block, n, R).
-        drag: by coefficients of drag (rows, n, R); None without any.
-        rate, damping, gravity: by what all nodes share, the share of each (n, R); by the rate without what motions, loads and
-            fields do as functions of time.
+        parameters: (rows of the parameter table, n, R).
+        mass, rotary: by masses of nodes and rotary inertia of edges (n, R).
+        load: by the forces on nodes and the moments on angles (block, n, R); zero at fixed dofs.
+        held: by the prescribed positions of fixed dofs at the solution (block, n, R).
+        drag: by drag coefficients (rows, n, R); None without drag.
+        rate, damping, gravity: by the quantities common to all nodes, a contribution per node (n, R). `rate` excludes the time
+            dependence of motions, loads and fields.
     """
 
     parameters: wp.array
@@ -63,18 +66,18 @@ class RodInputs:
 
 
 class RodStepAdjoint:
-    """Reverse of the steps of a group of rods, and of their equilibria.
+    """Reverse of the steps and equilibria of a rod group.
 
     Attributes:
-        gravity: of every world in what is pulled (worlds,), by which derivatives by masses go; the scene's at first.
-        axes: components of space that it has.
+        gravity: gravity of every world (worlds,) for gradients by masses; initially the scene's.
+        axes: components of space of the group.
 
     Args:
         scheme: of the steps, None for equilibria.
-        posed: whether equilibria are given poses of grips.
+        posed: True if equilibria take poses of grips.
 
     Attributes:
-        unread: names of the arrays of the state that a step led to which its reverse does not read.
+        unread: names of the arrays of the end state that the reverse does not read.
 
     Raises:
         SceneError: a motion has no gradient; see `Supports`.
@@ -131,22 +134,22 @@ class RodStepAdjoint:
             drag=self.drag.by_coefficients if self.drag else None,
         )
 
-    def suit(self, step, s: float, given: bool = False) -> bool:
-        """From now on reverse solves of a `RodStep` over s [s] by what suits them; whether that is anything else than before.
+    def suit(self, step, s: float, parameters_changed: bool = False) -> bool:
+        """Select the solvers of reverse solves of a `RodStep` over s [s]; return True if the selection changed.
 
         Args:
-            given: whether parameters may be others than those of the model.
+            parameters_changed: True if parameters may differ from the model's.
         """
         changed = self.predictor is not None and self.predictor.suit(step, s)
-        return self.solve.suit(s, given) or changed
+        return self.solve.suit(s, parameters_changed) or changed
 
     def upload(self, t0: float, t1: float) -> None:
-        """What supports, loads that follow and the fluid do between t0 and t1, the step whose reverse follows."""
+        """Upload supports, follower loads and flow between t0 and t1, the step to reverse."""
         for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
             part.upload(t0, t1)
 
     def lagged(self, before: RodGroupState, states=None) -> wp.array:
-        """The frames that the solve of a step lags as long as it does not renew them; `states` as of `pull`."""
+        """Return the lagged frames of a step's solve before any frame update; `states`: see `vjp`."""
         if self.predictor is None:
             return before.frame
         if self.supports:
@@ -155,7 +158,7 @@ class RodStepAdjoint:
         return self.predictor.frame
 
     def keep(self, step, before: RodGroupState) -> SavedStep:
-        """What the step that a `RodStep` has just made leaves for its reverse; `before` has to stay as it is."""
+        """Return the data of the last step of a `RodStep` for its reverse; `before` must stay unchanged."""
         newton, twist = step.newton, self.group.kind.twist
         theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
         islands = step.islands
@@ -163,18 +166,18 @@ class RodStepAdjoint:
             before, wp.clone(newton.x), theta, frame, wp.clone(islands.substep_fraction), wp.clone(islands.retries)
         )
 
-    def vjp(self, kept: SavedStep, after: RodGroupState, given: RodGroupState, s: float, states=None) -> tuple:
-        """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
+    def vjp(self, kept: SavedStep, after: RodGroupState, cotangent: RodGroupState, s: float, states=None) -> tuple:
+        """Return gradients by the start of a step and by its inputs; the next call overwrites both. Launches only, except for
         equilibria.
 
         Args:
-            after: the state that it led to.
-            given: derivatives by that state.
-            s: length of the implicit Euler step that it solved [s].
-            states: those of the model at both ends, where supports move.
+            after: the end state.
+            cotangent: gradient by the end state.
+            s: length of the implicit Euler step solved [s].
+            states: the model's states at both ends, with moving supports.
 
         Returns:
-            Derivatives by the start, a `RodGroupState`, and `RodInputs`.
+            Gradients by the start, a `RodGroupState`, and `RodInputs`.
         """
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
@@ -182,9 +185,9 @@ class RodStepAdjoint:
             device_arrays.clear(array)
         self._rate.fill_(1.0 / s)
         by_frame, lagged = (
-            given.frame,
+            cotangent.frame,
             start.frame,
-        )  # derivatives by frames of the end, and by those that the solve lags
+        )  # gradients by frames of the end state, and by the lagged frames of the solve
         predictor, tangents = self.predictor, before.x
         if predictor:
             kept = replace(kept, frame=self.lagged(before, states))
@@ -192,19 +195,19 @@ class RodStepAdjoint:
             lagged = predictor.by_frame if predictor.carries else lagged
             tangents = predictor.x if self._midpoint else tangents
         if kind.viscous:
-            # strains of the end, which the next step is damped from
-            read = [group.element_inputs(after, after.last), device_arrays.columns(given.last)]
+            # strains of the end state, the reference of the next step's damping
+            read = [group.element_inputs(after, after.last), device_arrays.columns(cotangent.last)]
             for kernel in self._strain:
                 self._launch(kernel, read, [*map(device_arrays.columns, (window, lag, inputs.parameters))])
             if kind.twist:
                 by_frame = self._by_frame
-                device_arrays.copy(by_frame, given.frame)
+                device_arrays.copy(by_frame, cotangent.frame)
                 self._launch(self._edges, [lag, group.count], [by_frame])
         if kind.twist:
             self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
         if kind.twist or kind.viscous:
             self._launch(self._ends, [window, group.count], [self._end])
-        end = [given.x, given.v, given.theta, given.omega, self._end]
+        end = [cotangent.x, cotangent.v, cotangent.theta, cotangent.omega, self._end]
         read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
         self._launch(self._solution, read, [self._dof, self._right])
         resisted = self.drag and (self.drag, before, tangents)
@@ -219,9 +222,9 @@ class RodStepAdjoint:
         if kind.twist:
             self._launch(self._edges, [lag, group.count], [lagged])
         if self.supports and kind.twist:
-            held = self._dof[: kind.dim], self._dof[kind.dim]
+            force = self._dof[: kind.dim], self._dof[kind.dim]
             self.supports.follow(*states)
-            self.supports.vjp(kept.x, kept.frame, *held, lagged)
+            self.supports.vjp(kept.x, kept.frame, *force, lagged)
         if self.drag:
             by_tangents = predictor.by_x if self._midpoint else None
             read = before, tangents, kept, inputs.load, self._rate, self._dof, start, inputs.rate
@@ -253,10 +256,10 @@ class RodStepAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._vjp, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
-        own += [*([self._frame] if self._frame else []), *self.solve.kernels]
+        result = [*self._vjp, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
+        result += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
-        return own + [kernel for part in parts if part for kernel in part.kernels]
+        return result + [kernel for part in parts if part for kernel in part.kernels]
 
     def _rows(self, rows: int, needed: bool = True) -> wp.array:
         shape = (rows, self.group.nodes, self.group.columns) if needed else (1, 1, 1)
@@ -271,13 +274,13 @@ class RodStepAdjoint:
 
 
 def _moved(group) -> np.ndarray:
-    """Dofs that motions put in place, as bits of nodes (n, R)."""
+    """Return the dofs with prescribed motion, as bits of nodes (n, R)."""
     host, rods = group.host, group.rods
     moved = np.zeros((group.nodes, rods), np.uint8)
     for place, *poses in host.moving:
-        for at, d in enumerate(host.axes):
+        for bit, d in enumerate(host.axes):
             if poses[d] > FREE:
-                moved[place // rods, place % rods] |= 1 << at
+                moved[place // rods, place % rods] |= 1 << bit
     for place in host.turning[:, 0] - host.nodes:
         moved[place // rods, place % rods] |= 1 << group.kind.dim
     return moved

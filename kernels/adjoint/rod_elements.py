@@ -1,8 +1,10 @@
-"""Reverse of a step on chains; see `kernels.elements.variation`.
+"""Reverse of a step of a rod group; see `kernels.elements.variation`.
 
-Every element writes its own shares, which nodes then gather, so that sums come in one order, without atomics. Cotangents of dofs lie
-as right-hand sides do, [component of a node][node][rod]. The first of the terms writes the windows, others add to them; one term alone
-has lagged data.
+Every element writes its own contributions, which nodes then gather, so that sums have one order, without atomics. Cotangents of
+dofs
+are stored like right-hand sides, [component of a node][node][rod]. The first of the terms writes the element windows, the others
+add
+to them; only one term has lagged data.
 """
 
 from functools import cache
@@ -17,7 +19,7 @@ from ddg_warp.kernels.residual.rod_residual import node_functions
 
 @cache
 def put_function(kind: RodKind, real, first: bool):
-    """put(out, k, r, f): what an element brings to its window; the `first` that does writes it."""
+    """Return the device function `put(out, k, r, f)`: add f to an element window, or write it if `first`."""
     W = wp.types.vector(kind.window, real)
 
     @wp.func
@@ -33,10 +35,12 @@ def put_function(kind: RodKind, real, first: bool):
 
 @cache
 def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
-    """pull(...): the reverse of `step.finish_frames_kernel`, or, not `unit`, of `search.relag`. Writes derivatives by frames; those by
-    windows, of which the first edge alone counts, where it is the `first` to do so, else adds.
+    """Build the kernel of gradients by frames.
 
-    The reference twist is found anew at every state; the lagged one only says which turn it is of.
+    `pull`: reverse `kernels.stepping.rod_step.finish_frames_kernel`, or without `unit` the frame update `relag` of
+    `kernels.newton.rod_iterate`. Frames are written; the first edges of element windows are written if `first`, else added to.
+
+    The reference twist is recomputed at every state; the lagged one only selects its multiple of 2 pi.
     """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along_node, *_ = gather_functions(kind, real)
@@ -53,7 +57,7 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
-        given: wp.array3d(dtype=real),
+        cotangent: wp.array3d(dtype=real),
         window_out: wp.array3d(dtype=real),
         frame_out: wp.array3d(dtype=real),
     ):
@@ -63,7 +67,7 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
             return
         e = x[along_node(k + 1, n), r] - x[k, r]
         de, du, dt, _u, _t = wp.grad(carried)(
-            e, three(frame, 0, k, r), three(frame, 3, k, r), three(given, 0, k, r), three(given, 3, k, r)
+            e, three(frame, 0, k, r), three(frame, 3, k, r), three(cotangent, 0, k, r), three(cotangent, 3, k, r)
         )
         f = W()
         for d in range(3):
@@ -77,17 +81,17 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
 
 @cache
 def gathered_function(kind: RodKind, real):
-    """gathered(windows, k, n, r): what windows bring to the dofs of node k of a rod of n nodes."""
+    """Return the device function `gathered(windows, k, n, r)`: sum of the element windows at the dofs of node k of n."""
     dim, twist, closed, window = kind.dim, kind.twist, kind.closed, kind.window
     B = wp.types.vector(kind.block, real)
-    _, behind, _, edge_force = node_functions(kind, real)
+    _, previous, _, edge_force = node_functions(kind, real)
 
     @wp.func
     def gathered(windows: wp.array3d(dtype=real), k: int, n: int, r: int):
         q = B()
-        b = behind(k, n)
-        ahead = wp.static(closed) or k < n - 1
-        if ahead:
+        b = previous(k, n)
+        has_next = wp.static(closed) or k < n - 1
+        if has_next:
             f = edge_force(windows, k, n, r)
             for d in range(wp.static(dim)):
                 q[d] = -f[d]
@@ -98,7 +102,7 @@ def gathered_function(kind: RodKind, real):
             for d in range(wp.static(dim)):
                 q[d] = q[d] + f[d]
             if wp.static(twist):
-                if ahead:
+                if has_next:
                     q[wp.static(dim)] = q[wp.static(dim)] + windows[wp.static(window - 1), b, r]
         return q
 
@@ -107,11 +111,14 @@ def gathered_function(kind: RodKind, real):
 
 @cache
 def gather_kernels(kind: RodKind, real):
-    """end(...) writes what windows bring to the dofs of a node, nodes(...) adds it; edges(...) adds what lagged data of vertices bring
-    to frames of edges.
+    """Build the kernels that assemble element contributions.
+
+    `end`: write the sums of windows at the dofs of a node. `nodes`: add them. `edges`: add contributions by vertices' lagged data
+    to
+    frames of edges.
     """
     block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
-    _, behind, *_ = node_functions(kind, real)
+    _, previous, *_ = node_functions(kind, real)
 
     def gather_kernel(adds: bool):
         @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -135,7 +142,7 @@ def gather_kernels(kind: RodKind, real):
         n = count[r]
         if k >= n - wp.static(0 if closed else 1):
             return
-        b = behind(k, n)
+        b = previous(k, n)
         for c in range(6):
             total = lag_in[c, k, r]
             if b >= 0:

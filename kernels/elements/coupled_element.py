@@ -1,12 +1,12 @@
 """Elements of the coupled system: their dofs, found by index, and their storage.
 
 All dofs lie in blocks of three reals: positions of nodes, then an angle each (in component 0), then rotation vectors of rigid
-joints. An element has *slots*: its nodes, its angles, its rotation vectors, each with the index of a block. Derivatives are
-written a slot, so that whoever gathers them knows blocks only. Worlds lie behind each other: block i of world w is
-w * blocks + i, element i of world w is w * elements + i; topology and constant data are stored once.
+joints. The *local nodes* of an element are its nodes, its angles and its rotation vectors, each with the index of a block. Derivatives
+are written by local node, so that their assembly needs block indices only. Worlds are consecutive: block i of world w is
+w * blocks + i, element i of world w is w * elements + i. Topology and constant data are stored once.
 
 The lagged data of an element are, in this order: (u, t) of the rod edges its angles belong to, its own lagged rows, its data. Data
-are shared by all worlds, or, where supports turn normals among them, each world has its own.
+are common to all worlds, except where supports rotate normals among them.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ FRAME = 6  # reals of the reference frame of an edge: first director and tangent
 
 @cache
 def elements_type(real):
-    """What every kernel of a term reads: the dofs and lagged data of the net, and the elements of a set."""
+    """Return the struct that every kernel of a term reads: dofs and lagged data of the coupled system, and an element set."""
     V, R, I = wp.types.vector(3, real), wp.array2d(dtype=real), wp.array2d(dtype=int)
 
     @wp.struct
@@ -47,10 +47,11 @@ def elements_type(real):
 
 @cache
 def edge_ends(measure: Measure):
-    """First and second node of the edges of a stencil.
+    """Return the first and second nodes of a stencil's edges as Warp constants, which a loop variable may index.
 
-    These are constants of Warp's, which a loop variable may index: wp.static of one would be resolved only when a kernel is built, and
-    so make the hash of every kernel depend on what was built before it.
+    Alternative: `wp.static` of an edge. It is resolved only when a kernel is built, and would make the hash of every kernel depend
+    on the
+    kernels built before it.
     """
     I = wp.types.vector(max(1, len(measure.edges)), int)
     return tuple(I(*(edge[end] for edge in measure.edges)) for end in (0, 1))
@@ -58,45 +59,45 @@ def edge_ends(measure: Measure):
 
 @cache
 def place_function(measure: Measure, real):
-    """place(given, q, w, e) -> (q, s) of element e of world w."""
+    """Return the device function `place(inputs, q, w, e) -> (q, s)`: local dofs and lagged data of element e of world w."""
     Elements = elements_type(real)
     V = wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
     nodes, angles, spins, edge_count = measure.nodes, measure.angles, measure.spins, len(measure.edges)
-    frames, own, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
+    frames, own_rows, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
     points, (angle_row, spin_row, point_row), (first, second) = measure.points, measure.starts, edge_ends(measure)
 
     @wp.func
-    def place(given: Elements, q: wp.array(dtype=V), w: int, e: int):
-        tid = e + w * given.elements
-        shift = w * given.blocks
+    def place(inputs: Elements, q: wp.array(dtype=V), w: int, e: int):
+        tid = e + w * inputs.elements
+        shift = w * inputs.blocks
         local = Q()
         for i in range(wp.static(edge_count)):
-            edge = q[given.slots[second[i], e] + shift] - q[given.slots[first[i], e] + shift]
+            edge = q[inputs.slots[second[i], e] + shift] - q[inputs.slots[first[i], e] + shift]
             for d in range(3):
                 local[3 * i + d] = edge[d]
         for i in range(wp.static(angles)):
-            angle = q[given.slots[wp.static(nodes) + i, e] + shift]
+            angle = q[inputs.slots[wp.static(nodes) + i, e] + shift]
             local[wp.static(angle_row) + i] = angle[0]
         for i in range(wp.static(spins)):
-            spin = q[given.slots[wp.static(nodes + angles) + i, e] + shift]
+            spin = q[inputs.slots[wp.static(nodes + angles) + i, e] + shift]
             for d in range(3):
                 local[wp.static(spin_row) + 3 * i + d] = spin[d]
         for i in range(wp.static(points)):
-            position = q[given.slots[i, e] + shift]
+            position = q[inputs.slots[i, e] + shift]
             for d in range(3):
                 local[wp.static(point_row) + 3 * i + d] = position[d]
         s = S()
         for i in range(wp.static(frames)):
-            f = given.slots[wp.static(nodes) + i, e] - given.angle_start + w * given.edges
+            f = inputs.slots[wp.static(nodes) + i, e] - inputs.angle_start + w * inputs.edges
             for c in range(wp.static(FRAME)):
-                s[wp.static(FRAME) * i + c] = given.frame[c, f]
-        for c in range(wp.static(own)):
-            s[wp.static(FRAME * frames) + c] = given.lag[c, tid]
+                s[wp.static(FRAME) * i + c] = inputs.frame[c, f]
+        for c in range(wp.static(own_rows)):
+            s[wp.static(FRAME * frames) + c] = inputs.lag[c, tid]
         if wp.static(data_size > 0):
-            column = wp.where(given.data.shape[1] > given.elements, tid, e)
+            column = wp.where(inputs.data.shape[1] > inputs.elements, tid, e)
             for c in range(wp.static(data_size)):
-                s[wp.static(FRAME * frames + own) + c] = given.data[c, column]
+                s[wp.static(FRAME * frames + own_rows) + c] = inputs.data[c, column]
         return local, s
 
     return place
@@ -104,7 +105,7 @@ def place_function(measure: Measure, real):
 
 @cache
 def spread_function(measure: Measure, real):
-    """Build `spread(f, slot)`: return the part of a derivative by the local dofs that belongs to the dof block of a slot."""
+    """Return the device function `spread(f, slot)`: derivative by the dof block of a local node, from that by the local dofs."""
     V = wp.types.vector(3, real)
     Q, _, _, _ = measure.types(real)
     nodes, angles, spins, edge_count = measure.nodes, measure.angles, measure.spins, len(measure.edges)
@@ -112,7 +113,7 @@ def spread_function(measure: Measure, real):
 
     @wp.func
     def spread(f: Q, slot: int):
-        """The three reals of a slot; `slot` is a constant where this is unrolled."""
+        """Return the three reals of a local node; `slot` is a constant where this is unrolled."""
         v = V()
         for i in range(wp.static(edge_count)):
             if slot == first[i]:
@@ -139,18 +140,18 @@ def spread_function(measure: Measure, real):
 
 
 def factor_type(linear, local: bool):
-    """Rows of factors: of the local dofs, or vectors a slot."""
+    """Return the type of factor rows: reals of the local dofs, or vectors by local node."""
     return wp.array2d(dtype=linear if local else wp.types.vector(3, linear))
 
 
 @cache
 def part_function(measure: Measure, real):
-    """part(f, row, slot, e): of rows of local dofs that begin at `row`, what belongs to a slot of element e.
+    """Return the device function `part(f, row, slot, e)`: block of a local node of element e in local-dof rows from `row` on.
 
-    For measures where one edge at most ends, and one starts, in a node; see `Measure.ends`.
+    For measures whose nodes end at most one edge and start at most one; see `Measure.ends`.
     """
     V, I = wp.types.vector(3, real), wp.types.vector(measure.slots, int)
-    plus, minus = (I(*of) for of in measure.ends)
+    plus, minus = (I(*ends) for ends in measure.ends)
     first, spins, _ = measure.starts
 
     @wp.func
@@ -177,8 +178,8 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
     """Return the storage of an element set: an island is a world, and dof blocks are found by index.
 
     Args:
-        slots: whether derivatives are vectors [slot][element], instead of reals of the local dofs.
-        serial: whether a thread takes all elements of a world.
+        slots: True if derivatives are vectors [local node][element], instead of reals of the local dofs.
+        serial: True if a thread takes all elements of a world.
     """
     measure, Inputs, V = term.measure, elements_type(real), wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
@@ -237,7 +238,7 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
 
 @cache
 def linear_stress_kernel(term: Term, real):
-    """Build the kernel of stresses at the strains that a step gives to first order, e + J step."""
+    """Build the kernel of stresses at the linearised strains of a step, e + J step."""
     storage, V, n = coupled_storage(term, real), wp.types.vector(3, real), len(term.measure.strains)
     Inputs, items, read = storage.Inputs, storage.items, storage.read
     displacement, column_of = storage.displacement, storage.column
@@ -252,10 +253,10 @@ def linear_stress_kernel(term: Term, real):
     def linear_stress(inputs: Inputs, step: wp.array(dtype=V), stress_out: wp.array2d(dtype=real)):
         i, j = wp.tid()
         world, element = items(i, j)
-        at = column_of(inputs, world, element)
-        w, p = parameters(inputs, world, element, at)
+        column = column_of(inputs, world, element)
+        w, p = parameters(inputs, world, element, column)
         q, s = read(inputs, world, element, True)
         e, jacobian = jacobian_of(q, s, w)
-        write(stress_out, 0, slope_of(e + jacobian * displacement(inputs, step, world, element, True), p), at)
+        write(stress_out, 0, slope_of(e + jacobian * displacement(inputs, step, world, element, True), p), column)
 
     return linear_stress

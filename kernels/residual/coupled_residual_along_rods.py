@@ -1,6 +1,6 @@
-"""Elements along the rods of a net at the places of its chains: their forces on nodes and angles, and whether these balance.
+"""Residuals of path nodes: forces of elements along rods on nodes and twist angles, and their convergence test.
 
-A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none.
+A path node has a node and the twist angle of the edge ahead; a missing one is block -1.
 """
 
 from functools import cache
@@ -16,9 +16,9 @@ from ddg_warp.kernels.terms import Term
 
 @cache
 def along_type(real, linear):
-    """What a set along rods writes, of the local dofs; and its elements at each place.
+    """Return the struct of a set along rods: outputs by local dof, and the elements at each path node.
 
-    Entry (i, k, c) of `at` is the element whose node i is at that place, -1 for none.
+    Entry (i, k, c) of `at` is the element with local node i at path node k of path c, -1 for none.
     """
 
     @wp.struct
@@ -37,12 +37,13 @@ def along_type(real, linear):
 
 @cache
 def force_function(terms: tuple[Term, ...], real, linear):
-    """collect(sets, k, c, w, accepted) of the last of the terms, and by calling itself of those before: what meets at a place.
+    """Return the device function `collect(sets, k, c, w, accepted)`: sums of all terms' elements at a path node, by recursion over
+    the terms.
 
-    Returns forces on its node, their sizes and stiffnesses, the same of the angle ahead, the change of the energy of the elements that
-    begin there, and the size of that.
+    It returns force, magnitude and stiffness of its node, the same of the angle ahead, the energy change of the elements that begin
+    there, and the magnitude of that energy.
     """
-    measure, first, which = terms[-1].measure, len(terms) == 1, len(terms) - 1
+    measure, first, last = terms[-1].measure, len(terms) == 1, len(terms) - 1
     V, Along = wp.types.vector(3, real), along_type(real, linear)
     nodes, angles = measure.nodes, measure.angles
     part, largest = part_function(measure, real), largest_function(real)
@@ -56,7 +57,7 @@ def force_function(terms: tuple[Term, ...], real, linear):
         w: int,
         accepted: int,
     ):
-        own = sets[wp.static(which)]
+        elements = sets[wp.static(last)]
         force = V()
         size = real(0.0)
         stiff = real(0.0)
@@ -68,21 +69,21 @@ def force_function(terms: tuple[Term, ...], real, linear):
         if wp.static(not first):
             force, size, stiff, moment, size_too, stiff_too, change, noise = before(sets, k, c, w, accepted)
         for i in range(wp.static(nodes)):
-            e = own.at[i, k, c]
+            e = elements.at[i, k, c]
             if e >= 0:
-                e += first_of(w, own.elements)
-                f = part(own.gradient, 0, i, e)
-                stiffness = real(own.stiffness[e])
+                e += first_of(w, elements.elements)
+                f = part(elements.gradient, 0, i, e)
+                stiffness = real(elements.stiffness[e])
                 force += f
                 size += largest(f)
                 stiff += stiffness
                 if i == 0:
-                    new = own.energy[1 - accepted, e]
-                    change += new - own.energy[accepted, e]
+                    new = elements.energy[1 - accepted, e]
+                    change += new - elements.energy[accepted, e]
                     noise += wp.abs(new)
                 if wp.static(angles > 0):
                     if i < wp.static(angles):
-                        m = own.gradient[wp.static(measure.size - angles) + i, e]
+                        m = elements.gradient[wp.static(measure.size - angles) + i, e]
                         moment += m
                         size_too += wp.abs(m)
                         stiff_too += stiffness
@@ -93,7 +94,10 @@ def force_function(terms: tuple[Term, ...], real, linear):
 
 @cache
 def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, contact: bool, serial: bool):
-    """balance(...) of the nodes and angles of places, but for those `elsewhere`; see `kernels.linear.sliced_ell`."""
+    """Build the kernel of residuals of path nodes.
+
+    `balance`: write the residuals of their nodes and angles, except blocks `elsewhere`; see `kernels.linear.sliced_ell`.
+    """
     Along, Given, Found = along_type(real, linear), inputs_type(real, drag), results_type(real, linear)
     M, until = wp.types.vector(1, real), until_function(serial)
     outer, settle = residual_functions(real, linear, drag, contact)
@@ -102,14 +106,14 @@ def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: b
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
-        given: Given,
+        inputs: Given,
         places: wp.array3d(dtype=int),
         count: wp.array(dtype=int),
         elsewhere: wp.array(dtype=wp.uint8),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         sets: wp.array(dtype=Along),
-        found: Found,
+        results: Found,
     ):
         start, r = wp.tid()
         w = r / count.shape[0]
@@ -119,17 +123,17 @@ def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: b
         load_scale = scalars[LOAD_SCALE, w]
         coefficient = scalars[INERTIA_COEFFICIENT, w]
         accepted = flags[ENERGY_BUFFER, w]
-        shift = first_of(w, given.blocks)
+        shift = first_of(w, inputs.blocks)
         for k in range(start, until(start, count[c])):
             f, size, stiff, moment, size_too, stiff_too, change, noise = collect(sets, k, c, w, accepted)
             node = places[0, k, c]
             if node >= 0:
                 if elsewhere[node] == wp.uint8(0):
                     i = node + shift
-                    force, large, rigid, work = outer(given, i, node, w, coefficient)
+                    force, large, rigid, work = outer(inputs, i, node, w, coefficient)
                     settle(
-                        given,
-                        found,
+                        inputs,
+                        results,
                         flags,
                         load_scale,
                         i,
@@ -146,10 +150,10 @@ def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: b
                 if angle >= 0:
                     if elsewhere[angle] == wp.uint8(0):
                         j = angle + shift
-                        turning, large_too, rigid_too, work_too = outer_of_angle(given, j, angle, w, coefficient)
+                        turning, large_too, rigid_too, work_too = outer_of_angle(inputs, j, angle, w, coefficient)
                         settle_angle(
-                            given,
-                            found,
+                            inputs,
+                            results,
                             flags,
                             load_scale,
                             j,

@@ -34,14 +34,16 @@ def element_kernel(term: Term, real, linear):
         w, e = items(i, j)
         if scalars[STEP_PROGRESS, w] >= real(1.0):
             return
-        at = column_of(inputs, w, e)
+        column = column_of(inputs, w, e)
         q, s = read(inputs, w, e, True)
         reach = wp.max(wp.abs(inputs.q[inputs.slots[0, e] + w * inputs.blocks]))
-        rows = rows_of(inputs, window_of(inputs, q0, w, e, True), s, q, s, True, reach, floor, w, e, at)
+        rows = rows_of(inputs, window_of(inputs, q0, w, e, True), s, q, s, True, reach, floor, w, e, column)
         least = floor * reach
         worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, e] = rows[wp.static(DRIFT)]
-        rows_out[wp.static(ROUNDING) * worlds + w, e] = rows[wp.static(ROUNDING)] + real(stiffness[at]) * least * least
+        rows_out[wp.static(ROUNDING) * worlds + w, e] = (
+            rows[wp.static(ROUNDING)] + real(stiffness[column]) * least * least
+        )
         rows_out[wp.static(FIXED) * worlds + w, e] = rows[wp.static(FIXED)]
         rows_out[wp.static(DISSIPATED) * worlds + w, e] = rows[wp.static(DISSIPATED)]
 

@@ -1,11 +1,14 @@
-"""What the implicit midpoint rule makes of the energy: of a step from x0 over the midpoint x to x1 = 2 x - x0
+"""Discrete energy balance of the implicit midpoint rule.
+
+The energy drift of a step from x0 over the midpoint x to x1 = 2 x - x0 is
 
     E(x1) - E(x0) - dE/dx(x) . (x1 - x0) + (f - f(x)) . (x1 - x0),
 
-with E the elastic energy and f the loads that follow what they act on, which the rule takes where it predicts x. All else it accounts
-for exactly: what its forces do along x1 - x0 is the change of kinetic energy, M (v1 - v0) . (v1 + v0) / 2, the work of loads and
-supports, or dissipated. It is zero where E is quadratic in x and nothing follows; where steps turn stiff elements far it adds up, at
-worst without a bound (Simo and Tarnow, Z. angew. Math. Phys. 43, 1992, 757).
+with E the elastic energy and f the follower loads, which the rule evaluates at the predicted x. All other work is exact: the
+forces'
+work along x1 - x0 is the change of kinetic energy, M (v1 - v0) . (v1 + v0) / 2, the work of loads and supports, or dissipation. The
+drift is zero where E is quadratic in x and no load follows. It accumulates, at worst without a bound, where steps rotate stiff
+elements far (Simo and Tarnow, Z. angew. Math. Phys. 43, 1992, 757).
 """
 
 from functools import cache
@@ -25,11 +28,11 @@ ROWS = 4
 
 @cache
 def balance_function(term: Term, real):
-    """balance(q0, s0, q, s, w, p, floor) of one element -> its rows.
+    """Return the device function `balance(q0, s0, q, s, w, p, reach, floor) -> rows` of one element.
 
-    They are what a step makes of its energy; what rounding may leave in that, `floor` the relative rounding of a position; its
-    elastic energy at the end; and what its viscosity takes in. `q0`, `q` are its dofs, `s0`, `s` its lagged data, at the start and in
-    the middle, `reach` is how large a position is.
+    Rows: energy drift of the step, its rounding bound, elastic energy at the end, viscous dissipation. `q0`, `q` are the dofs and
+    `s0`,
+    `s` the lagged data at the start and the midpoint. `reach` is the magnitude of positions, `floor` their relative rounding.
     """
     measure, density = term.measure, term.density
     Q, S, E, _ = measure.types(real)
@@ -56,7 +59,7 @@ def balance_function(term: Term, real):
             taken = w * wp.dot(slope_of(middle, p) - slope, strain)
         force = wp.max(wp.abs((slope * w) * jacobian))
         rounding = floor * (wp.abs(start) + wp.abs(end) + force * reach)
-        # that of a magnet may be negative, and counts by its size
+        # a magnet's energy may be negative: its magnitude counts
         return B(end - start - w * wp.dot(slope, strain), rounding, wp.abs(end), taken)
 
     return balance
@@ -64,15 +67,16 @@ def balance_function(term: Term, real):
 
 @cache
 def rows_function(storage: ElementStorage, index: int, real):
-    """Build `rows_at`: return the rows of an element, summed over the terms 0 to `index` that it has.
+    """Return the device function `rows_at`: rows of an element, summed over its terms 0 to `index`.
 
-    It calls itself for those before the last: a loop over functions would generate all code whenever the kernel is defined.
+    It recurses over the terms. Alternative: a loop over functions, for which Warp generates all code whenever the kernel is
+    defined.
     """
-    own, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
-    everywhere = own.term.measure.span != 2 or len(storage.terms) == 1
+    access, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
+    everywhere = access.term.measure.span != 2 or len(storage.terms) == 1
     before = rows_function(storage, index - 1, real) if index else None
-    local, short, parameters = own.local, own.short, parameter_function(storage, index, real)
-    balance, B = balance_function(own.term, real), wp.types.vector(ROWS, real)
+    local, short, parameters = access.local, access.short, parameter_function(storage, index, real)
+    balance, B = balance_function(access.term, real), wp.types.vector(ROWS, real)
 
     @wp.func
     def rows_at(
@@ -86,13 +90,13 @@ def rows_function(storage: ElementStorage, index: int, real):
         floor: real,
         island: int,
         e: int,
-        at: int,
+        column: int,
     ):
         rows = B()
         if wp.static(index > 0):
-            rows += before(inputs, window0, lagged0, window, lagged, whole, reach, floor, island, e, at)
+            rows += before(inputs, window0, lagged0, window, lagged, whole, reach, floor, island, e, column)
         if whole or wp.static(everywhere):
-            w, p = parameters(inputs, island, e, at)
+            w, p = parameters(inputs, island, e, column)
             rows += balance(local(window0), short(lagged0), local(window), short(lagged), w, p, reach, floor)
         return rows
 
@@ -131,7 +135,7 @@ def rod_kernel(kind: RodKind, real, linear):
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
-        """`load` and `load_angle` are those of the iterate, those `there` those that the step was solved with."""
+        """Sum the rows of a rod; `load` and `load_angle` belong to the iterate, `load_there` and `load_angle_there` to the solve."""
         first, r = wp.tid()
         if scalars[STEP_PROGRESS, r] >= real(1.0):
             return
@@ -142,8 +146,8 @@ def rod_kernel(kind: RodKind, real, linear):
                 m = mass[k, r].mass
             else:
                 m = mass[k, r]
-            here = middle.x[k, r]
-            moved = here - start.x[k, r]
+            x = middle.x[k, r]
+            moved = x - start.x[k, r]
             v = moved * (real(2.0) * scalars[INVERSE_STEP, r]) - v0[k, r]
             kinetic = real(0.5) * m * wp.length_sq(v)
             damped = real(2.0) * damping[0] * scalars[INVERSE_STEP, r] * m * wp.length_sq(moved)
@@ -155,7 +159,7 @@ def rod_kernel(kind: RodKind, real, linear):
                 if wp.static(drag):
                     damped += real(2.0) * mass[k, r].spin * turned * turned
             if wp.static(drag):
-                away = here - mass[k, r].carried
+                away = x - mass[k, r].carried
                 damped += real(2.0) * wp.dot(away, mass[k, r].resistance * away)
             made = real(0.0)
             worked = real(0.0)
@@ -169,11 +173,11 @@ def rod_kernel(kind: RodKind, real, linear):
             total += B(real(2.0) * made, real(2.0) * floor * worked, kinetic, damped)
             if wp.static(closed) or k < n - 1:
                 whole = whole_of(middle, r, k)
-                reach = wp.max(wp.abs(here))
+                reach = wp.max(wp.abs(x))
                 q0, s0 = read(start, r, k, whole)
                 q, s = read(middle, r, k, whole)
-                at = column_of(middle, r, k)
-                total += rows_of_all(middle, q0, s0, q, s, whole, reach, floor, r, k, at)
+                column = column_of(middle, r, k)
+                total += rows_of_all(middle, q0, s0, q, s, whole, reach, floor, r, k, column)
                 least = floor * reach
                 total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[k, r]) * least * least
         for i in range(wp.static(ROWS)):
@@ -184,11 +188,13 @@ def rod_kernel(kind: RodKind, real, linear):
 
 @cache
 def drift_kernel(real):
-    """Enters a solved step of every rod or world in its account, or has it fail.
+    """Build the kernel that accumulates the energy balance of every rod or world.
 
-    The account holds all that the scheme has made of the energy and what rounding may have, the largest kinetic and elastic energy,
-    and all that was dissipated. A step fails that brings what was made beyond the fraction `bound` of the energy held and dissipated,
-    and farther from zero.
+    `judge`: add a solved step to the account, or fail the step. The account holds the total drift and its rounding bound, the
+    largest
+    kinetic plus elastic energy, and the total dissipation. A step fails if the total drift exceeds the fraction `bound` of that
+    energy
+    plus dissipation, and grows.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -205,24 +211,24 @@ def drift_kernel(real):
             return
         drift = account[wp.static(DRIFT), r]
         rounding = account[wp.static(ROUNDING), r]
-        held = real(0.0)
+        energy = real(0.0)
         dissipated = account[wp.static(DISSIPATED), r]
         before = wp.abs(drift)
         for i in range(rows.shape[1]):
             drift += rows[wp.static(DRIFT), i, r]
             rounding += rows[wp.static(ROUNDING), i, r]
-            held += rows[wp.static(FIXED), i, r]
+            energy += rows[wp.static(FIXED), i, r]
             dissipated += rows[wp.static(DISSIPATED), i, r]
-        held = wp.max(held, account[wp.static(FIXED), r])
-        allowed = bound * (held + dissipated) + rounding
+        energy = wp.max(energy, account[wp.static(FIXED), r])
+        allowed = bound * (energy + dissipated) + rounding
         if not wp.abs(drift) <= wp.max(allowed, before):
             flags[STATUS, r] = wp.static(outcome.ENERGY_DRIFT)
             failed_out[0, r] = drift
-            failed_out[1, r] = held + dissipated
+            failed_out[1, r] = energy + dissipated
             return
         account[wp.static(DRIFT), r] = drift
         account[wp.static(ROUNDING), r] = rounding
-        account[wp.static(FIXED), r] = held
+        account[wp.static(FIXED), r] = energy
         account[wp.static(DISSIPATED), r] = dissipated
 
     return judge

@@ -1,4 +1,4 @@
-"""Friction of a net as a function of where everything is, normal forces and directions included; see `kernels.adjoint.contact`."""
+"""Friction of the coupled system as a function of positions, normal forces and directions included; see `kernels.adjoint.contact`."""
 
 import numpy as np
 import warp as wp
@@ -12,10 +12,10 @@ from ddg_warp.solve.collision.rolling_rotation import rotated_by
 
 
 class FrictionJacobian:
-    """Derivatives of friction, whose pairs are those of an `ExactContact`.
+    """Derivatives of friction on the pairs of an `ExactContact`.
 
     Attributes:
-        spun, radii, by_direction: what `rub_kernel` writes of pairs beside its parts.
+        spun, radii, by_direction: further outputs of `rub_kernel` per pair.
     """
 
     def __init__(self, coupled, system):
@@ -23,16 +23,24 @@ class FrictionJacobian:
         self._velocity = touching.law.velocity
         law, friction = touching.density, FRICTION_LAWS[touching.law.friction_law]
         self._spins = bool(terms.frictions) and terms.spins.any
-        self._rolls = any(of.rolls for of in terms.frictions)
-        self._leads = any(of.directions[0] is not None for of in terms.frictions)
+        self._rolls = any(friction_terms.rolls for friction_terms in terms.frictions)
+        self._leads = any(friction_terms.directions[0] is not None for friction_terms in terms.frictions)
         self.kernels = [
-            rub_kernel(of.found.kind, law, friction, coupled.real, of.directions[1] is not None, self._spins, of.rolls)
-            for of in terms.frictions
+            rub_kernel(
+                friction_terms.found.kind,
+                law,
+                friction,
+                coupled.real,
+                friction_terms.directions[1] is not None,
+                self._spins,
+                friction_terms.rolls,
+            )
+            for friction_terms in terms.frictions
         ]
         self.reserve()
 
     def reserve(self) -> None:
-        """Make room for as many pairs as the search has."""
+        """Allocate outputs for the capacity of the pair lists."""
         most = max(pairs.capacity for pairs in self.system.search.lists)
         shape, vector, device = (ITEMS if self._rolls else PAIR_NODES, most), self.coupled.vector, self.coupled.device
 
@@ -47,19 +55,31 @@ class FrictionJacobian:
         self._start_parts, self._lagged_parts = (device_arrays.allocate(shape, vector, device) for _ in range(2))
         self.by_direction = wp.zeros(most if self._leads else 1, dtype=vector, device=device)
 
-    def vjp(self, index: int, of: tuple, at: tuple, w: wp.array, rate: wp.array, numbers: wp.array) -> list[wp.array]:
-        """What friction on a list of pairs, with nodes and angles `of` these, brings by slot of the solution, of the start and of what
-        was lagged.
+    def vjp(
+        self, index: int, ends: tuple, positions: tuple, w: wp.array, rate: wp.array, numbers: wp.array
+    ) -> list[wp.array]:
+        """Return friction's derivatives by local node of the solution, of the start and of the lagged positions, on one list of
+        pairs.
 
         Args:
-            at: blocks where friction was lagged, at the start and at the solution (W N,) each.
+            index: number of the list.
+            ends: nodes and angles of the pairs.
+            positions: blocks at the friction lag, at the start and at the solution (W N,) each.
             w: solution of the linear system (W N,).
-            numbers: what it brings by the numbers of pairs, to be written.
+            numbers: output, derivatives by the parameters of pairs.
         """
         terms = self.system.terms
         rub = terms.frictions[index]
-        inputs = [rub.pairs, rub.count, rub.found.sides, terms.lag_law, *of, rub.factor.used]
-        inputs += [*at, w, self._velocity, rate, *rub.directions, terms.spins.places, terms.spins.turned.flatten()]
+        inputs = [rub.pairs, rub.count, rub.found.sides, terms.lag_law, *ends, rub.factor.used]
+        inputs += [
+            *positions,
+            w,
+            self._velocity,
+            rate,
+            *rub.directions,
+            terms.spins.places,
+            terms.spins.turned.flatten(),
+        ]
         written = [rub.gradient, self._start_parts, self._lagged_parts]
         more = [numbers, self.by_direction, self.spun, self.radii]
         device_arrays.take_turns(
@@ -68,9 +88,9 @@ class FrictionJacobian:
         return written
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
-        """What friction adds to the matrix of an equilibrium at blocks q that came there from others (3 W N, 3 W N) [N/m].
+        """Return friction's term in the matrix of an equilibrium at blocks q, reached from `before` (3 W N, 3 W N) [N/m].
 
-        Normal forces and directions are those at q, too, so that it is not symmetric. Makes room for pairs; reads from the device.
+        Normal forces and directions are evaluated at q, too: the matrix is unsymmetric. Enlarges pair lists; reads from the device.
         """
         while True:
             self.system.find(q, before, q, rate)
@@ -85,48 +105,48 @@ class FrictionJacobian:
         )
 
     def _of_list(self, index: int, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
-        """Derivative of the friction of elements by q.
+        """Return the derivative by q of the friction on one list of pairs.
 
-        Each pair has blocks of its own, behind those of the net, at which w is one component after another.
+        Each pair has private blocks, behind the blocks of the coupled system; w is a unit vector there, one component at a time.
         """
         rub = self.system.terms.frictions[index]
         count, device, size = int(rub.count.numpy()[0]), self.coupled.device, 3 * len(q)
         blocks, angles, ends = rub.factor.nodes.numpy()[:count], rub.factor.angles, None
         if rub.rolls:
             blocks = np.column_stack([blocks, angles.numpy()[:count]])
-        felt = (rub.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
-        felt[:, rub.found.kind.first + rub.found.kind.second : PAIR_NODES] = False
-        apart = np.where(felt, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
-        nodes = device_arrays.upload(apart[:, :PAIR_NODES], wp.vec4i, device)
+        involved = (rub.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
+        involved[:, rub.found.kind.first + rub.found.kind.second : PAIR_NODES] = False
+        private = np.where(involved, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
+        nodes = device_arrays.upload(private[:, :PAIR_NODES], wp.vec4i, device)
         if rub.rolls:
-            angles = device_arrays.upload(apart[:, PAIR_NODES:], wp.vec2i, device)
+            angles = device_arrays.upload(private[:, PAIR_NODES:], wp.vec2i, device)
         if rub.directions[0]:
             world, first = np.divmod(rub.pairs.numpy()[:count, 0], rub.found.first.count)
             ends = rub.directions[0].numpy()[first] + world[:, None] * self.coupled.blocks
         start, x = (
-            wp.array(np.concatenate([own, own[blocks.ravel()]]), dtype=q.dtype, device=device)
-            for own in (before.numpy(), q.numpy())
+            wp.array(np.concatenate([positions, positions[blocks.ravel()]]), dtype=q.dtype, device=device)
+            for positions in (before.numpy(), q.numpy())
         )
         w, entries = wp.zeros_like(x), [(np.zeros(0, int), np.zeros(0, int), np.zeros(0))]
 
-        def add(row, block, found):
-            """Derivatives `found` (n, 3) of components (n,) by those of blocks (n,)."""
+        def add(row, block, gradients):
+            """Add derivatives `gradients` (n, 3) of components (n,) by the positions of blocks (n,)."""
             columns = 3 * block[:, None] + np.arange(3)
-            entries.append((np.repeat(row, 3), columns.ravel(), found.astype(float).ravel()))
+            entries.append((np.repeat(row, 3), columns.ravel(), gradients.astype(float).ravel()))
 
         for slot in range(blocks.shape[1]):
-            on = np.flatnonzero(felt[:, slot])
+            on = np.flatnonzero(involved[:, slot])
             for d in range(3 if slot < PAIR_NODES else 1):
                 unit = np.zeros((len(x), 3))
-                unit[apart[on, slot], d] = 1.0
+                unit[private[on, slot], d] = 1.0
                 w.assign(unit)
                 written = self.vjp(index, (nodes, angles), (x, start, x), w, rate, self._numbers)
                 by_x, _, by_lagged = (array.numpy()[:, :count] for array in written)
                 by_x[:PAIR_NODES] += by_lagged[:PAIR_NODES]
                 row = 3 * blocks[:, slot] + d
-                for other in range(blocks.shape[1]):
-                    both = on[felt[on, other]]
-                    add(row[both], blocks[both, other], by_x[other, both])
+                for column in range(blocks.shape[1]):
+                    both = on[involved[on, column]]
+                    add(row[both], blocks[both, column], by_x[column, both])
                 if ends is not None:
                     led = self.by_direction.numpy()[on]
                     add(row[on], ends[on, 1], led)

@@ -154,7 +154,9 @@ class RodSubstructuring:
             self.longer = device_arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = rod_bands.lengthen_kernel(terms, real, linear)
         if self.exact and serial and not (self.reduction or reuse or self.split):
-            self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, exact_iterations, drag, self.joints > 0)
+            self._walk = walk_kernel(
+                terms, plan.twist, plan.span, real, linear, exact_iterations, drag, self.joints > 0
+            )
 
     @property
     def kernels(self) -> list:
@@ -221,7 +223,9 @@ class RodSubstructuring:
             threads = of_places + coupled.worlds * len(self._at_none)
         self._launch(self._product, threads, inputs, [product, dots])
 
-    def direct(self, matrix, mass, islands, updated_islands, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots) -> None:
+    def direct(
+        self, matrix, mass, islands, updated_islands, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots
+    ) -> None:
         """Write H^-1 r of the worlds that need a direction, if `exact`; raise `lost` where H is indefinite.
 
         `updated_islands` are the islands whose H is new.

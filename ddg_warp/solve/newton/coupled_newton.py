@@ -121,7 +121,7 @@ class CoupledNewton:
             banded and part.host.along for part in coupled.sets
         )  # True if derivatives are of the local dofs
         self.split = tuple(
-split and is_local and splits(part.term) for is_local, part in zip(self.local, coupled.sets, strict=True)
+            split and is_local and splits(part.term) for is_local, part in zip(self.local, coupled.sets, strict=True)
         )
         sets = zip(coupled.sets, exact, self.local, self.split, strict=True)
         self.parts = [self._part(*inputs, make, H) for inputs in sets]

@@ -1,4 +1,4 @@
-"""Projected Newton on chains: every rod has its own loop, line search and outcome, all on the device."""
+"""Projected Newton on rod groups; every rod has its own loop, line search and outcome, all on the device."""
 
 from dataclasses import dataclass
 
@@ -14,11 +14,9 @@ from ddg_warp.kernels.newton import rod_sweep as sweep
 from ddg_warp.kernels.residual import rod_residual
 from ddg_warp.kernels.stepping import rod_step, rod_warm_start
 
-FIRST_EXACT_ITERATION = (
-    2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
-)
+FIRST_EXACT_ITERATION = 2  # Gauss-Newton iterations of "progressive": far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
-FROZEN = ("auto", "gauss_newton")  # modes of the matrix that serves a whole step
+FROZEN = ("auto", "gauss_newton")  # `psd` modes of a frozen Hessian
 FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_newton'"
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
@@ -26,33 +24,44 @@ MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, s
 @argument_checks.called
 @dataclass(frozen=True)
 class NewtonOptions:
-    """How a Newton solve searches and when it stops.
+    """Options of a Newton solve: convergence test, line search and matrix.
 
     Attributes:
-        rtol: a dof is in equilibrium where its residual is below rtol times the load scale of its rod or shell (sum of its outer
-            forces; without any, the first residual), in shells times the root of its share of the area, or below what rounding
-            leaves of it; so are sums of residuals over parts. See `ddg_warp.compile.residual_tolerance`.
-        floor_factor: how many rounding units of the forces that meet at a node count as rounding.
+        rtol: a dof converges where its residual is below rtol times the load scale of its rod or shell, or below the rounding
+            floor. The
+            load scale is the sum of the body's outer forces; without any, the first residual. In shells it is scaled by the root of
+            the
+            dof's fraction of the area. Subset sums of residuals obey the same test. See `ddg_warp.compile.residual_tolerance`.
+        floor_factor: rounding units of the forces on a node that count as rounding.
         max_iterations: Newton iterations of one solve.
-        max_halvings: shortenings of one step by the line search.
-        rotation_cap: largest turn of an edge, a joint or the angle of a rod in one update [rad].
+        max_halvings: backtracks of one step by the line search.
+        rotation_cap: largest rotation of an edge, a joint or a twist angle in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
-        psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
-            compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian, and
-            in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or compressed rods
-            and long steps, where Gauss-Newton takes many iterations. Where many iterations are such, a time step is tried again
-            with a shorter one (outcome `indefinite`; see `kernels.core.islands.projected_limit_function`). "project": the exact one
-            with every element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
-            exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again with a
-            shorter one. "auto": "progressive" for rods that are curved or twisted at rest, or stiff over a time step
-            (`compile.precision.stiff`), on their own or in nets, else "gauss_newton". Nets take all but "project". Their exact
-            Hessian is that of rods and rigid joints; second derivatives of shells' bending, of glue and of magnets are left out,
-            which "none" refuses. It is indefinite where a pivot is lost, or conjugate gradients meet negative curvature; by
-            "gauss_newton" nets go on with the direction found so far, and leave compression out of the next matrix.
-        unconverged_fraction: in contact, part of the bodies of a world (rods, shells, and what is joined of them) that may be out
-            of balance at the end of a step, each by no more than ten times the tolerance: in crowds some slip off others at any
-            time, and hold up all the rest. What is left of its residual acts on such a body like a force, in that step. Where
-            contact cuts nothing, directions are solved until all but half as many balance by what is linear.
+        psd: the matrix. Mode "gauss_newton": no second derivatives of bending and twist. Only compression can make this matrix
+            indefinite;
+            it is dropped where a pivot is lost. Mode "progressive": the exact Hessian from the third iteration on, and Gauss-Newton
+            without compression in iterations where it is indefinite. This suits curved, twisted or compressed rods and long steps,
+            where Gauss-Newton takes many iterations. Too many projected iterations shorten a time step: outcome `indefinite`, see
+            `kernels.core.islands.projected_limit_function`. Mode "project": the exact Hessian with every element projected to
+            positive
+            semi-definite by its eigenvalues, at twenty times the cost of an iteration. Mode "none": the exact Hessian. An
+            indefinite one
+            ends the solve with the outcome `indefinite`, and a time step is retried with a shorter one. Mode "auto": "progressive"
+            for
+            rods that are curved or twisted at rest, or stiff over a time step (`compile.precision.stiff`), else "gauss_newton".
+            The coupled system takes all but "project". Its exact Hessian covers rods and rigid joints. Second derivatives of
+            shells'
+            bending, of rod-shell coupling and of magnets are omitted, which "none" refuses. A lost pivot or negative curvature in
+            conjugate gradients makes it indefinite. With "gauss_newton" the coupled system then keeps the direction reached, and
+            drops
+            compression from the next matrix.
+        unconverged_fraction: in contact, fraction of the bodies of a world that may exceed the tolerance at the end of a step, each by at most
+            ten
+            times. Bodies are rods, shells, or joined ones. With many bodies in contact some slip off others at any time, and delay
+            all
+            others. The remaining residual acts on such a body like a force in that step. Where contact cuts no motion, directions
+            are
+            solved until all but half as many bodies satisfy the linear system.
     """
 
     rtol: float = 1e-6
@@ -74,24 +83,25 @@ class NewtonOptions:
 
 
 class RodNewton:
-    """Newton on one group of uncoupled open rods by the chain sweep. Owns what is needed while a solve runs.
+    """Newton's method on one group of uncoupled open rods by the block LDL^T sweep, with the buffers of a solve.
 
     Args:
-        model, group, options: what to solve, and how.
-        linear: scalar type of the linear algebra; that of the model by default.
-        midpoint: whether predicted iterates are midpoints, to which the lagged frames are carried.
-        split: whether edges may be stiffer than the matrix carries, by tensions that are unknowns; see
+        model, group, options: the problem, and the options of its solve.
+        linear: scalar type of the linear algebra; default: the model's.
+        midpoint: True if predicted iterates are midpoints, to which the lagged frames are carried.
+        split: True if edges may be stiffer than the matrix carries, with tensions as unknowns; see
             `kernels.linear.mixed_axial_force`.
 
     Attributes:
-        x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
-        target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
-        mass, rotary: m; with drag, of which `kernels.forces.drag` makes them at the start of a solve, its own.
-        load, load_angle: forces on nodes and moments about edges, where there are any (`loaded`).
-        islands: state of every rod's search; see `kernels.core.islands`.
+        x, theta, frame: the iterate and its lagged frames.
+        base: the accepted positions before the update.
+        target: minimum of the inertial potential, coefficient * m |x - target|^2 / 2; for twist angles `target_angle`.
+        mass: m, and `rotary`; own arrays with drag, which `kernels.forces.drag` writes at the start of a solve.
+        load: forces on nodes, and moments about edges `load_angle`, if `loaded`.
+        islands: state of every rod's line search; see `kernels.core.islands`.
     """
 
-    reuse = False  # whether the matrix of a step's first iterate serves the whole step
+    reuse = False  # True if the matrix of a step's first iterate serves the whole step
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
         self.group, self.options = group, options
@@ -159,14 +169,14 @@ class RodNewton:
         self._adjust = None if kind.closed else rod_iterate.adjust_kernel(kind, self.real, self.linear, split)
 
     def automatic_psd(self) -> str:
-        """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""
+        """Return the mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks the effect of natural curvature on roll."""
         group = self.group
         rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
         return "progressive" if any(map(group.parameters.may_be_other_than_zero, rest)) else "gauss_newton"
 
     @property
     def outdated(self) -> bool:
-        """Whether parameters have changed so that another mode suits the rods than the one that was chosen."""
+        """True if changed parameters suit another `psd` mode than the one chosen."""
         return self.options.psd == "auto" and self.psd != self.automatic_psd()
 
     @property
@@ -181,21 +191,21 @@ class RodNewton:
 
     @property
     def kernels_around(self) -> list:
-        """Those that do not depend on how the system is solved."""
-        own = [self._predict, (self._evaluate, 128), self._check]
-        return [*own, *(kernel for kernel in (self._further, self._project) if kernel)]
+        """Kernels that do not depend on the linear solver."""
+        result = [self._predict, (self._evaluate, 128), self._check]
+        return [*result, *(kernel for kernel in (self._further, self._project) if kernel)]
 
     def pcg_iterations(self) -> int:
-        """None: the sweep is direct."""
+        """Return zero: the sweep is direct."""
         return 0
 
     def take_loads(self) -> None:
-        """Have loads of its own, on all nodes and angles, instead of the constant ones of the group."""
+        """Allocate loads on all nodes and angles, in place of the group's constant ones."""
         self.load, self.loaded = device_arrays.allocate(self.x.shape, self.x.dtype, self.device), True
         self.load_angle = device_arrays.allocate(self.theta.shape, self.real, self.device)
 
     def predict(self, before) -> None:
-        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
+        """Recompute the predictor of bent rods from the state `before` by rotating edges; carry frames to midpoints."""
         wp.launch(
             self._predict,
             self.group.columns,
@@ -205,7 +215,7 @@ class RodNewton:
         )
 
     def go_further(self, before, predicted: wp.array) -> None:
-        """Start bent rods from where accelerations lead from their predictor, `direction`, with edges turned."""
+        """Warm-start bent rods by the extrapolated correction `direction` of their predictor, by rotating edges."""
         group = self.group
         wp.launch(
             self._further,
@@ -220,13 +230,13 @@ class RodNewton:
         wp.capture_while(self.islands.any_active, lambda: self.iterate(last))
 
     def iterate(self, last: wp.array) -> None:
-        """One iteration of every active rod."""
+        """Perform one iteration of every active rod."""
         self.evaluate(last)
         self.check()
         self.sweep()
 
     def evaluate(self, last: wp.array) -> None:
-        """Energies, gradients and factors of all elements at the iterate."""
+        """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate."""
         group = self.group
         wp.launch(
             self._evaluate,
@@ -246,7 +256,7 @@ class RodNewton:
             )
 
     def check(self) -> None:
-        """Residuals, the change of the energy, and the rods that are out of equilibrium."""
+        """Compute residuals, the change of the energy, and the rods that are out of equilibrium."""
         group, options = self.group, self.options
         wp.launch(
             self._check,
@@ -260,7 +270,7 @@ class RodNewton:
         )
 
     def sweep(self) -> None:
-        """Factor, decide, and take the next step."""
+        """Factorise, decide, and take the next step."""
         self.eliminate()
         group = self.group
         wp.launch(
@@ -272,7 +282,7 @@ class RodNewton:
         )
 
     def eliminate(self) -> None:
-        """Factor, decide, find a direction and move straight along it."""
+        """Factorise, decide, find a direction and take a straight update along it."""
         group, options = self.group, self.options
         wp.launch(
             self._sweep,
