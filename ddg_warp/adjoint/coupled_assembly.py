@@ -32,7 +32,7 @@ class CoupledAssembly:
             self._framed.append(self._list(angles, coupled.edges) if measure.frames else None)
             shape = measure.slots, part.elements * coupled.worlds
             self.slots.append(wp.zeros(shape, dtype=coupled.vector, device=self.device))
-            self.friction_iterations.append(self.make(measure.lag_size + measure.data_size, part.elements))
+            self.lags.append(self.make(measure.lag_size + measure.data_size, part.elements))
         self._ends = wp.zeros((2, max(1, coupled.edges * coupled.worlds)), dtype=coupled.vector, device=self.device)
 
     @property
@@ -63,7 +63,7 @@ class CoupledAssembly:
     def collect(self, grad_q: wp.array, frame: wp.array, by_data: list[wp.array]) -> None:
         """Add contributions to the gradients by blocks, frames and constant data."""
         coupled = self.coupled
-        for i, (part, slot, lag) in enumerate(zip(coupled.sets, self.slots, self.friction_iterations, strict=True)):
+        for i, (part, slot, lag) in enumerate(zip(coupled.sets, self.slots, self.lags, strict=True)):
             starts, items, count = self._meets[i]
             self._launch(self.gather, len(grad_q), [starts, items, count, coupled.blocks, slot], [grad_q])
             if self._framed[i]:

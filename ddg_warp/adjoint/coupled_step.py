@@ -24,8 +24,8 @@ class CoupledSavedStep:
     """Data of a step for its reverse: the state `before`, and the solution of its solve with its time-lagged data.
 
     `lagged` are the solutions at the friction lags (W N,), in this order; all other lagged data stay. For an equilibrium with
-    friction,
-    `before` is the state that slips are measured from, and `rubbing` is the inverse increment of the load parameter since then.
+    friction, `before` is the state that slips are measured from, and `rubbing` is the inverse increment of the load parameter since
+    then.
     """
 
     before: CoupledState
@@ -244,7 +244,7 @@ class CoupledStepAdjoint:
             self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._vjp):
-                written = [shares.slots[i], shares.friction_iterations[i], inputs.parameters[i]]
+                written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
                 written += [start.last[i], inputs.elements_rate[i]]
                 self._over(i, kernel, [coupled.elements(damped, i, rate=self._rates), w], written)
             shares.collect(grad_q, carried, inputs.data)

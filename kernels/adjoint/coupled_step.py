@@ -1,6 +1,6 @@
-"""Reverse of a step on nets; see `kernels.elements.variation`, and `kernels.elements.coupled_element` for how elements and worlds lie.
+"""Reverse of a step of the coupled system; see `kernels.elements.variation` and `kernels.elements.coupled_element` for the layout.
 
-Every slot of an element writes its own shares, which `kernels.adjoint.coupled_assembly` gathers.
+Every local node of an element writes its own contributions, which `kernels.adjoint.coupled_assembly` gathers.
 """
 
 from functools import cache
@@ -15,12 +15,15 @@ from ddg_warp.kernels.terms import Term
 
 @cache
 def lag_kernel(term: Term, real):
-    """pull(...): the reverse of `net.frames.lag_kernel`, from the derivatives by an element's own lagged rows. Adds."""
+    """Build the kernel of gradients by an element's own lagged rows.
+
+    `pull`: reverse `kernels.elements.coupled_frames.lag_kernel`, and add.
+    """
     Elements, measure = elements_type(real), term.measure
     V = wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
-    own = measure.lag_size - FRAME * measure.frames
-    L = wp.types.vector(own, real)
+    own_rows = measure.lag_size - FRAME * measure.frames
+    L = wp.types.vector(own_rows, real)
     place, advance = place_function(measure, real), measure.advance(real)
     spread = spread_function(measure, real)
     slots, data = measure.slots, measure.lag_size + measure.data_size
@@ -31,17 +34,17 @@ def lag_kernel(term: Term, real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
-        given: Elements,
-        by: wp.array2d(dtype=real),
+        inputs: Elements,
+        cotangent: wp.array2d(dtype=real),
         slot_out: wp.array2d(dtype=V),
         lag_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
-        world = tid / given.elements
-        q, s = place(given, given.q, world, tid - world * given.elements)
+        world = tid / inputs.elements
+        q, s = place(inputs, inputs.q, world, tid - world * inputs.elements)
         f = L()
-        for i in range(wp.static(own)):
-            f[i] = by[i, tid]
+        for i in range(wp.static(own_rows)):
+            f[i] = cotangent[i, tid]
         dq, ds, _df = wp.grad(advanced)(q, s, f)
         for i in range(wp.static(slots)):
             slot_out[i, tid] = slot_out[i, tid] + spread(dq, i)
@@ -53,10 +56,10 @@ def lag_kernel(term: Term, real):
 
 @cache
 def step_kernels(real, midpoint: bool, drag: bool):
-    """solution(...) and start(...) as of `kernels.adjoint.rod_step`, of the blocks of a net, but for what forces, weight and
-    inertia in a solve bring, inert(...); ended(...): blocks at the end of a step.
+    """Build the kernels of the reverse of a step of the blocks of the coupled system.
 
-    Joints' rotations begin every step at zero.
+    `solution`, `start`: see `kernels.adjoint.rod_step`, without loads, weight and inertia of a solve. `inert`: add the gradients by
+    these. `ended`: write blocks at the end of a step. Joint rotations begin every step at zero.
     """
     V = wp.types.vector(3, real)
     share = real(2.0 if midpoint else 1.0)
@@ -66,7 +69,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
 
     @wp.func
     def swing(inertia: wp.array2d(dtype=Inertia), i: int, blocks: int):
-        """Of the rate over the solve in that at the end; see `drag.coupled_kernels`, settle."""
+        """Return the factor of the solve's rate in the rate at the end; see `settle` of `drag.coupled_kernels`."""
         result = V(share, share, share)
         if wp.static(settles):
             node = inertia[i / blocks, i % blocks]
@@ -86,7 +89,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
         blocks: int,
         out: wp.array(dtype=V),
     ):
-        """`last` is the number of blocks that are no rotations."""
+        """Write the gradient by the solution; `last` is the number of blocks without joint rotations."""
         i = wp.tid()
         total = more[i] * share
         if i % blocks < last:
@@ -114,17 +117,17 @@ def step_kernels(real, midpoint: bool, drag: bool):
         damping_out: wp.array(dtype=real),
         gravity_out: wp.array(dtype=V),
     ):
-        """`gravity` is of worlds. Adds."""
+        """Add gradients by inertia, weight and loads; `gravity` is by world."""
         i = wp.tid()
         world = i / blocks
         k = i - world * blocks
-        own = w[i]
-        load_out[i] = load_out[i] + own
+        residual = w[i]
+        load_out[i] = load_out[i] + residual
         if k >= last:
             return
         c = rate * (rate + damping[0])
         m = mass[world, k]
-        pushed = wp.cw_mul(m, own)
+        pushed = wp.cw_mul(m, residual)
         step = solved[i] - q0[i]
         before = v0[i]
         q_out[i] = q_out[i] + pushed * c
@@ -133,7 +136,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
         if k < nodes:
             outer += gravity[world]
             gravity_out[i] = gravity_out[i] + pushed
-        mass_out[i] = mass_out[i] + wp.cw_mul(own, outer)
+        mass_out[i] = mass_out[i] + wp.cw_mul(residual, outer)
         rate_out[i] = rate_out[i] - wp.dot(pushed, step * (real(2.0) * rate + damping[0]) - before)
         damping_out[i] = damping_out[i] - rate * wp.dot(pushed, step)
 
@@ -144,7 +147,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
         more: wp.array(dtype=V),
         solved: wp.array(dtype=V),
         q0: wp.array(dtype=V),
-        held: wp.array(dtype=V),
+        fixed_part: wp.array(dtype=V),
         inertia: wp.array2d(dtype=Inertia),
         last: int,
         blocks: int,
@@ -153,12 +156,12 @@ def step_kernels(real, midpoint: bool, drag: bool):
         v_out: wp.array(dtype=V),
         rate_out: wp.array(dtype=real),
     ):
-        """`held` is what is left at held dofs that no motion moves. Adds."""
+        """Add gradients by the start; `fixed_part` is the gradient at fixed dofs without prescribed motion."""
         i = wp.tid()
         if i % blocks >= last:
             return
         ended = wp.cw_mul(swing(inertia, i, blocks), v[i])
-        q_out[i] = q_out[i] + held[i] - (q[i] + more[i]) * kept - ended * rate
+        q_out[i] = q_out[i] + fixed_part[i] - (q[i] + more[i]) * kept - ended * rate
         v_out[i] = v_out[i] - (ended - v[i]) * kept
         rate_out[i] = rate_out[i] + wp.dot(ended, solved[i] - q0[i])
 

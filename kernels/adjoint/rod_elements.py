@@ -1,10 +1,8 @@
 """Reverse of a step of a rod group; see `kernels.elements.variation`.
 
 Every element writes its own contributions, which nodes then gather, so that sums have one order, without atomics. Cotangents of
-dofs
-are stored like right-hand sides, [component of a node][node][rod]. The first of the terms writes the element windows, the others
-add
-to them; only one term has lagged data.
+dofs are stored like right-hand sides, [component of a node][node][rod]. The first of the terms writes the element windows, the
+others add to them; only one term has lagged data.
 """
 
 from functools import cache
@@ -114,8 +112,7 @@ def gather_kernels(kind: RodKind, real):
     """Build the kernels that assemble element contributions.
 
     `end`: write the sums of windows at the dofs of a node. `nodes`: add them. `edges`: add contributions by vertices' lagged data
-    to
-    frames of edges.
+    to frames of edges.
     """
     block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
     _, previous, *_ = node_functions(kind, real)

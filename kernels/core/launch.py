@@ -1,37 +1,39 @@
-"""How kernels share work among threads: a thread a thing on a GPU, one thread for all in a row on the CPU, and its compiler flags."""
+"""Thread mapping: one thread per item on a GPU, one thread over all items on the CPU; and the CPU's compiler flags."""
 
 import os
 from functools import cache
 
 import warp as wp
 
-# Fusion of multiplications and additions on the CPU. "off" makes results independent of how the compiler arranges a kernel, so that two
-# versions of one algorithm can be compared bit for bit; see `tools/golden.py`.
+# Fusion of multiplications and additions on the CPU. "off" makes results independent of the compiler's arrangement of a kernel. Two
+# versions of one algorithm can then be compared bit for bit; see `tools/golden.py`.
 CONTRACTION = os.environ.get("DDG_WARP_FP_CONTRACT", "fast")
 
-# Of all kernels. Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of
-# it each); pairs instead of eights save the shuffles of small matrices, a tenth of it. Warp 1.19's own flags stop LLVM's SLP vectorizer
-# at a depth of 4, where it miscompiles large reverse-mode kernels for AVX-512: they read registers that nothing has written. 12 is
-# LLVM's own depth, said here because such options stay set in a process.
+# Options of all kernels. CUDA builds fuse multiply-adds, too.
+# Measured: fused multiply-adds and inlining halve the CPU's time for a sweep (1.9 to 0.9 of it each). Vectors of two instead of eight
+# avoid shuffles of small matrices, a tenth of that time.
+# Warp 1.19's own flags stop LLVM's SLP vectorizer at a depth of 4. There it miscompiles large reverse-mode kernels for AVX-512: they
+# read registers that nothing has written. 12 is LLVM's default depth, set here because such options persist in a process.
 CPU_OPTIONS = {
     "cpu_compiler_flags": f"-march=native -ffp-contract={CONTRACTION} -mprefer-vector-width=128"
     " -mllvm=-slp-recursion-max-depth=12 -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
 }
 
 
-THREADS = 256  # in a block, where a launch does not say
-# Threads of a block, and blocks that a multiprocessor runs at once, of kernels that would take more registers than that leaves: one
-# block more hides what memory takes (10,000 strands of hair in contact, an H100: shares of motions 90 us for 128, contact 90 for 115,
-# blocks of chains 70 for 102, steps 6 % shorter). Three are no faster.
+THREADS = 256  # default block size of launches
+# Launch bounds (block size, blocks a multiprocessor) of kernels that would otherwise take too many registers for two blocks. The second
+# block hides memory latency.
+# Measured (10,000 strands of hair in contact, an H100): step fractions 90 us instead of 128, contact 90 instead of 115, blocks of rod
+# paths 70 instead of 102, steps 6 % shorter. Three blocks are no faster.
 TWO_BLOCKS = THREADS, 2
 
 
 @cache
 def until_function(serial: bool):
-    """until(k, n): where what a thread takes ends that starts at k < n; if `serial`, it takes all, nodes of a rod or blocks of a net.
+    """Return the device function `until(k, n)`: end of the items of the thread that starts at k < n; n if `serial`.
 
-    For each thread of the CPU's Warp reads all arguments again, some 200 words, which takes as long as the balance of a node. On CUDA
-    the loop has one turn, which the compiler sees if nothing but k bounds it.
+    Measured: on the CPU Warp reads all arguments again for each thread, some 200 words, as long as the residual of a node takes. On
+    CUDA the loop has one iteration, which the compiler sees if only k bounds it.
     """
 
     @wp.func
@@ -45,7 +47,9 @@ def until_function(serial: bool):
 
 @cache
 def items_function(serial: bool):
-    """share(tid, count) -> (world, first): the world that a thread is in, and where it starts among `count` things that each has."""
+    """Return the device function `share(tid, count) -> (world, first)`: world and first item of a thread, with `count` items a
+    world.
+    """
 
     @wp.func
     def share(tid: int, count: int):
@@ -59,8 +63,8 @@ def items_function(serial: bool):
 
 @wp.func
 def first_of(world: int, count: int):
-    """Index of the first entry of a world where each has `count`.
+    """Return the index of the first entry of a world with `count` entries a world.
 
-    What is known not to be negative Warp's indexing need not wrap, which takes the CPU three instructions for every entry.
+    Warp's indexing need not wrap a nonnegative index, which saves the CPU three instructions an entry.
     """
     return wp.max(world * count, 0)

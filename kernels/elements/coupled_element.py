@@ -1,9 +1,9 @@
 """Elements of the coupled system: their dofs, found by index, and their storage.
 
 All dofs lie in blocks of three reals: positions of nodes, then an angle each (in component 0), then rotation vectors of rigid
-joints. The *local nodes* of an element are its nodes, its angles and its rotation vectors, each with the index of a block. Derivatives
-are written by local node, so that their assembly needs block indices only. Worlds are consecutive: block i of world w is
-w * blocks + i, element i of world w is w * elements + i. Topology and constant data are stored once.
+joints. The *local nodes* of an element are its nodes, its angles and its rotation vectors, each with the index of a block.
+Derivatives are written by local node, so that their assembly needs block indices only. Worlds are consecutive: block i of world w
+is w * blocks + i, element i of world w is w * elements + i. Topology and constant data are stored once.
 
 The lagged data of an element are, in this order: (u, t) of the rod edges its angles belong to, its own lagged rows, its data. Data
 are common to all worlds, except where supports rotate normals among them.
@@ -50,8 +50,7 @@ def edge_ends(measure: Measure):
     """Return the first and second nodes of a stencil's edges as Warp constants, which a loop variable may index.
 
     Alternative: `wp.static` of an edge. It is resolved only when a kernel is built, and would make the hash of every kernel depend
-    on the
-    kernels built before it.
+    on the kernels built before it.
     """
     I = wp.types.vector(max(1, len(measure.edges)), int)
     return tuple(I(*(edge[end] for edge in measure.edges)) for end in (0, 1))

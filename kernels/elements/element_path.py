@@ -5,10 +5,10 @@ and which thread takes which element. An `ElementStorage` holds these as Warp fu
 `kernels.elements.rod_layout.rod_storage` is that of uncoupled rods, `kernels.elements.coupled_element.coupled_storage` that of the
 coupled system. `kernels.adjoint.elements` and `kernels.stepping.rod_energy_drift` are written over the same storages.
 
-Alternative: one source for what surrounds elements. It is kept apart where the algorithms differ. Residuals have other stopping rules:
-sums over a whole rod, or over a tree of parts. The line search of rods is fused with their sweep, one thread a rod and one launch an
-iteration. Their frames are updated two edges a vertex in one kernel, those of the coupled system edge by edge. Matrix blocks and
-eliminations are those of a rod, or bands and slices with joints. Conjugate gradients of rods serve closed ones alone.
+Alternative: one source for the solvers around elements. It is separate where the algorithms differ. Residuals have other stopping
+rules: sums over a whole rod, or over hierarchical clusters. The line search of rods is fused with their sweep, one thread a rod and
+one launch an iteration. Rods update the frames of two edges a vertex in one kernel, the coupled system edge by edge. Matrix blocks
+and eliminations cover a rod, or bands and slices with joints. Conjugate gradients of rods serve closed ones alone.
 """
 
 from collections.abc import Callable
@@ -63,17 +63,17 @@ class ElementStorage:
         Inputs: struct of arrays that kernels read, with `buffer`, `table`, `last` and `rate`.
         Window, Lagged: vectors of local dofs and of lagged data.
         items: (i, j) -> (island, first element) of a thread.
-        last_item: (first, count) -> where the elements of a thread end.
+        last_item: (first, count) -> end of the elements of a thread.
         count: (inputs, island) -> number of elements.
         column: (inputs, island, e) -> column of element e.
         whole: (inputs, island, e) -> True if the element has all edges of its window.
         read: (inputs, island, e, whole) -> (window, lagged).
         displacement: (inputs, w, island, e, whole) -> window of a displacement w of all dofs.
         Displacements: type of the array of such a w.
-        slots: (f, slot) -> derivative with respect to a dof block; None where derivatives stay those of the window.
+        slots: (f, local node) -> derivative with respect to a dof block; None if derivatives stay by the window.
         num_slots: number of dof blocks of an element, zero without `slots`.
-        stiffness_dofs: number of leading dofs by which the stiffness is measured; None for all.
-        clears_active: whether the first thread of all clears the flag `active`.
+        stiffness_dofs: number of leading dofs that measure the stiffness; None for all.
+        clears_active: True if the first thread of all clears the flag `any_active`.
         launch_bounds: (curved) -> threads and blocks of the kernel of an iteration, None for the default.
     """
 
@@ -102,7 +102,7 @@ def results_type(real, linear, slots: bool = False):
 
     Rows of the factor and of the gradient are reals of local dofs, or with `slots` vectors of dof blocks.
     """
-    F, G = (wp.types.vector(3, of) if slots else of for of in (linear, real))
+    F, G = (wp.types.vector(3, scalar) if slots else scalar for scalar in (linear, real))
 
     @wp.struct
     class Results:
@@ -118,63 +118,63 @@ def results_type(real, linear, slots: bool = False):
 
 @cache
 def write_function(storage: ElementStorage, scalar, real, adds: bool = False):
-    """Build `write(out, first, f, at)`: write a derivative with respect to the window as rows from `first` on, or add it."""
+    """Return the device function `write(out, first, f, column)`: write or add a derivative by the window as rows from `first` on."""
     slots, count, W = storage.slots, storage.num_slots, storage.Window
     if not slots:
         return write_rows_function(W, scalar, real, adds)
     X = wp.types.vector(3, scalar)
 
     @wp.func
-    def write(out: wp.array2d(dtype=X), first: int, f: W, at: int):
+    def write(out: wp.array2d(dtype=X), first: int, f: W, column: int):
         for i in range(wp.static(count)):
             v = slots(f, i)
             x = X(scalar(v[0]), scalar(v[1]), scalar(v[2]))
             if wp.static(adds):
-                x += out[first + i, at]
-            out[first + i, at] = x
+                x += out[first + i, column]
+            out[first + i, column] = x
 
     return write
 
 
 @cache
 def write_rows_function(Q, scalar, real, adds: bool = False):
-    """Build `write(out, first, f, at)`: write the components of a vector as rows from `first` on, or add them."""
+    """Return the device function `write(out, first, f, column)`: write or add the components of a vector as rows from `first` on."""
     size = Q._length_
 
     @wp.func
-    def write(out: wp.array2d(dtype=scalar), first: int, f: Q, at: int):
+    def write(out: wp.array2d(dtype=scalar), first: int, f: Q, column: int):
         for i in range(wp.static(size)):
             x = scalar(f[i])
             if wp.static(adds):
-                x += out[first + i, at]
-            out[first + i, at] = x
+                x += out[first + i, column]
+            out[first + i, column] = x
 
     return write
 
 
 @cache
 def parameter_function(storage: ElementStorage, index: int, real):
-    """Build `parameters(inputs, island, e, at)`: return the rest measure w and the parameters p of a term.
+    """Return the device function `parameters(inputs, island, e, column)`: rest measure w and parameters p of a term.
 
-    A law with time-lagged strains has these and the inverse step length at the end of p.
+    With time-lagged strains, p ends with these strains and the inverse step length.
     """
-    own, Inputs = storage.terms[index], storage.Inputs
-    n, density, first = len(own.term.measure.strains), own.term.density, own.parameter
-    size, static_size, lagged = density.parameter_size(n), len(own.term.parameter_names) - 1, density.lagged
-    P, strain = wp.types.vector(size, real), own.strain
+    access, Inputs = storage.terms[index], storage.Inputs
+    n, density, first = len(access.term.measure.strains), access.term.density, access.parameter
+    size, static_size, lagged = density.parameter_size(n), len(access.term.parameter_names) - 1, density.lagged
+    P, strain = wp.types.vector(size, real), access.strain
 
     @wp.func
     def one(inputs: Inputs, row: int, island: int, e: int):
         return inputs.buffer[inputs.table[row, 0] + e * inputs.table[row, 1] + island * inputs.table[row, 2]]
 
     @wp.func
-    def parameters(inputs: Inputs, island: int, e: int, at: int):
+    def parameters(inputs: Inputs, island: int, e: int, column: int):
         p = P()
         for i in range(wp.static(static_size)):
             p[i] = one(inputs, wp.static(first + 1) + i, island, e)
         if wp.static(lagged):
             for i in range(wp.static(n)):
-                p[wp.static(static_size) + i] = inputs.last[wp.static(strain) + i, at]
+                p[wp.static(static_size) + i] = inputs.last[wp.static(strain) + i, column]
             p[wp.static(size - 1)] = inputs.rate[island]
         return one(inputs, wp.static(first), island, e), p
 
@@ -183,9 +183,9 @@ def parameter_function(storage: ElementStorage, index: int, real):
 
 @cache
 def left_out_function(term: Term, real):
-    """Build `left_out(root, e, p, w, jacobian)`: return the negative part of psi'' that the factor F leaves out.
+    """Return the device function `left_out(root, e, p, w, jacobian)`: negative part of psi'' that the factor F leaves out.
 
-    That is w J^T psi'' J - F^T F, its upper triangle packed. None for laws without such a part.
+    The matrix w J^T psi'' J - F^T F is returned as its packed upper triangle. None for laws without such a part.
     """
     if not term.density.coupled or term.density.quadratic:
         return None
@@ -209,9 +209,9 @@ def left_out_function(term: Term, real):
 
 @cache
 def transported_function(real):
-    """Build `share(k, carried)`: split the stiffness k of an edge between the matrix and its axial force.
+    """Return the device function `share(stiffness, carried)`: split an edge stiffness k between the matrix and its axial force.
 
-    It returns the root of k' / k, the part that the matrix carries, and the slack, zero where the matrix carries all of k. See
+    It returns the root of k' / k, with k' the stiffness that the matrix carries, and the slack, zero where k' = k. See
     `kernels.linear.mixed_axial_force`.
     """
 
@@ -226,7 +226,7 @@ def transported_function(real):
 
 @cache
 def drop_compression_function(real, tensions: int):
-    """Build `drop_compression(c)`: return stresses without their negative part, and True if strains lose their shift with it."""
+    """Return the device function `drop_compression(c)`: stresses without their negative part, and True if strains lose their shift."""
     if tensions < 3:
 
         @wp.func
@@ -250,24 +250,29 @@ def drop_compression_function(real, tensions: int):
             return C(), False
         # high * v v^T with v the eigenvector of the larger eigenvalue: (c - low I) high / (high - low)
         scale = high / (high - low)
-        return C((c[0] - low) * scale, c[1] * scale, (c[2] - low) * scale), False  # its strains have no shift
+        return C((c[0] - low) * scale, c[1] * scale, (c[2] - low) * scale), False  # strains of triangles have no shift
 
     return drop_of_triangle
 
 
 @cache
 def evaluate_function(storage: ElementStorage, index: int, real, linear, curved: bool, split: bool):
-    """Build `evaluate_at` of one term: write its factor, tensions and second derivatives.
+    """Return the device function `evaluate_at` of one term: write its factor, tensions and second derivatives.
 
     It returns energy, derivative with respect to the window, and the largest stiffness of a strain. A term that is alone writes its
     gradient itself and returns zero.
     """
-    own, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
-    Results, term, measure = results_type(real, linear, storage.slots is not None), own.term, own.term.measure
+    access, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
+    Results, term, measure = results_type(real, linear, storage.slots is not None), access.term, access.term.measure
     n, (Q, _, E, _) = len(measure.strains), measure.types(real)
     _, jacobian_of, tension_of, curvature_of = measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
-    local, short, spread, parameters = own.local, own.short, own.spread, parameter_function(storage, index, real)
+    local, short, spread, parameters = (
+        access.local,
+        access.short,
+        access.spread,
+        parameter_function(storage, index, real),
+    )
     is_coupled, tensions, stiffness_dofs = (
         term.density.coupled,
         measure.tensions,
@@ -279,7 +284,7 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
     drop_compression = drop_compression_function(real, tensions)
     left_out, carried_part = left_out_function(term, real), transported_function(real)
     alone, write_gradient = len(storage.terms) == 1, write_function(storage, real, real)
-    second_rows = own.second or tuple(range(measure.packed))
+    second_rows = access.second or tuple(range(measure.packed))
     where = wp.types.vector(max(1, len(second_rows)), int)(*(second_rows or (0,)))
 
     @wp.func
@@ -294,16 +299,16 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
         carried: real,
         island: int,
         e: int,
-        at: int,
+        column: int,
     ):
-        w, p = parameters(inputs, island, e, at)
+        w, p = parameters(inputs, island, e, column)
         q = local(window)
         strain, jacobian = jacobian_of(q, short(lagged), w)
         slope = slope_of(strain, p)
         energy = w * energy_of(strain, p)
         f = spread((slope * w) * jacobian)
-        if wp.static(alone):  # what is done with takes no registers
-            write_gradient(results.gradient, 0, f, at)
+        if wp.static(alone):  # frees its registers
+            write_gradient(results.gradient, 0, f, column)
             f = W()
         shift = E()
         if wp.static(tensions > 0):
@@ -315,9 +320,9 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
             if not frozen:
                 if wp.static(tensions == 3):
                     for i in range(3):
-                        results.tension[i, at] = linear(c[i])
+                        results.tension[i, column] = linear(c[i])
                 else:
-                    results.tension[wp.static(own.tension), at] = linear(c)
+                    results.tension[wp.static(access.tension), column] = linear(c)
         root = root_of(strain, p, shift) * wp.sqrt(w)
         if wp.static(is_coupled):
             factor = root * jacobian
@@ -338,19 +343,19 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
             if wp.static(splits):
                 part, rest = carried_part(stiffness, carried)
                 row *= part
-                results.tension[wp.static(own.slack), at] = linear(rest)
+                results.tension[wp.static(access.slack), column] = linear(rest)
             if not frozen:
-                write(results.factor, wp.static(own.factor) + m * wp.static(rows), row, at)
+                write(results.factor, wp.static(access.factor) + m * wp.static(rows), row, column)
         if wp.static(bends):
             if exact:
                 second = curvature_of(q, short(lagged), w, slope)
                 if wp.static(left_out is not None):
                     second = second + left_out(root, strain, p, w, jacobian)
                 for i in range(wp.static(len(second_rows))):
-                    if wp.static(own.second is None):
-                        results.second[i, at] = linear(second[i])
+                    if wp.static(access.second is None):
+                        results.second[i, column] = linear(second[i])
                     else:
-                        results.second[where[i], at] = linear(second[i])
+                        results.second[where[i], column] = linear(second[i])
         return energy, f, stiffest
 
     return evaluate_at
@@ -368,28 +373,29 @@ def evaluate_kernel(
 ):
     """Build the kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of all terms of an element.
 
-    Compression lowers the stiffness across an edge, which can make the matrix indefinite. Islands flagged `clamped` drop it, triangles
-    the negative part of their stress, and they write no second derivatives. Energies go to the buffer that the line search does not
-    hold. The flag `stale` is set where reference frames have to be updated before the next step.
+    Compression lowers the stiffness across an edge, which can make the matrix indefinite. Islands flagged `drop_compression` omit
+    it, and triangles the negative part of their stress; such islands write no second derivatives. Energies go to the buffer that
+    the line search does not use. The flag `frames_outdated` is set where reference frames must be updated before the next step.
 
     Args:
         exact_from: iteration from which second derivatives are written; with the factor, compression included, they make the exact
             Hessian. None for a Gauss-Newton matrix.
-        split: whether rows of edges have what the matrix carries of their stiffness, and slacks are written; see
+        split: True if rows of edges have only the stiffness that the matrix carries, and slacks are written; see
             `kernels.linear.mixed_axial_force`.
-        project: whether all islands drop compression, second derivatives or not.
-        reuse: whether factors are written at the first iterate of a step alone.
+        project: True if all islands drop compression, second derivatives or not.
+        reuse: True if factors are written at the first iterate of a step only.
     """
     Inputs, Results, W = storage.Inputs, results_type(real, linear, storage.slots is not None), storage.Window
     items, last_item, count_of, clears_active = storage.items, storage.last_item, storage.count, storage.clears_active
     whole_of, read, column_of, write = storage.whole, storage.read, storage.column, write_function(storage, real, real)
     curved, begin = exact_from is not None, exact_from or 0
-    measures = [own.term.measure for own in storage.terms]
-    # Not a loop over the terms: what depends on a loop variable, wp.static(each[i]), Warp resolves by generating all code of a kernel
-    # whenever it is defined, compiled before or not, 0.3 s each. A function that calls itself costs a step on the CPU 5 %.
+    measures = [access.term.measure for access in storage.terms]
+    # Alternatives: a loop over the terms, or a recursive function.
+    # Measured: for wp.static(each[i]) of a loop variable Warp generates all code of a kernel whenever it is defined, compiled or not,
+    # 0.3 s each. Recursion costs 5 % of a step on the CPU.
     terms, everywhere = len(measures), measures[0].span == 1 or len(measures) == 1
     several = terms > 1
-    first_term, last_term = (evaluate_function(storage, at, real, linear, curved, split) for at in (0, -1))
+    first_term, last_term = (evaluate_function(storage, index, real, linear, curved, split) for index in (0, -1))
     stale = next((m.stale(real) for m in measures if m.stale), None)
     packed = max(m.packed for m in measures) if curved else 0
     options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
@@ -411,33 +417,33 @@ def evaluate_kernel(
         slot = 1 - flags[ENERGY_BUFFER, island]
         carried = scalars[MAX_EDGE_STIFFNESS, island]
         for e in range(first, last_item(first, count)):
-            at = column_of(inputs, island, e)
+            column = column_of(inputs, island, e)
             whole = whole_of(inputs, island, e)
             q, s = read(inputs, island, e, whole)
-            if wp.static(
-                stale is not None
-            ):  # before the terms: after them, dofs would be kept in 30 to 50 registers more
+            if wp.static(stale is not None):  # before the terms: after them, dofs would occupy 30 to 50 more registers
                 if whole and stale(q, s):
                     flags[FRAMES_OUTDATED, island] = 1
             energy = real(0.0)
             f = W()
             stiffest = real(0.0)
             if whole or wp.static(everywhere):
-                own, part, stiff = first_term(inputs, results, q, s, clamped, frozen, exact, carried, island, e, at)
-                energy += own
+                term_energy, part, stiff = first_term(
+                    inputs, results, q, s, clamped, frozen, exact, carried, island, e, column
+                )
+                energy += term_energy
                 f += part
                 stiffest = wp.max(stiffest, stiff)
             if wp.static(terms > 1):
-                own_too, part_too, stiff_too = last_term(
-                    inputs, results, q, s, clamped, frozen, exact, carried, island, e, at
+                energy_too, part_too, stiff_too = last_term(
+                    inputs, results, q, s, clamped, frozen, exact, carried, island, e, column
                 )
-                energy += own_too
+                energy += energy_too
                 f += part_too
                 stiffest = wp.max(stiffest, stiff_too)
-            results.energy[slot, at] = energy
-            results.stiffness[at] = linear(stiffest)
+            results.energy[slot, column] = energy
+            results.stiffness[column] = linear(stiffest)
             if wp.static(several):
-                write(results.gradient, 0, f, at)
+                write(results.gradient, 0, f, column)
 
     return evaluate
 
@@ -450,17 +456,22 @@ def term_kernels(storage: ElementStorage, index: int, real, reverse: bool = Fals
     window [dof][dof][column], a column of the matrix a thread; where elements have several terms, add them.
 
     Args:
-        reverse: whether the first two have an adjoint, which doubles the time that they take to compile.
+        reverse: True if the first two have an adjoint, which doubles their compile time.
     """
-    own, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
-    term, span, size, several = own.term, own.term.measure.span, storage.Window._length_, len(storage.terms) > 1
+    access, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
+    term, span, size, several = access.term, access.term.measure.span, storage.Window._length_, len(storage.terms) > 1
     Q, _, E, _ = term.measure.types(real)
     n = len(term.measure.strains)
     P = wp.types.vector(term.density.parameter_size(n), real)
     strains_of, jacobian_of, *_ = term.measure.functions(real)
     energy_of, slope_of, _ = term.density.functions(real, n)
     along, _ = variation_functions(term, real)
-    local, short, spread, parameters = own.local, own.short, own.spread, parameter_function(storage, index, real)
+    local, short, spread, parameters = (
+        access.local,
+        access.short,
+        access.spread,
+        parameter_function(storage, index, real),
+    )
     items, count_of, whole_of = storage.items, storage.count, storage.whole
     read, column_of, write = storage.read, storage.column, write_function(storage, real, real)
     Rows = wp.array2d(dtype=wp.types.vector(3, real) if storage.slots else real)
@@ -479,20 +490,20 @@ def term_kernels(storage: ElementStorage, index: int, real, reverse: bool = Fals
         i, j = wp.tid()
         island, e = items(i, j)
         if present(inputs, island, e):
-            at = column_of(inputs, island, e)
-            w, p = parameters(inputs, island, e, at)
+            element_column = column_of(inputs, island, e)
+            w, p = parameters(inputs, island, e, element_column)
             q, s = read(inputs, island, e, wp.static(span == 2))
-            energy_out[at] = w * energy_of(strains_of(local(q), short(s), w), p)
+            energy_out[element_column] = w * energy_of(strains_of(local(q), short(s), w), p)
 
     @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
     def gradient(inputs: Inputs, gradient_out: Rows):
         i, j = wp.tid()
         island, e = items(i, j)
         if present(inputs, island, e):
-            at = column_of(inputs, island, e)
-            w, p = parameters(inputs, island, e, at)
+            element_column = column_of(inputs, island, e)
+            w, p = parameters(inputs, island, e, element_column)
             q, s = read(inputs, island, e, wp.static(span == 2))
-            write(gradient_out, 0, gradient_at(q, s, w, p), at)
+            write(gradient_out, 0, gradient_at(q, s, w, p), element_column)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def hessian(inputs: Inputs, extra: wp.array2d(dtype=real), hessian_out: wp.array3d(dtype=real)):
@@ -503,22 +514,22 @@ def term_kernels(storage: ElementStorage, index: int, real, reverse: bool = Fals
         i, j, column = wp.tid()
         island, e = items(i, j)
         if present(inputs, island, e):
-            at = column_of(inputs, island, e)
-            w, p = parameters(inputs, island, e, at)
+            element_column = column_of(inputs, island, e)
+            w, p = parameters(inputs, island, e, element_column)
             v = W()
             v[column] = real(1.0)
             more = E()
             if extra.shape[1] > 0:
                 for m in range(wp.static(n)):
-                    more[m] = extra[m, at]
+                    more[m] = extra[m, element_column]
             q, s = read(inputs, island, e, wp.static(span == 2))
             dq, _ds, _dw, _dp, _dv, _de = wp.grad(along)(local(q), short(s), w, p, local(v), more)
             f = spread(dq)
             for m in range(wp.static(size)):
                 if wp.static(several):
-                    hessian_out[m, column, at] = hessian_out[m, column, at] + f[m]
+                    hessian_out[m, column, element_column] = hessian_out[m, column, element_column] + f[m]
                 else:
-                    hessian_out[m, column, at] = f[m]
+                    hessian_out[m, column, element_column] = f[m]
 
     return energy, gradient, hessian
 
@@ -535,24 +546,24 @@ def strain_kernel(storage: ElementStorage, real):
         i, j = wp.tid()
         island, e = items(i, j)
         if e < count_of(inputs, island):
-            at = column_of(inputs, island, e)
+            column = column_of(inputs, island, e)
             whole = whole_of(inputs, island, e)
             q, s = read(inputs, island, e, whole)
-            strains_of_all(inputs, q, s, whole, stressed, strain_out, stress_out, island, e, at)
+            strains_of_all(inputs, q, s, whole, stressed, strain_out, stress_out, island, e, column)
 
     return strains
 
 
 @cache
 def _strain_function(storage: ElementStorage, index: int, real):
-    """Build `strains_at` of terms 0 to `index`, which calls that of the terms before; see `evaluate_kernel` on loops."""
-    own, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
-    term, n, first = own.term, len(own.term.measure.strains), own.strain
+    """Return the device function `strains_at`: strains of terms 0 to `index`, by recursion; see `evaluate_kernel` on loops."""
+    access, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
+    term, n, first = access.term, len(access.term.measure.strains), access.strain
     everywhere = term.measure.span != 2 or len(storage.terms) == 1
     strains_before = _strain_function(storage, index - 1, real) if index else None
     strains_of, *_ = term.measure.functions(real)
     _, slope_of, _ = term.density.functions(real, n)
-    local, short, parameters = own.local, own.short, parameter_function(storage, index, real)
+    local, short, parameters = access.local, access.short, parameter_function(storage, index, real)
     write = write_rows_function(term.measure.types(real)[2], real, real)
 
     @wp.func
@@ -566,15 +577,15 @@ def _strain_function(storage: ElementStorage, index: int, real):
         stress_out: wp.array2d(dtype=real),
         island: int,
         e: int,
-        at: int,
+        column: int,
     ):
         if wp.static(index > 0):
-            strains_before(inputs, window, lagged, whole, stressed, strain_out, stress_out, island, e, at)
+            strains_before(inputs, window, lagged, whole, stressed, strain_out, stress_out, island, e, column)
         if whole or wp.static(everywhere):
-            w, p = parameters(inputs, island, e, at)
+            w, p = parameters(inputs, island, e, column)
             strain = strains_of(local(window), short(lagged), w)
-            write(strain_out, wp.static(first), strain, at)
+            write(strain_out, wp.static(first), strain, column)
             if stressed != 0:
-                write(stress_out, wp.static(first), slope_of(strain, p), at)
+                write(stress_out, wp.static(first), slope_of(strain, p), column)
 
     return strains_at

@@ -1,11 +1,11 @@
 """Uncoupled rods of one kind, side by side: their layout, local dofs and element storage.
 
 Arrays run [component][node][rod]. Element k of a rod starts at its node k; edge k runs from node k to node k + 1, modulo the nodes
-of a closed rod. The *window* of an element holds its local dofs, q = [edge k, edge k + 1, theta k, theta k + 1], cut to what the rods
-have. Element forces and factors are derivatives with respect to the window; forces on nodes are differences of them.
+of a closed rod. The *window* of an element holds its local dofs, q = [edge k, edge k + 1, theta k, theta k + 1], without the dofs
+that the rods lack. Element forces and factors are derivatives with respect to the window; forces on nodes are differences of them.
 
-Parameters of all terms lie in one buffer. Row i of `table` is (offset, stride along the rod, stride across rods), so that one
-number, one a rod, one an element or one each are read by the same code.
+Parameters of all terms lie in one buffer. Row i of `table` is (offset, stride along the rod, stride across rods). The same code
+reads a parameter that is constant, per rod, per element, or both.
 """
 
 from dataclasses import dataclass
@@ -21,18 +21,18 @@ from ddg_warp.kernels.terms import Term
 
 @dataclass(frozen=True)
 class RodKind:
-    """What a group of rods has: decides every array and kernel of the group."""
+    """Kind of the rods of a group, which determines every array and kernel of the group."""
 
     dim: int
     twist: bool
     closed: bool
     terms: tuple[Term, ...]
-    serial: bool = False  # whether a thread takes all nodes of its rod; see `until_function`
-    drag: bool = False  # whether a fluid resists its motion; see `kernels.forces.drag`
+    serial: bool = False  # True if a thread takes all nodes of its rod; see `until_function`
+    drag: bool = False  # True with drag; see `kernels.forces.drag`
 
     @property
     def key(self) -> tuple:
-        """By what kinds are put in order."""
+        """Sort key of kinds."""
         return self.dim, self.twist, self.closed, self.drag, [term.key for term in self.terms]
 
     @property
@@ -82,16 +82,16 @@ class RodKind:
 
     @property
     def lagged_rows(self) -> int:
-        """Reals of the reference frame of an edge and the reference twist of its vertex."""
+        """Reals of lagged data per edge: reference frame and reference twist of a vertex."""
         return 7 if self.twist else 0
 
     @property
     def viscous(self) -> bool:
-        """Whether a term reads the strains of the last step."""
+        """True if a term reads the strains of the last step."""
         return any(term.density.lagged for term in self.terms)
 
     def places(self) -> list[tuple[int, int, int, int]]:
-        """Of each term: first row in the parameter table, in the factor, of its tension, and in the strains."""
+        """Return the first rows of each term: in the parameter table, in the factor, of its tension, and in the strains."""
         parameter, strain = 0, 0
         vertex, edge, tension = 0, self.vertex_strains * self.window, self.factor_rows - self.tensions
         result = []
@@ -110,16 +110,17 @@ class RodKind:
 
 
 def inertia_type(kind: RodKind, real):
-    """What a node has of inertia: its mass [kg]; with drag, a `drag_structure`."""
+    """Return the type of a node's inertia: its mass [kg]; with drag, a `drag_structure`."""
     return drag_structure(kind.dim, real) if kind.drag else real
 
 
 @cache
 def drag_structure(dim: int, real):
-    """Mass of a node, and its drag over a solve of length s; one for all kinds, whose kernels Warp shares where they are alike.
+    """Return the struct of a node's mass and drag over a solve of length s.
 
-    That is its resistance D / s [N/m], where the fluid alone would carry it, and the resistance to the spin of the edge that starts
-    there, over s [N m].
+    One struct serves all kinds, so that Warp uses one kernel for equal ones. It holds the mass, the resistance D / s [N/m], the
+    position that the fluid alone would carry the node to, and the resistance to the spin of the edge that starts there, over s [N
+    m].
     """
     V, M = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real)
 
@@ -135,7 +136,10 @@ def drag_structure(dim: int, real):
 
 @cache
 def gather_functions(kind: RodKind, real):
-    """Device functions that read the window, its lagged data and one parameter."""
+    """Return the device functions `along`, `window`, `lagged` and `parameter` of a rod.
+
+    They return the index of a node, the window, its lagged data and one parameter.
+    """
     V = wp.types.vector(kind.dim, real)
     W = wp.types.vector(kind.window, real)
     S = wp.types.vector(13, real)
@@ -143,7 +147,7 @@ def gather_functions(kind: RodKind, real):
 
     @wp.func
     def along(k: int, n: int):
-        """Node k of a rod of n nodes; only a closed rod has nodes past its last."""
+        """Return node k of a rod of n nodes; only a closed rod has nodes past its last."""
         if wp.static(closed):
             if k >= n:
                 k -= n
@@ -151,7 +155,7 @@ def gather_functions(kind: RodKind, real):
 
     @wp.func
     def window(x: wp.array2d(dtype=V), theta: wp.array2d(dtype=real), k: int, n: int, whole: bool, r: int):
-        """Window of element k; `whole` is False at the last edge of an open rod, which has no edge ahead."""
+        """Return the window of element k; `whole` is False at the last edge of an open rod, which has no next edge."""
         q = W()
         a = x[k, r]
         b = x[along(k + 1, n), r]
@@ -170,14 +174,14 @@ def gather_functions(kind: RodKind, real):
 
     @wp.func
     def lagged(frame: wp.array3d(dtype=real), k: int, n: int, whole: bool, r: int):
-        """(u, t) of both edges and the reference twist of the vertex between them."""
+        """Return (u, t) of both edges and the reference twist of the vertex between them."""
         s = S()
         if wp.static(twist):
             if whole:
-                ahead = along(k + 1, n)
+                following = along(k + 1, n)
                 for c in range(6):
                     s[c] = frame[c, k, r]
-                    s[6 + c] = frame[c, ahead, r]
+                    s[6 + c] = frame[c, following, r]
                 s[12] = frame[6, k, r]
         return s
 
@@ -190,7 +194,7 @@ def gather_functions(kind: RodKind, real):
 
 @cache
 def displaced_function(kind: RodKind, real):
-    """Build `displaced(v, k, count, whole, r)`: return the window of a displacement [component of a node][node][rod]."""
+    """Return the device function `displaced(v, k, count, whole, r)`: window of a displacement [component of a node][node][rod]."""
     W = wp.types.vector(kind.window, real)
     along_node, *_ = gather_functions(kind, real)
     dim, span, twist = kind.dim, kind.span, kind.twist
@@ -236,7 +240,7 @@ def rod_elements_type(dim: int, real):
 
 @cache
 def _term_access(kind: RodKind, index: int, real) -> TermAccess:
-    """Return the access of term `index` to the window, and to its rows among those of all terms."""
+    """Return the access of term `index` to the window and to its rows."""
     term, measure = kind.terms[index], kind.terms[index].measure
     Q, S, _, _ = measure.types(real)
     W, L, lag_size = wp.types.vector(kind.window, real), wp.types.vector(13, real), measure.lag_size
@@ -292,7 +296,7 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
     def column(inputs: Inputs, r: int, k: int):
         """Return the column of `arrays.columns`: elements of a rod in a row on the CPU, of all rods on a GPU.
 
-        It is not below 0, as in `first_of`.
+        It is nonnegative, as in `first_of`.
         """
         if wp.static(serial):
             return wp.max(r * inputs.x.shape[0] + k, 0)
@@ -312,8 +316,8 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
         return displaced(w, k, inputs.count[r], all, r)
 
     def launch_bounds(curved: bool):
-        # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200; second derivatives in
-        # float64 need more, and take a quarter less time with two
+        # Measured: three blocks a multiprocessor, 168 registers instead of 170, save 30 % at 100,000 rods on an H200; second
+        # derivatives in float64 need more registers, and take a quarter less time with two blocks.
         return 128, 2 if curved and linear == wp.float64 else 3
 
     return ElementStorage(

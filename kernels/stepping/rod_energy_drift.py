@@ -5,10 +5,9 @@ The energy drift of a step from x0 over the midpoint x to x1 = 2 x - x0 is
     E(x1) - E(x0) - dE/dx(x) . (x1 - x0) + (f - f(x)) . (x1 - x0),
 
 with E the elastic energy and f the follower loads, which the rule evaluates at the predicted x. All other work is exact: the
-forces'
-work along x1 - x0 is the change of kinetic energy, M (v1 - v0) . (v1 + v0) / 2, the work of loads and supports, or dissipation. The
-drift is zero where E is quadratic in x and no load follows. It accumulates, at worst without a bound, where steps rotate stiff
-elements far (Simo and Tarnow, Z. angew. Math. Phys. 43, 1992, 757).
+forces' work along x1 - x0 is the change of kinetic energy, M (v1 - v0) . (v1 + v0) / 2, the work of loads and supports, or
+dissipation. The drift is zero where E is quadratic in x and no load follows. It accumulates, at worst without a bound, where steps
+rotate stiff elements far (Simo and Tarnow, Z. angew. Math. Phys. 43, 1992, 757).
 """
 
 from functools import cache
@@ -31,8 +30,7 @@ def balance_function(term: Term, real):
     """Return the device function `balance(q0, s0, q, s, w, p, reach, floor) -> rows` of one element.
 
     Rows: energy drift of the step, its rounding bound, elastic energy at the end, viscous dissipation. `q0`, `q` are the dofs and
-    `s0`,
-    `s` the lagged data at the start and the midpoint. `reach` is the magnitude of positions, `floor` their relative rounding.
+    `s0`, `s` the lagged data at the start and the midpoint. `reach` is the magnitude of positions, `floor` their relative rounding.
     """
     measure, density = term.measure, term.density
     Q, S, E, _ = measure.types(real)
@@ -191,10 +189,8 @@ def drift_kernel(real):
     """Build the kernel that accumulates the energy balance of every rod or world.
 
     `judge`: add a solved step to the account, or fail the step. The account holds the total drift and its rounding bound, the
-    largest
-    kinetic plus elastic energy, and the total dissipation. A step fails if the total drift exceeds the fraction `bound` of that
-    energy
-    plus dissipation, and grows.
+    largest kinetic plus elastic energy, and the total dissipation. A step fails if the total drift exceeds the fraction `bound` of
+    that energy plus dissipation, and grows.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

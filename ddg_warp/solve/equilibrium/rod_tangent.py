@@ -1,7 +1,9 @@
-"""What chains contribute to a model's energy and tangent on the host.
+"""Energy and tangent of rod groups on the host.
 
-Element windows come from the device; B, a constant sparse matrix of 0, 1 and -1 per group, takes dofs to windows. Then
-g = B^T g_window and H = B^T K_window B, for every term and every kind of chain alike.
+Element windows come from the device; B, a constant sparse matrix of 0, 1 and -1 per group, takes dofs to windows. Then, for every
+term and every kind of rod,
+
+    g = B^T g_window,    H = B^T K_window B.
 """
 
 from functools import cached_property
@@ -22,7 +24,7 @@ from ddg_warp.solve.forces.prescribed_motion import Motion
 
 
 class RodTangent(TangentBlock):
-    """The part of one group of rods; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
+    """Tangent block of one rod group; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
 
     def __init__(self, model, group, offset: int):
         kind, real, device = group.kind, model.types.real, model.wp_device
@@ -30,7 +32,7 @@ class RodTangent(TangentBlock):
         super().__init__(model, group, offset, group.columns * group.nodes * kind.block)
         self.group, self.block = group, kind.block
         self.body_count = self.islands = group.columns
-        self.rate = group.still  # over what strain-rate damping counts: at rest not
+        self.rate = group.still  # inverse time of strain-rate damping: zero at rest
         self.incidence = _incidence(group)
         self.free = _free(group)
         self.angle = np.tile(np.arange(kind.block) >= kind.dim, group.columns * group.nodes)
@@ -42,11 +44,11 @@ class RodTangent(TangentBlock):
         return np.append(gravity[list(self.host.axes)], 0.0)[None, : self.group.kind.block]
 
     def data(self, state):
-        """This part of a state."""
+        """Return the group's state."""
         return state.groups[self.model.groups.index(self.group)]
 
     def energies(self, state):
-        """(term's name, energies of its elements (worlds, elements))."""
+        """Yield (term's name, energies of its elements (worlds, elements))."""
         for i, term in enumerate(self.group.kind.terms):
             self._energies.zero_()
             self._launch(state, i, 0, self._energies)
@@ -74,20 +76,20 @@ class RodTangent(TangentBlock):
         return self.incidence.T @ (diagonal @ self.incidence)
 
     def unit_forces(self, state, strains: np.ndarray) -> sparse.csr_matrix:
-        """Derivatives of the strains by the dofs, times the measures: forces of unit stresses (size, columns n strains).
+        """Return the derivatives of the strains by the dofs, times the measures: forces of unit stresses (size, columns n strains).
 
         Args:
-            strains: of all terms at this state, whose laws are quadratic (strains, n, columns).
+            strains: of all terms at this state, with quadratic laws (strains, n, columns).
         """
         group, values = self.group, self.group.parameters.values
         blocks = np.zeros((group.columns, group.nodes, group.kind.window, len(strains)))
         for index, (term, place) in enumerate(zip(group.kind.terms, group.kind.places(), strict=True)):
-            names = [[f"{term.name}.{name}" for name in own] for own in (term.stiffness, term.rest)]
+            names = [[f"{term.name}.{name}" for name in family] for family in (term.stiffness, term.rest)]
             first = place[3]
             for unit in range(len(term.rest)):
-                own = {name: np.full((1, 1), float(m == unit)) for m, name in enumerate(names[0])}
-                own |= {name: strains[first + m] - 1.0 for m, name in enumerate(names[1])}
-                table = ParameterTable(values | own, 0, self.model.types.real, self.model.wp_device)
+                unit_values = {name: np.full((1, 1), float(m == unit)) for m, name in enumerate(names[0])}
+                unit_values |= {name: strains[first + m] - 1.0 for m, name in enumerate(names[1])}
+                table = ParameterTable(values | unit_values, 0, self.model.types.real, self.model.wp_device)
                 self._windows.zero_()
                 self._launch(state, index, 1, self._windows, table)
                 blocks[..., first + unit] = device_arrays.download(self._windows).transpose(2, 1, 0)
@@ -96,7 +98,7 @@ class RodTangent(TangentBlock):
         return sparse.csr_matrix(self.incidence.T @ sparse.bsr_matrix((blocks, elements[:-1], elements)))
 
     def blocks(self, q: np.ndarray) -> np.ndarray:
-        """Dofs (size,) as (column, node, dofs of a node)."""
+        """Return dofs (size,) as (column, node, dofs of a node)."""
         return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
 
     def dofs(self, state) -> np.ndarray:
@@ -124,18 +126,18 @@ class RodTangent(TangentBlock):
     def _motion(self) -> Motion:
         return Motion(self.model, self.group)
 
-    def move_supports(self, state, before: float, at: float) -> None:
-        """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
+    def move_supports(self, state, before: float, load_factor: float) -> None:
+        """Move supports of a state at load parameter `before` to load parameter `load_factor`."""
         if self.host.moves:
             data = self.data(state)
-            self._motion.put(state, before, at, data.x, data.frame, data.theta)
+            self._motion.put(state, before, load_factor, data.x, data.frame, data.theta)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
-        """Edge vectors of the windows (E, dim), zero where there is none."""
+        """Return the edge vectors of the windows (E, dim), zero for missing edges."""
         return (self.incidence @ q).reshape(-1, self.group.kind.window)[:, : self.group.kind.dim]
 
     def edge_dofs(self) -> np.ndarray:
-        """Dofs of the positions of both ends of all edges (2, E, dim)."""
+        """Return the position dofs of both ends of all edges (2, E, dim)."""
         group, kind, ends = self.group, self.group.kind, []
         for column in range(group.columns):
             n = group.host.count[column % group.rods]
@@ -144,19 +146,19 @@ class RodTangent(TangentBlock):
         return kind.block * np.concatenate(ends, axis=1)[..., None] + np.arange(kind.dim)
 
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Sum of the outer forces on every rod, or its largest support force if that is more (columns,) [N]."""
+        """Return the sum of the outer forces on every rod, or its largest support force if larger (columns,) [N]."""
         columns, nodes, force = self.group.columns, self.group.nodes, ~self.angle
         total = np.where(self.free & force, np.abs(outer), 0.0).reshape(columns, -1).sum(1)
-        held = np.where(~self.free & force, gradient, 0.0).reshape(columns * nodes, -1)
-        return np.maximum(total, support_forces(held, np.repeat(np.arange(columns), nodes), columns))
+        support = np.where(~self.free & force, gradient, 0.0).reshape(columns * nodes, -1)
+        return np.maximum(total, support_forces(support, np.repeat(np.arange(columns), nodes), columns))
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:
-        """Residuals at rtol = 1 (size,) [N, N m] of rods with such loads; see `ddg_warp.compile.residual_tolerance`."""
+        """Return the residual tolerance at rtol = 1 (size,) [N, N m] from rod loads; see `ddg_warp.compile.residual_tolerance`."""
         lengths = np.where(self.angle, np.repeat(np.tile(self.group.host.length, self.group.worlds), self._dofs), 1.0)
         return np.repeat(loads, self._dofs) * lengths
 
     def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
-        """Whether residuals add up to little along each rod from its first node, and the largest excess over rounding (islands,)."""
+        """Return the test of residual sums along each rod from its first node, and the largest excess over rounding (islands,)."""
         dim = self.group.kind.dim
         sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
         limit = (rtol * loads)[:, None, None]
@@ -168,16 +170,16 @@ class RodTangent(TangentBlock):
         return self.size // self.group.columns
 
     def edge_length(self) -> float:
-        """Mean rest length of edges [m]."""
+        """Return the mean rest length of edges [m]."""
         return float((self.group.host.length / np.maximum(1, self.group.host.own - 1)).mean())
 
     def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of `State.points`, and the dofs (rows, 3) of the first world, -1 for none."""
+        """Return the rows of `State.points`, and the dofs (rows, 3) of the first world, -1 for none."""
         k, column, rows = self.model.order.places(self.group)
         return rows, self.host.dofs(k * self.group.rods + column)
 
     def bodies(self) -> list[Body]:
-        """Every rod of every world."""
+        """Return every rod of every world."""
         group, kind, result = self.group, self.group.kind, []
         axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
         for column in range(group.columns):
@@ -191,30 +193,32 @@ class RodTangent(TangentBlock):
         return result
 
     def where(self, dof: int) -> str:
-        """Name of a dof's place."""
+        """Return the label of the node or edge of a dof."""
         column, k = divmod(dof // self.group.kind.block, self.group.nodes)
         return self.host.name(k * self.group.rods + column % self.group.rods)
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.geometry.edge_rotation`."""
+        """Return q moved along `step` by rotating edges; see `ddg_warp.geometry.edge_rotation`."""
         moved = q + step
         kind, group = self.group.kind, self.group
         x, dx = (self.blocks(v)[..., : kind.dim] for v in (q, step))
-        held = ~self.blocks(self.free)[..., : kind.dim]
+        fixed = ~self.blocks(self.free)[..., : kind.dim]
         out = self.blocks(moved)
         for column in range(group.columns):
             n = group.host.count[column % group.rods]
             still = np.zeros((n, kind.dim))
-            out[column, :n, : kind.dim] += turned(x[column, :n], dx[column, :n], held[column, :n], still, kind.closed)
+            out[column, :n, : kind.dim] += turned(x[column, :n], dx[column, :n], fixed[column, :n], still, kind.closed)
         return moved
 
-    def _launch(self, state, index: int, which: int, out: wp.array, parameters: ParameterTable | None = None) -> None:
+    def _launch(
+        self, state, index: int, kernel_index: int, out: wp.array, parameters: ParameterTable | None = None
+    ) -> None:
         group, data, real = self.group, self.data(state), self.model.types.real
         window, device = group.kind.window, self.model.wp_device
-        kernel = element_path.term_kernels(rod_storage(group.kind, real), index, real)[which]
+        kernel = element_path.term_kernels(rod_storage(group.kind, real), index, real)[kernel_index]
         inputs, grid = [group.element_inputs(data, data.last, self.rate, parameters)], (group.elements, group.columns)
         rows = ()
-        if which == 2:  # by the stresses of the law alone
+        if kernel_index == 2:  # stresses of the law only
             inputs, grid, rows = (
                 [*inputs, wp.zeros((0, 0), dtype=real, device=device)],
                 (*grid, window),
@@ -224,7 +228,7 @@ class RodTangent(TangentBlock):
 
 
 def _incidence(group) -> sparse.csr_matrix:
-    """B of one group: (window dofs of all elements, dofs)."""
+    """Return B of one group: (window dofs of all elements, dofs)."""
     kind, n = group.kind, group.nodes
     count = np.tile(group.host.count, group.worlds)
     column, k = (a.ravel() for a in np.meshgrid(np.arange(group.columns), np.arange(n), indexing="ij"))
@@ -259,5 +263,5 @@ def _free(group) -> np.ndarray:
 
 
 def _every_world(group, values: np.ndarray) -> np.ndarray:
-    """Values of dofs (n, R, block) as those of all worlds are numbered (size,)."""
+    """Return values of dofs (n, R, block) in the numbering of all worlds (size,)."""
     return np.concatenate([values] * group.worlds, axis=1).transpose(1, 0, 2).ravel()

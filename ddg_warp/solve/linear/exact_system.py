@@ -1,4 +1,4 @@
-"""Linear systems with the exact Hessian of a net, on the device: those of the reverse of its steps."""
+"""Linear systems with the exact Hessian of the coupled system on the device, for the reverse of its steps."""
 
 import numpy as np
 import warp as wp
@@ -18,23 +18,23 @@ from ddg_warp.solve.linear.sparse_system import SparseSystem
 
 
 class ExactSystem:
-    """(H + c M) w = g on the free dofs of every world, with the exact Hessian H at the solution of a step.
+    """Linear system (H + c M) w = g on the free dofs of every world, with the exact Hessian H at the solution of a step.
 
-    The solve is that of a direction of `CoupledNewton`, whose names it has for what `PCG` reads, with all of H in one place,
-    in float64 whatever the precision of the model, and to a tolerance of its own. H is symmetric, as drag is and loads do not follow
-    within a step, but may be indefinite, at a saddle. The host reads nothing.
+    The solve resembles a direction of `CoupledNewton`, and has the same attributes for `PCG`. But all of H is in one array, in
+    float64 whatever the precision of the model, and the tolerance is its own. H is symmetric, as drag is, and loads do not follow
+    within a step; it may be indefinite, at a saddle. The host reads nothing.
 
-    On a CPU the reverse of a step takes a quarter to a half of the time that it takes by sparse factors where rods branch, and up to
-    twice and three times that of large sheets and gridshells (tools/results/gradient_nets_cpu.csv).
+    Measured: on a CPU the reverse of a step takes a quarter to a half of the time of sparse factors where rods branch. Large sheets
+    and gridshells take up to twice and three times that time (tools/results/gradient_nets_cpu.csv).
 
     Args:
         inertia: inertia and drag of the blocks (worlds, N); None without drag.
-        contact: `ExactContact`, which is where the solution is; None without contact.
+        contact: `ExactContact` at the solution; None without contact.
 
     Attributes:
-        tolerance: what conjugate gradients leave of the residual, in the norm of their preconditioner.
-        missed: what they may have left in truth, for rounding.
-        failed: not zero of worlds where it is more, so that w means nothing (worlds,); zeroed by who asks for solves.
+        tolerance: residual after conjugate gradients, relative, in the norm of their preconditioner.
+        missed: bound of the true relative residual, which rounding increases.
+        failed: nonzero for worlds above this bound, whose w is invalid (worlds,); zeroed by the caller.
     """
 
     tolerance = 1e-12
@@ -84,23 +84,23 @@ class ExactSystem:
         self.krylov = PCG(self, preconditioner.endswith("multilevel"), indefinite=True)
 
     def bits(self, dofs: np.ndarray) -> wp.array:
-        """Dofs (blocks, 3) bool as bits of blocks."""
+        """Return dofs (blocks, 3) bool as bits of blocks."""
         return wp.array((dofs * [1, 2, 4]).sum(1).astype(np.uint8), dtype=wp.uint8, device=self.device)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         used = [part.kernels for part in (self.krylov, self.chains, self.planes, self.contact) if part]
-        own = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
-        return [*own, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
+        result = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
+        return [*result, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
     def solve(self, state: CoupledState, coefficient: float, rate: wp.array, rhs: wp.array, w: wp.array) -> None:
-        """Write w (W N,), zero at held dofs; what g (W N,) has there is left out. Launches alone.
+        """Write w (W N,), zero at fixed dofs, where g (W N,) is ignored. Launches only.
 
         Args:
             state: the solution with its lagged data and the strains of the last step.
             coefficient: c [1/s^2].
-            rate: of every world, over which strain-rate damping counts [1/s].
+            rate: inverse time of strain-rate damping of every world [1/s].
         """
         self.islands.needs_direction.fill_(1)
         self.islands.inertia_coefficient.fill_(coefficient)
@@ -115,7 +115,7 @@ class ExactSystem:
         self._give(self.direction, w)
 
     def part(self, values: wp.array, left_out: wp.array, out: wp.array) -> None:
-        """Write `values` (W N,) without their components at dofs whose bits are set, in the frames of planes where there are some."""
+        """Write `values` (W N,) without the components at dofs with set bits, in the nodal frames of skew supports, if any."""
         self._launch(self._into, self.all, [values], [self.rhs])
         if self.planes:
             self.planes.into(self.rhs, self.coupled.every)
@@ -123,15 +123,15 @@ class ExactSystem:
         self._give(self.rhs, out)
 
     def assemble(self, state: CoupledState, rate: wp.array) -> None:
-        """H of all worlds."""
+        """Assemble H of all worlds."""
         table, flags = self.system, self.islands.arrays[0]
         every = device_arrays.takers(self.matrix.shape[1], self.device)
         read = [self.mass, *self.islands.arrays, table.rows, table.columns, table.positions]
         self._launch(self._begin, every, read, [self.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
-            given = self.coupled.elements(state, i, rate=rate)
+            inputs = self.coupled.elements(state, i, rate=rate)
             grid = self.coupled.worlds, self.coupled.sets[i].elements, hessian.shape[1]
-            self._launch(kernel, grid, [given, self._no_stress], [hessian.transpose((1, 2, 0))])
+            self._launch(kernel, grid, [inputs, self._no_stress], [hessian.transpose((1, 2, 0))])
             read = [
                 hessian,
                 *table.adds[i],
@@ -149,7 +149,7 @@ class ExactSystem:
             self.contact.assemble()
 
     def check(self) -> None:
-        """`failed`, by the residual that the solution leaves."""
+        """Set `failed` from the residual of the solution."""
         krylov, wanted = self.krylov, self.islands.needs_direction
         wanted.fill_(1)
         krylov.multiply(self.direction)
@@ -160,7 +160,7 @@ class ExactSystem:
         self._launch(self._check, self.worlds, [krylov.total, krylov.rho_first, self.missed], [self.failed])
 
     def _give(self, values: wp.array, out: wp.array) -> None:
-        """Write blocks in the precision of the model, in space."""
+        """Write blocks in the precision of the model, in spatial components."""
         if self.planes:
             self.planes.back(values, self.coupled.every)
         self._launch(self._back, self.all, [values], [out])
@@ -170,21 +170,21 @@ class ExactSystem:
 
 
 def _ends(measure) -> np.ndarray:
-    """What every slot of an element sees of its local dofs; see `kernels.linear.exact_hessian`."""
+    """Return the local dofs of every local node of an element; see `kernels.linear.exact_hessian`."""
     angles, spins, points = measure.starts
-    seen = [[] for _ in range(measure.slots)]
+    dofs_of = [[] for _ in range(measure.slots)]
     for i, edge in enumerate(measure.edges):
         for node, sign in zip(edge, (-1, 1), strict=True):
-            seen[node].append((3 * i, sign, 3))
+            dofs_of[node].append((3 * i, sign, 3))
     for i in range(measure.points):
-        seen[i].append((points + 3 * i, 1, 3))
+        dofs_of[i].append((points + 3 * i, 1, 3))
     for i in range(measure.angles):
-        seen[measure.nodes + i].append((angles + i, 1, 1))
+        dofs_of[measure.nodes + i].append((angles + i, 1, 1))
     for i in range(measure.spins):
-        seen[measure.nodes + measure.angles + i].append((spins + 3 * i, 1, 3))
-    most = max(map(len, seen))
+        dofs_of[measure.nodes + measure.angles + i].append((spins + 3 * i, 1, 3))
+    most = max(map(len, dofs_of))
     result = np.zeros((measure.slots, most, 3), np.int32)
-    for slot, dofs in enumerate(seen):
+    for slot, dofs in enumerate(dofs_of):
         for i, (first, sign, count) in enumerate(dofs):
             result[slot, i, FIRST], result[slot, i, SIGN], result[slot, i, COUNT] = first, sign, count
     return result.reshape(-1, 3)

@@ -28,40 +28,30 @@ class NewtonOptions:
 
     Attributes:
         rtol: a dof converges where its residual is below rtol times the load scale of its rod or shell, or below the rounding
-            floor. The
-            load scale is the sum of the body's outer forces; without any, the first residual. In shells it is scaled by the root of
-            the
-            dof's fraction of the area. Subset sums of residuals obey the same test. See `ddg_warp.compile.residual_tolerance`.
+            floor. The load scale is the sum of the body's outer forces; without any, the first residual. In shells it is scaled by
+            the root of the dof's fraction of the area. Subset sums of residuals obey the same test. See
+            `ddg_warp.compile.residual_tolerance`.
         floor_factor: rounding units of the forces on a node that count as rounding.
         max_iterations: Newton iterations of one solve.
         max_halvings: backtracks of one step by the line search.
         rotation_cap: largest rotation of an edge, a joint or a twist angle in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
         psd: the matrix. Mode "gauss_newton": no second derivatives of bending and twist. Only compression can make this matrix
-            indefinite;
-            it is dropped where a pivot is lost. Mode "progressive": the exact Hessian from the third iteration on, and Gauss-Newton
-            without compression in iterations where it is indefinite. This suits curved, twisted or compressed rods and long steps,
-            where Gauss-Newton takes many iterations. Too many projected iterations shorten a time step: outcome `indefinite`, see
-            `kernels.core.islands.projected_limit_function`. Mode "project": the exact Hessian with every element projected to
-            positive
-            semi-definite by its eigenvalues, at twenty times the cost of an iteration. Mode "none": the exact Hessian. An
-            indefinite one
-            ends the solve with the outcome `indefinite`, and a time step is retried with a shorter one. Mode "auto": "progressive"
-            for
-            rods that are curved or twisted at rest, or stiff over a time step (`compile.precision.stiff`), else "gauss_newton".
-            The coupled system takes all but "project". Its exact Hessian covers rods and rigid joints. Second derivatives of
-            shells'
-            bending, of rod-shell coupling and of magnets are omitted, which "none" refuses. A lost pivot or negative curvature in
-            conjugate gradients makes it indefinite. With "gauss_newton" the coupled system then keeps the direction reached, and
-            drops
-            compression from the next matrix.
+            indefinite; it is dropped where a pivot is lost. Mode "progressive": the exact Hessian from the third iteration on, and
+            Gauss-Newton without compression in iterations where it is indefinite. This suits curved, twisted or compressed rods and
+            long steps, where Gauss-Newton takes many iterations. Too many projected iterations shorten a time step: outcome
+            `indefinite`, see `kernels.core.islands.projected_limit_function`. Mode "project": the exact Hessian with every element
+            projected to positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. Mode "none": the exact
+            Hessian. An indefinite one ends the solve with the outcome `indefinite`, and a time step is retried with a shorter one.
+            Mode "auto": "progressive" for rods that are curved or twisted at rest, or stiff over a time step
+            (`compile.precision.stiff`), else "gauss_newton". The coupled system takes all but "project". Its exact Hessian covers
+            rods and rigid joints. Second derivatives of shells' bending, of rod-shell coupling and of magnets are omitted, which
+            "none" refuses. A lost pivot or negative curvature in conjugate gradients makes it indefinite. With "gauss_newton" the
+            coupled system then keeps the direction reached, and drops compression from the next matrix.
         unconverged_fraction: in contact, fraction of the bodies of a world that may exceed the tolerance at the end of a step, each by at most
-            ten
-            times. Bodies are rods, shells, or joined ones. With many bodies in contact some slip off others at any time, and delay
-            all
-            others. The remaining residual acts on such a body like a force in that step. Where contact cuts no motion, directions
-            are
-            solved until all but half as many bodies satisfy the linear system.
+            ten times. Bodies are rods, shells, or joined ones. With many bodies in contact some slip off others at any time, and
+            delay all others. The remaining residual acts on such a body like a force in that step. Where contact cuts no motion,
+            directions are solved until all but half as many bodies satisfy the linear system.
     """
 
     rtol: float = 1e-6

@@ -289,12 +289,9 @@ class CoupledStep(StepDriver):
         """Return the state with the time-lagged data of the solve, carried to the predicted midpoint for the midpoint rule.
 
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary inertia:
-        the rule
-        would be of first order. Joint rotations have no inertia and are not predicted: the solve finds their change over the whole
-        half step.
-        Rotating support normals and the magnetic field belong to the solve. Finished worlds keep the frames of their solve, from
-        which
-        gradients detect a frame update.
+        the rule would be of first order. Joint rotations have no inertia and are not predicted: the solve finds their change over
+        the whole half step. Rotating support normals and the magnetic field belong to the solve. Finished worlds keep the frames of
+        their solve, from which gradients detect a frame update.
         """
         if not self.coupled.edges:
             return replace(before, data=self._data)

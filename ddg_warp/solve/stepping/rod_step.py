@@ -1,7 +1,4 @@
-"""A time step of a group of rods on their own:
-
-predictor, prescribed motion and loads, Newton, end update. See `kernels.stepping.rod_step`.
-"""
+"""Time step of a rod group: predictor, prescribed motion and loads, Newton, end update. See `kernels.stepping.rod_step`."""
 
 from dataclasses import replace
 
@@ -25,14 +22,14 @@ from ddg_warp.solve.stepping import energy_drift
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 
 DIRECT = {"sweep": RodNewton, "partitioned": RodNewtonParallel}  # solvers of open rods by their name
-COUPLED_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
+COUPLED_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of the coupled system
 
 
 class RodStep(StepDriver):
-    """Steps the rods of a group in all worlds, each an island.
+    """Time step of the rods of a group in all worlds, one island each.
 
     Args:
-        means: what solves take; see `LinearSolverChoice`. The psd mode "auto" takes second derivatives of stiff rods.
+        means: the solver selection; see `LinearSolverChoice`. The psd mode "auto" takes second derivatives of stiff rods.
         counts_of: the step that this one replaces; see `StepDriver`.
     """
 
@@ -42,15 +39,15 @@ class RodStep(StepDriver):
         kind, real = group.kind, model.types.real
         self._begin = rod_step.begin_kernel(kind, real, self.midpoint)
         self._foresee = rod_warm_start.warm_start_kernel(kind, real, self.newton.linear)
-        predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
-        self._predicted, self._predicted_angle = (device_arrays.allocate(*given) for given in predicted)
+        predicted = ((array.shape, array.dtype, model.wp_device) for array in (self.newton.x, self.newton.theta))
+        self._predicted, self._predicted_angle = (device_arrays.allocate(*layout) for layout in predicted)
         self._nodes = rod_step.finish_nodes_kernel(kind, real, self.midpoint)
         self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
         self.outer = group.outer
-        if (given := integrator.given) is not None:
+        if (controls := integrator.given) is not None:
             self.newton.take_loads()
             scale = RodScale(model, group)
-            self.outer, self.loads = scale.load, ControlledLoads(model, group, self.midpoint, given, scale)
+            self.outer, self.loads = scale.load, ControlledLoads(model, group, self.midpoint, controls, scale)
         elif group.host.timed or group.host.followers:
             self.loads = Loads(model, group, self.midpoint)
         self.energy = energy_drift.RodEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
@@ -59,16 +56,16 @@ class RodStep(StepDriver):
 
     @property
     def index(self) -> int:
-        """Which of the model's groups it is."""
+        """Index of the group in the model."""
         return self.model.groups.index(self.group)
 
     def attempt(self, before, after) -> None:
-        """One solve of every rod that has not finished the step, from state `before` to `after`."""
+        """Launch one solve of every rod that has not finished the step, from state `before` to `after`."""
         self.move(before, after)
         self.complete(before, after)
 
     def move(self, before, after) -> None:
-        """Positions of an attempt, and their rates."""
+        """Launch the positions of an attempt, and their rates."""
         group, newton = self.group, self.newton
         self._launch(
             self._begin,
@@ -103,7 +100,7 @@ class RodStep(StepDriver):
             self.drag.settle(before, after, newton, self.islands)
 
     def complete(self, before, after) -> None:
-        """Frames and strains that go with the positions."""
+        """Update frames and strains to the positions."""
         group, newton = self.group, self.newton
         if self._frames:
             self._launch(
@@ -116,7 +113,7 @@ class RodStep(StepDriver):
             self.model.strains(group, after, after.last)
 
     def _start_further(self, before) -> None:
-        """Start from where accelerations lead from the predictor, and keep that."""
+        """Warm-start from the predictor by the last correction, and store the start."""
         group, newton = self.group, self.newton
         self._launch(
             self._foresee,
@@ -128,7 +125,7 @@ class RodStep(StepDriver):
 
     @property
     def own_kernels(self) -> list:
-        """Kernels of an attempt, without those of the solver."""
+        """Kernels of an attempt, without the solver's."""
         kernels = [self._begin, self._nodes, *([self._frames] if self._frames else [])]
         kernels += [] if self.midpoint else [self._foresee]
         if self.group.kind.viscous:
@@ -138,33 +135,33 @@ class RodStep(StepDriver):
 
     @property
     def stiffness_version(self) -> int:
-        """As of `StepDriver`."""
+        """Version of the stiffnesses behind `limits` and float32 errors; zero for the stiffnesses of the scene."""
         return self.group.parameters.version
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """Of every rod; see `precision.float32_error`."""
+        """Return the float32 error of every rod; see `precision.float32_error`."""
         return self.group.float32_errors(s)
 
     def split_errors(self, s: float) -> np.ndarray:
-        """Of every rod; infinite where the solver cannot take tensions for unknowns."""
+        """Return float32 errors of every rod in the mixed axial-force formulation; infinite if unavailable."""
         return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
-        """As of `StepDriver`; and what float32 matrices carry."""
+        """Return the limits of islands by name, with the largest edge stiffnesses that float32 carries."""
         return super()._find_limits(s) | {"max_edge_stiffness": largest_carried(self.group.stiffnesses(s)[2])}
 
     def island_label(self, column: int) -> str:
-        """The rod of a column, and its world where there are several."""
+        """Return the label of the rod of a column, with its world if there are several."""
         rod = self._rod(column)
         world = f" of world {column // self.group.rods}" if self.model.worlds > 1 else ""
         return f"rod {rod} ('{self.model.curves.names[rod]}'){world}"
 
     def rods_of(self, columns: np.ndarray) -> list[int]:
-        """Rods of columns, as the user counts them."""
+        """Return the rods of columns, in the user's numbering."""
         return [self._rod(column) for column in columns]
 
     def where(self, state, column: int) -> str:
-        """Where the largest residual was, estimated by the element forces that meet there, and what to do."""
+        """Return the location of the largest residual, estimated by element forces, and the remedy."""
         size = float(self.islands.max_residual.numpy()[column])
         direction = np.abs(device_arrays.download(self.newton.direction)[:, :, column]).max(0)
         largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
@@ -175,26 +172,26 @@ class RodStep(StepDriver):
         return int(self.group.host.rods[column % self.group.rods])
 
     def _remedy(self, state, column: int) -> str:
-        """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
+        """Return the remedy for a failed rod: degenerate edges of its last good state, or advice."""
         host, kind, rod = self.group.host, self.group.kind, column % self.group.rods
         x = device_arrays.download(state.groups[self.index].x)[: host.count[rod], column]
         return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
 
 
 def _newton(model, group, integrator, means) -> RodNewton:
-    """The solver of a group that the integrator's `linear` asks for."""
+    """Return the solver of a group selected by the integrator's `linear`."""
     linear = automatic(group) if integrator.linear in ("auto", *COUPLED_ONLY) else integrator.linear
     options = integrator.options
     if options.psd == "auto" and means.stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
         options = replace(options, psd="progressive")
-    given = (model, group, options)
+    arguments = (model, group, options)
     last = (means.linear, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
-        return RodModifiedNewton(*given, *last)
+        return RodModifiedNewton(*arguments, *last)
     if linear in tuple(DIRECT) and group.kind.closed:
         raise SceneError(
             f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
         )
     if linear in tuple(DIRECT):
-        return DIRECT[linear](*given, *last, split=means.split)
-    return PcgNewton(*given, linear, *last)
+        return DIRECT[linear](*arguments, *last, split=means.split)
+    return PcgNewton(*arguments, linear, *last)
