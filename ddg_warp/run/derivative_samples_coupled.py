@@ -82,12 +82,12 @@ class Elements(Sample):
         ]
         types = [vector, real, real, vector, real, real]
         out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
-        search = Islands(1, real, self.device)
-        search.clamped.fill_(0 if exact else 1)
+        islands = Islands(1, real, self.device)
+        islands.drop_compression.fill_(0 if exact else 1)
         kernel = element_path.evaluate_kernel(self.storage(real), real, real, 0 if exact and packed else None)
         found = element_path.results_type(real, real, True)()
         found.factor, found.tension, found.second, found.gradient, found.energy, found.stiffness = out
-        wp.launch(kernel, (1, count), [self.inputs(real), *search.arrays], [found], device=self.device)
+        wp.launch(kernel, (1, count), [self.inputs(real), *islands.arrays], [found], device=self.device)
         factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)
