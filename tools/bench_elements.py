@@ -3,9 +3,9 @@
     python tools/bench_elements.py --base TREE [--out DIR]
 
 Builds the kernels of a Newton iteration and of the adjoint of several kinds of elements for sm_90. From the binaries it reads
-registers, stack [B] and code [kB]. On the CPU it times the first of these alone, and whole steps, each the least of many, in processes
-of both checkouts by turns. TREE is another checkout with its kernels and scenes beside the package (links `ddg_warp/kernels` and
-`ddg_warp/scenes`).
+registers, stack [B] and code [kB]. On the CPU it times the first of these alone, and whole steps, each the least of many, in
+alternating processes of both checkouts. TREE is another checkout with its kernels and scenes next to the package (links
+`ddg_warp/kernels` and `ddg_warp/scenes`).
 Prints two tables; writes elements_registers.csv, elements_cpu.csv and their .json.
 """
 
@@ -34,7 +34,7 @@ REGISTERS, STACK = 0x2F, 0x12  # attributes of cubins: EIATTR_REGCOUNT, EIATTR_M
 
 
 def scene(kind: str, rods: int, nodes: int) -> ddg.Scene:
-    """Cantilevers side by side, uncoupled or each hinged to a stub that is held."""
+    """Return cantilevers side by side, uncoupled or each hinged to a clamped stub."""
     plane = kind.startswith("planar")
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), dimension=2 if plane else 3)
     points = np.zeros((rods, nodes, 3))
@@ -43,14 +43,14 @@ def scene(kind: str, rods: int, nodes: int) -> ddg.Scene:
         points[:, :, 1] = 0.2 * np.sin(3.0 * points[:, :, 0])
         points[:, :, 2] = 0.2 * np.cos(3.0 * points[:, :, 0])
     points[:, :, 2 if plane else 1] += 10.0 * RADIUS * np.arange(rods)[:, None]
-    given = {"section": ddg.Circle(RADIUS), "material": RUBBER} | ({"twist": False} if "twist-free" in kind else {})
-    long = scene.add_rods(points, **given)
+    options = {"section": ddg.Circle(RADIUS), "material": RUBBER} | ({"twist": False} if "twist-free" in kind else {})
+    long = scene.add_rods(points, **options)
     scene.clamp(long, edges=[0])
     if kind.startswith("net"):
-        stubs = scene.add_rods(points[:, :3] - points[:, 2:3] + points[:, :1], **given)
+        stubs = scene.add_rods(points[:, :3] - points[:, 2:3] + points[:, :1], **options)
         scene.clamp(stubs, edges=[0, 1])
-        for one, other in zip(long, stubs, strict=True):
-            scene.join([(int(one), 0), (int(other), -1)], rigid=False)
+        for rod, stub in zip(long, stubs, strict=True):
+            scene.join([(int(rod), 0), (int(stub), -1)], rigid=False)
     return scene
 
 
@@ -82,23 +82,23 @@ def cubin(data: bytes) -> dict:
     heads = [struct.unpack_from("<IIQQQQ", data, start + i * size) for i in range(count)]
 
     def name(head) -> str:
-        at = heads[names][4] + head[0]
-        return data[at : data.index(b"\0", at)].decode()
+        position = heads[names][4] + head[0]
+        return data[position : data.index(b"\0", position)].decode()
 
-    found = {"registers": 0, "stack": 0, "code_kb": 0.0}
+    attributes = {"registers": 0, "stack": 0, "code_kb": 0.0}
     for head in heads:
         offset, length = head[4], head[5]
         if name(head).startswith(".text."):
-            found["code_kb"] += length / 1e3
+            attributes["code_kb"] += length / 1e3
         if name(head) == ".nv.info":
-            at = offset
-            while at < offset + length:
-                form, attribute, more = struct.unpack_from("<BBH", data, at)
+            position = offset
+            while position < offset + length:
+                form, attribute, more = struct.unpack_from("<BBH", data, position)
                 if form == 4 and attribute in (REGISTERS, STACK):
                     key = "registers" if attribute == REGISTERS else "stack"
-                    found[key] = max(found[key], struct.unpack_from("<I", data, at + 8)[0])
-                at += 4 + (more if form == 4 else 0)
-    return found
+                    attributes[key] = max(attributes[key], struct.unpack_from("<I", data, position + 8)[0])
+                position += 4 + (more if form == 4 else 0)
+    return attributes
 
 
 def registers() -> list[dict]:
@@ -154,16 +154,16 @@ def times() -> list[dict]:
     return rows
 
 
-def work(tree: Path | None, what: str) -> list[dict]:
+def work(tree: Path | None, task: str) -> list[dict]:
     """Return the rows of a process of a checkout, or of this one."""
     path = {"PYTHONPATH": str(tree)} if tree else {}
-    command = [sys.executable, __file__, "--work", what]
+    command = [sys.executable, __file__, "--work", task]
     done = subprocess.run(command, env=os.environ | path, stdout=subprocess.PIPE, check=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--base", type=Path, help="checkout to compare with")
     parser.add_argument("--base-commit", default="", help="its commit")
@@ -197,7 +197,7 @@ def main() -> int:
         for i, kind in enumerate(TIMED):
             row = {"kind": kind}
             for name in ("kernel_us", "step_us"):
-                old, new = (min(run[which][i][name] for run in runs) for which in (0, 1))
+                old, new = (min(run[tree][i][name] for run in runs) for tree in (0, 1))
                 row |= {f"{name}_before": old, f"{name}_after": new, f"{name[:-3]}_ratio": new / old}
             row |= {"newton_before": runs[0][0][i]["newton"], "newton_after": runs[0][1][i]["newton"]}
             rows.append(row)

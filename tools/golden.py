@@ -1,11 +1,11 @@
-"""Golden test: record states of small scenes on the CPU, and compare those of another version with them.
+"""Golden test: record states of small scenes on the CPU, and compare them with another version's.
 
     DDG_WARP_FP_CONTRACT=off python tools/golden.py write FILE [SCENE ...]
     DDG_WARP_FP_CONTRACT=off python tools/golden.py compare FILE [SCENE ...]
 
-`write` keeps all arrays of the state after a few steps, and the counts of Newton and PCG iterations; with torch, also gradients of a
-loss by what steps read, of objects of `ddg_warp.torch.gradient_check_scenes`. `compare` prints, by scene, the
-largest difference over the largest entry of the array that differs most, and fails where iteration counts differ or differences exceed
+`write` stores all arrays of the state after a few steps, and the counts of Newton and PCG iterations. With torch, it also stores
+gradients of a loss by the inputs of steps, of objects of `ddg_warp.torch.gradient_check_scenes`. `compare` prints, by scene, the
+largest difference over the largest entry of the array that differs most. It fails if iteration counts differ or differences exceed
 1e-9. Without fused multiply-adds (DDG_WARP_FP_CONTRACT=off) versions that compute the same are equal bit for bit.
 """
 
@@ -34,7 +34,7 @@ SECTION = ddg.Circle(0.01)
 
 
 def line(nodes: int, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """Nodes of a straight rod of 1 m along x (nodes, 3) [m]."""
+    """Return the nodes of a straight rod of 1 m along x (nodes, 3) [m]."""
     points = np.zeros((nodes, 3))
     points[:] = 0.0, y, z
     points[:, 0] = np.linspace(0.0, 1.0, nodes)
@@ -103,12 +103,12 @@ def joined() -> ddg.Scene:
 
 
 def sheet() -> ddg.Scene:
-    """A sheet held at two corners, by St. Venant and Kirchhoff, with bending by mid-edge normals."""
+    """Return a sheet fixed at two corners: St. Venant-Kirchhoff membrane, bending by mid-edge normals."""
     points, triangles = meshes.rectangle(5, 5, (1.0, 1.0), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
     shell = scene.add_shell(points, triangles, thickness=1e-2, material=RUBBER)
-    held = (points[:, 0] == points[:, 0].min()) & np.isin(points[:, 1], [points[:, 1].min(), points[:, 1].max()])
-    scene.hold(shell, np.flatnonzero(held))
+    fixed = (points[:, 0] == points[:, 0].min()) & np.isin(points[:, 1], [points[:, 1].min(), points[:, 1].max()])
+    scene.hold(shell, np.flatnonzero(fixed))
     return scene
 
 
@@ -123,7 +123,7 @@ def contact() -> ddg.Scene:
 
 
 def magnet() -> ddg.Scene:
-    """A magnetised rod that turns into a field."""
+    """Return a magnetised rod that rotates into a field."""
     scene = ddg.Scene()
     (rod,) = cantilevers(scene, 1)
     scene.magnetize(int(rod), 1e5)
@@ -132,7 +132,7 @@ def magnet() -> ddg.Scene:
 
 
 def strands(scene: ddg.Scene, joined: bool = False) -> ddg.Scene:
-    """Add curly hair, whose axial forces are unknowns in mixed precision; `joined`: its roots to stubs that are held."""
+    """Add curly hair, whose axial forces are unknowns in mixed precision; `joined`: with its roots joined to clamped stubs."""
     kind = {"section": ddg.Circle(40e-6), "material": HAIR}
     for points in hair.curls(2, 32):
         rod = scene.add_rod(points, natural="shape", **kind)
@@ -191,18 +191,18 @@ GRADIENTS = {
 
 
 def gradient(name: str) -> tuple[dict[str, np.ndarray], str]:
-    """Return the derivatives of a loss by everything that steps, or equilibria, of an object read."""
+    """Return the derivatives of a loss by all inputs of an object's steps or equilibria."""
     from ddg_warp.torch.gradient_check_cases import Case
 
-    found = {}
-    for own in Case(*GRADIENTS[name], "cpu").inputs():
-        with suppress(ddg.SceneError):  # where equilibria are searched from has no gradient
-            found[own.name] = np.array(own.found())
-    return found | {"counts": np.zeros(3)}, ""
+    gradients = {}
+    for quantity in Case(*GRADIENTS[name], "cpu").inputs():
+        with suppress(ddg.SceneError):  # the start of a search for equilibria has no gradient
+            gradients[quantity.name] = np.array(quantity.found())
+    return gradients | {"counts": np.zeros(3)}, ""
 
 
 def record(name: str) -> tuple[dict[str, np.ndarray], str]:
-    """Return all arrays of the state after `STEPS` steps with the iteration counts, and which linear solvers were used."""
+    """Return all arrays of the state after `STEPS` steps with the iteration counts, and the linear solvers used."""
     if name in GRADIENTS:
         return gradient(name)
     build, precision, dt, options = CASES[name]
@@ -210,25 +210,25 @@ def record(name: str) -> tuple[dict[str, np.ndarray], str]:
     integrator, state = ddg.Integrator(model, check_every=1, **options), model.state()
     for _ in range(STEPS):
         state = integrator.step(state, dt)
-    found = integrator.statistics()
-    newton, energy = found["newton_iterations"], found.get("energy", {})
-    counts = np.array([newton["mean"], newton["max"], found["pcg_iterations"]])
+    statistics = integrator.statistics()
+    newton, energy = statistics["newton_iterations"], statistics.get("energy", {})
+    counts = np.array([newton["mean"], newton["max"], statistics["pcg_iterations"]])
     account = {f"energy {key}": np.array(value) for key, value in energy.items()}
-    return {**state.snapshot(), **account, "counts": counts}, ", ".join(found["linear"])
+    return {**state.snapshot(), **account, "counts": counts}, ", ".join(statistics["linear"])
 
 
-def difference(one: np.ndarray, other: np.ndarray) -> float:
+def difference(one: np.ndarray, second: np.ndarray) -> float:
     """Return the largest difference over the largest entry; infinity where shapes differ."""
-    if one.shape != other.shape:
+    if one.shape != second.shape:
         return np.inf
-    if one.size == 0 or np.array_equal(one, other, equal_nan=True):
+    if one.size == 0 or np.array_equal(one, second, equal_nan=True):
         return 0.0
     largest = np.abs(one.astype(float)).max()
-    return float(np.abs(one.astype(float) - other).max() / (largest or 1.0))
+    return float(np.abs(one.astype(float) - second).max() / (largest or 1.0))
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("write", "compare"))
     parser.add_argument("file", type=Path, help="NumPy archive of recorded states")
@@ -238,12 +238,12 @@ def main() -> int:
     names, failed = chosen.scene or [*CASES, *(GRADIENTS if find_spec("torch") else [])], False
     print(f"floating-point contraction: {CONTRACTION}")
     if chosen.action == "write":
-        found = {}
+        archive = {}
         for name in names:
             arrays, linear = record(name)
-            found |= {f"{name}/{key}": values for key, values in arrays.items()}
+            archive |= {f"{name}/{key}": values for key, values in arrays.items()}
             print(f"{name:14} Newton {arrays['counts'][0]:.3f} PCG {arrays['counts'][2]:.0f} {linear}", flush=True)
-        np.savez_compressed(chosen.file, **found)
+        np.savez_compressed(chosen.file, **archive)
         return 0
     golden = np.load(chosen.file)
     for name in names:

@@ -1,8 +1,8 @@
-"""The reverse's linear system H w = g of open rods in the precision of the state, by solutions in another one.
+"""Iterative refinement of the reverse system H w = g of open rods, by solutions in another precision.
 
-w is of the size of s times the derivatives by velocities, while what it says of positions is their difference, so that rounding of w
-weighs 1 / s times as much. It begins as what inertia alone makes of g; solutions for what remains, g - H w, are added to it (iterative
-refinement; Wilkinson, Rounding Errors in Algebraic Processes, 1963): each leaves what the solver errs by, relatively.
+The magnitude of w is s times the derivatives by velocities, while derivatives by positions are differences of w: rounding of w
+weighs 1 / s times as much. The first w is that of inertia alone. Solutions for the residual g - H w are added (Wilkinson, Rounding
+Errors in Algebraic Processes, 1963); each reduces the error to the solver's relative error.
 """
 
 from functools import cache
@@ -16,7 +16,10 @@ from ddg_warp.kernels.elements.rod_layout import RodKind, displaced_function
 
 @cache
 def product_kernel(kind: RodKind, real):
-    """product(...): H v of every element, as its window, from the factors and geometric stiffnesses that `evaluate_kernel` wrote."""
+    """Build the kernel of matrix-vector products of elements.
+
+    `product`: write H v of every element, as its window, from the factors and geometric stiffnesses of `evaluate_kernel`.
+    """
     W = wp.types.vector(kind.window, real)
     displaced = displaced_function(kind, real)
     dim, window, span = kind.dim, kind.window, kind.span
@@ -50,14 +53,14 @@ def product_kernel(kind: RodKind, real):
                     along += factor[m * wp.static(window) + i, k, r] * u[i]
                 for i in range(wp.static(window)):
                     y[i] += factor[m * wp.static(window) + i, k, r] * along
-            at = int(0)  # of an upper triangle, row by row
+            row = int(0)  # entry of the upper triangle, row by row
             for i in range(wp.static(window)):
                 for j in range(i, wp.static(window)):
-                    g = geometric[at, k, r]
+                    g = geometric[row, k, r]
                     y[i] += g * u[j]
                     if j > i:
                         y[j] += g * u[i]
-                    at += 1
+                    row += 1
         for m in range(wp.static(edge_rows)):
             along = real(0.0)
             for d in range(wp.static(dim)):
@@ -76,8 +79,9 @@ def product_kernel(kind: RodKind, real):
 
 @cache
 def refine_kernels(kind: RodKind, real, linear):
-    """guess(...): w of inertia alone; rest(...): the right-hand side that w leaves, from the products of elements; add(...): a solution
-    to w.
+    """Build the kernels of iterative refinement.
+
+    `guess`: write w of inertia alone. `rest`: write the residual of w, from the products of elements. `add`: add a solution to w.
     """
     dim, block, gathered = kind.dim, kind.block, gathered_function(kind, real)
 
@@ -88,14 +92,14 @@ def refine_kernels(kind: RodKind, real, linear):
         coefficient: wp.array(dtype=real),
         w_out: wp.array3d(dtype=real),
     ):
-        """`coefficient` is that of inertia [1/s^2]."""
+        """Write w of inertia alone; `coefficient` is the factor of inertia [1/s^2]."""
         k, r = wp.tid()
         c = coefficient[r] * mass[k, r]
         for d in range(wp.static(block)):
-            own = real(0.0)
+            value = real(0.0)
             if d < wp.static(dim) and c > real(0.0):
-                own = rhs[d, k, r] / c
-            w_out[d, k, r] = own
+                value = rhs[d, k, r] / c
+            w_out[d, k, r] = value
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def rest(
@@ -109,7 +113,7 @@ def refine_kernels(kind: RodKind, real, linear):
         count: wp.array(dtype=int),
         out: wp.array3d(dtype=linear),
     ):
-        """Zero at held dofs."""
+        """Write the residual of w, zero at fixed dofs."""
         k, r = wp.tid()
         n = count[r]
         if k >= n:
@@ -123,8 +127,8 @@ def refine_kernels(kind: RodKind, real, linear):
                 inertia *= mass[k, r]
             else:
                 inertia *= rotary[k, r]
-            own = rhs[d, k, r] - inertia * w[d, k, r] - q[d]
-            out[d, k, r] = wp.where(((mask >> d) & 1) == 0, linear(own), linear(0.0))
+            value = rhs[d, k, r] - inertia * w[d, k, r] - q[d]
+            out[d, k, r] = wp.where(((mask >> d) & 1) == 0, linear(value), linear(0.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(values: wp.array3d(dtype=linear), w: wp.array3d(dtype=real)):

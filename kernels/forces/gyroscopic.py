@@ -1,7 +1,7 @@
-"""Gyroscopic couple: the spin of a rod about its tangent resists turns of the tangent.
+"""Gyroscopic couple: the spin of a rod about its tangent resists rotation of the tangent.
 
-An edge with the inertia I about its tangent t that spins at w has the angular momentum I w t. Its rate has a part along t, the equation
-of the angle, and I w dt/dt across: the edge takes this couple from its nodes, which feel -I w dt/dt as a pair of forces
+An edge with the inertia I about its tangent t that spins at w has the angular momentum I w t. Its rate along t is the equation of the
+twist angle. Its rate across, I w dt/dt, is a couple that the nodes exert; they feel -I w dt/dt as a pair of forces
 
     f_b = -f_a = g t x (v_b - v_a) ,  g = I w / |e|^2 ,
 
@@ -12,8 +12,8 @@ before and after each step of everything else, positions and spins unchanged. Ed
     d' = d + W p ,  p = g s / 2 t x (d + d') ,  d = v_b - v_a ,  W = W_a + W_b
 
 over s, with the inverse masses W of free components, solved exactly. Kinetic energy stays whatever s is, as p . (d + d') = 0, and
-linear momentum too; angular momentum drifts by O(s^2). Edges that share a node take turns by color, in one order before and in the
-reverse one after a step, so that the whole is symmetric in time: of second order by the midpoint rule.
+linear momentum too; angular momentum drifts by O(s^2). Edges with a common node act one after another, by colour, in one order before
+and in the reverse order after a step. The whole is symmetric in time: of second order by the midpoint rule.
 """
 
 from functools import cache
@@ -28,7 +28,10 @@ from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 @cache
 def kick_kernel(real):
-    """kick(...): half a time step of the couples of edges that share no node, in place."""
+    """Build the kernel of the gyroscopic couples.
+
+    `kick`: apply half a time step of the couples of edges without common nodes, in place.
+    """
     X = wp.types.vector(3, real)
     get, put = point_functions(3, real)
 
@@ -46,8 +49,9 @@ def kick_kernel(real):
         flags: wp.array2d(dtype=int),
         v: wp.array2d(dtype=X),
     ):
-        """`edges` are both nodes and the angle, `free` tells the components of nodes that are. Islands that have been given up take
-        back, `after` the step, what they were given before.
+        """Apply the couples of `edges`, given by both nodes and the angle; `free` masks free components of nodes.
+
+        `after` the step, failed islands revert the change from before.
         """
         i, w = wp.tid()
         a = edges[i, 0]

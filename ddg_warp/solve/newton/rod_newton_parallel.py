@@ -1,4 +1,4 @@
-"""Newton on few, long rods: every node a thread, the system by block cyclic reduction."""
+"""Newton's method on few, long rods: one thread a node, the system by block cyclic reduction."""
 
 import math
 
@@ -15,7 +15,7 @@ from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
 
 class RodNewtonParallel(AssembledNewton):
-    """As `RodNewton`, without a loop of one thread over the nodes of a rod, for open rods.
+    """Newton's method on open rods as in `RodNewton`, without one-thread loops over the nodes of a rod.
 
     An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
     """
@@ -49,15 +49,15 @@ class RodNewtonParallel(AssembledNewton):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim]
-        own += [self._renew] if self.midpoint else [self._again]
-        own += [self._turn_ahead] * self.split  # without, it is among the moves
-        others = self._predict, self._further  # in place of which it has its own
-        around = [kernel for kernel in self.kernels_around if kernel not in others]
-        return [*around, self._assemble, *own, *self.reduction.kernels]
+        result = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim]
+        result += [self._renew] if self.midpoint else [self._again]
+        result += [self._turn_ahead] * self.split  # without `split`, it is among the moves
+        replaced = self._predict, self._further  # replaced by kernels of this class
+        around = [kernel for kernel in self.kernels_around if kernel not in replaced]
+        return [*around, self._assemble, *result, *self.reduction.kernels]
 
     def predict(self, before) -> None:
-        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
+        """Recompute the predictor of bent rods from the state `before` by rotating edges; carry frames to midpoints."""
         group = self.group
         self._launch(
             self._aim,
@@ -71,7 +71,7 @@ class RodNewtonParallel(AssembledNewton):
             self.move()
 
     def go_further(self, before, predicted: wp.array) -> None:
-        """As of `RodNewton`."""
+        """Warm-start bent rods by the extrapolated correction `direction` of their predictor, by rotating edges."""
         wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
         self.move(EXTRAPOLATE_ROTATED, base=predicted, now=before.x)
 
@@ -84,7 +84,7 @@ class RodNewtonParallel(AssembledNewton):
         self.move()
 
     def judge(self) -> None:
-        """Stop rods, reject their iterates, or ask for a direction."""
+        """Stop rods, reject their iterates, or request a direction."""
         options = self.options
         self._launch(
             self._weigh,
@@ -101,7 +101,7 @@ class RodNewtonParallel(AssembledNewton):
         )
 
     def direct(self) -> None:
-        """Directions by cyclic reduction."""
+        """Compute directions by cyclic reduction."""
         islands = self.islands
         if self.split:
             self.reduction.solve(self.blocks, self.factor, self.rhs, self.x, islands, self.direction)
@@ -111,7 +111,7 @@ class RodNewtonParallel(AssembledNewton):
             )
 
     def take(self) -> None:
-        """Lengths of the steps along the directions."""
+        """Compute the step lengths along the directions."""
         group = self.group
         self._launch(
             self._gauge,
@@ -127,12 +127,13 @@ class RodNewtonParallel(AssembledNewton):
         )
 
     def move(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
-        """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate.
+        """Apply the pending update of every rod: a step, straight or by rotating edges, or a frame update of the iterate.
 
         Args:
-            onward: of a predictor's step, which has no tensions, how it goes on, see `kernels.newton.edge_rotation`; None of one of
-                the solve.
-            base: where it starts, `base` by default; now: see `search.move_functions`.
+            onward: continuation of a predictor's step, which has no tensions, see `kernels.newton.edge_rotation`; None for a step
+                of the solve.
+            base: start of the step, `base` by default.
+            now: see `rod_iterate_parallel.move_kernels`.
         """
         base = self.base if base is None else base
         group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
@@ -160,14 +161,14 @@ class RodNewtonParallel(AssembledNewton):
         )
 
     def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
-        """One thread for each of `size` parts of every rod."""
+        """Launch one thread for each of `size` ranges or nodes of every rod."""
         wp.launch(kernel, (size, self.group.columns), inputs, outputs, device=self.device)
 
 
 def _fixed_neighbours(group) -> np.ndarray:
-    """The held nodes next to every node, itself included: (before or after, node, column), -1 where there is none."""
-    k, held = np.arange(group.nodes)[:, None], group.host.anchored
-    before = np.maximum.accumulate(np.where(held, k, -1), axis=0)
-    after = np.minimum.accumulate(np.where(held, k, group.nodes)[::-1], axis=0)[::-1]
+    """Return the nearest fixed nodes of every node, itself included: (before or after, node, column), -1 for none."""
+    k, fixed = np.arange(group.nodes)[:, None], group.host.anchored
+    before = np.maximum.accumulate(np.where(fixed, k, -1), axis=0)
+    after = np.minimum.accumulate(np.where(fixed, k, group.nodes)[::-1], axis=0)[::-1]
     neighbours = np.stack([before, np.where(after < group.nodes, after, -1)]).astype(np.int32)
     return np.tile(neighbours, (1, 1, group.worlds))

@@ -1,4 +1,4 @@
-"""Newton on chains with preconditioned conjugate gradients: closed rods, and open ones as a check of the chain sweep."""
+"""Newton's method on rod groups with preconditioned conjugate gradients: closed rods, and open ones as a check of the sweep."""
 
 import numpy as np
 import warp as wp
@@ -11,11 +11,11 @@ from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
 
 class PcgNewton(AssembledNewton):
-    """As `RodNewton`, with the system assembled in blocks and solved by conjugate gradients.
+    """Newton's method with the system assembled in blocks and solved by conjugate gradients; see `RodNewton`.
 
     Args:
-        preconditioner: "jacobi", "block_jacobi", or "chain" (block LDL^T of the open part of the chain: exact for an open rod,
-            a few iterations for a closed one).
+        preconditioner: "jacobi", "block_jacobi", or "chain": block LDL^T of the open rod, exact without closure; a closed rod takes
+            a few iterations.
     """
 
     def __init__(
@@ -46,18 +46,18 @@ class PcgNewton(AssembledNewton):
 
     @property
     def definite(self) -> bool:
-        """True if matrices always drop compression: PCG needs definite ones where it cannot tell."""
+        """True if matrices always drop compression: PCG needs definite ones where it cannot detect indefinite ones."""
         return self.psd not in ("progressive", "none")
 
     def automatic_psd(self) -> str:
-        """Gauss-Newton where an indefinite matrix would not be noticed."""
+        """Return the `psd` mode that suits the rods: Gauss-Newton where an indefinite matrix would go undetected."""
         return super().automatic_psd() if self._by_chain and not self.reuse else "gauss_newton"
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._assemble, self._judge, self._start, self._product, self._advance, self._take]
-        return [*self.kernels_around, *own, *filter(None, (self._factor, self._repeat))]
+        kernels = [self._assemble, self._judge, self._start, self._product, self._advance, self._take]
+        return [*self.kernels_around, *kernels, *filter(None, (self._factor, self._repeat))]
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
@@ -84,7 +84,7 @@ class PcgNewton(AssembledNewton):
         )
 
     def _repeat_indefinite(self, done: int) -> None:
-        """Let rods whose exact Hessian turned out to be indefinite come again, before or after directions are found."""
+        """Repeat the iterate of rods with an indefinite exact Hessian, before or after directions are computed."""
         if self._repeat:
             wp.launch(
                 self._repeat,
@@ -94,7 +94,7 @@ class PcgNewton(AssembledNewton):
             )
 
     def assemble(self) -> None:
-        """Blocks and residual of active rods; accept or shorten the last step; factors where a direction is wanted."""
+        """Assemble blocks and residuals of active rods, run the line search, and factorise where a direction is needed."""
         group, options, device = self.group, self.options, self.device
         self.assemble_blocks()
         wp.launch(
@@ -109,7 +109,7 @@ class PcgNewton(AssembledNewton):
             self.factorise()
 
     def factorise(self) -> None:
-        """Factors of the open parts of rods that want a direction."""
+        """Factorise the open rods, without closure, that need a direction."""
         group, islands = self.group, self.islands
         wp.launch(
             self._factor,
@@ -120,7 +120,7 @@ class PcgNewton(AssembledNewton):
         )
 
     def direct(self) -> None:
-        """Directions by conjugate gradients."""
+        """Compute directions by conjugate gradients."""
         group = self.group
         self.busy.zero_()
         wp.launch(
@@ -151,15 +151,16 @@ class PcgNewton(AssembledNewton):
         )
 
     def pcg_iterations(self) -> int:
-        """Iterations of all solves so far."""
+        """Return the iterations of all solves so far."""
         return int(np.asarray(self.pcg_work.numpy())[0])
 
 
 class RodModifiedNewton(PcgNewton):
-    """Newton with the matrix frozen: that of a step's first iterate is projected, factorised once and used for the whole step.
+    """Modified Newton: the matrix of a step's first iterate is projected, factorised once and used for the whole step.
 
-    An iteration costs a gradient and a substitution instead of a sweep, and converges linearly: it pays where the matrix hardly
-    changes within a step, so for small steps and loose tolerances. The frozen matrix of a closed rod is that of its open part.
+    An iteration costs a gradient and a substitution instead of a sweep, and converges linearly. This pays where the matrix hardly
+    changes
+    within a step: small steps and loose tolerances. The frozen matrix of a closed rod omits its closure.
     """
 
     reuse = True
@@ -176,7 +177,7 @@ class RodModifiedNewton(PcgNewton):
         return [*self.kernels_around, self._assemble, self._judge, self._factor, self._direct, self._take]
 
     def direct(self) -> None:
-        """Directions by the factors of the first iterate."""
+        """Compute directions by the factors of the first iterate."""
         wp.launch(
             self._direct,
             self.group.columns,
