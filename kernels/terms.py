@@ -117,7 +117,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Potential:
-    """Potential of one kind of collision, of the distance (`contact.pair_energy`) or slip (`contact.pair_friction`).
+    """Potential of one kind of collision, of the distance (`collision.contact.potential`) or slip (`collision.friction.potential`).
 
     Attributes:
         name: name in the registry.

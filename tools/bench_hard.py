@@ -145,7 +145,7 @@ def sway(amplitude: float, frequency: float, axis: int = 0) -> ddg.Motion | None
 
 
 def ramp(displacement: float) -> ddg.Motion:
-    """Return a motion along x by `way` [m] within a second."""
+    """Return a motion along x by `displacement` [m] within a second."""
     return ddg.Motion(translation=lambda t: (displacement * min(t, 1.0), 0.0, 0.0))
 
 

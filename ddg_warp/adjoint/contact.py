@@ -98,7 +98,7 @@ class ContactAdjoint:
         return self.by_groups[RATE].flatten()
 
     def has_overflow(self, q: wp.array) -> bool:
-        """Regrow lists after a capacity overflow as `ExactContact`; return True if the last `pull` is to be repeated."""
+        """Regrow lists after a capacity overflow as `ExactContact`; return True if the last `vjp` is to be repeated."""
         grown = self.system.has_overflow(q)
         if grown:
             self._reserve()
@@ -152,14 +152,14 @@ class ContactAdjoint:
             self._spins.vjp(before, q, self._by_spun, [by_before, grad_q, self.by_radius])
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array):
-        """Return the friction matrix as `FrictionJacobian`; a following `pull` has room for all pairs."""
+        """Return the friction matrix as `FrictionJacobian`; a following `vjp` has room for all pairs."""
         version, matrix = self.system.search.version, self.rubbing.matrix(q, before, rate)
         if self.system.search.version != version:
             self._reserve()
         return matrix
 
     def roll(self, q: wp.array, before: wp.array, by_before: wp.array, grad_q: wp.array) -> None:
-        """Add the terms of transported frames to gradients by blocks q and `before`, after `pull` of an equilibrium.
+        """Add the terms of transported frames to gradients by blocks q and `before`, after `vjp` of an equilibrium.
 
         Reads from the device.
         """

@@ -89,7 +89,7 @@ class CoupledLinearSolve:
             self.held.assign(tangent.back(host.held).reshape(-1, 3))
 
     def chain(self, by_lagged: wp.array, grad_q: wp.array) -> None:
-        """Overwrite free entries of `by_q` (W N,) with the gradient `by_lagged`, and add `by_lagged` to its fixed entries.
+        """Overwrite free entries of `grad_q` (W N,) with the gradient `by_lagged`, and add `by_lagged` to its fixed entries.
 
         The result is the right-hand side g of the friction iteration before; `by_lagged` is zeroed.
         """

@@ -105,13 +105,13 @@ class CoupledPredictor:
             coupled.carry(before, self.state)
 
     def vjp(self, before: CoupledState, by_fixed: wp.array, start: CoupledState, grad_inverse_step: wp.array) -> None:
-        """Add the gradient by the state before the step, given `by_q`, which is overwritten.
+        """Add the gradient by the state before the step, given the gradient by fixed dofs, which is overwritten.
 
         Args:
             before: as of the last `find`.
             by_fixed: gradient by fixed dofs.
             start: gradient by the state before the step.
-            by_rate: gradient by the inverse step.
+            grad_inverse_step: gradient by the inverse step.
         """
         coupled, islands, worlds = self.coupled, self._islands, self.coupled.worlds
         for array in (self._along, self._excess, self._added, self._by_base, self._by_step):

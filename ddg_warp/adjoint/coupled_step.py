@@ -21,7 +21,7 @@ from ddg_warp.model.coupled_model import CoupledState
 
 @dataclass
 class CoupledSavedStep:
-    """Data of a step for its reverse: the state `before`, and the solution of its solve with its time-lagged data.
+    """Data of a step for the reverse pass: the state `before`, and the solution of its solve with time-lagged data.
 
     `lagged` are the solutions at the friction lags (W N,), in this order; all other lagged data stay. For an equilibrium with
     friction, `before` is the state that slips are measured from, and `rubbing` is the inverse increment of the load parameter since
@@ -171,7 +171,7 @@ class CoupledStepAdjoint:
         return self.predictor.state.frame
 
     def keep(self, step, before: CoupledState) -> CoupledSavedStep:
-        """Return the data of the last step of a `CoupledStep` for its reverse; `before` must stay unchanged."""
+        """Return the saved data of the last step of a `CoupledStep`; `before` must stay unchanged."""
         coupled, q = self.coupled, wp.clone(step.newton.q)
         data = {index: wp.clone(values) for index, values in step._data.items()}
         solved = replace(before, q=q, data=data)
@@ -193,7 +193,7 @@ class CoupledStepAdjoint:
         states=None,
         factors: bool = False,
     ) -> tuple[CoupledState, CoupledInputs]:
-        """Return gradients by the start of a step and by its inputs; see `RodStepAdjoint.vjp`.
+        """Return gradients by a step's start and inputs; see `RodStepAdjoint.vjp`.
 
         `factors`: see `CoupledLinearSolve`.
         """

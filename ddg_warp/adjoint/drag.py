@@ -19,7 +19,7 @@ class RodDragAdjoint:
     """VJP of drag on a rod group.
 
     Attributes:
-        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `pull`.
+        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `vjp`.
     """
 
     def __init__(self, model, group, midpoint: bool):

@@ -20,7 +20,7 @@ from ddg_warp.model.state import RodGroupState
 
 @dataclass
 class SavedStep:
-    """Data of a step for its reverse.
+    """Data of a step for the reverse pass.
 
     Attributes:
         before: the start state.
@@ -158,7 +158,7 @@ class RodStepAdjoint:
         return self.predictor.frame
 
     def keep(self, step, before: RodGroupState) -> SavedStep:
-        """Return the data of the last step of a `RodStep` for its reverse; `before` must stay unchanged."""
+        """Return the saved data of the last step of a `RodStep`; `before` must stay unchanged."""
         newton, twist = step.newton, self.group.kind.twist
         theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
         islands = step.islands
@@ -167,7 +167,7 @@ class RodStepAdjoint:
         )
 
     def vjp(self, kept: SavedStep, after: RodGroupState, cotangent: RodGroupState, s: float, states=None) -> tuple:
-        """Return gradients by the start of a step and by its inputs; the next call overwrites both. Launches only, except for
+        """Return gradients by a step's start and inputs; the next call overwrites both. Launches only, except for
         equilibria.
 
         Args:

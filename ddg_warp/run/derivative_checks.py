@@ -16,7 +16,7 @@ and q the local dofs of an element. Collisions (`ddg_warp.run.derivative_samples
                  tension, derivatives by differences
     definite     F^T F + C has no negative eigenvalue
     exact        F^T F + C, compression included, and second derivatives of measures of rods = Hessian kernels; of collisions
-                 F^T F and `pair_bend` where no edges are mollified
+                 F^T F and `geometric_stiffness` where no edges are mollified
     rest         no force at the rest strains; for laws of rods without rest strains, in straight rods
     invariance   a rigid motion keeps the energy, with rotated lagged data or with compensating angles
     rigid        the gradient of a rod is orthogonal to translations and infinitesimal rotations

@@ -1,8 +1,8 @@
 """Samples for the checks of `ddg_warp.run.derivative_checks`: a term at a random state without zeros, with results of its kernels.
 
-`chain_samples` covers rods, `element_samples` indexed elements of all other measures, user-defined ones included, and `contact_samples`
-collisions. The *local dofs* of an element are the dofs by which kernels write derivatives: the window of a rod, or three reals for each
-local dof block.
+`derivative_samples_rod` covers rods, `derivative_samples_coupled` indexed elements of all other measures, user-defined ones included,
+and `derivative_samples_contact` collisions. The *local dofs* of an element are the dofs by which kernels write derivatives: the window
+of a rod, or three reals for each local dof block.
 """
 
 from functools import cached_property
@@ -19,13 +19,13 @@ class Sample:
     """A term at a random state. Kernels run in float64, the precision of references, unless given another type.
 
     Attributes:
-        chain: "open", "closed", "net" for indexed elements, or "pair" for collisions.
+        chain: label "open" or "closed" of rods, "net" of indexed elements, or "pair" of collisions.
         real: type under test.
         shape: shape of arrays with one value for each element: (E,), for rods (n, R).
         data: inputs of the kernels by name, all of order one: dofs q, lagged data, parameters and constants.
         first: row of the first parameter of the term in the buffer.
         rows: rows of the term's strains among the strains of the last step.
-        parts: samples of all terms in the fused kernel, this one included.
+        parts: samples of all terms in the fused kernel, including the present one.
         grid: dimensions of a launch over the elements; index: index of the term in its storage.
     """
 
@@ -71,32 +71,32 @@ class Sample:
         """Return strains and stresses (strains, *shape)."""
         return self._launch(3, wp.float64, **changed)
 
-    def _launch(self, which: int, real, **changed):
-        """Return what the energy (0), gradient (1), Hessian (2) or strain (3) kernel writes, by local dofs."""
+    def _launch(self, kernel_index: int, real, **changed):
+        """Return the output of the energy (0), gradient (1), Hessian (2) or strain (3) kernel, by local dofs."""
         storage, device = self.storage(real), self.device
-        size, strains = storage.Window._length_, sum(len(own.term.measure.strains) for own in storage.terms)
-        rows, dtype = [(), (storage.num_slots or size,), (size, size), (strains,)][which], real
-        if which == 1 and storage.slots:
+        size, strains = storage.Window._length_, sum(len(access.term.measure.strains) for access in storage.terms)
+        rows, dtype = [(), (storage.num_slots or size,), (size, size), (strains,)][kernel_index], real
+        if kernel_index == 1 and storage.slots:
             dtype = wp.types.vector(3, real)
         count = int(np.prod(self.grid))
-        out = [wp.zeros((*rows, count), dtype=dtype, device=device) for _ in range(2 if which == 3 else 1)]
+        out = [wp.zeros((*rows, count), dtype=dtype, device=device) for _ in range(2 if kernel_index == 3 else 1)]
         kernels = element_path.term_kernels(storage, self.index, real, reverse=True)
-        kernel = element_path.strain_kernel(storage, real) if which == 3 else kernels[which]
-        more = [[], [], [wp.zeros((0, 0), dtype=real, device=device)], [1]][which]
-        grid = (*self.grid, size) if which == 2 else self.grid
+        kernel = element_path.strain_kernel(storage, real) if kernel_index == 3 else kernels[kernel_index]
+        more = [[], [], [wp.zeros((0, 0), dtype=real, device=device)], [1]][kernel_index]
+        grid = (*self.grid, size) if kernel_index == 2 else self.grid
         wp.launch(kernel, grid, [self.inputs(real, **changed), *more], out, device=device)
-        found = [array.numpy().astype(float) for array in out]
-        if which == 3:
-            return tuple(values.reshape(-1, *self.shape)[self.rows] for values in found)
-        return self.of_local(found[0], which)
+        outputs = [array.numpy().astype(float) for array in out]
+        if kernel_index == 3:
+            return tuple(values.reshape(-1, *self.shape)[self.rows] for values in outputs)
+        return self.of_local(outputs[0], kernel_index)
 
-    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
-        """Reverse mode of the energy (which = 0) or gradient (1) kernel of the term, by input."""
+    def reverse(self, kernel_index: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the reverse mode of the energy (0) or gradient (1) kernel of the term, by input."""
         storage, inputs = self.storage(self.real), self.inputs(self.real)
-        dtype = wp.types.vector(3, self.real) if which and storage.slots else self.real
-        seeds = wp.array(np.ascontiguousarray(self.as_written(seed, which)), dtype=dtype, device=self.device)
+        dtype = wp.types.vector(3, self.real) if kernel_index and storage.slots else self.real
+        seeds = wp.array(np.ascontiguousarray(self.as_written(seed, kernel_index)), dtype=dtype, device=self.device)
         wp.launch(
-            element_path.term_kernels(storage, self.index, self.real, reverse=True)[which],
+            element_path.term_kernels(storage, self.index, self.real, reverse=True)[kernel_index],
             self.grid,
             [inputs],
             [wp.zeros_like(seeds, requires_grad=True)],
@@ -250,7 +250,7 @@ def random_parameters(term: Term, random: np.random.Generator, shape: tuple) -> 
 
 
 def random_strains(term: Term, random: np.random.Generator, shape: tuple) -> np.ndarray:
-    """Return strains of `shape` near the undeformed ones."""
+    """Return random strains of `shape` near zero deformation."""
     return float(term.measure.strains[0].startswith("stretch")) + 0.4 * random.normal(size=shape)
 
 

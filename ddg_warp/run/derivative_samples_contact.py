@@ -97,7 +97,7 @@ class ContactSample(Sample):
         return np.stack([self._flat(column) for column in out.numpy()[: 3 * self.nodes]], 1)
 
     def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return F^T F (3 nodes, 3 nodes, E), gradients and energies; `exact` adds `pair_bend`."""
+        """Return F^T F (3 nodes, 3 nodes, E), gradients and energies; `exact` adds `geometric_stiffness`."""
         energy, gradient, factor = self._evaluated(self.real)
         matrix = self._product(factor) + (self._bent() if exact else 0.0)
         return matrix, self._flat(gradient), energy.numpy().astype(float)
@@ -124,7 +124,7 @@ class ContactSample(Sample):
         return np.einsum("kp,kap,kbp->abp", curvature, slopes, slopes)
 
     def compared(self) -> np.ndarray:
-        """Return the mask of collisions with one distance, where F^T F and `pair_bend` form the exact Hessian (E,)."""
+        """Return the mask of collisions with one distance, where F^T F and `geometric_stiffness` form the exact Hessian (E,)."""
         return self._evaluated(wp.float64)[2].bend.numpy() != 0.0
 
     def _product(self, factor) -> np.ndarray:
@@ -136,7 +136,7 @@ class ContactSample(Sample):
         return np.einsum("kpa,kpb->abp", each, each)
 
     def _bent(self) -> np.ndarray:
-        """Return psi' D'' of `pair_bend` (3 nodes, 3 nodes, E)."""
+        """Return psi' D'' of `geometric_stiffness` (3 nodes, 3 nodes, E)."""
         real, kind = self.real, KINDS.index(self.collision)
         near, bend = distance_function(self.collision, real), bend_function(real)
         (_, corners), V = read_functions(self.collision, real), self._vector(real)

@@ -17,7 +17,7 @@ class Elements(Sample):
 
     Attributes:
         data: q (blocks, 3), frame, lag, last, rate, buffer (rows, E), constants (data, E); see `Measure.sample`.
-        slots: dof blocks of each element (local, E): nodes of all elements first, then angles, then rotation vectors.
+        slots: dof blocks of each element's local nodes (local, E): nodes of all elements first, then angles, then rotation vectors.
         felt: mask of the dofs in the energy, shaped as q.
     """
 
@@ -85,9 +85,9 @@ class Elements(Sample):
         islands = Islands(1, real, self.device)
         islands.drop_compression.fill_(0 if exact else 1)
         kernel = element_path.evaluate_kernel(self.storage(real), real, real, 0 if exact and packed else None)
-        found = element_path.results_type(real, real, True)()
-        found.factor, found.tension, found.second, found.gradient, found.energy, found.stiffness = out
-        wp.launch(kernel, (1, count), [self.inputs(real), *islands.arrays], [found], device=self.device)
+        results = element_path.results_type(real, real, True)()
+        results.factor, results.tension, results.second, results.gradient, results.energy, results.stiffness = out
+        wp.launch(kernel, (1, count), [self.inputs(real), *islands.arrays], [results], device=self.device)
         factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)
@@ -121,22 +121,22 @@ class Elements(Sample):
         """Return the element storage of the term."""
         return coupled_element.coupled_storage(self.term, real)
 
-    def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
-        """Return gradients (slots, E, 3) and Hessians by the dofs of the measure as those by three reals a slot."""
-        if which == 2:
+    def of_local(self, values: np.ndarray, kernel_index: int) -> np.ndarray:
+        """Return gradients (local nodes, E, 3) and Hessians by the dofs of the measure as derivatives by three reals a local node."""
+        if kernel_index == 2:
             return np.einsum("ia,ije,jb->abe", self.incidence, values, self.incidence)
-        return _flat(values) if which == 1 else values
+        return _flat(values) if kernel_index == 1 else values
 
-    def as_written(self, seed: np.ndarray, which: int) -> np.ndarray:
-        """Return weights of energies or gradients as kernels write these."""
-        return seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1) if which else seed
+    def as_written(self, seed: np.ndarray, kernel_index: int) -> np.ndarray:
+        """Return weights of energies or gradients in the layout of the kernels' outputs."""
+        return seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1) if kernel_index else seed
 
     def by_data(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return derivatives by what kernels read as those by `data`."""
-        return {name: own.reshape(self.data[name].shape) for name, own in values.items()}
+        """Return derivatives by kernel inputs as derivatives by `data`."""
+        return {name: derivative.reshape(self.data[name].shape) for name, derivative in values.items()}
 
     def inputs(self, real, **changed):
-        """Return what kernels read; see `kernels.elements.coupled_element.elements_type`."""
+        """Return the struct of kernel inputs; see `kernels.elements.coupled_element.elements_type`."""
         data, elements = {**self.data, **changed}, coupled_element.elements_type(real)()
 
         def put(values, dtype):

@@ -117,13 +117,13 @@ class RodSample(Sample):
         sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
         kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, 0 if exact else None)
-        islands, found = Islands(2, real, self.device), element_path.results_type(real, real)()
+        islands, results = Islands(2, real, self.device), element_path.results_type(real, real)()
         islands.drop_compression.fill_(0 if exact else 1)
         rows = [array.reshape((*array.shape[:-2], -1)) for array in out]
-        found.factor, found.second, found.gradient, found.energy, found.stiffness = rows
-        found.tension = found.factor
+        results.factor, results.second, results.gradient, results.energy, results.stiffness = rows
+        results.tension = results.factor
         inputs = [self.inputs(real), *islands.arrays]
-        wp.launch(kernel, shape, inputs, [found], device=self.device, block_dim=128)  # it is bound to that
+        wp.launch(kernel, shape, inputs, [results], device=self.device, block_dim=128)  # its launch bound
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
         vertex = rows[:edge_row].reshape(kind.vertex_strains, window, *shape)
@@ -195,25 +195,25 @@ class RodSample(Sample):
             yield velocity, last
 
     def storage(self, real):
-        """Return the element storage of the chain."""
+        """Return the element storage of the rods."""
         return rod_storage(self.kind, real)
 
-    def of_local(self, values: np.ndarray, which: int) -> np.ndarray:
+    def of_local(self, values: np.ndarray, kernel_index: int) -> np.ndarray:
         """Return derivatives by the window as (window, ..., n, R)."""
         return values.reshape(*values.shape[:-1], *self.shape)
 
-    def as_written(self, seed: np.ndarray, which: int) -> np.ndarray:
-        """Return weights of energies or gradients as kernels write these."""
+    def as_written(self, seed: np.ndarray, kernel_index: int) -> np.ndarray:
+        """Return weights of energies or gradients in the layout of the kernels' outputs."""
         return seed.reshape(*seed.shape[:-2], -1)
 
     def by_data(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return derivatives by what kernels read as those by `data`."""
+        """Return derivatives by kernel inputs as derivatives by `data`."""
         q = np.zeros((*self.shape, 4))
         q[..., : self.kind.dim], q[..., 3] = values["x"], values["theta"]
-        return {"q": q} | {name: values[name].reshape(own.shape) for name, own in self.data.items() if name != "q"}
+        return {"q": q} | {name: values[name].reshape(array.shape) for name, array in self.data.items() if name != "q"}
 
     def inputs(self, real, **changed):
-        """Return what the kernels of a term read; see `kernels.elements.rod_layout.rod_elements_type`."""
+        """Return the struct of kernel inputs; see `kernels.elements.rod_layout.rod_elements_type`."""
         data, dim = {**self.data, **changed}, self.kind.dim
         q = data["q"]
         last = data["last"].reshape(len(data["last"]), -1)
@@ -226,7 +226,7 @@ class RodSample(Sample):
         n, rods = self.shape
         table = np.array([(row * n * rods, rods, 1) for row in range(len(data["buffer"]))], np.int32)
         out += [wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32))]
-        given = rod_elements_type(dim, real)()
+        struct = rod_elements_type(dim, real)()
         for name, values in zip((*self.INPUTS, "table", "count"), out, strict=True):
-            setattr(given, name, values)
-        return given
+            setattr(struct, name, values)
+        return struct

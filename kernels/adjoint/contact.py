@@ -1,8 +1,9 @@
 """Reverse mode of contact and friction in a step of the coupled system, pair by pair; see `kernels.elements.variation`.
 
 For a loss with the solution w of H^T w = g, contact contributes the derivative of -w . dE/dx by x, stiffness, range and thickness. E is
-the energy of pairs (`contact.pair_energy`) at the solution x. Friction also depends on lagged data (`contact.pair_friction`). The
-gradient g of contact at lagged positions y depends on y and the same parameters. The friction force along w is
+the energy of pairs (`collision.contact.potential`) at the solution x. Friction also depends on lagged data
+(`collision.friction.potential`). The gradient g of contact at lagged positions y depends on y and the same parameters. The friction
+force along w is
 
     w . f = sum_i weight_i w_i . (t1, t2) psi'(u; mu N) ,   N, n = sum of g_i over the first primitive,   weight_i = g_i . n / N ,
     u = (t1, t2) . sum_i weight_i (x_i - x_i^n) .
@@ -85,8 +86,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
     """Build the kernel of derivatives of friction by local node index of the solution, the start and the lagged positions.
 
     Derivatives by parameters of pairs are as in `pull_kernel`. `directed` or `rolls`: also by the directions of rods (capacity,);
-    `rod_nodes` and `multipliers` are as in `pair_friction.lag_kernel`. `spins`: also by `STRAIGHT_ROTATION_LIMIT` and `ARM` of the
-        object (SPUN, capacity). `rolls`: also by twist angles, and by radii of both primitives (ROLLED, capacity).
+    `rod_nodes` and `multipliers` are as in `collision.friction.potential.lag_kernel`. `spins`: also by `STRAIGHT_ROTATION_LIMIT`
+        and `ARM` of the object (SPUN, capacity). `rolls`: also by twist angles, and by radii of both primitives (ROLLED, capacity).
     """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = node_types(real)

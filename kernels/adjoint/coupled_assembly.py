@@ -11,7 +11,7 @@ from ddg_warp.kernels.elements.variation import transported_function
 
 @cache
 def frame_kernel(real):
-    """Build the kernel of frame updates, the reverse of `net.frames.edge_kernel`.
+    """Build the kernel of frame updates, the reverse of `kernels.elements.coupled_frames.edge_kernel`.
 
     `pull`: write gradients by the edge vector, and add gradients by the previous frame.
     """

@@ -1,7 +1,7 @@
 """Vector-Jacobian product of predictors with edge rotations; see `kernels.newton.edge_rotation`.
 
-It is needed if a solve lags quantities of its predictor: follower loads and, with the midpoint rule, frames and drag. `chain_predictor`
-and `net_predictor` apply it to uncoupled rods and to the coupled system.
+It is needed if a solve lags quantities of its predictor: follower loads and, with the midpoint rule, frames and drag. `rod_predictor`
+and `coupled_predictor` apply it to uncoupled rods and to the coupled system.
 """
 
 from functools import cache
@@ -78,7 +78,7 @@ def unplace_function(dim: int, real, Rod, anchored, by_shift, free_part, give_ex
 def excess_function(dim: int, real, midpoint: bool):
     """Return the device function `excess_product(e, de, f, straight)`:
 
-    excess of a rotated edge, dot f; see `turns.repeat_rotation_function`.
+    excess of a rotated edge, dot f; see `kernels.newton.edge_rotation.repeat_rotation_function`.
     """
     V = wp.types.vector(dim, real)
     along_edge, excess_of, _ = edge_functions(dim, real)

@@ -15,7 +15,7 @@ from ddg_warp.kernels.elements.variation import variation_functions
 
 @cache
 def _write_functions(storage: ElementStorage, index: int, real, adds: bool):
-    """Return the device functions `present`, `write_window` and `write_lagged`, which write contributions of a term, or add with
+    """Return the device functions `present`, `write` and `write_lagged`, which write contributions of a term, or add with
     `adds`.
 
     The terms of an element have one window: the first writes it, zero where the term has no element, and others add.
@@ -49,8 +49,8 @@ def _write_functions(storage: ElementStorage, index: int, real, adds: bool):
 def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured: bool):
     """Build the reverse of the element forces of a term: derivatives of -w . dE/dq by all inputs of an element.
 
-    `pull`: write the derivatives by the window, by lagged and constant data, by rest measure and parameters in the rows of the
-    term, and by the strains of the last step. Add the derivative by the inverse step length.
+    `pull`: write the derivatives by the window, lagged and constant data, rest measure, parameters in the rows of the term,
+    and strains of the last step. Add the derivative by the inverse step length.
 
     Args:
         adds: True to add all of these.

@@ -25,7 +25,7 @@ FLAGS = (
     "energy_buffer",  # Which half of the energy buffer belongs to the accepted iterate.
     "backtracks",
     "needs_direction",  # Whether a direction is to be computed.
-    "iterate_action",  # Remaining action on the iterate, see `search`.
+    "iterate_action",  # Remaining action on the iterate, see `kernels.newton.rod_iterate`.
     "edges_rotated",  # Whether the iterate came from an edge-rotation update, not a straight one.
     "frames_outdated",  # Whether frames have to be updated before the next step.
     # The matrix: whether compression is dropped, and pivots lost in all iterations and in this one
@@ -42,8 +42,8 @@ FLAGS = (
     "substep_accepted",  # Whether this substep succeeded.
     "support_motion_pending",  # Whether supports blocked by contact moved in the last iteration; see `kernels.newton.contact_newton`.
     "ccd_limited",  # Whether CCD has limited the last motion, of the predictor or of an iteration.
-    # In float32, see `judge`: whether the rounding floor decides and exceeds `ROUNDED` of the loads, the iteration from which it
-    # decides anyway, and whether a solve has ended so.
+    # In float32, see `kernels.newton.line_search`: whether the rounding floor decides and exceeds `ROUNDED` of the loads, the
+    # iteration from which it decides anyway, and whether a solve has ended so.
     "doubtful",
     "polished",
     "doubted",
@@ -63,8 +63,8 @@ SCALARS = (
     "predicted_decrease",  # Predicted decrease of the energy by a full step.
     "residual_norm_sq",  # Squared residual of the accepted iterate.
     "angle_step_left",  # Remaining motion of twist angles along the direction.
-    "max_edge_stiffness",  # Largest axial stiffness of an edge in a float32 matrix [N/m]; see `solve.tension`.
-    "straight_rotation_limit",  # Largest edge rotation of a straight update [rad]; see `turns`.
+    "max_edge_stiffness",  # Largest axial stiffness of an edge in a float32 matrix [N/m]; see `kernels.linear.mixed_axial_force`.
+    "straight_rotation_limit",  # Largest edge rotation of a straight update [rad]; see `kernels.newton.edge_rotation`.
     # The fraction of the time step that is done, and of the current substep
     "step_progress",
     "substep_fraction",

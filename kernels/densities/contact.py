@@ -19,7 +19,7 @@ J^T psi'' J is exactly the positive part of the Hessian where two points are clo
 Measured: for other random pairs about as long as their distance, its error is 0.14 to 0.18 of the Hessian at half the range. In squared
 distances it is 0.6, even for points, as 4 g^2 b'' of the curvature 4 g^2 b'' + 2 b' along the normal is kept.
 
-Both laws are convex in g, psi'' >= 0, and repulsive, psi' <= 0, as `contact.pair_energy` requires.
+Both laws are convex in g, psi'' >= 0, and repulsive, psi' <= 0, as `kernels.collision.contact.potential` requires.
 """
 
 from functools import cache

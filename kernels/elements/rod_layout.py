@@ -294,7 +294,7 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
 
     @wp.func
     def column(inputs: Inputs, r: int, k: int):
-        """Return the column of `arrays.columns`: elements of a rod in a row on the CPU, of all rods on a GPU.
+        """Return the column of `device_arrays.columns`: elements of a rod in a row on the CPU, of all rods on a GPU.
 
         It is nonnegative, as in `first_of`.
         """

@@ -1,8 +1,8 @@
 """Preconditioned conjugate gradients on the coupled system, each world by itself: block Jacobi, scalars on the device.
 
-Substructuring (`elimination`) or `levels` update z after the kernels that start and advance a solve, before r . z is summed. `wanted`
-is 1 while a world iterates, 2 once it has converged, 3 if it cannot go on. Sums over blocks have a fixed order (tiles, then a tile of
-tiles).
+Substructuring (`rod_substructuring`) or `multilevel` update z after the kernels that start and advance a solve, before r . z is
+summed. `wanted` is 1 while a world iterates, 2 once it has converged, 3 if it cannot go on. Sums over blocks have a fixed order
+(tiles, then a tile of tiles).
 """
 
 from functools import cache

@@ -8,7 +8,7 @@ Gander and Golub, Cyclic Reduction - History and Applications, 1997). With l = j
     x_u = A_u^-1 r_u - (A_u^-1 B_j^T) x_j - (A_u^-1 B_u) x_j+2 .
 
 Pivots of a definite matrix are positive, as in the sweep, which eliminates in another order; lost pivots mean the same. Nodes past
-the end of a rod are rows of the identity. The last dofs of a node may be tensions; see `paired`.
+the end of a rod are rows of the identity. The last dofs of a node may be tensions; see `mixed_pairs`.
 """
 
 from functools import cache
@@ -170,7 +170,7 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool =
     in a loop that is not unrolled to stay in registers. All threads of a block read the same data; threads of as many rods as fill a
     memory transaction are neighbours and hit the cache.
 
-    If it `packs`, there is no right-hand side, and kept data is stored for many right-hand sides; see `reduction_again`.
+    If it `packs`, there is no right-hand side, and kept data is stored for many right-hand sides; see `cyclic_reduction_solve`.
     """
     nb2, sides = nb**2, 1 - packs
     H = wp.types.vector(nb, linear)

@@ -196,7 +196,7 @@ def again_kernel(nb: int, linear):
 def solve_at_path_nodes_kernel(twist: bool, linear):
     """Build the kernel for another rhs_in-hand side of rod paths in the coupled system.
 
-    `again`: compute z from the residual r by dof block, and r . z; see `matrix.chain_places`.
+    `again`: compute z from the residual r by dof block, and r . z; see `rod_dof_map`.
     """
     nb = path_node_dofs(twist)
     H, parts = wp.types.vector(3, linear), 1 + twist  # dof blocks of a path node: node, twist angle of the edge ahead

@@ -1,4 +1,4 @@
-"""Exact Hessian of the coupled system by dof block, from element Hessians in local dofs; stored as in `sliced`."""
+"""Exact Hessian of the coupled system by dof block, from element Hessians in local dofs; stored as in `sliced_ell`."""
 
 from functools import cache
 
@@ -59,7 +59,7 @@ def exact_kernels(real, linear, drag: bool, serial: bool):
         positions: int,
         matrix: wp.array2d(dtype=linear),
     ):
-        """Add element Hessians; see `sliced.sum_function` for items.
+        """Add element Hessians; see `sliced_ell.sum_function` for items.
 
         `hessian` is [element][row][column], symmetric up to rounding. `ends (slots * n, 3)` has `FIRST`, `SIGN` and `COUNT` of up to
         n runs of dofs per local node; a sign of zero ends them early.

@@ -1,4 +1,4 @@
-"""Joints of the coupled system after elimination of rod interiors: diagonal blocks of the joint Schur complement; see `elimination`."""
+"""Joint Schur complement: diagonal blocks of joints after elimination of rod interiors; see `rod_substructuring`."""
 
 from functools import cache
 

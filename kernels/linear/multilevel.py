@@ -6,8 +6,8 @@ dofs, a common translation. With P_l the prolongation from groups to nodes and D
     z = D_0^-1 r + sum_l P_l D_l^-1 P_l^T r
 
 (Bramble, Pasciak and Xu 1990; Wu, Wang, Wang and Guo, A GPU-based multilevel additive Schwarz preconditioner for cloth, 2022, with
-dense blocks). D_0^-1 r may come from substructuring (`elimination`). D_l sums the blocks of D_l-1 of its members, and the blocks of H
-whose row and column are first in one group at level l.
+dense blocks). D_0^-1 r may come from substructuring (`rod_substructuring`). D_l sums the blocks of D_l-1 of its members, and the
+blocks of H whose row and column are first in one group at level l.
 """
 
 from functools import cache

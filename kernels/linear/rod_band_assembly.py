@@ -1,4 +1,4 @@
-"""Blocks of H at path nodes of the coupled system: D of a node, E and F with the next two, as in `matrix.block_band`.
+"""Blocks of H at path nodes of the coupled system: D of a node, E and F with the next two, as in `rod_matrix`.
 
 A path node has a node and the twist angle of the edge ahead, a dof block of -1 if missing. Contributions of elements along rods are
 summed from element data. Contributions of other elements, such as joints, come from positions of H.

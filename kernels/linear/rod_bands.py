@@ -1,6 +1,6 @@
-"""Bands of H between path nodes of the coupled system: blocks D, E and F of `chain_blocks`, stored as in `block_band`.
+"""Bands of H between path nodes of the coupled system: blocks D, E and F of `rod_band_assembly`, stored as in `rod_matrix`.
 
-Blocks of H between two nodes of a path are stored here. The positions of `matrix.sliced` hold all others.
+Blocks of H between two nodes of a path are stored here. The positions of `sliced_ell` hold all others.
 """
 
 from functools import cache

@@ -63,9 +63,9 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
 
     `assemble`: write the blocks of H of every rod that has not converged.
 
-    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not `clamped`. `stored`: precision of the
-    stored blocks, if it differs. Launched over (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still
-    cached.
+    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. `stored`:
+    precision of the stored blocks, if it differs. Launched over (tiles of `TILE` rods, nodes, rods of a tile), so that data of
+    three nodes is still cached.
     """
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions

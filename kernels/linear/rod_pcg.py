@@ -194,7 +194,7 @@ def repeat_kernel(real, fails: bool, exact: bool = True):
 
     `repeat`: end the solve (if it `fails`), or undo the acceptance and repeat the iterate.
 
-    `negative` counts lost pivots and negative curvatures of this iteration. `clamped` then drops the geometric stiffness and
+    `negative` counts lost pivots and negative curvatures of this iteration. `drop_compression` then drops the geometric stiffness and
     compression from the next matrix, and the line search accepts again on the same numbers. `done`: the direction has been computed.
     `exact`: the matrix is the exact Hessian unless that is indefinite.
     """

@@ -1,7 +1,7 @@
 """Rod paths of the coupled system on the CPU: one thread takes a path from element contributions to the solution.
 
-Blocks of path nodes are assembled, eliminated and substituted in one sweep, as in `sweep`, and H is never stored. A GPU assembles
-with one thread a path node; see `matrix.bands`, `matrix.chain_blocks` and `elimination`.
+Blocks of path nodes are assembled, eliminated and substituted in one sweep, as in `kernels.newton.rod_sweep`, and H is never
+stored. A GPU assembles with one thread a path node; see `rod_bands`, `rod_band_assembly` and `rod_substructuring`.
 """
 
 from functools import cache
@@ -32,7 +32,7 @@ def walk_kernel(
 ):
     """Build the kernel that solves rod paths on the CPU.
 
-    `walk`: compute H_II^-1 r_I of every path, and mark worlds with lost or negative pivots; see `elimination`.
+    `walk`: compute H_II^-1 r_I of every path, and mark worlds with lost or negative pivots; see `rod_substructuring`.
 
     If paths are `joined`, factors and solution stay at path nodes, for the joints. Otherwise the solution goes to the blocks z.
     """

@@ -4,13 +4,13 @@ A thread that eliminates along a path mostly waits for memory, and many short pa
 Babuska (SIAM J. Numer. Anal. 9, 1972, 53) and van der Vorst (Parallel Computing 5, 1987, 45). One side eliminates path nodes 0, 1,
 ... up to the middle, the other n - 1, n - 2, .... The two middle nodes, h - 1 and h with h = n // 2, follow with the updates of both
 sides. The far side is the near side of the reversed path, with blocks D_k, E_(k-1)^T and F_(k-2)^T. A path node keeps U, V, L and
-inverse pivots of its side, as in `block_band.factor_function`.
+inverse pivots of its side, as in `rod_matrix.factor_function`.
 
 Not for the mixed axial-force formulation (`kernels.linear.mixed_axial_force`). A tension is stored with the node where its edge
 ends, and has to be eliminated after both nodes. From the far end it would come before one of them. If the other is fixed, the slack
 alone is the pivot, and the digits that tensions are to save are lost.
 
-Measured: 10,000 paths of 32 nodes, an H200, float32: 49 us, against 82 us for load, solve and finish of `elimination`. Without
+Measured: 10,000 paths of 32 nodes, an H200, float32: 49 us, against 82 us for load, solve and finish of `rod_substructuring`. Without
 prefetched dof indices 64 us. The factors take 26 us at 4 TB/s.
 """
 
@@ -108,7 +108,7 @@ def factor_kernels(twist: bool, span: int, linear):
         steps = share(n, side)
         D, E, F = M(), M(), M()
         for j in range(-1, steps):
-            # Prefetch: data of the next path node is read first, as in `block_band.factor_function`.
+            # Prefetch: data of the next path node is read first, as in `rod_matrix.factor_function`.
             next_j = wp.min(j + 1, steps - 1)
             if next_j < 0:
                 break
@@ -204,7 +204,7 @@ def solve_kernels(twist: bool, span: int, linear):
         c = r - w * count.shape[0]
         n, first = count[c], w * blocks
         before, before2 = B(), B()
-        # Prefetch: data of the next path node is read first, as in `block_band.substitute_function`, and dof indices one node
+        # Prefetch: data of the next path node is read first, as in `rod_matrix.substitute_function`, and dof indices one node
         # earlier; otherwise a thread waits twice.
         k = index_of(0, n, side)
         U, V = load(factors, 0, k, r), M()

@@ -114,7 +114,7 @@ def rotation_kernels(real, linear, serial: bool):
         blocks: int,
         excess_out: wp.array2d(dtype=V),
     ):
-        """Write the excess of the edge from every path node to the next; see `search.move_functions`."""
+        """Write the excess of the edge from every path node to the next; see `rod_iterate.move_functions`."""
         p, w = wp.tid()
         if todo[w] != wp.static(ROTATE_EDGES):
             return

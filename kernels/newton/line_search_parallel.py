@@ -1,4 +1,4 @@
-"""Line search of few, long rods, one thread a node; `judge` and `pcg.take` use one thread a rod.
+"""Line search of few, long rods, one thread a node; `judge` and `rod_pcg.take_kernel` use one thread a rod.
 
 Sums over a rod run over fixed ranges of about the square root of its nodes, one thread a range, then over the ranges, one thread a
 rod. The order of summation is fixed.
@@ -112,7 +112,7 @@ def decide_kernels(kind: RodKind, real, linear, exact: bool):
     `judge`: test the iterate of a rod.
     `take`: set the step length along a direction.
 
-    `exact` as in `pcg.repeat_kernel`.
+    `exact` as in `rod_pcg.repeat_kernel`.
     """
     balanced, decide = line_search_functions(kind.twist, real)
     out_of_patience = projected_limit_function(real)

@@ -1,4 +1,4 @@
-"""Moves of few, long rods, one thread a node; `search.adjust` and `step.predict` use one thread a rod.
+"""Moves of few, long rods, one thread a node; `rod_iterate.adjust_kernel` and `rod_step.predict_kernel` use one thread a rod.
 
 A prefix sum maps rotated edges to positions. It runs within ranges of about the square root of a rod's nodes, one thread a range,
 then over the ranges, one thread a rod.
@@ -31,7 +31,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
 
     `turn`: compute the excess of rotated edges, or their frames, into a second array as neighbours read the old frames.
     `scan`, `offset`: take the prefix sum of edges.
-    `move`: write nodes or frames; see `search.place`.
+    `move`: write nodes or frames; see `rod_iterate.search_functions`.
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)

@@ -124,10 +124,11 @@ def node_functions(kind: RodKind, real):
 def check_kernel(kind: RodKind, real, linear):
     """Build the kernel of the residual and of the convergence test.
 
-    `check`: write residual and energy change at every node, and set `unbalanced` of rods with a residual above tolerance and floor.
+    `check`: write residual and energy change at every node, and set `not_converged` of rods with a residual above tolerance and floor.
 
-    `drowned` is set if a residual is above the tolerance but within the floor. Residuals of fixed dofs are zero. `noise` bounds the
-    rounding of `change`, the sum of element energy differences and of the work of inertia and loads along the step.
+    `below_rounding_floor` is set if a residual is above the tolerance but within the floor. Residuals of fixed dofs are zero.
+    `noise` bounds the rounding of `change`, the sum of element energy differences and of the work of inertia and loads along the
+    step.
     """
     dim, nb, twist, closed, drag = kind.dim, kind.block, kind.twist, kind.closed, kind.drag
     V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)

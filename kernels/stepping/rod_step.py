@@ -9,9 +9,9 @@ extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
 
 Newton's method starts from the predictor, x_n + s v_n with rotated edges, plus a warm start: see `kernels.stepping.rod_warm_start`.
 
-A rod whose solve fails first repeats it with a cold start from x_n, then halves the substep (`portion`), each rod on its own.
-`progress` is the completed fraction of the step; both are multiples of powers of two, and exact. With large rotations of prescribed
-motions, substeps are at most `substep`, and each is retried as a step is (`solve.collision.support_arcs`).
+A rod whose solve fails first repeats it with a cold start from x_n, then halves the substep (`substep_fraction`), each rod on its own.
+`step_progress` is the completed fraction of the step; both are multiples of powers of two, and exact. With large rotations of
+prescribed motions, substeps are at most `substep`, and each is retried as a step is (`solve.collision.support_arcs`).
 """
 
 from functools import cache

@@ -86,7 +86,7 @@ class Primitives:
         `count`, `all`: number in one world, and in all.
         `surface`: see `surface_struct`.
         `lower`, `upper`: corners of AABBs (all,).
-        `bundles`, `bundle`: first primitives of the leaves of one world, then their number; primitives of the largest leaf.
+        `bvh_leaves`, `bundle`: first primitives of the leaves of one world, then their number; primitives of the largest leaf.
         `leaves`: AABBs of leaves, and the BVH.
         `walked`: True if there is a BVH.
         `order`: order of queries; None for order by number.

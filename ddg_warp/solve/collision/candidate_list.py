@@ -61,7 +61,7 @@ class CandidateList:
         `starts`, `partners`: offset and number of the pairs of each first primitive (first.all,), without overflow.
         `count`, `picked`: number of pairs, zero after an overflow; room for indices of some.
         `single`: True if every leaf has one primitive.
-        `sides`, `trees`: see `kernels.collision.primitives` and `boxes`.
+        `sides`, `trees`: see `kernels.collision.primitives` and `kernels.collision.broad_phase.aabb`.
         `overflow`: shared with other lists; nonzero after an overflow.
     """
 

@@ -284,7 +284,7 @@ class ContactPotential:
         Requires `meet`.
 
         Args:
-            `barred`: bits of inactive dofs of each node; dots: (worlds, nodes).
+            inactive_mask: bits of inactive dofs of each node; dots: (worlds, nodes).
         """
         self.products.settle(v, out, inactive_mask, busy, dots)
 

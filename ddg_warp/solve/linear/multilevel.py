@@ -11,7 +11,7 @@ class Multilevel:
     """Node groups of all levels, and their additive (BPX) preconditioner.
 
     Args:
-        `net`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
+        `coupled`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
     """
 
     def __init__(self, coupled, table, linear):

@@ -14,7 +14,7 @@ class SparseSystem:
     """Sparsity and incidence lists of the coupled system, common to all worlds.
 
     Args:
-        `net`: `CoupledModel`.
+        `coupled`: `CoupledModel`.
         kept: blocks (N,) bool whose couplings along rods are stored in bands, see `kernels.linear.rod_bands`. Entries of fixed blocks
             then are left out. None stores all entries here.
 

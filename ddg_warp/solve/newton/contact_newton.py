@@ -42,10 +42,9 @@ class NewtonContact:
         bound: (W N,) target positions of worlds with pending motion; positions of all others.
         bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
         `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.collision.contact.geometric_stiffness`.
-        `rubs`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
-        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `friction_iterations` -
-            1 of (W N,).
-        farthest: [m] largest motion of nodes in worlds with a single step fraction, while candidates do not fit; see `outgrown`.
+        `has_friction`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
+        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `lags` - 1 of (W N,).
+        farthest: [m] largest motion of nodes in worlds with a single step fraction, while candidates do not fit; see `has_overflow`.
         crossed: (1,) interpenetrating pairs refused in all steps so far; least: (1,) smallest gap [m].
     """
 

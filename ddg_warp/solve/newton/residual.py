@@ -1,4 +1,5 @@
-"""Residuals of the coupled system on a device; see `kernels.residual.coupled_residual` and `places`."""
+"""Residuals of the coupled system on a device; see `kernels.residual.coupled_residual` and
+`coupled_residual_along_rods`."""
 
 import numpy as np
 import warp as wp

@@ -1,4 +1,4 @@
-"""Newton on chains whose system is assembled in blocks, for solvers that need the whole matrix at once."""
+"""Newton's method on rod groups with the system assembled in blocks, for solvers that need the whole matrix."""
 
 import warp as wp
 
@@ -8,10 +8,10 @@ from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
 
 
 class AssembledNewton(RodNewton):
-    """As `RodNewton`, with the matrix of every node in memory; see `kernels.linear.rod_matrix`.
+    """Newton's method with the matrix of every node in memory; see `RodNewton` and `kernels.linear.rod_matrix`.
 
     Args:
-        stored: scalar type of the blocks, where it is another one than that of the elements.
+        stored: scalar type of the blocks, if it differs from the elements'.
 
     Attributes:
         blocks: D, E and F of every node, (3 block^2, nodes, columns).
@@ -30,16 +30,16 @@ class AssembledNewton(RodNewton):
         super().__init__(model, group, options, linear, midpoint, split)
         kind, self.stored = group.kind, stored or self.linear
         self.blocks = self.vectors(3 * kind.block**2)
-        self.islands.edges_rotated.fill_(1)  # `base` holds where every step comes from
+        self.islands.edges_rotated.fill_(1)  # `base` is the start of every step
         self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
 
     def vectors(self, rows: int | None = None) -> wp.array:
-        """Zeros of the linear algebra for every node, as many as a node has dofs unless told otherwise."""
+        """Return zeros of the linear algebra for every node, by default as many as its dofs."""
         group = self.group
         return device_arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.stored, self.device)
 
     def assemble_blocks(self) -> None:
-        """Blocks of active rods."""
+        """Assemble the blocks of active rods."""
         group = self.group
         wp.launch(
             self._assemble,

@@ -52,9 +52,9 @@ def choose_solver(precision: str, before: LinearSolverChoice, errors: float, spl
 class StepDriver:
     """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.rod_step`.
 
-    Subclasses define the attempt (`attempt`) and its kernels (`own_kernels`). For a failed island they return its name (`who`), its
-    rods (`rods_of`) and the location of the failure (`where`). `float32_errors` returns the float32 errors of the islands of a world
-    over a solve.
+    Subclasses define the attempt (`attempt`) and its kernels (`own_kernels`). For a failed island they return its label
+    (`island_label`), its rods (`rods_of`) and the location of the failure (`where`). `float32_errors` returns the float32 errors of
+    the islands of a world over a solve.
 
     Args:
         integrator: owner of the stepper; model: model to step.

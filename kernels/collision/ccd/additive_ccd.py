@@ -2,7 +2,7 @@
 
 Source: Li, Kaufman and Jiang, "Codimensional incremental potential contact", ACM ToG 40(4), 2021, algorithm 1. The distance of a
 pair decreases at most as fast as the fastest nodes of both sides approach, less their common motion. Time advances by the fraction
-of the gap that is safe at that speed. It ends when the gap is `SLEEP` of its initial value or, within the search distance, `NEAR` of
+of the gap that is safe at that speed. It ends when the gap is `REST` of its initial value or, within the search distance, `NEAR` of
 it or of the search distance. The time found is never late.
 """
 
@@ -147,7 +147,7 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
 def passing_kernel(kind: Kind, real):
     """Build the kernel of the crossing test.
 
-    `passing`: count the pairs of a list that cross or, with `keep`, whose distance falls below `keep` of the thickness plus `OFFSET` of
+    `passing`: count the pairs of a list that cross or, with `keep`, whose distance falls below `keep` of the thickness plus `BESIDE` of
     `reach` [m].
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)

@@ -1,7 +1,7 @@
 """Assembly of contact: sum the contributions of pairs to their nodes in a fixed order.
 
 An item is 6 pair + local index. Local indices 0-3 are the nodes of a pair; if friction rolls rods, 4 and 5 are twist angles of its
-edges, the x of dof blocks of their own. `node_items` lists the items of each node.
+edges, the x of dof blocks of their own. `incidence` lists the items of each node.
 """
 
 from functools import cache
@@ -121,7 +121,7 @@ def factor_struct(linear):
     `lever` (rows, capacity): entries of the row for the twist angles of the pair.
     `nodes` (capacity,): indices in all worlds.
     `used` (capacity,): 0 for pairs that contribute nothing, else bit 0 is set.
-    `bend` (capacity,): coefficient of the geometric stiffness, see `pair_bend`, or 0.
+    `bend` (capacity,): coefficient of the geometric stiffness, see `geometric_stiffness`, or 0.
     `angles` (capacity,): dof blocks of twist angles, negative for none; empty without rolling friction.
     """
     R, A = wp.types.vector(ROW, linear), wp.types.vector(ANGLES, linear)
@@ -145,10 +145,10 @@ def set_struct(real, linear):
     `ranks`, `angle_ranks`: positions of the items of a pair in the list of all items, -1 for none.
     `placed`: contributions of products, by rank, so that nodes read consecutive entries.
     `places`, `numbers`, `items`: incidence list of the nodes.
-    `marks`, `starts`, `columns`: stored Hessians, see `pair_terms.mollified_kernels`; empty if there are none.
+    `marks`, `starts`, `columns`: stored Hessians, see `pair_evaluation`; empty if there are none.
     `idle`: not zero for inactive pairs, which products skip.
     `count` (1,): number of pairs.
-    `kind`: index in `pair_bend.KINDS`, -1 without `bend`.
+    `kind`: index in `geometric_stiffness.KINDS`, -1 without `bend`.
     `edges`: number of leading primitives of a pair that are edges.
     `rows`: number of factor rows.
     `things`: number of first primitives in one world.

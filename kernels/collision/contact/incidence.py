@@ -1,4 +1,4 @@
-"""Incidence list of contact: the pairs of each node, as items (see `gather`).
+"""Incidence list of contact: the pairs of each node, as items (see `assembly`).
 
 A serial thread lists items in order. Parallel threads list them in any order and then sort each list by rank, so that sums of two runs
 agree bitwise.

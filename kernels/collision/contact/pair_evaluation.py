@@ -1,4 +1,4 @@
-"""Kernels of contact on lists of pairs: energies, gradients, Gauss-Newton factors, products with a vector; see `pair_energy`."""
+"""Kernels of contact on lists of pairs: energies, gradients, Gauss-Newton factors, products with a vector; see `potential`."""
 
 from functools import cache
 
@@ -24,7 +24,7 @@ def law_struct(real):
 
     stiffness [N/m]. range [m]. thickness [m], negative for the sum of radii. friction: coefficient. inertia: (groups, groups) [kg].
     rate: (worlds,) [1/s], 1/h of a step. Inertia times the squared rate bounds the stiffness from below.
-    group (objects,). square (edges,): squared rest lengths of edges [m^2]. inner (edges,): of both nodes, see `pair_energy`.
+    group (objects,). square (edges,): squared rest lengths of edges [m^2]. inner (edges,): of both nodes, see `potential`.
     """
     U = wp.types.vector(2, real)
 
@@ -242,9 +242,9 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
 
 @cache
 def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: bool = False):
-    """Build the product of the exact Hessian of each pair with v, by rank (see `gather.set_struct`).
+    """Build the product of the exact Hessian of each pair with v, by rank (see `assembly.set_struct`).
 
-    The product is the reverse of the derivative along v. `unbent`: restrict to pairs that `pair_bend` does not cover.
+    The product is the reverse of the derivative along v. `unbent`: restrict to pairs that `geometric_stiffness` does not cover.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = node_types(real)
@@ -322,7 +322,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
 
 @cache
 def mark_kernel(linear):
-    """Build the kernel that marks nearly parallel edge pairs, which `pair_bend` does not cover, in the `wanted` worlds."""
+    """Build the kernel that marks nearly parallel edge pairs, which `geometric_stiffness` does not cover, in the `wanted` worlds."""
     Factor = factor_struct(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

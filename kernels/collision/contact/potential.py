@@ -1,6 +1,6 @@
 """Contact potential: energy of a collision by its distance, gradient, and rows of the Gauss-Newton factor.
 
-For a point and a triangle or plane, or an edge and a ball, the energy is psi(d) (`contact.collisions`, `densities.contact`). The
+For a point and a triangle or plane, or an edge and a ball, the energy is psi(d) (`closest_points`, `densities.contact`). The
 closest points of two edges jump where the edges are parallel. So with the mollifier m, 0 for parallel edges a, b and 1 beyond about two
 degrees, the energy of two edges is
 
@@ -94,7 +94,7 @@ def end_functions(density: Density, real):
 def bend_function(kind: Kind, density: Density, real):
     """Return the device function `bends(x, p, threshold, d)`: psi' / d for an energy of the distance d alone, else 0.
 
-    See `pair_bend`.
+    See `geometric_stiffness`.
     """
     X, W, V = node_types(real)
     E = wp.types.vector(1, real)
