@@ -32,7 +32,7 @@ def functions(size: int, linear):
     """Return the struct `Pending` and the device function `eliminate(...) -> Eliminated`.
 
     `Pending` is a tension waiting for a node: its coupling to that node and to the node ahead, its negative pivot and its right-hand
-    side. `eliminate` eliminates a node, given the factors, right-hand side and couplings L^-1 of its block (`block_ldlt.functions`), and
+    side. `eliminate` eliminates a node, from the factors, right-hand side and couplings L^-1 of its block (`block_ldlt`), and
     the tension of the edge behind.
 
     Updates of the two blocks ahead are `weight` (b, c) (b, c)^T, of their right-hand sides `weight` `right` (b, c). The tension
