@@ -8,4 +8,4 @@ if __name__ != "ddg_warp.kernels":
     raise ImportError("import ddg_warp.kernels, not kernels: install the package with `pip install -e .`")
 
 if not os.environ.get("DDG_WARP_VERBOSE") and wp.config.log_level == wp.LOG_INFO:
-    wp.config.log_level = wp.LOG_WARNING  # scripts print what they say themselves, no module loads
+    wp.config.log_level = wp.LOG_WARNING  # scripts print their own output, no module loads

@@ -105,21 +105,21 @@ def roll_out(worlds: int, nodes: int, steps: int, every: int | None, device: str
     scene.clamp(scene.add_rod(points, section=ddg.Circle(0.02), material=RUBBER))
     simulator, clock = Simulator(scene.build(device, worlds=worlds), DT), Clock(wp.get_device(device))
     stiffness = simulator.parameter(NAME).clone().requires_grad_()
-    held = 0
+    used_memory = 0
 
     def run(steps: int):
-        nonlocal held
+        nonlocal used_memory
         options = {"steps": steps, "save": steps, "checkpoint_every": every}
         start = simulator.initial_state()
         if device.startswith("cuda"):
             torch.cuda.reset_peak_memory_stats()
         before = memory(device)
         (state,) = clock("forward", lambda: simulator.rollout(start, {NAME: stiffness}, **options))
-        held = memory(device) - before
+        used_memory = memory(device) - before
         loss = (state.positions[..., 2] ** 2).sum()
         clock("backward", lambda: torch.autograd.grad(loss, stiffness))
         if device.startswith("cuda"):
-            held = torch.cuda.max_memory_allocated() - before
+            used_memory = torch.cuda.max_memory_allocated() - before
 
     for _ in range(2):  # captures graphs
         run(2)
@@ -128,7 +128,7 @@ def roll_out(worlds: int, nodes: int, steps: int, every: int | None, device: str
         run(steps)
     row = {"worlds": worlds, "nodes": nodes, "steps": steps, "checkpoint every": every or 0}
     row |= {f"{name} [s]": seconds for name, seconds in clock.best.items()}
-    return row | {"memory [MB]": held / 1e6}
+    return row | {"memory [MB]": used_memory / 1e6}
 
 
 def memory(device: str) -> int:

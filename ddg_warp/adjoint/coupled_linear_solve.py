@@ -62,7 +62,7 @@ class CoupledLinearSolve:
         Args:
             state: the solution with its lagged data and the strains of the last step.
             rate: inverse step of implicit Euler [1/s], zero for an equilibrium with the load parameter `time`.
-            right: g (W N,).
+            rhs: g (W N,).
             factors: True to solve on the host, after conjugate gradients have failed.
             rubbing: friction term of H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.rubbing`; None without.
 

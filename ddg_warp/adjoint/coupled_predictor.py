@@ -21,7 +21,7 @@ class CoupledPredictor:
     Attributes:
         state: predicted blocks `q` with lagged data.
         frame: transported frames, in the midpoint rule.
-        by_q: gradient by predicted blocks, scratch.
+        grad_q: gradient by predicted blocks, scratch.
     """
 
     def __init__(self, model, coupled, motion, midpoint: bool):

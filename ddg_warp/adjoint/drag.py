@@ -83,7 +83,7 @@ class RodDragAdjoint:
         Args:
             by_fixed: gradient with respect to fixed dofs, added to.
             start: gradient with respect to the state before the step, added to.
-            by_rate: gradient with respect to the inverse step, added to.
+            grad_inverse_step: gradient with respect to the inverse step, added to.
             by_tangents: gradient with respect to the tangents, added to; if None these terms are added to the positions of `start`.
         """
         group = self.group

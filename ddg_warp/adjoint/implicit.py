@@ -133,7 +133,7 @@ class Adjoint:
     def pull_parts(
         self, before: State, after: State, parts: list, cotangent: State, s: float, factors: bool = False
     ) -> tuple[State, list]:
-        """Return the same as `pull` without checks, for solves of length s [s], in memory that the next call overwrites.
+        """Return the result of `vjp` without checks, for solves of length s [s], in memory that the next call overwrites.
 
         With `factors` the coupled system is solved by sparse factors on the host, for steps where conjugate gradients failed.
         """
@@ -204,15 +204,15 @@ class EquilibriumAdjoint:
         check_state("pull", self.model, state)
         check_state("pull", self.model, cotangent)
         control_values, inputs = checked(controls, self.model, "pull"), []
-        for own in self.parts:
-            own.solve.tangent.give(control_values)
+        for adjoint in self.parts:
+            adjoint.solve.tangent.give(control_values)
             gravity = np.broadcast_to(control_values.get("gravity", self.model.scene.gravity), (self.model.worlds, 3))
-            own.gravity.assign(np.ascontiguousarray(gravity[:, list(own.axes)], float))
-            own.upload(state.time, state.time)
-        for own, group_state, by_group in zip(self.chains, state.groups, cotangent.groups, strict=True):
+            adjoint.gravity.assign(np.ascontiguousarray(gravity[:, list(adjoint.axes)], float))
+            adjoint.upload(state.time, state.time)
+        for adjoint, group_state, by_group in zip(self.chains, state.groups, cotangent.groups, strict=True):
             kept = SavedStep(group_state, group_state.x, group_state.theta, group_state.frame, None, time=state.time)
             inputs += _copied(
-                self.model.empty_state(), [own.vjp(kept, group_state, by_group, np.inf, (state, state))[1]]
+                self.model.empty_state(), [adjoint.vjp(kept, group_state, by_group, np.inf, (state, state))[1]]
             )[1]
         if self.coupled:
             kept = CoupledSavedStep(state.coupled, state.coupled, None, time=state.time)
@@ -226,8 +226,8 @@ class EquilibriumAdjoint:
                 self.by_before = self.model.empty_state()
                 wp.copy(self.by_before.coupled.q, start.q)
             inputs += _copied(self.model.empty_state(), [read])[1]
-        for own in inputs:
-            for array in (own.gravity, own.mass):
+        for gradients in inputs:
+            for array in (gradients.gravity, gradients.mass):
                 wp.map(wp.mul, array, self.model.types.real(state.time), out=array)
         return inputs
 

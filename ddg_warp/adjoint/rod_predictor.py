@@ -102,7 +102,7 @@ class RodPredictor:
             gather: kernel that assembles element windows to nodes.
             window: scratch.
             by_fixed: gradient by fixed dofs, added to.
-            by_rate: gradient by the inverse step, added to.
+            grad_inverse_step: gradient by the inverse step, added to.
         """
         group = self.group
         if self.carries:

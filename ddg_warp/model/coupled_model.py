@@ -119,7 +119,7 @@ class CoupledModel:
 
     Attributes:
         mass: of dof blocks (worlds, N) [kg, kg m^2].
-        weighed: whether `mass` may differ from `host`.
+        has_custom_mass: True if `mass` may differ from `host`.
         moves: masses of dof blocks (N,), positive where inertia or drag determine a rate.
         drag: drag coefficients of edges, world by world (rows, W E), see `kernels.forces.drag`; None without.
         touching: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).

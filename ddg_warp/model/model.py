@@ -36,7 +36,7 @@ class Model:
         scene: the scene it was built from.
         curves: rods in the user's order.
         groups: rod groups: uncoupled rods, each group of one kind and similar length.
-        net: coupled system: shells, and rods that are joined, attached or in contact; None without.
+        coupled: coupled system: shells, and rods that are joined, attached or in contact; None without.
         motions: distinct motions of supports.
         grips: motions that are control inputs, in the order of `Controls.poses`: as supports were added, of rods, then of shells,
             then of shells of revolution.

@@ -7,7 +7,7 @@ class RodElements:
     """Map from rods of one kind to elements in the element sets of the coupled system.
 
     Args:
-        net: a `CoupledModel`.
+        coupled: a `CoupledModel`.
         kind: `RodKind` of the rods.
         rods: the scene's indices (R,).
         nodes: number of nodes of the longest rod, with ghosts.

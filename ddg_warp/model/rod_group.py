@@ -18,7 +18,7 @@ class RodGroup:
 
     Attributes:
         parameters: "term.parameter" of all terms, broadcastable to (node, column).
-        weighed: whether `mass` and `rotary` may differ from `host`.
+        has_custom_mass: True if `mass` and `rotary` may differ from `host`.
     """
 
     def __init__(self, host: RodGroupData, scene, worlds: int, device, real):
@@ -61,12 +61,12 @@ class RodGroup:
         self._stiffnesses = None, ()  # key and values
 
     def element_inputs(self, state, last: wp.array, rate: wp.array | None = None, table: ParameterTable | None = None):
-        """Return what kernels of elements read at a state, or at an iterate with its x, theta and frame.
+        """Return the inputs of element kernels at a state, or at an iterate with its x, theta and frame.
 
         Args:
             last: strains of the last step (strains, n, R).
             rate: inverse length of the solve of every rod [1/s], zero by default.
-            table: parameters, those of the group by default.
+            table: parameters, by default the group's.
         """
         inputs = rod_layout.rod_elements_type(self.dim, self.parameters.arrays[0].dtype)()
         inputs.x, inputs.theta, inputs.frame = state.x, state.theta, state.frame

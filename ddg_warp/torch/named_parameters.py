@@ -108,7 +108,7 @@ def _rows(model, name: str) -> slice:
 
 
 def rule(name: str, usual: np.ndarray) -> tuple[str, Callable]:
-    """Return the rule for values of a parameter in words, and a function that tests values; `usual` are those of the model."""
+    """Return the rule for values of a parameter in words, and a function that tests values; `usual` are the model's."""
     if name in SIGNED:
         return "a number", np.isfinite
     if name in POSITIVE or (name in MASSES and (usual > 0.0).all()):

@@ -111,8 +111,8 @@ def gathered_function(kind: RodKind, real):
 def gather_kernels(kind: RodKind, real):
     """Build the kernels that assemble element contributions.
 
-    `end`: write the sums of windows at the dofs of a node. `nodes`: add them. `edges`: add contributions by vertices' lagged data
-    to frames of edges.
+    The first writes the sums of windows at the dofs of a node, the second adds them. `edges`: add contributions by vertices' lagged
+    data to frames of edges.
     """
     block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
     _, previous, *_ = node_functions(kind, real)

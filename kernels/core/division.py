@@ -1,4 +1,4 @@
-"""Division by sizes that may be zero, without a smallest size: what has a dimension has none."""
+"""Division by magnitudes that may be zero, without a smallest magnitude, which a quantity with a dimension lacks."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @cache
 def nonzero_function(real):
-    """nonzero(x): x where it is positive, else 1, for quotients whose dividend is zero there."""
+    """Return the device function `nonzero(x)`: x if positive, else 1, for quotients whose dividend is then zero."""
 
     @wp.func
     def nonzero(x: real):

@@ -56,7 +56,7 @@ class TermAccess:
 
 @dataclass(frozen=True, eq=False)
 class ElementStorage:
-    """Storage of elements. An island is a rod or a world; what an element reads and writes apart from dofs has one column.
+    """Storage of elements. An island is a rod or a world; the data of an element, except dofs, has one column.
 
     Attributes:
         terms: terms evaluated in one pass, all of a rod or the one of an element set.

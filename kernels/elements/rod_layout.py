@@ -118,9 +118,8 @@ def inertia_type(kind: RodKind, real):
 def drag_structure(dim: int, real):
     """Return the struct of a node's mass and drag over a solve of length s.
 
-    One struct serves all kinds, so that Warp uses one kernel for equal ones. It holds the mass, the resistance D / s [N/m], the
-    position that the fluid alone would carry the node to, and the resistance to the spin of the edge that starts there, over s [N
-    m].
+    One struct serves all kinds, so that Warp uses one kernel for equal ones. `resistance`: D / s [N/m]. `carried`: position that the
+    fluid alone would carry the node to. `spin`: resistance to the spin of the edge that starts there, over s [N m].
     """
     V, M = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real)
 
@@ -275,7 +274,7 @@ def _term_access(kind: RodKind, index: int, real) -> TermAccess:
 
 @cache
 def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
-    """Return the storage of uncoupled rods: an island is a rod, and all terms share one window."""
+    """Return the storage of uncoupled rods: an island is a rod, and all terms have one window."""
     Inputs, missing, closed, serial = (
         rod_elements_type(kind.dim, real),
         0 if kind.closed else 1,

@@ -1,1 +1,1 @@
-"""Forces beside elements: drag, follower loads, control loads, prescribed motion, gyroscopic couples."""
+"""Forces other than elastic ones: drag, follower loads, control loads, prescribed motion, gyroscopic couples."""

@@ -298,7 +298,7 @@ def coupled_kernels(real):
         v_out: wp.array(dtype=V),
         a_out: wp.array(dtype=V),
     ):
-        """Write rates of massless dofs with drag; see `path_kernels`."""
+        """Write rates of massless dofs with drag; see `rod_kernels`."""
         i = wp.tid()
         w = i / blocks
         if scalars[STEP_PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):

@@ -35,7 +35,7 @@ def functions(size: int, linear):
     side. `eliminate` eliminates a node, from the factors, right-hand side and couplings L^-1 of its block (`block_ldlt`), and
     the tension of the edge behind.
 
-    Updates of the two blocks ahead are `weight` (b, c) (b, c)^T, of their right-hand sides `weight` `right` (b, c). The tension
+    Updates of the two blocks ahead are `weight` (b, c) (b, c)^T, of their right-hand sides `weight` `load` (b, c). The tension
     behind is T = `weight` (b . e1 + c . e2 + `coupling` T_ahead - `load`). `behind` and `ahead` are the effects of the two
     tensions on the node. `pending` is the tension of the edge ahead, with row -`row` on the node and `row` on the next. `slack` is
     zero without a tension; `free` is one for free dofs.

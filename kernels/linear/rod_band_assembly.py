@@ -36,7 +36,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     )
     second_of = second_function(measure, linear) if curved else None
     before = sum_function(terms[:-1], twist, real, linear, exact[:-1], split) if len(terms) > 1 else None
-    first, which = len(terms) == 1, len(terms) - 1
+    first, last = len(terms) == 1, len(terms) - 1
     part = part_function(measure, linear)
 
     @wp.func
@@ -114,7 +114,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
 
     @wp.func
     def add(sets: wp.array(dtype=Along), k: int, c: int, w: int, with_second: bool):
-        element_set = sets[wp.static(which)]
+        element_set = sets[wp.static(last)]
         D, E, F = own_sum(element_set, k, c, w, with_second)
         if wp.static(not first):
             D1, E1, F1 = before(sets, k, c, w, with_second)

@@ -112,9 +112,9 @@ def value_function(twist: bool, linear, split: bool = False):
 
 @cache
 def solve_functions(twist: bool, linear, split: bool = False):
-    """Return the device functions `right` and `hand`, for systems that consist of rod paths alone.
+    """Return the device functions `rhs` and `hand`, for systems that consist of rod paths alone.
 
-    `right(v, node, angle, fixed_dofs, shift)`: the right-hand side of a path node, zero at fixed dofs.
+    `rhs(v, node, angle, fixed_dofs, shift)`: the right-hand side of a path node, zero at fixed dofs.
     `hand(u, b, node, angle, w, shift, z, dots_out)`: write the solution u, of residual b, to its dof blocks in world w.
     """
     H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, split), linear)

@@ -85,7 +85,7 @@ def inputs_type(real, drag: bool):
 def results_type(real, linear):
     """Return the struct of outputs of the residual.
 
-    `right`: residuals of free dofs. `least`: rounding floor. `ratio`, `square`: residual over its tolerance, and squared.
+    `rhs`: residuals of free dofs. `least`: rounding floor. `ratio`, `square`: residual over its tolerance, and squared.
     `change`, `noise`: change of the energy along the step from `base`, and its rounding.
     """
     H = wp.types.vector(3, linear)

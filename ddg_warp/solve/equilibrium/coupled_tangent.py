@@ -93,7 +93,7 @@ class CoupledTangent(TangentBlock):
         return self.planes.matrix(values) if self.planes else values
 
     def forces(self, state, index: int) -> np.ndarray:
-        """Return the energy derivatives of a set's elements by the blocks of their local nodes (local nodes, elements, 3)."""
+        """Return the energy derivatives of a set's elements by blocks (local nodes, elements, 3)."""
         part = self.coupled.sets[index]
         shape = (len(part.host.slots), part.elements * self.coupled.worlds)
         out = wp.zeros(shape, dtype=self.coupled.vector, device=self.coupled.device)
@@ -225,7 +225,7 @@ class CoupledTangent(TangentBlock):
 
     @cached_property
     def balances(self) -> np.ndarray:
-        """Mask of dofs whose forces sum to zero over a free body (size,); false for radial dofs of bodies of revolution."""
+        """Mask of dofs with forces that sum to zero over a free body (size,); false for radial dofs of bodies of revolution."""
         result = np.repeat(np.arange(self.host.blocks)[:, None] < self.host.nodes, 3, axis=1)
         for shell in self.host.meridians:
             result[shell.nodes, :2] = False

@@ -158,7 +158,7 @@ class RodTangent(TangentBlock):
         return np.repeat(loads, self._dofs) * lengths
 
     def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
-        """Return the test of residual sums along each rod from its first node, and the largest excess over rounding (islands,)."""
+        """Return the test of residual sums along each rod from the first node, and the largest excess over rounding (islands,)."""
         dim = self.group.kind.dim
         sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
         limit = (rtol * loads)[:, None, None]

@@ -143,7 +143,7 @@ class Equilibrium:
     Attributes:
         tangent: energy, gradient and Hessian of the model.
         residuals: convergence test.
-        descent: direct solver; net: solver by conjugate gradients and contact, None without.
+        descent: direct solver; coupled: solver by conjugate gradients and contact, None without.
         factors: True if the tangent at equilibria is factorised, to test stability.
         mixed: True to try mixed Newton first; by default if applicable.
         iterations: Newton iterations so far.

@@ -1,1 +1,1 @@
-"""Forces beside elements, as launches of a step: drag, loads, control loads, prescribed motion, gyroscopic couples."""
+"""Forces other than elastic ones, as launches of a step: drag, loads, control loads, prescribed motion, gyroscopic couples."""

@@ -375,11 +375,11 @@ class RodSubstructuring:
         self._launch(self._columns[0], self.columns, [wanted, self.idle, self.width], [self._wanted])
 
     def _note(self) -> None:
-        """Raise `lost` of worlds whose rod paths lost a pivot."""
+        """Raise `lost` of worlds with a lost pivot in a rod path."""
         self._launch(self._columns[1], self.columns, [self.width], [self._bad, self._lost])
 
     def _elements(self, index: int, written: dict, real, linear):
-        """Return the output arrays of an element set with the path nodes of its elements."""
+        """Return the outputs and path nodes of an element set as a struct."""
         part, struct = self.coupled.sets[index], along_type(real, linear)()
         for name, array in written.items():
             setattr(struct, name, array)

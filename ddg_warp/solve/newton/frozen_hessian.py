@@ -12,7 +12,7 @@ class FrozenHessian:
     Compression is dropped, since the matrix has to be definite for all iterates.
 
     Attributes:
-        arrays, wanted: as of the islands, but worlds need a direction only while the matrix is new.
+        arrays, needs_direction: see `Islands`, but worlds need a direction only while the matrix is new.
     """
 
     def __init__(self, islands: Islands):

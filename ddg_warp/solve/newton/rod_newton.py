@@ -205,7 +205,7 @@ class RodNewton:
         )
 
     def go_further(self, before, predicted: wp.array) -> None:
-        """Warm-start bent rods by the extrapolated correction `direction` of their predictor, by rotating edges."""
+        """Warm-start bent rods: rotate edges of the predictor by the extrapolated correction `direction`."""
         group = self.group
         wp.launch(
             self._further,

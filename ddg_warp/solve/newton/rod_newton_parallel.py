@@ -71,7 +71,7 @@ class RodNewtonParallel(AssembledNewton):
             self.move()
 
     def go_further(self, before, predicted: wp.array) -> None:
-        """Warm-start bent rods by the extrapolated correction `direction` of their predictor, by rotating edges."""
+        """Warm-start bent rods: rotate edges of the predictor by the extrapolated correction `direction`."""
         wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
         self.move(EXTRAPOLATE_ROTATED, base=predicted, now=before.x)
 

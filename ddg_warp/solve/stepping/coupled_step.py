@@ -112,7 +112,7 @@ class CoupledStep(StepDriver):
         self._since_renewal = 0
 
     def outdated(self, anew: bool) -> int:
-        """Return the BVHs to rebuild before a step, see `renew`: those used since the last rebuild, every `RENEWAL` steps or
+        """Return the BVHs to rebuild before a step, see `renew`: BVHs used since the last rebuild, every `RENEWAL` steps or
         queries.
         """
         if self.newton.contact is None or self.model.wp_device.is_cpu:
@@ -202,10 +202,10 @@ class CoupledStep(StepDriver):
         """Uncoupled steps of the rods; empty without `alone`."""
         return self.alone.chains if self.alone else []
 
-    def adapt(self, s: float, anew: bool = False) -> bool:
+    def adapt(self, s: float, parameters_changed: bool = False) -> bool:
         """Select uncoupled stepping of rods out of contact and its solvers for s [s]; return True if the selection changed.
 
-        `anew`: see `parameters_changed` of `StepDriver.choose_solver`.
+        `parameters_changed`: see `StepDriver.choose_solver`.
         """
         before = self.alone
         if not (uncoupled(self.model) and is_decoupled(self.integrator)):
@@ -213,7 +213,7 @@ class CoupledStep(StepDriver):
         elif self.alone is None:
             self._groups = self._groups or rods_of(self.model)
             self.alone = DecoupledStep(self, self._groups)
-        return self.alone is not before or (self.alone is not None and self.alone.adapt(s, anew))
+        return self.alone is not before or (self.alone is not None and self.alone.adapt(s, parameters_changed))
 
     def has_overflow(self, before) -> bool:
         """Return True if the last step, from the state `before`, overflowed the pair lists and must be repeated.

@@ -48,7 +48,7 @@ class WorldReset:
         return wp.zeros(count, dtype=int, device=self.model.wp_device)
 
     def watch(self) -> None:
-        """Watch worlds: exclude those with `invalid` parameters or a NaN state from steps; failed ones become NaN."""
+        """Watch worlds: exclude worlds with `invalid` parameters or a NaN state from steps; failed worlds become NaN."""
         self.invalid, self.start = self._zeros(self.model.worlds), self.model.state()
 
     def bar(self, parts: list, before: State, after: State, handed: list[wp.array]) -> None:
