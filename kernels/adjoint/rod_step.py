@@ -28,7 +28,7 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
     other kernels have written.
     """
     dim, twist = kind.dim, kind.twist
-    settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.path_kernels`
+    settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.rod_kernels`
     V = wp.types.vector(dim, real)
     end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
     start_weight = real(1.0 if midpoint else 0.0)  # derivative of the end by minus the start

@@ -239,7 +239,7 @@ def rod_elements_type(dim: int, real):
 
 @cache
 def _term_access(kind: RodKind, index: int, real) -> TermAccess:
-    """Return the access of term `index` to the window and to its rows."""
+    """Return the access of term `index` to the window and to the term's rows."""
     term, measure = kind.terms[index], kind.terms[index].measure
     Q, S, _, _ = measure.types(real)
     W, L, lag_size = wp.types.vector(kind.window, real), wp.types.vector(13, real), measure.lag_size

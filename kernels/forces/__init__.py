@@ -1,1 +1,1 @@
-"""Forces other than elastic ones: drag, follower loads, control loads, prescribed motion, gyroscopic couples."""
+"""Non-elastic forces: drag, follower loads, control loads, prescribed motion, gyroscopic couples."""

@@ -89,7 +89,7 @@ class ContactModel:
         return self.terms.forces.numpy() - pushed + self.terms.spins.forces(x, self.terms.frictions)
 
     def slides(self) -> bool:
-        """Return True if friction reaches its bound mu N at a pair, after `friction`."""
+        """Return True if friction reaches the bound mu N at a pair, after `friction`."""
         for part in self.terms.frictions:
             used, forces = part.forces()
             if (np.linalg.norm(forces, axis=1) > SLIDING * part.lagged.bound.numpy()[used]).any():
@@ -137,7 +137,7 @@ class ContactModel:
         }
 
     def closest(self, x: wp.array) -> tuple[float, str]:
-        """Return the smallest gap of all candidates [m] and the name of its pair; infinite without candidates."""
+        """Return the smallest gap of all candidates [m] and the name of the pair; infinite without candidates."""
         gap, pair, _ = self.closest_nodes(x)
         return gap, pair
 

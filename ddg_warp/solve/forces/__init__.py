@@ -1,1 +1,1 @@
-"""Forces other than elastic ones, as launches of a step: drag, loads, control loads, prescribed motion, gyroscopic couples."""
+"""Non-elastic forces as launches of a step: drag, loads, control loads, prescribed motion, gyroscopic couples."""

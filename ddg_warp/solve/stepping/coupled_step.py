@@ -203,7 +203,7 @@ class CoupledStep(StepDriver):
         return self.alone.chains if self.alone else []
 
     def adapt(self, s: float, parameters_changed: bool = False) -> bool:
-        """Select uncoupled stepping of rods out of contact and its solvers for s [s]; return True if the selection changed.
+        """Select uncoupled stepping of rods out of contact, and solvers for s [s]; return True if the selection changed.
 
         `parameters_changed`: see `StepDriver.choose_solver`.
         """
@@ -377,7 +377,7 @@ class CoupledStep(StepDriver):
         return next(filter(None, dead_ends), "") or self._tightest(state, world)
 
     def _tightest(self, state, world: int) -> str:
-        """Return the closest pair of the last good state if it may be the cause, with its remedy; and advice.
+        """Return the closest pair of the last good state as a possible cause, with its remedy; and advice.
 
         Without room, or with a motion that drives two prescribed bodies into each other, a smaller dt or a looser rtol does not
         help.
