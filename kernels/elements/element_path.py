@@ -208,7 +208,7 @@ def left_out_function(term: Term, real):
 
 
 @cache
-def transported_function(real):
+def stiffness_split_function(real):
     """Return the device function `share(stiffness, carried)`: split an edge stiffness k between the matrix and its axial force.
 
     It returns the root of k' / k, with k' the stiffness that the matrix carries, and the slack, zero where k' = k. See
@@ -282,7 +282,7 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
     rows = storage.num_slots or measure.size
     splits, bends = split and tensions > 0, curved and curvature_of is not None
     drop_compression = drop_compression_function(real, tensions)
-    left_out, carried_part = left_out_function(term, real), transported_function(real)
+    left_out, carried_part = left_out_function(term, real), stiffness_split_function(real)
     alone, write_gradient = len(storage.terms) == 1, write_function(storage, real, real)
     second_rows = access.second or tuple(range(measure.packed))
     where = wp.types.vector(max(1, len(second_rows)), int)(*(second_rows or (0,)))

@@ -8,7 +8,7 @@ from ddg_warp.kernels.core.islands import INVERSE_STEP, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.linear.sliced_ell import mass_type
-from ddg_warp.kernels.stepping.rod_energy_drift import DISSIPATED, DRIFT, FIXED, ROUNDING, rows_function
+from ddg_warp.kernels.stepping.rod_energy_drift import DISSIPATED, DRIFT, ENERGY, ROUNDING, rows_function
 from ddg_warp.kernels.terms import Term
 
 
@@ -44,7 +44,7 @@ def element_kernel(term: Term, real, linear):
         rows_out[wp.static(ROUNDING) * worlds + w, e] = (
             rows[wp.static(ROUNDING)] + real(stiffness[column]) * least * least
         )
-        rows_out[wp.static(FIXED) * worlds + w, e] = rows[wp.static(FIXED)]
+        rows_out[wp.static(ENERGY) * worlds + w, e] = rows[wp.static(ENERGY)]
         rows_out[wp.static(DISSIPATED) * worlds + w, e] = rows[wp.static(DISSIPATED)]
 
     return measure
@@ -88,7 +88,7 @@ def block_kernel(real, drag: bool = False):
             m = mass[w, k].mass
         else:
             m = mass[w, k]
-        rows_out[wp.static(FIXED) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
+        rows_out[wp.static(ENERGY) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
         damped = real(2.0) * damping[0] * scalars[INVERSE_STEP, w] * wp.dot(wp.cw_mul(m, moved), moved)
         if wp.static(drag):
             away = q[i] - mass[w, k].carried

@@ -21,7 +21,7 @@ from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_fun
 from ddg_warp.kernels.elements.rod_layout import RodKind, inertia_type, rod_storage
 from ddg_warp.kernels.terms import Term
 
-DRIFT, ROUNDING, FIXED, DISSIPATED = range(4)  # rows of a balance
+DRIFT, ROUNDING, ENERGY, DISSIPATED = range(4)  # rows of a balance
 ROWS = 4
 
 
@@ -213,9 +213,9 @@ def drift_kernel(real):
         for i in range(rows.shape[1]):
             drift += rows[wp.static(DRIFT), i, r]
             rounding += rows[wp.static(ROUNDING), i, r]
-            energy += rows[wp.static(FIXED), i, r]
+            energy += rows[wp.static(ENERGY), i, r]
             dissipated += rows[wp.static(DISSIPATED), i, r]
-        energy = wp.max(energy, account[wp.static(FIXED), r])
+        energy = wp.max(energy, account[wp.static(ENERGY), r])
         allowed = bound * (energy + dissipated) + rounding
         if not wp.abs(drift) <= wp.max(allowed, before):
             flags[STATUS, r] = wp.static(outcome.ENERGY_DRIFT)
@@ -224,7 +224,7 @@ def drift_kernel(real):
             return
         account[wp.static(DRIFT), r] = drift
         account[wp.static(ROUNDING), r] = rounding
-        account[wp.static(FIXED), r] = energy
+        account[wp.static(ENERGY), r] = energy
         account[wp.static(DISSIPATED), r] = dissipated
 
     return judge

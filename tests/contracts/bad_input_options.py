@@ -43,7 +43,7 @@ refuse("options: unknown", {
     "Circle of two": (lambda: ddg.Circle(0.1, 0.2), "Circle", "too many positional"),
     "Motion, nearly angle": (lambda: ddg.Motion(angel=lambda t: t), "did you mean 'angle'"),
     "Sphere without a radius": (lambda: ddg.Sphere((0, 0, 0)), "Sphere", "missing", "'radius'"),
-    "Trace": (lambda: ddg.PathAnalysis(foo=1), "Trace takes no 'foo'", "load_scale"),
+    "Trace": (lambda: ddg.PathAnalysis(foo=1), "PathAnalysis takes no 'foo'", "load_scale"),
     "Dynamics, nearly duration": (lambda: ddg.Dynamics(durations=1.0), "did you mean 'duration'"),
     "Stop, nearly limit_points": (lambda: ddg.StopCriterion(limit_point=1), "did you mean 'limit_points'"),
     "Viscous, nearly scale": (lambda: ddg.Viscous(1.0, scales=1.0), "did you mean 'scale'"),
@@ -82,7 +82,7 @@ def smooth(**options) -> ddg.Scene:
     return scene
 
 
-each("options: no effect", "friction_iterations", [2, 3], lambda v: built(smooth(friction_iterations=v)), "contact: lags", "friction")
+each("options: no effect", "friction_iterations", [2, 3], lambda v: built(smooth(friction_iterations=v)), "contact", "friction")
 each("options: no effect", "velocity", [1e-2], lambda v: built(smooth(velocity=v, friction=0.0)), "contact: velocity", "friction")
 each("options: no effect", "friction_law", ["polynomial"], lambda v: built(smooth(friction_law=v)), "contact: friction_law", "friction")
 refuse("options: no effect", {

@@ -221,7 +221,8 @@ scene_call("drag", {"rods": 0, "tangential": 1.0, "normal": 2.0}, {
     "rods": [0, 1], "law": Change(ddg.Viscous(1.0), {"tangential": NOTHING, "normal": NOTHING}, ddg.Viscous(2.0)),
     "tangential": 2.0, "normal": 1.0, "rotational": 1.0, "nodes": 1.0}, two_clamped_rods,
     lambda s: s.add_twisting_moment(0, -1, 0.1))  # fmt: skip
-scene_call("join", {"members": [(0, -1), (1, 0)]}, {"members": [(0, 0), (1, 0)], "rigid": False},
+scene_call("join", {"members": [(0, -1), (1, 0)]}, {
+    "members": [(0, 0), (1, 0)], "rigid": False, "laws": {"rigid_joint": ddg.Law(quadratic, stiffness=0.1)}},
            lambda s: (s.add_rods([ARC, ARC[[-1]] + ARC], section=ddg.Circle(0.02), material=RUBBER),
                       s.add_rod(ARC * [1, -1, 1], section=ddg.Circle(0.02), material=RUBBER)), lambda s: s.clamp(0))  # fmt: skip
 CALLS["join"].rows["members"] = [(0, 0), (2, 0)]
@@ -341,6 +342,7 @@ def two_sheets(scene: ddg.Scene) -> None:
 scene_call("add_shell", SHEET | {"thickness": 0.05, "material": RUBBER}, {
     "points": SHEET["points"] * 1.1, "triangles": SHEET["triangles"][::-1], "thickness": 0.06, "material": ddg.Material(2e6, 0.3),
     "bending": "hinge", "membrane": Change("curved", refused=True), "name": "odd",
+    "laws": Change({"shell_hinge": ddg.Law(quadratic, stiffness=1e-3)}, {"bending": "hinge"}),
     "rest": Change("flat", {"points": SHEET["points"] + [0, 0, 1] * (SHEET["points"][:, :1] - 0.3) ** 2}, "shape")},
     lambda s: None, lambda s: s.clamp_boundary(0, [0, 1, 2]))  # fmt: skip
 scene_call(

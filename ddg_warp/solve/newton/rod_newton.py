@@ -48,10 +48,10 @@ class NewtonOptions:
             rods and rigid joints. Second derivatives of shells' bending, of rod-shell coupling and of magnets are omitted, which
             "none" refuses. A lost pivot or negative curvature in conjugate gradients makes it indefinite. With "gauss_newton" the
             coupled system then keeps the direction reached, and drops compression from the next matrix.
-        unconverged_fraction: in contact, fraction of the bodies of a world that may exceed the tolerance at the end of a step, each by at most
-            ten times. Bodies are rods, shells, or joined ones. With many bodies in contact some slip off others at any time, and
-            delay all others. The remaining residual acts on such a body like a force in that step. Where contact cuts no motion,
-            directions are solved until all but half as many bodies satisfy the linear system.
+        unconverged_fraction: in contact, fraction of the bodies of a world (rods, shells, or joined ones) that may exceed the
+            tolerance at the end of a step, each by at most ten times. The remaining residual acts on such a body like a force in
+            that step. With many bodies in contact some slip off others at any time, and delay all others. Where contact cuts no
+            motion, directions are solved until all but half as many bodies satisfy the linear system.
     """
 
     rtol: float = 1e-6
