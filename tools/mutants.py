@@ -126,7 +126,7 @@ FAULTS = (
     ),
     Fault(
         "line search: sign of Armijo's constant",
-        "kernels/newton/line_search.py",
+        "kernels/newton/rod_sweep.py",
         "real(-1.0e-4) * expected",
         "real(1.0e-4) * expected",
         ("tests/kernels/test_chain.py",),
