@@ -83,7 +83,7 @@ class Elements(Sample):
         types = [vector, real, real, vector, real, real]
         out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
         search = Islands(1, real, self.device)
-        search.clamped.fill_(0 if exact else 1)
+        search.drop_compression.fill_(0 if exact else 1)
         kernel = element_path.evaluate_kernel(self.storage(real), real, real, 0 if exact and packed else None)
         found = element_path.results_type(real, real, True)()
         found.factor, found.tension, found.second, found.gradient, found.energy, found.stiffness = out
