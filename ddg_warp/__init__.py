@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
     from ddg_warp.solve.stepping.integrator import Integrator
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "AdaptiveStepper",
     "Box",

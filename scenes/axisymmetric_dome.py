@@ -55,7 +55,9 @@ def build(load: str = "pressure", shallowness: int = 5, n: int = 80) -> ddg.Scen
         scene.hold_ring(dome, -1, "z")
         scene.add_pole_force(dome, -FORCE)
     watch = {"drop": ddg.Displacement.of(0, "z", -1.0)}
-    scene.analysis = ddg.Trace(watch, ddg.Stop(limit_points=2), step=1e-4, max_step=4e-4, load_scale=400.0)
+    scene.analysis = ddg.PathAnalysis(
+        watch, ddg.StopCriterion(limit_points=2), step=1e-4, max_step=4e-4, load_scale=400.0
+    )
     return scene
 
 

@@ -35,7 +35,7 @@ def build(n: int = 240) -> ddg.Scene:
     scene.fix(arch, [-1])
     scene.add_force(arch, n // 2, (0.0, 0.0, -LOAD))
     watch = {"drop": ddg.Displacement.of(n // 2, "z", -1.0), "shift": ddg.Displacement.of(n // 2, "x")}
-    scene.analysis = ddg.Trace(watch, ddg.Stop(limit_points=1), step=0.03, max_step=0.15)
+    scene.analysis = ddg.PathAnalysis(watch, ddg.StopCriterion(limit_points=1), step=0.03, max_step=0.15)
     return scene
 
 

@@ -41,8 +41,8 @@ def build(n: int = 60, stretch: float = EA) -> ddg.Scene:
     scene.add_force(beam, n // 5, (0.0, 0.0, -1.0))
     loaded = n + 1 + n // 5  # its row among the points
     watch = {"v": ddg.Displacement.of(loaded, "z", -1.0), "u": ddg.Displacement.of(loaded, "x")}
-    stop = ddg.Stop(limit_points=2)
-    scene.analysis = ddg.Trace(watch, stop, step=0.02, max_step=0.1, load_scale=2.0)
+    stop = ddg.StopCriterion(limit_points=2)
+    scene.analysis = ddg.PathAnalysis(watch, stop, step=0.02, max_step=0.1, load_scale=2.0)
     return scene
 
 

@@ -42,8 +42,8 @@ def build(n: int = 20, sense: int = 1, in_plane: float = 1.0) -> ddg.Scene:
     scene.clamp_end(clamped, "first")
     scene.add_force(free, -1, (float(np.sign(sense)), 0.0, 0.0))
     watch = {"deflection": ddg.Displacement.of(-1, "y")}
-    scene.analysis = ddg.Trace(
-        watch, ddg.Stop(load=(-np.inf, 1.3 * abs(CRITICAL[int(np.sign(sense))]))), load_scale=10.0
+    scene.analysis = ddg.PathAnalysis(
+        watch, ddg.StopCriterion(load=(-np.inf, 1.3 * abs(CRITICAL[int(np.sign(sense))]))), load_scale=10.0
     )
     return scene
 

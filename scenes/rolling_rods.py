@@ -31,7 +31,7 @@ def build(
     velocity: float = 1e-3,
     stiffness: float = 2e4,
     range: float = RANGE,
-    lags: int = 2,
+    friction_iterations: int = 2,
     dt: float = 1e-3,
     duration: float = 0.5,
     seed: int = -1,
@@ -47,7 +47,7 @@ def build(
         velocity: stick threshold nu of the friction law [m/s]
         stiffness: contact stiffness [N/m]
         range: activation distance of contact [m]
-        lags: normal-force iterations a step
+        friction_iterations: normal-force iterations a step
         dt: time step [s]
         duration: duration of the run [s]
         seed: seed of the initial jitter of rods; no jitter below 0
@@ -73,7 +73,14 @@ def build(
             name=name,
         )
     scene.add_obstacle(ddg.Plane(normal=tuple(normal)), name="plane")
-    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags, rolling=True)
+    scene.contact(
+        range=range,
+        stiffness=stiffness,
+        friction=friction,
+        velocity=velocity,
+        friction_iterations=friction_iterations,
+        rolling=True,
+    )
     scene.contact_between("slips", "plane", friction=slippery)
     return scene
 
@@ -122,7 +129,7 @@ def _checks(result, scene) -> list[ddg.Check]:
 def benchmark() -> ddg.bench.Study:
     """Study the displacement of the bowled rod over parameters of contact, friction, steps and nodes, one by one."""
     grid = {"n": (5, 10, 20), "dt": (4e-3, 2e-3, 1e-3, 5e-4), "velocity": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)}
-    grid |= {"stiffness": (2e3, 2e4, 2e5), "range": (2.5e-5, RANGE, 4e-4), "lags": (1, 2, 3)}
+    grid |= {"stiffness": (2e3, 2e4, 2e5), "range": (2.5e-5, RANGE, 4e-4), "friction_iterations": (1, 2, 3)}
     return ddg.bench.Study(grid, WAYS[1], one_by_one=True)
 
 

@@ -42,7 +42,7 @@ def build(
     velocity: float = 1e-6,
     stiffness: float = 5e4,
     range: float = RANGE,
-    lags: int = 2,
+    friction_iterations: int = 2,
     seed: int = -1,
 ) -> ddg.Scene:
     """Build the rod along z, its tip half the activation distance above the floor z = 0.
@@ -54,7 +54,7 @@ def build(
         velocity: stick threshold nu of the friction law [m/s]; the clamp moves by about 1e-3 m/s
         stiffness: contact stiffness [N/m]
         range: activation distance of contact [m]
-        lags: normal-force iterations a step
+        friction_iterations: normal-force iterations a step
         seed: seed of a jitter of the sideways nudge; no jitter below 0
     """
     if friction not in SLIP:
@@ -75,7 +75,9 @@ def build(
     nudge = NUDGE * (1.0 + 0.5 * float(_touching.jitter((), seed)))
     scene.add_force(rod, n // 2, (nudge, 0.0, 0.0), amplitude=lambda t: max(0.0, 1.0 - t / fades))
     scene.add_obstacle(ddg.Plane(), name="floor")
-    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags)
+    scene.contact(
+        range=range, stiffness=stiffness, friction=friction, velocity=velocity, friction_iterations=friction_iterations
+    )
     return scene
 
 
@@ -141,7 +143,9 @@ def benchmark() -> ddg.bench.Study:
     grid = {"n": (10, 20, 40, 80), "dt": (3.0, 1.5, 1.0, 0.5), "velocity": (1e-7, 1e-6, 1e-5, 1e-4)}
     grid |= {"stiffness": (5e3, 1.5e4, 5e4, 1.5e5, 5e5), "range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4)}
     return ddg.bench.Study(
-        grid | {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8), "lags": (1, 2, 3)}, "delta / L of the slip", one_by_one=True
+        grid | {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8), "friction_iterations": (1, 2, 3)},
+        "delta / L of the slip",
+        one_by_one=True,
     )
 
 

@@ -386,7 +386,7 @@ def test_a_run_that_fails_before_its_first_state_says_so(failure, tmp_path, monk
             raise SolverError("no equilibrium", state=state)
 
         monkeypatch.setattr(continuation.Continuation, "trace", lost)
-        trace = "ddg.Trace({'u': ddg.Displacement.of(-1, 'y')}, ddg.Stop(steps=3))"
+        trace = "ddg.PathAnalysis({'u': ddg.Displacement.of(-1, 'y')}, ddg.StopCriterion(steps=3))"
         code = SCENE.replace("ddg.Dynamics(dt=0.01, duration=0.05)", trace).replace(
             "    build.shift = shift", "    scene.clamp(0)"
         )

@@ -61,6 +61,6 @@ def test_copies_keep_the_outcome_of_an_equilibrium(device):
 def test_copies_of_solvers_are_refused(device, copied):
     model = scene("rods").build(device, "float64")
     integrator = ddg.Integrator(model)
-    for solver in (integrator, ddg.StepControl(integrator, 1e-3), statics.Equilibrium(model), Continuation(model)):
+    for solver in (integrator, ddg.AdaptiveStepper(integrator, 1e-3), statics.Equilibrium(model), Continuation(model)):
         with pytest.raises(ddg.SceneError, match=f"{type(solver).__name__}: .* make another"):
             copied(solver)

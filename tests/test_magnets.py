@@ -130,10 +130,10 @@ def test_path_branches_at_the_critical_field(device):
     """The load parameter scales the field: continuation finds the bifurcation and the lateral tip position of its branch."""
     model = cantilever(20, -3.0 / MA * X, dimension=2).build(device, "float64")
     follow = Continuation(model, {"tip": ddg.Displacement.of(-1, "z")}, max_step=0.3)
-    path = follow.trace(stop=ddg.Stop(load=(-1.0, 1.0)))
+    path = follow.trace(stop=ddg.StopCriterion(load=(-1.0, 1.0)))
     (fork,) = path.bifurcations
     assert 3.0 * fork.load == pytest.approx(0.25 * np.pi**2, rel=1e-3)
-    branch = follow.switch(fork, stop=ddg.Stop(load=(-1.0, 1.0)))
+    branch = follow.switch(fork, stop=ddg.StopCriterion(load=(-1.0, 1.0)))
     straight, bent = path.points[-1], branch.points[-1]
     assert not straight.stable and bent.stable
     # elastica: M A B L^2 / EI = K(k)^2, lateral tip position 2 k L / K(k)

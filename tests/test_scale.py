@@ -108,7 +108,7 @@ def answers(name: str, length: float, precision: str, device: str) -> dict:
     result = {"equilibrium": state.points() / length}
     if precision == "float64":
         result["frequencies"] = spectrum(model, state, 3).frequencies * length
-        path = Continuation(model).trace(stop=ddg.Stop(steps=3))
+        path = Continuation(model).trace(stop=ddg.StopCriterion(steps=3))
         result["path"] = path.points[-1].state.points() / length
     integrator, state = ddg.Integrator(model, rtol=1e-9 if precision == "float64" else 1e-7), model.state()
     for _ in range(4):

@@ -46,7 +46,7 @@ def shell() -> ddg.Scene:
 def test_error_of_free_fall_is_the_tolerance(device, kind):
     """Implicit Euler falls h g / 2 t too far; h is the largest halving of 1/60 s with h g / 2 below the error."""
     error, model = 5e-3, kind().build(device)
-    steps, state = ddg.StepControl(ddg.Integrator(model), error, halvings=6), model.state()
+    steps, state = ddg.AdaptiveStepper(ddg.Integrator(model), error, halvings=6), model.state()
     start = state.points()
     for _ in range(6):
         state = steps.advance(state, 1 / 60)
@@ -61,7 +61,7 @@ def test_error_of_free_fall_is_the_tolerance(device, kind):
 
 def test_objects_at_rest_take_the_longest_step(device):
     model = rods(gravity=(0.0, 0.0, 0.0)).build(device)
-    steps, state = ddg.StepControl(ddg.Integrator(model), 1e-4, halvings=3), model.state()
+    steps, state = ddg.AdaptiveStepper(ddg.Integrator(model), 1e-4, halvings=3), model.state()
     for _ in range(5):
         state = steps.advance(state, 0.08)
     assert steps.level == 0 and steps.estimate == 0.0
@@ -74,7 +74,7 @@ def test_adaptive_steps_are_integrator_steps(device):
     scene = rods()
     scene.clamp(0, edges=[0])
     model = scene.build(device)
-    steps, state = ddg.StepControl(ddg.Integrator(model), 1e-1, halvings=4), model.state()
+    steps, state = ddg.AdaptiveStepper(ddg.Integrator(model), 1e-1, halvings=4), model.state()
     integrator, expected, lengths = ddg.Integrator(model), model.state(), []
     step = steps.integrator.step
     steps.integrator.step = lambda state, dt, controls: lengths.append(dt) or step(state, dt, controls)
@@ -96,7 +96,7 @@ def test_the_error_is_of_first_order(device):
     model = scene.build(device, "float64")
 
     def swung(error: float) -> np.ndarray:
-        steps, state = ddg.StepControl(ddg.Integrator(model, rtol=1e-9), error, halvings=9), model.state()
+        steps, state = ddg.AdaptiveStepper(ddg.Integrator(model, rtol=1e-9), error, halvings=9), model.state()
         for _ in range(8):
             state = steps.advance(state, 0.02)
         return state.points()
@@ -121,7 +121,7 @@ def test_fastest_world_sets_the_step(device):
         speed = np.zeros((worlds, 9, 3))
         speed[moving_world, -1, 2] = 1.0
         state = model.state(velocities=speed if worlds > 1 else speed[0])
-        steps = ddg.StepControl(ddg.Integrator(model), 5e-2, halvings=5)
+        steps = ddg.AdaptiveStepper(ddg.Integrator(model), 5e-2, halvings=5)
         for _ in range(3):
             state = steps.advance(state, 0.02)
         return dict(steps.lengths)
@@ -134,11 +134,11 @@ def test_refusals(device):
     integrator = ddg.Integrator(model)
     for options, message in (({"error": 0.0}, "error"), ({"error": 1.0, "halvings": -1}, "halvings")):
         with pytest.raises(ddg.SceneError, match=message):
-            ddg.StepControl(integrator, **options)
+            ddg.AdaptiveStepper(integrator, **options)
     with pytest.raises(ddg.SceneError, match="implicit_midpoint"):
-        ddg.StepControl(ddg.Integrator(model, scheme="implicit_midpoint"), 1e-3)
+        ddg.AdaptiveStepper(ddg.Integrator(model, scheme="implicit_midpoint"), 1e-3)
     with pytest.raises(ddg.SceneError, match="dt"):
-        ddg.StepControl(integrator, 1e-3).advance(model.state(), -1.0)
+        ddg.AdaptiveStepper(integrator, 1e-3).advance(model.state(), -1.0)
 
 
 def rod_on_a_grip() -> ddg.Scene:
@@ -154,7 +154,7 @@ def test_grips_move_evenly_over_the_steps(device):
     recorded, scene = [], rod_on_a_grip()
     scene.callbacks = [lambda state: recorded.append((state.time, state.poses()[0]))]
     model = scene.build(device, "float64")
-    steps, state = ddg.StepControl(ddg.Integrator(model), 5e-3), model.state()
+    steps, state = ddg.AdaptiveStepper(ddg.Integrator(model), 5e-3), model.state()
     ends = np.array([[0.0, 0.0, 0.01, 0.0, 0.4, 0.0], [0.004, 0.0, 0.01, 0.3, 0.4, 0.0]])
     for end in ends:
         begin, first = state.poses()[0].copy(), len(recorded)
@@ -187,17 +187,17 @@ def test_control_loads_are_constant_or_linear(device):
     total_force = np.array([0.5, 1.0, 1.0, 1.0, 0.5])[:, None] / 4.0 * [0.0, 0.0, 1e-3]  # distributed like the masses
     T, halvings = 0.02, 3
     for start, duration in ((None, T), (ddg.Controls(forces=0.0 * total_force), 0.5 * T + 0.5 * T / 2**halvings)):
-        steps = ddg.StepControl(ddg.Integrator(model), 1e-12, halvings)
+        steps = ddg.AdaptiveStepper(ddg.Integrator(model), 1e-12, halvings)
         state = steps.advance(model.state(), T, ddg.Controls(forces=total_force), start)
         np.testing.assert_allclose(state.velocities()[:, 2], 1e-3 / mass * duration, rtol=1e-9)
     # a missing start or end takes the value of the scene: zero gravity
-    steps = ddg.StepControl(ddg.Integrator(model), 1e-12, halvings)
+    steps = ddg.AdaptiveStepper(ddg.Integrator(model), 1e-12, halvings)
     state = steps.advance(model.state(), T, None, ddg.Controls(gravity=(0.0, 0.0, -8.0)))
     np.testing.assert_allclose(state.velocities()[:, 2], -8.0 * (0.5 * T - 0.5 * T / 2**halvings), rtol=1e-9)
 
 
 def test_poses_are_no_start(device):
     model = rod_on_a_grip().build(device, "float64")
-    steps = ddg.StepControl(ddg.Integrator(model), 5e-3)
+    steps = ddg.AdaptiveStepper(ddg.Integrator(model), 5e-3)
     with pytest.raises(ddg.SceneError, match="poses begin where the state has them"):
         steps.advance(model.state(), 0.02, None, ddg.Controls(poses=np.zeros((1, 6))))

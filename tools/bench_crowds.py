@@ -8,7 +8,7 @@ runs to its end or for `limit` seconds of wall time. A row covers a sixth of tha
 - wall time a simulated second, and means a step of solves (above one with substeps), Newton and conjugate gradient iterations, and
   searches; `dt` is the mean step [s]
 - pairs in contact, the smallest gap so far over the search distance, and `refused`, crossing pairs in rejected steps
-- `rtol`, residual tolerance over the weight of a rod, and `outliers`, the fraction of rods that may exceed it
+- `rtol`, residual tolerance over the weight of a rod, and `unconverged_fraction`, the fraction of rods that may exceed it
 - `astray`, the largest local error estimate of `AdaptiveStepper` [m/s], which halves the steps of some scenes
 - `gained`, energy created over energy lost so far, in scenes without driving
 - `search_share`, the fraction of wall time for searches, from one timed separately
@@ -85,8 +85,8 @@ def run(name: str, device, limit: float) -> list[dict]:
     scene, rtol = import_module(f"ddg_warp.scenes.{scene_name}").build(**arguments), RTOL.get(name, OTHERWISE)
     model = scene.build(device)
     outliers = OUTLIERS.get(name, 0.0)
-    integrator = ddg.Integrator(model, check_every=1, rtol=rtol, outliers=outliers)
-    steps = ddg.StepControl(integrator, *CONTROL.get(name, ONE_LENGTH))
+    integrator = ddg.Integrator(model, check_every=1, rtol=rtol, unconverged_fraction=outliers)
+    steps = ddg.AdaptiveStepper(integrator, *CONTROL.get(name, ONE_LENGTH))
     state = scene.initial(model) if scene.initial else model.state()
     contact = integrator._coupled.newton.contact  # for the time of a search, which has no public interface
     state = integrator.step(state, dt / 2**steps.halvings)
@@ -111,7 +111,7 @@ def run(name: str, device, limit: float) -> list[dict]:
                 "nodes": model.coupled.host.nodes,
                 "dt": (state.time - since) / number,
                 "rtol": rtol,
-                "outliers": outliers,
+                "unconverged_fraction": outliers,
                 "astray": astray,
                 "until": state.time,
                 "wall_per_second": wall / (state.time - since),
@@ -246,8 +246,8 @@ def _compared(name: str, model, start, duration: float, settings: list[tuple]) -
     """Run from a state by (error and halvings of `AdaptiveStepper`, rtol, outliers, longest step); compare each with the first."""
     rows, points = [], None
     for control, rtol, outliers, length in settings:
-        integrator, state, astray = ddg.Integrator(model, rtol=rtol, outliers=outliers), start, 0.0
-        steps = ddg.StepControl(integrator, *control)
+        integrator, state, astray = ddg.Integrator(model, rtol=rtol, unconverged_fraction=outliers), start, 0.0
+        steps = ddg.AdaptiveStepper(integrator, *control)
         wp.synchronize_device(model.device)
         began = time.perf_counter()
         for _ in range(round(duration / length)):
@@ -262,7 +262,7 @@ def _compared(name: str, model, start, duration: float, settings: list[tuple]) -
                 "case": name,
                 "error": control[0] if control[1] else None,
                 "rtol": rtol,
-                "outliers": outliers,
+                "unconverged_fraction": outliers,
                 "dt": duration / number,
                 "astray": astray,
                 "wall": wall,

@@ -37,7 +37,7 @@ class ContactAdjoint:
     near-parallel pairs, and collision exclusion distances keep their values of the build.
 
     Attributes:
-        lags: friction iterations in a step.
+        friction_iterations: number of friction updates in a step.
         by_groups: gradient by stiffness, range, thickness, friction and rate, of groups of first and second primitives (`NUMBERS`,
             worlds, groups, groups), added to.
         by_radius: gradient by radii (worlds, bodies), added to.
@@ -49,7 +49,7 @@ class ContactAdjoint:
         terms, search = self.system.terms, self.system.search
         serial, nodes = device_arrays.serial(device), len(terms.forces)
         every = wp.zeros(coupled.blocks, dtype=wp.uint8, device=device)
-        self.lags = contact.law.lags if terms.frictions else 1
+        self.friction_iterations = contact.law.friction_iterations if terms.frictions else 1
         self._rubs = terms.frictions or [None] * len(terms.lists)
         kinds = [pairs.kind for pairs in search.lists]
         self._vjp = [pull_kernel(kind, contact.density, real) for kind in kinds]

@@ -25,14 +25,14 @@ class CoupledAssembly:
         self._lags = [coupled_step.lag_kernel(p.term, real) if p.term.measure.advance else None for p in coupled.sets]
         self._meets = [self._list(part.host.slots, coupled.blocks) for part in coupled.sets]
         self._edges = self._list(np.reshape(coupled.host.ends, (-1, 2)).T, coupled.blocks) if coupled.edges else None
-        self._framed, self.slots, self.lags = [], [], []  # the first: of the frames that elements read
+        self._framed, self.slots, self.friction_iterations = [], [], []  # the first: of the frames that elements read
         for part in coupled.sets:
             measure = part.term.measure
             angles = part.host.slots[measure.nodes : measure.nodes + measure.frames] - coupled.host.nodes
             self._framed.append(self._list(angles, coupled.edges) if measure.frames else None)
             shape = measure.slots, part.elements * coupled.worlds
             self.slots.append(wp.zeros(shape, dtype=coupled.vector, device=self.device))
-            self.lags.append(self.make(measure.lag_size + measure.data_size, part.elements))
+            self.friction_iterations.append(self.make(measure.lag_size + measure.data_size, part.elements))
         self._ends = wp.zeros((2, max(1, coupled.edges * coupled.worlds)), dtype=coupled.vector, device=self.device)
 
     @property
@@ -57,13 +57,13 @@ class CoupledAssembly:
 
     def clear(self) -> None:
         """Nothing is brought yet."""
-        for array in (*self.slots, *self.lags):
+        for array in (*self.slots, *self.friction_iterations):
             array.zero_()
 
     def collect(self, grad_q: wp.array, frame: wp.array, by_data: list[wp.array]) -> None:
         """Add shares to the blocks, frames and constant data that they belong to."""
         coupled = self.coupled
-        for i, (part, slot, lag) in enumerate(zip(coupled.sets, self.slots, self.lags, strict=True)):
+        for i, (part, slot, lag) in enumerate(zip(coupled.sets, self.slots, self.friction_iterations, strict=True)):
             starts, items, count = self._meets[i]
             self._launch(self.gather, len(grad_q), [starts, items, count, coupled.blocks, slot], [grad_q])
             if self._framed[i]:
@@ -76,7 +76,7 @@ class CoupledAssembly:
 
     def add_own(self, out: list[wp.array]) -> None:
         """Add what is brought of own lagged rows."""
-        for part, lag, rows in zip(self.coupled.sets, self.lags, out, strict=True):
+        for part, lag, rows in zip(self.coupled.sets, self.friction_iterations, out, strict=True):
             if part.term.measure.advance:
                 self._launch(self._rows, rows.shape, [lag, FRAME * part.term.measure.frames], [rows])
 
@@ -106,7 +106,7 @@ class CoupledAssembly:
                 at = coupled.elements(after, i, q)
                 at.lag = before.lag[i]
                 count = coupled.sets[i].elements * coupled.worlds
-                self._launch(kernel, count, [at, own[i]], [self.slots[i], self.lags[i]])
+                self._launch(kernel, count, [at, own[i]], [self.slots[i], self.friction_iterations[i]])
         self.collect(grad_q, frame, by_data)
         if coupled.edges:
             read = [q, coupled.ends, coupled.blocks, before.frame, frame]

@@ -117,7 +117,7 @@ class CoupledStepAdjoint:
             return [self._shares.make(rows(part.term), part.elements) for part in coupled.sets]
 
         self._by_end, self._by_q, self._w, self._end, self._stays = (make() for _ in range(5))
-        self._by_lagged = make() if self.contact and self.contact.lags > 1 else None
+        self._by_lagged = make() if self.contact and self.contact.friction_iterations > 1 else None
         self._given_frame = self._shares.make(FRAME, coupled.edges)
         # of frames and own lagged rows: of what the step ends in, of its solve, and of where it starts
         self._by_frame = [self._shares.make(FRAME, coupled.edges) for _ in range(2)]
@@ -203,7 +203,7 @@ class CoupledStepAdjoint:
         for i, kernel in enumerate(self._strains):
             if kernel:
                 read = [coupled.elements(after, i), given.last[i]]
-                self._over(i, kernel, read, [shares.slots[i], shares.lags[i], inputs.parameters[i]])
+                self._over(i, kernel, read, [shares.slots[i], shares.friction_iterations[i], inputs.parameters[i]])
         shares.collect(by_end, frame, inputs.end_data)
         for part, rows, lag in zip(coupled.sets, of_end, given.lag, strict=True):
             if part.term.measure.advance:
@@ -239,7 +239,7 @@ class CoupledStepAdjoint:
             self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._vjp):
-                written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
+                written = [shares.slots[i], shares.friction_iterations[i], inputs.parameters[i]]
                 written += [start.last[i], inputs.elements_rate[i]]
                 self._over(i, kernel, [coupled.elements(damped, i, rate=self._rates), w], written)
             shares.collect(grad_q, carried, inputs.data)

@@ -19,7 +19,7 @@ from ddg_warp.run.simulate import Result, simulate
 from ddg_warp.scene.scene import Dynamics
 
 RUN_SETTINGS = ("dt", "duration", "precision")
-SOLVER_OPTIONS = ("solver", "linear", "rtol", "outliers")
+SOLVER_OPTIONS = ("solver", "linear", "rtol", "unconverged_fraction")
 RESOLUTION = ("n", "cells", "segments", "rings", "around")  # names of the number of edges or cells in scenes
 REFINED = 4  # refinement of the reference of a default study, where no check has one
 
@@ -30,7 +30,7 @@ class Study:
 
     Attributes:
         grid: Values by name; every combination is run, and the scene's defaults. A name is a parameter of `build`, a setting of the
-            run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol, outliers).
+            run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol, unconverged_fraction).
         measure: Quantity to compare: the beginning of the name of a check of the scene, or a function of a result that returns a
             number or an array.
         reference: Expected value of `measure`, or settings, by name, of the reference run of a case. A check has its own.
@@ -247,7 +247,9 @@ def defaults(module, study: Study, device: str | None) -> dict:
     analysis = module.build(**{name: value for name, value in study.fixed.items() if name in build_defaults}).analysis
     usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
     if isinstance(analysis, Dynamics):
-        usual |= {name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol", "outliers")}
+        usual |= {
+            name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol", "unconverged_fraction")
+        }
         usual["precision"] = analysis.precision or usual["precision"]
     else:
         usual |= {"solver": "auto", "rtol": StaticsOptions().rtol}

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 RUN_SETTINGS = ("dt", "precision", "worlds")  # fixed in a resumed run, like the scene's parameters
+RENAMED = {"lags": "friction_iterations"}  # scene parameters of runs recorded by 0.1.0
 RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "fields", "help", *RUN_SETTINGS)
 SHARED = ("dt", "duration")  # flags of `run` that a scene's build may take too, to fit its motions to them
 
@@ -164,7 +165,8 @@ def stored_settings(directory: Path, scene: str, settings: dict) -> dict:
         raise InputError(f"{path} is not of `ddg-warp run`: resume it where it was made, with Recorder(resume=True)")
     if provenance["scene"] != scene:
         raise InputError(f"{directory} holds a run of '{provenance.get('scene')}', not of '{scene}'")
-    stored = provenance["parameters"] | {name: provenance[name] for name in RUN_SETTINGS}
+    parameters_of_run = {RENAMED.get(name, name): value for name, value in provenance["parameters"].items()}
+    stored = parameters_of_run | {name: provenance[name] for name in RUN_SETTINGS}
     for name, value in settings.items():
         if stored.get(name) != value:
             raise InputError(f"the run in {directory} has {name} = {stored.get(name)}; resume it without --{name}")

@@ -288,7 +288,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     from ddg_warp.solve.stepping.integrator import Integrator
 
     analysis = result.scene.analysis
-    settings = {name: getattr(analysis, name) for name in ("scheme", "rtol", "outliers")}
+    settings = {name: getattr(analysis, name) for name in ("scheme", "rtol", "unconverged_fraction")}
     integrator = Integrator(result.model, **settings | options)
     counted = partial(counts_of, integrator)
     if not result.times:

@@ -29,9 +29,9 @@ class Contact:
     friction: float = 0.0
     friction_law: str = "logistic"
     velocity: float = 1e-3
-    lags: int = 1
+    friction_iterations: int = 1
     rolling: bool = False
-    apart: float | None = None
+    exclusion_length: float | None = None
     radius: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     objects: tuple[str, ...] | None = None
 
@@ -73,9 +73,9 @@ class Contacts:
         friction: float = 0.0,
         friction_law: str = "logistic",
         velocity: float = 1e-3,
-        lags: int = 1,
+        friction_iterations: int = 1,
         rolling: bool = False,
-        apart: float | None = None,
+        exclusion_length: float | None = None,
         radius: Mapping[str, float] | None = None,
         objects=None,
     ) -> None:
@@ -102,12 +102,13 @@ class Contacts:
             friction: Coulomb coefficient; `contact_between` accepts one for each direction, too.
             friction_law: "logistic" or "polynomial" growth of friction with slip velocity.
             velocity: stick threshold nu [m/s], the slip velocity of nearly full friction; sticking contacts creep at less.
-            lags: friction lag: number of updates of normal forces and tangents in a step.
+            friction_iterations: friction lag: number of updates of normal forces and tangents in a step.
             rolling: whether friction acts on the surface of rods, with its torque on the twist angle, so that rods roll. Otherwise it
                 acts between centrelines and loses angular momentum. Two free parallel rods that collide and slide across each
                 other lose all of it, but keep 0.95 with rolling. Friction along rods exerts no torque about the
                 axis, and loses angular momentum in both cases.
-            apart: collision exclusion distance: arc length below which edges of one rod form no pair [m]; by default pi radii.
+            exclusion_length: collision exclusion distance: arc length below which edges of one rod form no pair [m]; by default pi
+                radii.
             radius: by name of objects, instead of radii of sections or half thicknesses [m].
             objects: names of the rods and shells with contact; by default all. Obstacles always have contact.
 
@@ -119,8 +120,10 @@ class Contacts:
         call = "contact: "
         range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
         stiffness = None if stiffness is None else argument_checks.positive(f"{call}stiffness", stiffness, "N/m")
-        if apart is not None:
-            apart = argument_checks.number(f"{call}apart", apart, "an arc length, zero or more [m]", lambda v: v >= 0.0)
+        if exclusion_length is not None:
+            exclusion_length = argument_checks.number(
+                f"{call}exclusion_length", exclusion_length, "an arc length, zero or more [m]", lambda v: v >= 0.0
+            )
         if radius is not None and not isinstance(radius, Mapping):
             raise SceneError(
                 f"{call}radius is {argument_checks.shown(radius)}; give a dictionary from names of objects to radii [m]"
@@ -135,9 +138,9 @@ class Contacts:
             _friction(f"{call}friction", friction, ONE),
             argument_checks.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
             argument_checks.positive(f"{call}velocity", velocity, "m/s"),
-            argument_checks.count(f"{call}lags", lags),
+            argument_checks.count(f"{call}friction_iterations", friction_iterations),
             argument_checks.flag(f"{call}rolling", rolling),
-            apart,
+            exclusion_length,
             MappingProxyType(dict(radius or {})),
             None if objects is None else _names(f"{call}objects", objects),
         )
@@ -244,7 +247,7 @@ def check_contact(scene) -> None:
             f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything"
         )
     if not any(np.any(between.friction) for between in (scene.touching, *scene.betweens) if between.friction):
-        for name in ("friction_law", "velocity", "lags"):
+        for name in ("friction_law", "velocity", "friction_iterations"):
             if getattr(scene.touching, name) != getattr(Contact, name):
                 raise SceneError(
                     f"contact: {name} is of friction, and there is none; give friction, or leave {name} out"

@@ -23,7 +23,7 @@ class Dynamics:
     """Time integration with steps dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
 
     Each step converges to residuals of `rtol` of the load of a rod or shell, its weight and other loads. In contact a fraction
-    `outliers` of bodies may exceed the tolerance; see `Integrator`.
+    `unconverged_fraction` of bodies may exceed the tolerance; see `Integrator`.
     `precision` ("float64", "mixed" or "float32") is the default of `Scene.build`; None selects by device.
     """
 
@@ -32,13 +32,13 @@ class Dynamics:
     scheme: str = "implicit_euler"
     rtol: float = 1e-6
     precision: str | None = None
-    outliers: float = 0.0
+    unconverged_fraction: float = 0.0
 
     def __post_init__(self):
         argument_checks.positive("Dynamics: dt", self.dt, "s")
         argument_checks.positive("Dynamics: duration", self.duration, "s")
         argument_checks.positive("Dynamics: rtol", self.rtol)
-        argument_checks.part("Dynamics: outliers", self.outliers)
+        argument_checks.part("Dynamics: unconverged_fraction", self.unconverged_fraction)
         argument_checks.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
         if self.precision is not None:
             argument_checks.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))
@@ -74,12 +74,12 @@ class PathAnalysis:
 
     def __post_init__(self):
         for name in ("step", "max_step", "load_scale"):
-            argument_checks.positive(f"Trace: {name}", getattr(self, name))
+            argument_checks.positive(f"PathAnalysis: {name}", getattr(self, name))
         if not isinstance(self.stop, StopCriterion):
-            raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
+            raise SceneError(f"PathAnalysis: stop is {self.stop!r}; give StopCriterion(...)")
         if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
             raise SceneError(
-                f"Trace: watch is {argument_checks.shown(self.watch)}; give displacements by name, "
+                f"PathAnalysis: watch is {argument_checks.shown(self.watch)}; give displacements by name, "
                 "{'tip': Displacement.of(row, axis)}"
             )
 

@@ -173,20 +173,20 @@ class StopCriterion:
     limit_points: int | None = None
 
     def __post_init__(self):
-        argument_checks.count("Stop: steps", self.steps)
+        argument_checks.count("StopCriterion: steps", self.steps)
         if self.limit_points is not None:
-            argument_checks.count("Stop: limit_points", self.limit_points)
+            argument_checks.count("StopCriterion: limit_points", self.limit_points)
         bounds = {"load": self.load}
         if self.displacement is not None:
             entry = self.displacement
             if not (isinstance(entry, tuple | list) and len(entry) == 3 and isinstance(entry[0], str)):
                 shown = argument_checks.shown(entry)
                 raise SceneError(
-                    f"Stop: displacement is {shown}; give (name of what is watched, lowest, highest value)"
+                    f"StopCriterion: displacement is {shown}; give (name of what is watched, lowest, highest value)"
                 )
             bounds["displacement"] = entry[1:]
         for name, bound in bounds.items():
             limits = argument_checks.floats(bound)
             if limits.shape != (2,) or not limits[0] < limits[1]:
                 shown = argument_checks.shown(getattr(self, name))
-                raise SceneError(f"Stop: {name} is {shown}; its lowest value comes before a higher one")
+                raise SceneError(f"StopCriterion: {name} is {shown}; its lowest value comes before a higher one")

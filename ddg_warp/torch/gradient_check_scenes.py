@@ -137,7 +137,7 @@ def _crossing(scene: Scene, material: Material, motion: Grip | None = None, **op
     points = CURVE[3] + np.stack([0.1 * T - 0.05, 0.3 * T - 0.15, 0.014 + 0.03 * (T - 0.5) ** 2], axis=1)
     rods.append(scene.add_rod(points, section=Circle(0.003), material=material, name="upper"))
     scene.clamp(rods[0], edges=[0, -1], motion=motion)
-    _add_contact(scene, "barrier", lags=2, **options)
+    _add_contact(scene, "barrier", friction_iterations=2, **options)
 
 
 def _on_ball(scene: Scene, material: Material) -> None:

@@ -11,8 +11,8 @@ Its reverse yields derivatives by normal force, normal and weights at y, by the 
 rate. Directed or rolling friction adds the directions of rods at y. Spinning obstacles and rolling rods add their rotations. The matrix
 by x is symmetric, since lagged data do not depend on x.
 
-Initially y is x^n. With `lags` > 1, y is the previous solution, so that a step is a sequence of solves. The derivative by y of one
-solve is the g of the solve before, each with its own matrix.
+Initially y is x^n. With `friction_iterations` > 1, y is the previous solution, so that a step is a sequence of solves. The
+derivative by y of one solve is the g of the solve before, each with its own matrix.
 """
 
 from functools import cache

@@ -53,7 +53,7 @@ def test_edges_within_the_exclusion_distance_form_no_pairs(device, closed, exclu
     radius = 0.05 / np.sin(np.pi / n)
     points = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     shapes = CollisionMesh(points)
-    shapes.rod(np.arange(n), 0.01, closed=closed, apart=exclusion)
+    shapes.rod(np.arange(n), 0.01, closed=closed, exclusion_length=exclusion)
     (candidates,) = candidate_pairs(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
     i, j = np.triu_indices(n if closed else n - 1, 1)
     steps = np.minimum(j - i, n - (j - i)) if closed else j - i
@@ -336,7 +336,7 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
         (lambda s: s.rod([0, 1, 2, 3], 0.1, name="cable"), "edge 1 of cable has zero length"),
         (lambda s: s.rod([0], 0.1), "rod 0 has 1 nodes; it needs at least 2"),
         (lambda s: s.rod([0, 1], 0.0), "rod 0: radius = 0.0"),
-        (lambda s: s.rod([0, 1], 0.1, apart=-1.0), "apart = -1.0"),
+        (lambda s: s.rod([0, 1], 0.1, exclusion_length=-1.0), "exclusion_length = -1.0"),
         (lambda s: s.rod([0, 5], 0.1), "rod 0 has node 5; nodes are 0 to 4"),
         (lambda s: s.rod([0.0, 1.0], 0.1), "whole numbers"),
         (lambda s: s.shell([[0, 1, 4], [0, 1, 3]], 0.1, name="sheet"), "triangle 1 of sheet has no area"),

@@ -157,10 +157,10 @@ def test_slope_holds_by_friction_up_to_its_coefficient(device):
             np.testing.assert_allclose((speeds[-1] - speeds[29]) / (30 * 0.005), expected, rtol=0.02)
 
 
-@pytest.mark.parametrize("lags", [1, 3])
-def test_friction_is_lagged_as_often_as_stated(device, lags):
-    scene = bar(1.3 * RADIUS, friction=0.5, lags=lags)
+@pytest.mark.parametrize("friction_iterations", [1, 3])
+def test_friction_is_lagged_as_often_as_stated(device, friction_iterations):
+    scene = bar(1.3 * RADIUS, friction=0.5, friction_iterations=friction_iterations)
     scene.add_obstacle(ddg.Plane(), motion=ddg.Motion(translation=lambda t: (0.1 * t, 0.0, 0.0)))
     _, integrator, state = run(scene, device, 60)
     assert state.coupled.v.numpy()[:11, 0].mean() == pytest.approx(0.1, rel=0.05)  # moves with the plane
-    assert len(integrator._coupled.newton.contact.solutions) == lags - 1
+    assert len(integrator._coupled.newton.contact.solutions) == friction_iterations - 1

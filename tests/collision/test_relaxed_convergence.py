@@ -40,7 +40,7 @@ def step_residuals(device, outliers: float, worlds: int = 1):
     """Return positions after a step, the largest residual over the tolerance of every body, and Newton iterations."""
     scene, velocities = crossed_pairs(10, fastest=4.0)
     model = scene.build(device=device, worlds=worlds)
-    integrator = ddg.Integrator(model, rtol=RTOL, outliers=outliers, check_every=1)
+    integrator = ddg.Integrator(model, rtol=RTOL, unconverged_fraction=outliers, check_every=1)
     state = integrator.step(model.state(velocities=velocities), DT)
     newton = integrator._coupled.newton
     ratio, owner = newton.allowed.ratio.numpy(), newton.resting.owner.numpy()
@@ -68,7 +68,7 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
     scene, velocities = crossed_pairs(10, fastest=0.02)
     model = scene.build(device=device)
     tolerance = 3e-2
-    integrator = ddg.Integrator(model, rtol=tolerance, outliers=0.2)
+    integrator = ddg.Integrator(model, rtol=tolerance, unconverged_fraction=0.2)
     records, take = [], CoupledNewton.take
 
     def record(newton):
@@ -76,9 +76,9 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
         if newton is integrator._coupled.newton and not newton.islands.ccd_limited.numpy()[0]:
             newton.islands.needs_direction.fill_(2)
             newton.krylov.compare()
-            newton.outliers.count(SPARE * tolerance)
+            newton.unconverged_fraction.count(SPARE * tolerance)
             reduced, limit = float(newton.forcing.numpy()[0]), float(newton.limit.numpy()[0])
-            records.append((int(newton.outliers.number.numpy()[0]), reduced, limit))
+            records.append((int(newton.unconverged_fraction.number.numpy()[0]), reduced, limit))
 
     monkeypatch.setattr(CoupledNewton, "take", record)
     step_without_capture(integrator, model.state(velocities=velocities), DT)
@@ -89,12 +89,12 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
 
 
 def test_scene_and_run_options_set_outliers(device):
-    """`Dynamics(outliers=...)` and the options of a run are equivalent."""
+    """`Dynamics(unconverged_fraction=...)` and the options of a run are equivalent."""
     ends = []
-    for analysis, options in ((0.2, {}), (0.0, {"outliers": 0.2}), (0.0, {})):
+    for analysis, options in ((0.2, {}), (0.0, {"unconverged_fraction": 0.2}), (0.0, {})):
         scene, velocities = crossed_pairs(10)
         scene.initial = partial(moving_state, velocities=velocities)
-        scene.analysis = ddg.Dynamics(dt=DT, duration=6 * DT, rtol=RTOL, outliers=analysis)
+        scene.analysis = ddg.Dynamics(dt=DT, duration=6 * DT, rtol=RTOL, unconverged_fraction=analysis)
         ends.append(simulate(scene, device=device, options=options, progress=False).state.points())
     assert (ends[0] == ends[1]).all()
     assert (ends[0] != ends[2]).any()
@@ -130,11 +130,11 @@ def test_outliers_are_accepted_by_number_and_residual(device, case):
     bodies, off, finite, excused = CASES[case]
     scene, _ = crossed_pairs(10)
     model = scene.build(device=device, precision="float64")
-    newton = ddg.Integrator(model, rtol=RTOL, outliers=0.1)._coupled.newton
+    newton = ddg.Integrator(model, rtol=RTOL, unconverged_fraction=0.1)._coupled.newton
     owner, islands, scale = newton.resting.owner.numpy().copy(), newton.islands, 3.0
     if bodies == (-1,):
         owner[7] = -1
-        newton.outliers._owner.assign(owner)
+        newton.unconverged_fraction._owner.assign(owner)
     ratio = np.where(np.isin(owner, bodies), off, 0.5) * RTOL * scale
     newton.allowed.ratio.assign(ratio[None])
     newton.worst.fill_(ratio.max())
@@ -143,8 +143,8 @@ def test_outliers_are_accepted_by_number_and_residual(device, case):
     flags = islands.arrays[0].numpy()
     flags[[STATUS, NOT_CONVERGED, BELOW_ROUNDING_FLOOR]] = [[0], [1], [1]]
     islands.arrays[0].assign(flags)
-    newton.outliers.count(RTOL)
-    newton.outliers.excuse()
+    newton.unconverged_fraction.count(RTOL)
+    newton.unconverged_fraction.excuse()
     wp.synchronize()
     assert (islands.arrays[0].numpy()[[NOT_CONVERGED, BELOW_ROUNDING_FLOOR]] == (0 if excused else 1)).all()
 
@@ -152,8 +152,8 @@ def test_outliers_are_accepted_by_number_and_residual(device, case):
 @pytest.mark.parametrize("wrong", [-0.1, 1.0, np.nan, "0.1", True, None])
 def test_invalid_fractions_are_refused(device, wrong):
     scene, _ = crossed_pairs(2)
-    with pytest.raises(ddg.SceneError, match="outliers"):
-        ddg.Integrator(scene.build(device=device), outliers=wrong)
+    with pytest.raises(ddg.SceneError, match="unconverged_fraction"):
+        ddg.Integrator(scene.build(device=device), unconverged_fraction=wrong)
 
 
 def test_outliers_require_contact(device):
@@ -161,4 +161,4 @@ def test_outliers_require_contact(device):
     scene = ddg.Scene()
     scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT)
     with pytest.raises(ddg.SceneError, match="scenes with contact"):
-        ddg.Integrator(scene.build(device=device), outliers=0.1)
+        ddg.Integrator(scene.build(device=device), unconverged_fraction=0.1)

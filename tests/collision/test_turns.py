@@ -334,6 +334,6 @@ def test_substeps_work_with_both_laws_and_precisions(device, law, precision):
 
 def test_step_control_splits_its_steps(device):
     model = scene("mesh", rotating(0.5), polar_point(0.198, 0.5 * np.pi)).build(device=device)
-    steps = ddg.StepControl(ddg.Integrator(model), error=1.0, halvings=2)
+    steps = ddg.AdaptiveStepper(ddg.Integrator(model), error=1.0, halvings=2)
     state = steps.advance(model.state(), DT)
     assert 0.0 < angles_ahead(state.points()[5:6], np.pi)[0] < 0.02

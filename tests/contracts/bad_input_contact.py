@@ -57,8 +57,8 @@ for _name, _unit in (("range", "[m]"), ("stiffness", "[N/m]"), ("velocity", "[m/
          f"contact: {_name}", "positive", _unit)
 each("contact", "friction", [-1.0, NAN, INF, "rough", True, (0.1, 0.2, 0.3)], lambda v: in_contact(friction=v),
      "contact: friction", "zero or more", "contact_between")
-each("contact", "apart", [-1.0, NAN, INF, "far"], lambda v: in_contact(apart=v), "contact: apart", "zero or more [m]")
-each("contact", "lags", [0, -1, 2.5, "two"], lambda v: in_contact(lags=v), "contact: lags", "whole number")
+each("contact", "exclusion_length", [-1.0, NAN, INF, "far"], lambda v: in_contact(exclusion_length=v), "exclusion_length", "zero or")
+each("contact", "friction_iterations", [0, -1, 2.5, "two"], lambda v: in_contact(friction_iterations=v), "friction_iterations", "whole")
 each("contact", "law", ["spring", None, 3], lambda v: in_contact(law=v), "contact: law", "'barrier' or 'penalty'")
 each("contact", "friction law", ["dry", None], lambda v: in_contact(friction_law=v), "friction_law", "'logistic' or 'polynomial'")
 each("contact", "radius", [0.1, [1.0]], lambda v: in_contact(radius=v), "contact: radius", "dictionary")

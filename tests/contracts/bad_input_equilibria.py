@@ -90,16 +90,16 @@ each("continuation", "iterations", [0, 2.5], lambda v: _path(iterations=v), "ite
 each("continuation", "direction", [0, 2, "up", None], lambda v: _path().trace(direction=v), "direction", "-1")
 each("continuation", "start", [NAN, "rest"], lambda v: _path().trace(start=v), "start", "finite")
 each("continuation", "state", [3, "rest"], lambda v: _path().trace(v), "continuation", "model.state()")
-each("continuation", "stop", [3, "soon"], lambda v: _path().trace(stop=v), "stop", "Stop(...)")
-each("continuation", "steps", [0, 1.5, "few"], lambda v: ddg.Stop(steps=v), "steps", "whole number")
-each("continuation", "limit_points", [0, 1.5], lambda v: ddg.Stop(limit_points=v), "limit_points", "whole number")
-each("continuation", "load", [(1.0, 0.0), 1.0, (0.0, NAN)], lambda v: ddg.Stop(load=v), "load", "lowest")
-each("continuation", "displacement", ["tip", ("tip", 1.0, 0.0)], lambda v: ddg.Stop(displacement=v), "displacement", "lowest")
+each("continuation", "stop", [3, "soon"], lambda v: _path().trace(stop=v), "stop", "StopCriterion(...)")
+each("continuation", "steps", [0, 1.5, "few"], lambda v: ddg.StopCriterion(steps=v), "steps", "whole number")
+each("continuation", "limit_points", [0, 1.5], lambda v: ddg.StopCriterion(limit_points=v), "limit_points", "whole number")
+each("continuation", "load", [(1.0, 0.0), 1.0, (0.0, NAN)], lambda v: ddg.StopCriterion(load=v), "load", "lowest")
+each("continuation", "displacement", ["tip", ("tip", 1.0, 0.0)], lambda v: ddg.StopCriterion(displacement=v), "displacement", "lowest")
 each(
     "continuation",
     "side",
     [0, "left"],
-    lambda v: _path().switch(_path().trace(stop=ddg.Stop(steps=1)).points[0], side=v),
+    lambda v: _path().switch(_path().trace(stop=ddg.StopCriterion(steps=1)).points[0], side=v),
     "side",
     "-1",
 )
@@ -109,9 +109,10 @@ refuse("continuation", {
     "worlds": (lambda: continuation.Continuation(model("rods", 2)), "one world", "2"),
     "watched point": (lambda: _path({"tip": ddg.Displacement.of(12, "z")}), "point 12", "12 points"),
     "watched elsewhere": (lambda: _path().control("tip", [0.1]), "'tip'", "watch="),
-    "stop elsewhere": (lambda: _path().trace(stop=ddg.Stop(displacement=("tip", 0.0, 1.0))), "'tip'", "watched"),
+    "stop elsewhere": (lambda: _path().trace(stop=ddg.StopCriterion(displacement=("tip", 0.0, 1.0))), "'tip'", "watched"),
     "state of another model": (lambda: _path().trace(model("net").state()), "another model"),
-    "switch at a regular point": (lambda: _path().switch(_path().trace(stop=ddg.Stop(steps=1)).points[0]), "regular", "bifurcation"),
+    "switch at a regular point": (
+        lambda: _path().switch(_path().trace(stop=ddg.StopCriterion(steps=1)).points[0]), "regular", "bifurcation"),
 })
 
 # --- stability ---

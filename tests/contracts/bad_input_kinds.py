@@ -44,7 +44,7 @@ each("kinds: numbers", "friction", NUMBERS, lambda v: rods().contact(friction=v)
 each("kinds: numbers", "range", NUMBERS, lambda v: rods().contact(range=v), "contact: range", "positive")
 each("kinds: numbers", "tangential drag", NUMBERS, lambda v: rods().drag(0, tangential=v, normal=1.0), "drag: tangential")
 each("kinds: numbers", "dt", NUMBERS, lambda v: integrator().step(model().state(), v), "dt", "positive")
-each("kinds: numbers", "error", NUMBERS, lambda v: AdaptiveStepper(integrator(), v), "StepControl: error", "positive")
+each("kinds: numbers", "error", NUMBERS, lambda v: AdaptiveStepper(integrator(), v), "AdaptiveStepper: error", "positive")
 each("kinds: numbers", "thickness", NUMBERS, lambda v: sheet(thickness=v), "shell 'sheet': thickness")
 each("kinds: numbers", "stiffness of a law", NUMBERS, lambda v: ddg.Law(None, stiffness=[1.0, v]), "Law: stiffness")
 each("kinds: numbers", "EA", NUMBERS, lambda v: built(rods(section=ddg.Stiffness(v))), "EA")
@@ -125,8 +125,9 @@ each("kinds: flags", "copy", [{"gravity": "down"}, {"dimension": 3.0}, {"callbac
      lambda v: rods().copy(**v), "; ")
 each("kinds: flags", "section", [ddg.Circle, ddg.Stiffness, RUBBER, b"c"], lambda v: rods(section=v), "section", "Circle")
 each("kinds: flags", "stop", ["a", 3.0, ("a", 1.0), ("a", "b", "c"), (1, 0.0, 1.0), {"a": 1}, True],
-     lambda v: ddg.Stop(displacement=v), "Stop: displacement")
-each("kinds: flags", "load of a stop", [None, 3.0, (1.0,), ("a", "b"), (2.0, 1.0)], lambda v: ddg.Stop(load=v), "Stop: load")
+     lambda v: ddg.StopCriterion(displacement=v), "StopCriterion: displacement")
+LOADS = [None, 3.0, (1.0,), ("a", "b"), (2.0, 1.0)]
+each("kinds: flags", "load of a stop", LOADS, lambda v: ddg.StopCriterion(load=v), "StopCriterion: load")
 each("kinds: flags", "terms", [[], (), 3, None, [1]], ddg.Displacement, "Displacement")
 each("kinds: flags", "watch", [3, ["tip"], {3: ddg.Displacement.of(0, "x")}, {"tip": 3}],
      lambda v: continuation.Continuation(model(), v), "watch")

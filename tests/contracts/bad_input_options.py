@@ -43,9 +43,9 @@ refuse("options: unknown", {
     "Circle of two": (lambda: ddg.Circle(0.1, 0.2), "Circle", "too many positional"),
     "Motion, nearly angle": (lambda: ddg.Motion(angel=lambda t: t), "did you mean 'angle'"),
     "Sphere without a radius": (lambda: ddg.Sphere((0, 0, 0)), "Sphere", "missing", "'radius'"),
-    "Trace": (lambda: ddg.Trace(foo=1), "Trace takes no 'foo'", "load_scale"),
+    "Trace": (lambda: ddg.PathAnalysis(foo=1), "Trace takes no 'foo'", "load_scale"),
     "Dynamics, nearly duration": (lambda: ddg.Dynamics(durations=1.0), "did you mean 'duration'"),
-    "Stop, nearly limit_points": (lambda: ddg.Stop(limit_point=1), "did you mean 'limit_points'"),
+    "Stop, nearly limit_points": (lambda: ddg.StopCriterion(limit_point=1), "did you mean 'limit_points'"),
     "Viscous, nearly scale": (lambda: ddg.Viscous(1.0, scales=1.0), "did you mean 'scale'"),
     "Controls, nearly forces": (lambda: ddg.Controls(force=[]), "did you mean 'forces'"),
     "NewtonOptions": (lambda: NewtonOptions(foo=1), "NewtonOptions takes no 'foo'", "rtol"),
@@ -82,13 +82,14 @@ def smooth(**options) -> ddg.Scene:
     return scene
 
 
-each("options: no effect", "lags", [2, 3], lambda v: built(smooth(lags=v)), "contact: lags", "friction")
+each("options: no effect", "friction_iterations", [2, 3], lambda v: built(smooth(friction_iterations=v)), "contact: lags", "friction")
 each("options: no effect", "velocity", [1e-2], lambda v: built(smooth(velocity=v, friction=0.0)), "contact: velocity", "friction")
 each("options: no effect", "friction_law", ["polynomial"], lambda v: built(smooth(friction_law=v)), "contact: friction_law", "friction")
 refuse("options: no effect", {
     "a material beside a Stiffness": (lambda: rods(section=STIFFNESS, material=RUBBER), "rods 'odd'", "leave material out"),
-    "lags, and friction that contact_between takes away": (
-        lambda: built(smooth(lags=2), lambda s: s.contact_between("rod", "odd", friction=0.0)), "contact: lags", "friction"),
+    "friction_iterations, and friction that contact_between takes away": (
+        lambda: built(smooth(friction_iterations=2), lambda s: s.contact_between("rod", "odd", friction=0.0)),
+        "friction_iterations", "friction"),
 })
 
 

@@ -10,8 +10,8 @@ from ddg_warp.postprocess import quantities
 
 
 # --- Integrator and step ---
-def _controlled(**options) -> ddg.StepControl:
-    return ddg.StepControl(ddg.Integrator(model(), **options), 1e-3)
+def _controlled(**options) -> ddg.AdaptiveStepper:
+    return ddg.AdaptiveStepper(ddg.Integrator(model(), **options), 1e-3)
 
 
 each("Integrator", "model", [None, 3, "rods"], ddg.Integrator, "Integrator", "scene.build()")
@@ -57,18 +57,18 @@ each(
     "energy_bound",
     "between 0 and 1",
 )
-each("StepControl", "integrator", [None, 3, "rods"], lambda v: ddg.StepControl(v, 1e-3), "Integrator(model)")
+each("AdaptiveStepper", "integrator", [None, 3, "rods"], lambda v: ddg.AdaptiveStepper(v, 1e-3), "Integrator(model)")
 for name, values, word in (
     ("error", [0.0, -1.0, NAN, INF, "small", None], "m/s"),
     ("halvings", [-1, 1.5, "many", None], "whole"),
 ):
 
     def control(value, name=name):
-        ddg.StepControl(ddg.Integrator(model()), **({"error": 1e-3} | {name: value}))
+        ddg.AdaptiveStepper(ddg.Integrator(model()), **({"error": 1e-3} | {name: value}))
 
-    each("StepControl", name, values, control, name, word)
-each("StepControl", "dt", [0.0, -1.0, NAN, None], lambda v: _controlled().advance(model().state(), v), "dt")
-refuse("StepControl", {"midpoint": (lambda: _controlled(scheme="implicit_midpoint"), "implicit_euler", "implicit_midpoint")})
+    each("AdaptiveStepper", name, values, control, name, word)
+each("AdaptiveStepper", "dt", [0.0, -1.0, NAN, None], lambda v: _controlled().advance(model().state(), v), "dt")
+refuse("AdaptiveStepper", {"midpoint": (lambda: _controlled(scheme="implicit_midpoint"), "implicit_euler", "implicit_midpoint")})
 each("Integrator", "check_every", [0, -1, 1.5, "often"], lambda v: ddg.Integrator(model(), check_every=v), "check_every", "whole")
 each("Integrator", "psd", ["exact", None], lambda v: ddg.Integrator(model(), psd=v), "psd", "gauss_newton", "progressive")
 for name in ("rtol", "floor_factor", "rotation_cap", "linear_rtol"):

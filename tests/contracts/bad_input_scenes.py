@@ -47,14 +47,14 @@ each("scene", "callbacks", [[5], print, [print, None]], lambda v: ddg.Scene(call
 each("scene", "initial", [5, "rest"], lambda v: ddg.Scene(initial=v), "initial", "function of the model")
 each("analysis", "dt", [0.0, -1.0, NAN, "0.01", None], lambda v: ddg.Dynamics(dt=v), "Dynamics: dt", "positive")
 each("analysis", "duration", [0.0, INF, "long"], lambda v: ddg.Dynamics(duration=v), "Dynamics: duration", "positive")
-each("analysis", "outliers", [-0.1, 1.0, True], lambda v: ddg.Dynamics(outliers=v), "Dynamics: outliers", "from 0 to")
+each("analysis", "unconverged", [-0.1, 1.0, True], lambda v: ddg.Dynamics(unconverged_fraction=v), "unconverged_fraction", "from 0")
 each("analysis", "precision", ["double", 64], lambda v: ddg.Dynamics(precision=v), "Dynamics: precision", "float64")
 each("analysis", "scheme", ["rk4", None, 3], lambda v: ddg.Dynamics(scheme=v), "scheme", "implicit_euler")
 each("analysis", "load_steps", [0, 1.5, True, "two"], lambda v: ddg.Statics(load_steps=v), "load_steps", "whole number")
-each("analysis", "trace step", [0.0, -1.0, NAN], lambda v: ddg.Trace(step=v), "Trace: step", "positive")
+each("analysis", "trace step", [0.0, -1.0, NAN], lambda v: ddg.PathAnalysis(step=v), "PathAnalysis: step", "positive")
 refuse("analysis", {
-    "trace stop": (lambda: ddg.Trace(stop=5), "stop", "Stop(...)"),
-    "trace watch": (lambda: ddg.Trace(watch={"tip": 3}), "watch", "Displacement.of"),
+    "trace stop": (lambda: ddg.PathAnalysis(stop=5), "stop", "StopCriterion(...)"),
+    "trace watch": (lambda: ddg.PathAnalysis(watch={"tip": 3}), "watch", "Displacement.of"),
 })
 
 # --- rods; all kinds are compiled by the same code: a twisted rod in space represents them ---

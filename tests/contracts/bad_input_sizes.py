@@ -94,7 +94,7 @@ sizes("sizes: steps", "linear_rtol", lambda v: ddg.Integrator(model(), linear_rt
 sizes("sizes: steps", "max_iterations", lambda v: ddg.Integrator(model(), max_iterations=v), (2**31, 10**30),
       ("max_iterations", "at most"))
 sizes("sizes: steps", "halvings", lambda v: AdaptiveStepper(integrator(), 1e-3, v), (2000, 41, 10**30), ("halvings", "at most 40"))
-sizes("sizes: steps", "error", lambda v: AdaptiveStepper(integrator(), v), (*LARGE[:2], *SMALL), ("StepControl: error", *OUTSIDE))
+sizes("sizes: steps", "error", lambda v: AdaptiveStepper(integrator(), v), (*LARGE[:2], *SMALL), ("AdaptiveStepper: error", *OUTSIDE))
 
 # --- equilibria ---
 sizes("sizes: equilibria", "end", lambda v: statics.solve(model(), end=v), (1e300, 1e-300), ("statics: end", *OUTSIDE))
@@ -151,7 +151,7 @@ for name in ("range", "stiffness", "velocity"):
 
     sizes("sizes: contact", name, rub, words=(f"contact: {name}", *OUTSIDE))
 sizes("sizes: contact", "radius", lambda v: rods().contact(radius={"odd": v}), words=("contact: radius of 'odd'", *OUTSIDE))
-sizes("sizes: contact", "apart", lambda v: rods().contact(apart=v), words=("contact: apart", *OUTSIDE))
+sizes("sizes: contact", "exclusion_length", lambda v: rods().contact(exclusion_length=v), words=("contact: exclusion_length", *OUTSIDE))
 each("sizes: contact", "range beyond the scene", [1e60, 1e10, 1e3], lambda v: built(crossed_rods(range=v)),
      "range between 'high' and 'high'", "far beyond the size of the scene", "half of the smallest radius")
 each("sizes: contact", "range that is lost", [1e-60, 1e-20, 1e-14], lambda v: built(crossed_rods(range=v)),

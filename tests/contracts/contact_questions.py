@@ -125,7 +125,7 @@ def rests(kind, variant):
 def path_onto_a_ball(kind, variant):
     """A path of equilibria under growing weight ends on the ball, at the result of load stepping."""
     model = variant.build(_scene_over_ball(kind, variant))
-    path = Continuation(model).trace(stop=ddg.Stop(load=(-1.0, 1.0)))
+    path = Continuation(model).trace(stop=ddg.StopCriterion(load=(-1.0, 1.0)))
     first, last = path.points[0], path.points[-1]
     before, after = (model.reactions(point.state)[-1].force[2] for point in (first, last))
     assert last.load == 1.0

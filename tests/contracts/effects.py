@@ -469,7 +469,8 @@ def add_lateral_forces(scene: ddg.Scene) -> None:
 
 RUB = {"range": 5e-3, "friction": 0.5}
 scene_call("contact", RUB, {
-    "law": "penalty", "range": 6e-3, "stiffness": 10.0, "friction": 0.1, "friction_law": "polynomial", "velocity": 1e-2, "lags": 2,
+    "law": "penalty", "range": 6e-3, "stiffness": 10.0, "friction": 0.1, "friction_law": "polynomial", "velocity": 1e-2,
+    "friction_iterations": 2,
     "rolling": True, "radius": {"low": 0.0095}, "objects": "low"}, crossed_rods, add_lateral_forces, steps=2)  # fmt: skip
 
 
@@ -483,7 +484,7 @@ def observe_coil(**named) -> list:
     return observe_steps(scene, 1)
 
 
-CALLS["contact of a coil"] = Call(ddg.Scene.contact, observe_coil, {}, {"apart": 5.0})
+CALLS["contact of a coil"] = Call(ddg.Scene.contact, observe_coil, {}, {"exclusion_length": 5.0})
 
 scene_call("contact_between", {"one": "low", "other": "high", "friction": 0.3}, {
     "one": "high", "other": "low", "ignore": Change(True, {"friction": NOTHING, "stiffness": 10.0}, False, refused=True),
@@ -570,21 +571,22 @@ def analyse(analysis, **options) -> list:
 
 CALLS["Dynamics"] = Call(ddg.Dynamics, lambda **named: analyse(ddg.Dynamics(**named)), {"dt": 0.01, "duration": 0.02}, {
     "dt": 0.02, "duration": 0.03, "scheme": "implicit_midpoint", "rtol": 1e-1, "precision": "mixed",
-    "outliers": Change(0.1, refused=True)})  # fmt: skip
+    "unconverged_fraction": Change(0.1, refused=True)})  # fmt: skip
 CALLS["Statics"] = Call(ddg.Statics, lambda **named: analyse(ddg.Statics(**named)), {}, {"load_steps": 2})
 TIP = {"tip": ddg.Displacement.of(5, "z")}
-CALLS["Trace"] = Call(ddg.Trace, lambda **named: analyse(ddg.Trace(**named)), {"stop": ddg.Stop(steps=2)}, {
-    "watch": TIP, "stop": ddg.Stop(steps=1), "step": 0.01, "max_step": 0.01, "load_scale": 3.0})  # fmt: skip
+CALLS["Trace"] = Call(ddg.PathAnalysis, lambda **named: analyse(ddg.PathAnalysis(**named)), {"stop": ddg.StopCriterion(steps=2)}, {
+    "watch": TIP, "stop": ddg.StopCriterion(steps=1), "step": 0.01, "max_step": 0.01, "load_scale": 3.0})  # fmt: skip
 
 
 def observe_stop(**named) -> list:
     """Observe a path with a stop criterion."""
-    return analyse(ddg.Trace(watch=TIP, stop=ddg.Stop(**named), step=0.1, max_step=0.1))
+    return analyse(ddg.PathAnalysis(watch=TIP, stop=ddg.StopCriterion(**named), step=0.1, max_step=0.1))
 
 
-CALLS["Stop"] = Call(ddg.Stop, observe_stop, {"steps": 3}, {
+CALLS["Stop"] = Call(ddg.StopCriterion, observe_stop, {"steps": 3}, {
     "steps": 2, "load": (-1.0, 0.01), "displacement": ("tip", -1e-3, 1e-3)})  # fmt: skip
-CALLS["Displacement"] = Call(ddg.Displacement, lambda terms: analyse(ddg.Trace(watch={"tip": ddg.Displacement(terms)}, stop=ddg.Stop(
+CALLS["Displacement"] = Call(ddg.Displacement, lambda terms: analyse(ddg.PathAnalysis(
+    watch={"tip": ddg.Displacement(terms)}, stop=ddg.StopCriterion(
     steps=1))), {"terms": ((5, "z", 1.0),)}, {"terms": ((5, "z", -1.0), (4, "y", 1.0))})  # fmt: skip
-CALLS["Displacement.of"] = Call(ddg.Displacement.of, lambda **named: analyse(ddg.Trace(watch={"tip": ddg.Displacement.of(
-    **named)}, stop=ddg.Stop(steps=1))), {"row": 5, "axis": "z"}, {"row": 4, "axis": "y", "weight": 2.0})  # fmt: skip
+CALLS["Displacement.of"] = Call(ddg.Displacement.of, lambda **named: analyse(ddg.PathAnalysis(watch={"tip": ddg.Displacement.of(
+    **named)}, stop=ddg.StopCriterion(steps=1))), {"row": 5, "axis": "z"}, {"row": 4, "axis": "y", "weight": 2.0})  # fmt: skip

@@ -96,7 +96,7 @@ CALLS["Integrator"] = Call(ddg.Integrator, observe_integrator, {}, {
     "gyroscopic": Change(False, {"kind": "falling", "spins": 500.0}), "rtol": 1e-2, "floor_factor": Change(1e9, {"rtol": 1e-14}),
     "max_iterations": 1, "max_halvings": Change(1, {"points": ODD, "dt": 1.0, "rotation_cap": 20.0, "retry_limit": 1}),
     "rotation_cap": 1e-2,
-    "linear_rtol": Change(1e-1, {"kind": "ring"}), "psd": "project", "outliers": Change(0.1, refused=True)},
+    "linear_rtol": Change(1e-1, {"kind": "ring"}), "psd": "project", "unconverged_fraction": Change(0.1, refused=True)},
     subjects=("model",), kinds=(NewtonOptions,))  # fmt: skip
 
 
@@ -265,7 +265,7 @@ def observe_path(kind: str = "arch", tip: int = 4, trace=None, **named) -> list:
     made = model(kind)
     watch = named.pop("watch", {"tip": ddg.Displacement.of(tip, "z")})
     followed = continuation.Continuation(made, watch, **named)
-    path = followed.trace(**({"stop": ddg.Stop(steps=3)} | (trace or {})))
+    path = followed.trace(**({"stop": ddg.StopCriterion(steps=3)} | (trace or {})))
     return [path.load, path.arclength, path.negative, path.kinds, [list(point.values.items()) for point in path.points], path.outcome,
             [point.iterations for point in path.points]]  # fmt: skip
 
@@ -273,7 +273,7 @@ def observe_path(kind: str = "arch", tip: int = 4, trace=None, **named) -> list:
 CALLS["Continuation"] = Call(continuation.Continuation, observe_path, {}, {
     "watch": {"side": ddg.Displacement.of(3, "x")}, "step": 0.01, "max_step": 0.021, "min_step": Change(0.5, refused=True),
     "load_scale": 0.3, "iterations": 2, "max_iterations": Change(1, {"min_step": 1e-2}, refused=True), "rotation_cap": 1e-2,
-    "tolerance": Change(0.1, {"trace": {"stop": ddg.Stop(steps=40, limit_points=1)}, "max_step": 0.3}), "rtol": 1e-2,
+    "tolerance": Change(0.1, {"trace": {"stop": ddg.StopCriterion(steps=40, limit_points=1)}, "max_step": 0.3}), "rtol": 1e-2,
     "floor_factor": Change(1e12, {"rtol": 1e-30})}, ("model",), (ContinuationOptions,))  # fmt: skip
 
 
@@ -285,9 +285,10 @@ def observe_trace(**named) -> list:
     return observe_path(trace=named)
 
 
-CALLS["trace"] = Call(continuation.Continuation.trace, observe_trace, {"stop": ddg.Stop(steps=3)}, {
-    "state": True, "start": 0.01, "direction": -1, "stop": ddg.Stop(steps=2)})  # fmt: skip
-CALLS["Stop at limit points"] = Call(ddg.Stop, lambda **named: observe_path(trace={"stop": ddg.Stop(**named)}, max_step=0.3), {
+CALLS["trace"] = Call(continuation.Continuation.trace, observe_trace, {"stop": ddg.StopCriterion(steps=3)}, {
+    "state": True, "start": 0.01, "direction": -1, "stop": ddg.StopCriterion(steps=2)})  # fmt: skip
+CALLS["Stop at limit points"] = Call(
+    ddg.StopCriterion, lambda **named: observe_path(trace={"stop": ddg.StopCriterion(**named)}, max_step=0.3), {
     "steps": 30}, {"limit_points": 1})  # fmt: skip
 
 
@@ -309,15 +310,15 @@ CALLS["control"] = Call(continuation.Continuation.control, observe_control, {}, 
 def bifurcated_path():
     """Return a path of the column through the first bifurcation."""
     followed = continuation.Continuation(model("column"), max_step=0.3)
-    return followed, followed.trace(stop=ddg.Stop(load=(-1.0, 1.0))).bifurcations[0]
+    return followed, followed.trace(stop=ddg.StopCriterion(load=(-1.0, 1.0))).bifurcations[0]
 
 
 def observe_branch(**named) -> list:
     """Observe a branch."""
     followed, fork = bifurcated_path()
-    path = followed.switch(fork, **({"stop": ddg.Stop(steps=2)} | named))
+    path = followed.switch(fork, **({"stop": ddg.StopCriterion(steps=2)} | named))
     return [path.load, path.points[-1].state.points()]
 
 
 CALLS["switch"] = Call(continuation.Continuation.switch, observe_branch, {}, {
-    "side": -1, "step": 0.05, "stop": ddg.Stop(steps=1)}, ("bifurcation",))  # fmt: skip
+    "side": -1, "step": 0.05, "stop": ddg.StopCriterion(steps=1)}, ("bifurcation",))  # fmt: skip

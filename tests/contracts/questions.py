@@ -380,7 +380,7 @@ def continuation(kind, variant):
     scene, added = kind.scene(gravity=(0.0, 0.0, 0.0))
     added.load(scene, 1e-2, None)
     model = variant.build(scene)
-    path = Continuation(model, {"z": ddg.Displacement.of(-1, "z")}).trace(stop=ddg.Stop(steps=3))
+    path = Continuation(model, {"z": ddg.Displacement.of(-1, "z")}).trace(stop=ddg.StopCriterion(steps=3))
     assert len(path.points) >= 3
     assert path.points[-1].load > 0.0
     assert all(point.stable for point in path.points)

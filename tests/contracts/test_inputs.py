@@ -430,7 +430,7 @@ def test_oblique_symmetry_agrees_across_worlds_precisions_and_paths(device):
         model = quarter(turn, axes=axes).build(device, "float64")
         state = statics.solve(model)
         watch = {"middle": ddg.Displacement.of(0, "z")}
-        path = Continuation(model, watch).trace(stop=ddg.Stop(load=(-1.0, 0.5))).values("middle")
+        path = Continuation(model, watch).trace(stop=ddg.StopCriterion(load=(-1.0, 0.5))).values("middle")
         results.append([*spectrum(model, state, 3).frequencies, path[-1]])
     np.testing.assert_allclose(results[1], results[0], rtol=1e-6)
     reference = ddg.Integrator(model).step(model.state(), 0.02).points()

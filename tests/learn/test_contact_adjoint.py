@@ -29,7 +29,7 @@ RUBBING = {"friction": 0.3, "velocity": 0.05}  # what slides does so at twice th
 SLIDING = 0.1  # [m/s]
 ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
 each_scene = pytest.mark.parametrize("name", SCENES)
-lagged_once_or_twice = pytest.mark.parametrize("lags", [1, 2])
+lagged_once_or_twice = pytest.mark.parametrize("friction_iterations", [1, 2])
 each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
@@ -84,34 +84,38 @@ def test_a_step_that_rubs(name, law, form):
     )
 
 
-@covering(1, name=SCENES, lags=(2, 3))
-def test_friction_that_is_lagged_anew(name, lags):
+@covering(1, name=SCENES, friction_iterations=(2, 3))
+def test_friction_that_is_lagged_anew(name, friction_iterations):
     """Two steps of some solves each, which lag what is of the one before."""
-    law = "penalty" if lags == 2 else "barrier"
-    model, gradient, inputs, difference = differentiated(name, law, 2, SLIDING, lags=lags, **RUBBING)
+    law = "penalty" if friction_iterations == 2 else "barrier"
+    model, gradient, inputs, difference = differentiated(
+        name, law, 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
+    )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
     )
 
 
-@covering(1, name=[name for name in SCENES if not name.startswith("sheet")], lags=(1, 2))
-def test_friction_that_rolls_rods(name, lags):
+@covering(1, name=[name for name in SCENES if not name.startswith("sheet")], friction_iterations=(1, 2))
+def test_friction_that_rolls_rods(name, friction_iterations):
     """By angles, and by directions and radii of what rolls, too."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, SLIDING, lags=lags, rolling=True, **RUBBING
+        name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **RUBBING
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
     )
 
 
-@pytest.mark.parametrize("lags", [2, 3])
+@pytest.mark.parametrize("friction_iterations", [2, 3])
 @pytest.mark.parametrize("name", ["crossing rods", "sheet on ball"])
-def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):
+def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeypatch):
     """Without the derivative by it gradients are off by a tenth and more of their largest entry."""
 
     def found():
-        _, gradient, inputs, _ = differentiated(name, "barrier", 1, SLIDING, lags=lags, **RUBBING)
+        _, gradient, inputs, _ = differentiated(
+            name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        )
         return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
     whole, chain = found(), CoupledLinearSolve.chain
@@ -125,11 +129,17 @@ def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):
         assert np.abs(right - wrong).max() > 0.1 * np.abs(right).max()
 
 
-@covering(name=("rod on plane", "rod on ball", "rod on capsule", "rod on mesh"), speed=(SLIDING, -SLIDING), lags=(1, 2))
+@covering(
+    name=("rod on plane", "rod on ball", "rod on capsule", "rod on mesh"),
+    speed=(SLIDING, -SLIDING),
+    friction_iterations=(1, 2),
+)
 @pytest.mark.parametrize("ways", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
-def test_friction_by_direction(name, speed, ways, lags):
+def test_friction_by_direction(name, speed, ways, friction_iterations):
     """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
-    model, gradient, inputs, difference = differentiated(name, "barrier", 2, speed, ways, lags=lags, **RUBBING)
+    model, gradient, inputs, difference = differentiated(
+        name, "barrier", 2, speed, ways, friction_iterations=friction_iterations, **RUBBING
+    )
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
@@ -148,23 +158,30 @@ def test_what_sticks_creeps(name):
 
 @lagged_once_or_twice
 @pytest.mark.parametrize("name", ["crossing rods", "rod on sheet"])
-def test_a_step_by_its_length(name, lags):
-    _, _, (inputs,), difference = differentiated(name, "penalty", 1, SLIDING, lags=lags, **RUBBING)
+def test_a_step_by_its_length(name, friction_iterations):
+    _, _, (inputs,), difference = differentiated(
+        name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
+    )
     own = inputs[0]
     assert float(own.elements_rate[-1].numpy().sum()) != 0.0
     check_length(own, difference, DT, 1e-8)
 
 
 @lagged_once_or_twice
-def test_elements_of_what_touches(lags):
+def test_elements_of_what_touches(friction_iterations):
     """Stiffnesses of rods and sheets, as without contact."""
-    model, _, inputs, difference = differentiated("rod on sheet", "barrier", 2, SLIDING, lags=lags, **RUBBING)
+    model, _, inputs, difference = differentiated(
+        "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
+    )
     check(difference, parameter_shifts(model, inputs))
 
 
 @lagged_once_or_twice
-def test_gradients_repeat_bit_by_bit(lags):
-    first, second = (differentiated("sheets", "barrier", 2, SLIDING, lags=lags, **RUBBING)[1:3] for _ in range(2))
+def test_gradients_repeat_bit_by_bit(friction_iterations):
+    first, second = (
+        differentiated("sheets", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING)[1:3]
+        for _ in range(2)
+    )
     for name, array in entries(first[0]).items():
         np.testing.assert_array_equal(device_arrays.download(array), device_arrays.download(entries(second[0])[name]))
     for name in (*ROWS, "radius"):
@@ -172,9 +189,9 @@ def test_gradients_repeat_bit_by_bit(lags):
 
 
 @lagged_once_or_twice
-def test_pairs_that_do_not_fit_are_made_room_for(lags):
+def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
     """Gradients are the same to the bit."""
-    model = built(scene_of("sheets", "penalty", lags=lags, **RUBBING))
+    model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **RUBBING))
     state = touching(model, along=SLIDING)
     found = []
     for few in (False, True):
@@ -199,9 +216,9 @@ def test_without_friction_there_is_nothing_to_lag():
 
 
 @lagged_once_or_twice
-def test_what_is_not_solved_has_no_gradient(lags, monkeypatch):
+def test_what_is_not_solved_has_no_gradient(friction_iterations, monkeypatch):
     """Of several solves it may be the last one alone, which comes first."""
-    model = built(scene_of("crossing rods", lags=lags, **RUBBING))
+    model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **RUBBING))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)
     system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.chain

@@ -36,7 +36,7 @@ def weighed(state):
 
 
 @pytest.mark.parametrize(
-    ("name", "law", "lags"),
+    ("name", "law", "friction_iterations"),
     [
         ("crossing rods", "penalty", 1),
         ("crossing rods", "penalty", 2),
@@ -44,9 +44,9 @@ def weighed(state):
         ("sheets", "barrier", 1),
     ],
 )
-def test_numbers_of_every_world_over_steps(name, law, lags):
+def test_numbers_of_every_world_over_steps(name, law, friction_iterations):
     """Two worlds with numbers of their own, five steps of sliding."""
-    own, start = simulator(name, law, 2, lags=lags, **RUBBING)
+    own, start = simulator(name, law, 2, friction_iterations=friction_iterations, **RUBBING)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
     names = [f"contact.{name}" for name in ("stiffness", "range", "friction", "radius")]
     usual = {name: own.parameter(name, 2) for name in names}
@@ -74,11 +74,11 @@ SHAPES = {
 @covering(1, shape=SHAPES, solves=(("barrier", 1), ("penalty", 1), ("barrier", 2), ("barrier", 3)))
 def test_moved_obstacles(shape, solves):
     """Poses of a grip that lifts, shifts and turns what a rod lies on, over four steps, and one that keeps the last pose."""
-    law, lags = solves
+    law, friction_iterations = solves
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
     bar(scene, RADIUS + 0.8 * RANGE)
     scene.add_obstacle(SHAPES[shape], motion=ddg.Grip(pivot=(0.01, 0.0, -0.02)), name="obstacle")
-    scene.contact(law=law, range=RANGE, stiffness=50.0, lags=lags, **RUBBING)
+    scene.contact(law=law, range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **RUBBING)
     own, start = simulated(scene)
     poses = torch.tensor([[[1e-4, 2e-4, 1e-4, 2e-3, -1e-3, 4e-3]]], dtype=torch.float64)
 
@@ -122,10 +122,10 @@ def test_a_coefficient_of_friction_is_found_again():
     assert abs(float(logarithm.detach().exp()) - 0.45) < 1e-6
 
 
-@pytest.mark.parametrize("lags", [1, 2])
-def test_transforms_and_checkpoints(lags):
+@pytest.mark.parametrize("friction_iterations", [1, 2])
+def test_transforms_and_checkpoints(friction_iterations):
     """A gradient of a batch of coefficients is that of each, and the same with states made anew."""
-    own, start = simulator("rod on ball", lags=lags, **RUBBING)
+    own, start = simulator("rod on ball", friction_iterations=friction_iterations, **RUBBING)
 
     def loss(mu, **kept):
         return weighed(own.rollout(start, {"contact.friction": mu}, steps=4, **kept)[-1])

@@ -41,7 +41,7 @@ class CollisionMesh:
         radius: float,
         *,
         closed: bool = False,
-        apart: float | None = None,
+        exclusion_length: float | None = None,
         name: str | None = None,
         still: bool = False,
         angles=None,
@@ -51,8 +51,8 @@ class CollisionMesh:
         Args:
             radius: of the capsules [m].
             closed: True if an edge connects the last node with the first.
-            apart: collision exclusion distance [m]: edges with a smaller arc length in between form no pair, nor do neighbours. By
-                default pi radius, the arc between opposite sides of the tightest possible bend.
+            exclusion_length: collision exclusion distance [m]: edges with a smaller arc length in between form no pair, nor do
+                neighbours. By default pi radius, the arc between opposite sides of the tightest possible bend.
             still: True for an obstacle.
             angles: blocks with the twist angles of edges as first component; none by default.
 
@@ -64,15 +64,15 @@ class CollisionMesh:
         if len(nodes) < 2 + closed:
             raise SceneError(f"{name} has {len(nodes)} nodes; it needs at least {2 + closed}")
         self._positive(radius, "radius", name)
-        apart = np.pi * radius if apart is None else apart
-        if not 0.0 <= apart < np.inf:
-            raise SceneError(f"{name}: apart = {apart!r}; it is an arc length, zero or more [m]")
+        exclusion_length = np.pi * radius if exclusion_length is None else exclusion_length
+        if not 0.0 <= exclusion_length < np.inf:
+            raise SceneError(f"{name}: exclusion_length = {exclusion_length!r}; it is an arc length, zero or more [m]")
         edges = np.column_stack([nodes, np.roll(nodes, -1)])[: None if closed else -1]
         lengths = np.linalg.norm(self.points[edges[:, 1]] - self.points[edges[:, 0]], axis=1)
         self._refuse(lengths <= 0.0, "edge", "has zero length", name)
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         loop = np.full(len(edges), ends[-1] if closed else 0.0)
-        span = np.column_stack([ends[:-1], ends[1:], loop, np.full(len(edges), float(apart))])
+        span = np.column_stack([ends[:-1], ends[1:], loop, np.full(len(edges), float(exclusion_length))])
         if angles is not None:
             angles = self._angles[len(self.names)] = self._checked(angles, 1, name)
             if len(angles) != len(edges):

@@ -183,9 +183,11 @@ def shapes_of(host) -> CollisionMesh:
         elif body.kind == BALL:
             number = shapes.ball(int(body.nodes[0]), body.radius, **options)
         else:
-            exclusion = 0.0 if body.kind == CAPSULE else touching.law.apart
+            exclusion = 0.0 if body.kind == CAPSULE else touching.law.exclusion_length
             angles = body.angles if body.angles.size else None
-            number = shapes.rod(body.nodes, body.radius, closed=body.closed, apart=exclusion, angles=angles, **options)
+            number = shapes.rod(
+                body.nodes, body.radius, closed=body.closed, exclusion_length=exclusion, angles=angles, **options
+            )
         if body.markers.size:
             shapes.spin(number, np.append(body.nodes[0], body.markers))
     for g, h in touching.ignored:

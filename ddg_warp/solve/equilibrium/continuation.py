@@ -99,7 +99,7 @@ class Continuation:
     def _stop(self, stop: StopCriterion | None) -> StopCriterion:
         """Return the checked end of a path."""
         if stop is not None and not isinstance(stop, StopCriterion):
-            raise SceneError(f"stop is {argument_checks.shown(stop)}; give Stop(...)")
+            raise SceneError(f"stop is {argument_checks.shown(stop)}; give StopCriterion(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
             raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
         return stop or StopCriterion()

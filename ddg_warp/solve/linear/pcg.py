@@ -204,7 +204,7 @@ class NewtonPCG(PCG):
 
     def reduce(self) -> None:
         """Iterate to the forcing term, then test the residual tolerance."""
-        newton, few = self.newton, self.newton.outliers
+        newton, few = self.newton, self.newton.unconverged_fraction
         super().iterate()
         self.compare()
         self._worst(newton.allowed.ratio, newton.worst)

@@ -43,7 +43,8 @@ class NewtonContact:
         bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
         `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.collision.contact.geometric_stiffness`.
         `rubs`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
-        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `lags` - 1 of (W N,).
+        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `friction_iterations` -
+            1 of (W N,).
         farthest: [m] largest motion of nodes in worlds with a single step fraction, while candidates do not fit; see `outgrown`.
         crossed: (1,) interpenetrating pairs refused in all steps so far; least: (1,) smallest gap [m].
     """
@@ -71,7 +72,7 @@ class NewtonContact:
         self.touch = ContactModel(coupled, linear, newton.q, host.of_obstacles)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
         self.has_friction, self.rate = host.touching.has_friction, newton.islands.inverse_step
-        worlds, updates = coupled.worlds, self.touch.law.lags - 1 if self.has_friction else 0
+        worlds, updates = coupled.worlds, self.touch.law.friction_iterations - 1 if self.has_friction else 0
         self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
 
         def make(shape, dtype):

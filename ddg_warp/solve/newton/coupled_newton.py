@@ -159,7 +159,7 @@ class CoupledNewton:
             coupled, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
         self.turns = EdgeRotations(self) if host.rods else None
-        most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
+        most = int(options.unconverged_fraction * self.contact.touching_bodies) if self.contact else 0
         self._judge, self._measure, self._rotate, self._take, self._move = coupled_newton.search_kernels(
             self.real, self.linear, serial, bool(host.rods), bool(coupled.edges), self.contact is not None, most > 0
         )
@@ -167,7 +167,7 @@ class CoupledNewton:
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self.resting = SleepingIslands(self, *self.contact.bodies) if self.contact else None
-        self.outliers = RelaxedConvergence(self, most) if most else None
+        self.unconverged_fraction = RelaxedConvergence(self, most) if most else None
         self.here = self.contact.bound if self.contact else self.q
         self._balance = ResidualAssembler(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
@@ -227,7 +227,7 @@ class CoupledNewton:
         own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
-        used += (self.outliers,)
+        used += (self.unconverged_fraction,)
         parts = [self._move, *self.coupled.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
@@ -302,10 +302,10 @@ class CoupledNewton:
         options = self.options
         weights = self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten()
         sums = [partial(self._sum_weights, *weights), partial(self._worst, self.allowed.ratio, self.worst)]
-        counts = [partial(self.outliers.count, options.rtol)] if self.outliers else []
+        counts = [partial(self.unconverged_fraction.count, options.rtol)] if self.unconverged_fraction else []
         device_arrays.side_by_side([*sums, *counts], self.device)
-        if self.outliers:
-            self.outliers.excuse()
+        if self.unconverged_fraction:
+            self.unconverged_fraction.excuse()
         if self.contact:
             self.contact.account(self._weight[0], self._weight[1])
         wp.launch(

@@ -2,7 +2,7 @@
 
 A rod that stands on another by its end slides off along a direction in which the energy is concave. There the Hessian is projected
 and its steps are short, while ten thousand other rods wait. The residual left on such a rod acts like an external force for the
-length of the step; see `NewtonOptions.outliers`.
+length of the step; see `NewtonOptions.unconverged_fraction`.
 
 Measured: such slips take Newton's method as many iterations as all other rods together.
 """

@@ -49,10 +49,10 @@ class NewtonOptions:
             Hessian is that of rods and rigid joints; second derivatives of shells' bending, of glue and of magnets are left out,
             which "none" refuses. It is indefinite where a pivot is lost, or conjugate gradients meet negative curvature; by
             "gauss_newton" nets go on with the direction found so far, and leave compression out of the next matrix.
-        outliers: in contact, part of the bodies of a world (rods, shells, and what is joined of them) that may be out of balance
-            at the end of a step, each by no more than ten times the tolerance: in crowds some slip off others at any time, and
-            hold up all the rest. What is left of its residual acts on such a body like a force, in that step. Where contact cuts
-            nothing, directions are solved until all but half as many balance by what is linear.
+        unconverged_fraction: in contact, part of the bodies of a world (rods, shells, and what is joined of them) that may be out
+            of balance at the end of a step, each by no more than ten times the tolerance: in crowds some slip off others at any
+            time, and hold up all the rest. What is left of its residual acts on such a body like a force, in that step. Where
+            contact cuts nothing, directions are solved until all but half as many balance by what is linear.
     """
 
     rtol: float = 1e-6
@@ -62,10 +62,10 @@ class NewtonOptions:
     rotation_cap: float = 1.0
     linear_rtol: float = 1e-8
     psd: str = "auto"
-    outliers: float = 0.0
+    unconverged_fraction: float = 0.0
 
     def __post_init__(self):
-        argument_checks.part("outliers", self.outliers)
+        argument_checks.part("unconverged_fraction", self.unconverged_fraction)
         argument_checks.check_options(
             self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings")
         )

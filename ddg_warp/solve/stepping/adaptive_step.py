@@ -26,7 +26,7 @@ ROOM = 0.8  # fraction of the tolerance that permits doubling the step
 class AdaptiveStepper:
     """Time-step controller for implicit Euler: halve or double steps by a local error estimate.
 
-        steps = StepControl(Integrator(model), error=5e-3)
+        steps = AdaptiveStepper(Integrator(model), error=5e-3)
         while state.time < 2.0:
             state = steps.advance(state, 1 / 60)
 
@@ -53,14 +53,14 @@ class AdaptiveStepper:
     def __init__(self, integrator: Integrator, error: float, halvings: int = HALVINGS):
         if not isinstance(integrator, Integrator):
             raise SceneError(
-                f"StepControl steps by an Integrator, not by {type(integrator).__name__}; give Integrator(model)"
+                f"AdaptiveStepper steps by an Integrator, not by {type(integrator).__name__}; give Integrator(model)"
             )
         if integrator.scheme != "implicit_euler":
-            raise SceneError(f"StepControl estimates the error of 'implicit_euler', not of {integrator.scheme!r}")
+            raise SceneError(f"AdaptiveStepper estimates the error of 'implicit_euler', not of {integrator.scheme!r}")
         self.integrator, self.model = integrator, integrator.model
-        self.error = argument_checks.positive("StepControl: error", error, "m/s")
+        self.error = argument_checks.positive("AdaptiveStepper: error", error, "m/s")
         self.halvings = argument_checks.count(
-            "StepControl: halvings (0 for steps of one length)", halvings, 0, MOST_HALVINGS
+            "AdaptiveStepper: halvings (0 for steps of one length)", halvings, 0, MOST_HALVINGS
         )
         self.level, self.estimate, self.lengths = self.halvings, math.inf, Counter()
         self._changes, self._version = integrator.watch_changes(), None
@@ -79,7 +79,7 @@ class AdaptiveStepper:
         Raises:
             SolverError, SceneError: as for `Integrator.step`.
         """
-        dt = argument_checks.positive("StepControl: dt", dt, "s")
+        dt = argument_checks.positive("AdaptiveStepper: dt", dt, "s")
         between = self._between(state, controls, start)
         units, done = 2**self.halvings, 0
         while done < units:
@@ -98,7 +98,7 @@ class AdaptiveStepper:
         check_state("AdaptiveStepper.advance", model, state)
         end, begin = (checked(values, model, "AdaptiveStepper.advance") for values in (controls, start))
         if "poses" in begin:
-            raise SceneError("StepControl.advance: poses begin where the state has them; leave them out of start")
+            raise SceneError("AdaptiveStepper.advance: poses begin where the state has them; leave them out of start")
         usual = {"gravity": np.array(model.scene.gravity, float)[None]}
         ramps = {
             name: [inputs.get(name, usual.get(name, 0.0)) for inputs in (begin, end)]
@@ -119,7 +119,7 @@ class AdaptiveStepper:
         if self.model.version != self._version:
             self._version, self._mass = self.model.version, self._changes.masses()
             if not (self._mass > 0.0).all():
-                raise SceneError("StepControl weighs errors by mass, and nothing in the model has any")
+                raise SceneError("AdaptiveStepper weighs errors by mass, and nothing in the model has any")
         self.estimate = 0.5 * math.sqrt((self._changes.squares() / self._mass).max())
         if not self.estimate <= self.error:
             times = math.ceil(math.log2(self.estimate / self.error)) if math.isfinite(self.estimate) else self.halvings

@@ -110,9 +110,10 @@ class Integrator:
             argument_checks.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = argument_checks.options("Integrator", NewtonOptions, options, argument_checks.names(Integrator))
-        if self.options.outliers and not model.scene.touching:
+        if self.options.unconverged_fraction and not model.scene.touching:
             raise SceneError(
-                f"outliers = {self.options.outliers!r} is of scenes with contact, whose bodies wait for each other; this one has none"
+                f"unconverged_fraction = {self.options.unconverged_fraction!r} is of scenes with contact, whose bodies wait for "
+                "each other; this one has none"
             )
         self.retry_limit = argument_checks.count("retry_limit (0 for no retry)", retry_limit, 0)
         self.energy_bound = energy_drift.bound(energy_bound, scheme)
