@@ -7,7 +7,7 @@ Hessians of a sound solve. Faults that slow a solver down without a change of it
 most specific first, that run until the first failure. A test finds a fault if it fails with the fault and passes without.
 
 --list prints the faults. --whole runs all fast tests if the files of a fault do not find it. Tests run in a temporary copy of
-the tracked files, with a copy of the kernel cache, so that neither this checkout nor its cache changes. Writes mutants.csv and .json.
+the tracked files, with links to the kernel cache, so that neither this checkout nor its cache changes. Writes mutants.csv and .json.
 Exit status 1 if more than one fault is not found.
 """
 
@@ -257,24 +257,24 @@ FAULTS = (
         ("tests/test_continuation.py",),
     ),
     Fault(
-        "monolithic friction Newton: derivative of normal forces dropped",
+        "friction Jacobian: derivative of normal forces dropped",
         "ddg_warp/solve/equilibrium/friction_jacobian.py",
         "by_x[:PAIR_NODES] += by_lagged[:PAIR_NODES]",
         "by_x[:PAIR_NODES] += 0.0 * by_lagged[:PAIR_NODES]",
-        ("tests/collision/test_friction_statics.py",),
+        ("tests/learn/test_contact_equilibria.py",),
     ),
     Fault(
-        "end moments: axis of twist",
+        "end moments: directors of the inner edge instead of the clamp",
         "ddg_warp/postprocess/end_moments.py",
-        "along = (t0 + t1) / (1.0 + np.sum(t0 * t1, -1, keepdims=True))",
-        "along = 0.5 * (t0 + t1)",
+        "((first[k + e, column], t[k + e, column]) for e in (ghost, edge))",
+        "((first[k + e, column], t[k + e, column]) for e in (edge, ghost))",
         ("tests/test_clamped_ends.py",),
     ),
 )
 
 
 class Copy:
-    """Copy of the tracked files in a temporary folder, with a kernel cache of its own, in which tests run."""
+    """Copy of the tracked files in a temporary folder, with its own view of the kernel cache, in which tests run."""
 
     def __init__(self, folder: Path):
         import warp as wp
@@ -287,7 +287,7 @@ class Copy:
             shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
         for package in ("kernels", "scenes"):  # as the package's own finder resolves them
             (self.root / "ddg_warp" / package).symlink_to(self.root / package)
-        shutil.copytree(wp.config.kernel_cache_dir, cache)
+        shutil.copytree(wp.config.kernel_cache_dir, cache, copy_function=_link)
         self.environment = os.environ | {
             "PYTHONPATH": str(self.root),
             "PYTHONDONTWRITEBYTECODE": "1",
@@ -329,6 +329,14 @@ class Copy:
         if test and self.failure(test, WHOLE_LIMIT):
             return f"{MISSED}: {test} fails without it, too"
         return test or MISSED
+
+
+def _link(source: str, target: str) -> None:
+    """Link a file, which Warp never writes in place; copy it from another file system."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def main() -> int:
