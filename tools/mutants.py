@@ -287,7 +287,8 @@ class Copy:
             shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
         for package in ("kernels", "scenes"):  # as the package's own finder resolves them
             (self.root / "ddg_warp" / package).symlink_to(self.root / package)
-        shutil.copytree(wp.config.kernel_cache_dir, cache, copy_function=_link)
+        unfinished = shutil.ignore_patterns("*_p[0-9]*_t[0-9]*")  # folders in which other processes compile
+        shutil.copytree(wp.config.kernel_cache_dir, cache, copy_function=_link, ignore=unfinished)
         self.environment = os.environ | {
             "PYTHONPATH": str(self.root),
             "PYTHONDONTWRITEBYTECODE": "1",
