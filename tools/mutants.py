@@ -2,9 +2,10 @@
 
     python tools/mutants.py [NAME ...] [--list] [--whole] [--out DIR]
 
-A fault replaces a text that occurs once in its file: a sign, an index, a factor, a dropped term. All faults change results or
-Hessians of a sound solve. Faults that slow a solver down without a change of its result are left out. `tests` of a fault are files,
-most specific first, that run until the first failure. A test finds a fault if it fails with the fault and passes without.
+A fault replaces a text that occurs once in its file: a sign, an index, a factor, a dropped term. Most change results or Hessians.
+Faults of the line search, the edge-rotation update and the joint Schur complement change iterates or a preconditioner alone. Tests
+compare these directly. `tests` of a fault are files, most specific first, that run until the first failure. A test finds a fault if
+it fails with the fault and passes without.
 
 --list prints the faults. --whole runs all fast tests if the files of a fault do not find it. Tests run in a temporary copy of
 the tracked files, with links to the kernel cache, so that neither this checkout nor its cache changes. Writes mutants.csv and .json.
