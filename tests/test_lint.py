@@ -1,4 +1,4 @@
-"""Kernel lint: every fault is found at its position, and sound code passes."""
+"""Kernel lint: every fault is found at its position, and sound code passes; faults of the mutation check fit their files."""
 
 import subprocess
 import sys
@@ -9,6 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tools"))
 
+import mutants  # noqa: E402
 from lint_kernels import lint  # noqa: E402
 
 HEAD = "import warp as wp\n\n"
@@ -89,3 +90,10 @@ def test_position_and_exit_code(tmp_path):
 
 def test_kernels_of_the_package():
     assert lint([ROOT / "kernels"]) == []
+
+
+def test_texts_of_the_mutation_check_occur_once():
+    for fault in mutants.FAULTS:
+        fault.check(ROOT)
+        assert fault.new != fault.old
+    assert len({fault.name for fault in mutants.FAULTS}) == len(mutants.FAULTS) == 30

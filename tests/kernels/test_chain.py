@@ -261,6 +261,29 @@ def test_overshooting_step_is_backtracked_by_the_energy(device, name):
 
 
 @EVERY_KIND
+@pytest.mark.parametrize(("decrease", "accepted"), [(0.0, 0), (2e-4, 1)])
+def test_armijo_rule_asks_for_a_decrease(device, name, decrease, accepted):
+    """A step decreases the energy by a fraction of the predicted decrease, below or above Armijo's constant of 1e-4."""
+    problem = Problem(name, device, noise=0.05, inertia=1e3)
+    newton, start = problem.newton, problem.iterate_dofs()
+    problem.iterate()
+    direction, decrement = problem.direction(), device_arrays.download(newton.islands.predicted_decrease)
+
+    def excess(length):
+        change = problem.energy(start + length[:, None, None] * direction) - problem.energy(start)
+        return change + decrease * length * decrement
+
+    before, length = np.full(4, 1.9), np.full(4, 2.0)
+    for _ in range(2):  # secant method
+        values = excess(before), excess(length)
+        before, length = length, length - values[1] * (length - before) / (values[1] - values[0])
+    problem.put(start + length[:, None, None] * direction)
+    newton.islands.step_length.assign(length)
+    problem.iterate()
+    assert (device_arrays.download(newton.islands.iteration) == 1 + accepted).all()
+
+
+@EVERY_KIND
 def test_accepted_steps_lower_the_energy(device, name):
     """Rejected steps from far away get shorter, accepted steps decrease the energy, and all rods converge."""
     problem = Problem(name, device, noise=0.6, inertia=0.02, rotation_cap=100.0, max_iterations=100)
