@@ -47,8 +47,8 @@ class Meaning:
         node = np.arange(group.nodes)[:, None] < np.tile(host.count, group.worlds)
         edge = np.arange(group.nodes)[:, None] < np.tile(host.count - (0 if kind.closed else 1), group.worlds)
         if name in ("x", "v"):
-            held = np.stack([(fixed >> d) & 1 for d in range(kind.dim)], -1) == 1
-            return np.where(held & (name == "v"), 0.0, values) * node[..., None]
+            fixed_components = np.stack([(fixed >> d) & 1 for d in range(kind.dim)], -1) == 1
+            return np.where(fixed_components & (name == "v"), 0.0, values) * node[..., None]
         if name == "omega":
             return np.where((fixed >> kind.dim) & 1, 0.0, values) * edge
         if name == "last":
@@ -63,12 +63,12 @@ class Meaning:
     def _coupled(self, name: str, values: np.ndarray) -> np.ndarray:
         host = self.model.coupled.host
         if name in ("q", "v"):
-            felt = np.ones((host.blocks, 3), bool)
-            felt[host.nodes :, 1:] = False
-            felt[host.blocks - host.spins :] = False
+            active = np.ones((host.blocks, 3), bool)
+            active[host.nodes :, 1:] = False
+            active[host.blocks - host.spins :] = False
             if name == "v":
-                felt &= ~host.fixed & (host.mass > 0.0)
-            return np.where(np.tile(felt, (self.model.worlds, 1)), values, 0.0)
+                active &= ~host.fixed & (host.mass > 0.0)
+            return np.where(np.tile(active, (self.model.worlds, 1)), values, 0.0)
         if name.startswith("data") or (name == "frame" and not self.model.coupled.edges):
             return 0.0 * values
         if name.startswith("lag"):
@@ -208,9 +208,9 @@ class Difference:
         def longer(x):
             self.advance = lambda start: ddg.Integrator(self.model, scheme=scheme, **TIGHT).step(start, dt + x)
 
-        found = self.by(longer, step)
+        derivative = self.by(longer, step)
         self.advance = before
-        return found
+        return derivative
 
 
 def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
@@ -245,15 +245,15 @@ def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
         return advance
 
     adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
-    tapes, at = [], state
+    tapes, current = [], state
     for _ in range(steps):
-        at, tape = adjoint.step(at, dt)
+        current, tape = adjoint.step(current, dt)
         tapes.append(tape)
-    given, inputs = cotangent(model, weights), []
+    grad_state, inputs = cotangent(model, weights), []
     for tape in reversed(tapes):
-        given, read = adjoint.vjp(tape, given)
+        grad_state, read = adjoint.vjp(tape, grad_state)
         inputs.append(read)
-    return given, inputs, Difference(model, state.copy(), weights, advancing(model), advancing)
+    return grad_state, inputs, Difference(model, state.copy(), weights, advancing(model), advancing)
 
 
 def tables(model) -> list:
@@ -265,8 +265,8 @@ def tables(model) -> list:
 
 def by_parameters(model, inputs: list) -> list[np.ndarray]:
     """Derivatives by the parameters of each table, (rows, ...)."""
-    found = [device_arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
-    return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.coupled else [])
+    gradients = [device_arrays.download(group_inputs.parameters) for group_inputs in inputs[: len(model.groups)]]
+    return gradients + ([rows.numpy() for rows in inputs[-1].parameters] if model.coupled else [])
 
 
 def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
@@ -300,11 +300,11 @@ def parameter_shifts(model, inputs: list, names=None, seed: int = 11) -> list[Sh
         for row, (name, values) in enumerate(table.values.items()):
             if names is not None and name not in names:
                 continue
-            own = total[row] if of_rods else total[row].reshape(model.worlds, -1)
+            by_element = total[row] if of_rods else total[row].reshape(model.worlds, -1)
             worlds = 1 if of_rods else 0
             if of_rods:  # a column a rod, of every world
-                values = np.broadcast_to(values, (values.shape[0], own.shape[1]))
-            slopes = shared(own, values.shape)
+                values = np.broadcast_to(values, (values.shape[0], by_element.shape[1]))
+            slopes = shared(by_element, values.shape)
             size = random.uniform(0.5, 1.0, values.shape) * (np.abs(values).max() or 1.0)
 
             def write(wide, _state, new, number=number, name=name):
@@ -324,23 +324,25 @@ def check(difference: "Difference", shifts: list[Shift]) -> None:
         largest = LARGEST / CHANGE if ":" in shift.name else np.inf
         shift.direction = shift.direction * (min(1.0 / slope, largest) if slope > 1e-9 else 1.0)
     wanted = sum(shift.slope for shift in shifts)
-    found = difference.along(shifts, CHANGE)
-    if not close(wanted, found):
+    slope_difference = difference.along(shifts, CHANGE)
+    if not close(wanted, slope_difference):
         alone = {shift.name: (shift.slope, difference.along([shift], CHANGE)) for shift in shifts}
-        raise AssertionError(f"gradient {wanted:.12g}, difference {found:.12g}; each alone: {alone}")
+        raise AssertionError(f"gradient {wanted:.12g}, difference {slope_difference:.12g}; each alone: {alone}")
 
 
-def close(found: float, wanted: float, scale: float = 0.0) -> bool:
-    return abs(found - wanted) <= CLOSE * max(abs(wanted), scale)
+def close(value: float, expected: float, scale: float = 0.0) -> bool:
+    return abs(value - expected) <= CLOSE * max(abs(expected), scale)
 
 
-def check_state(model, gradient, difference, *others: Shift) -> None:
+def check_state(model, gradient, difference, *shifts: Shift) -> None:
     """Check the derivatives by every array of the first state, and by others."""
-    check(difference, [*state_shifts(model, gradient, difference.state), *others])
+    check(difference, [*state_shifts(model, gradient, difference.state), *shifts])
 
 
-def check_length(own, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
+def check_length(step_inputs, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
     """What one part read of a step, dt long, against the derivative of the loss by its length."""
-    grad_inverse_step = sum(float(array.numpy().sum()) for array in (own.rate, *getattr(own, "elements_rate", ())))
+    grad_inverse_step = sum(
+        float(array.numpy().sum()) for array in (step_inputs.rate, *getattr(step_inputs, "elements_rate", ()))
+    )
     per_step = 2.0 if scheme == "implicit_midpoint" else 1.0  # rate of the implicit Euler step that is solved, times dt
     assert close(-per_step * grad_inverse_step / dt**2, difference.by_length(dt, step, scheme))

@@ -148,15 +148,15 @@ def test_a_step_by_its_state_and_parameters(name, scheme):
 def test_a_step_by_what_all_share(name, scheme):
     """The length of the step, damping by mass."""
     model, _, (inputs,), difference = differentiated(name, scheme, 1)
-    own = inputs[0]
-    check_length(own, difference, DT, 1e-7, scheme)
+    step_inputs = inputs[0]
+    check_length(step_inputs, difference, DT, 1e-7, scheme)
     damping = model.scene.mass_damping
 
     def damped(x):  # which an integrator takes when it is made
         model.scene.mass_damping = damping + x
         difference.advance = lambda start: ddg.Integrator(model, scheme=scheme, **TIGHT).step(start, DT)
 
-    assert close(float(own.damping.numpy().sum()), difference.by(damped, 1e-3))
+    assert close(float(step_inputs.damping.numpy().sum()), difference.by(damped, 1e-3))
 
 
 LONG = [(name, "implicit_euler") for name in ("twisted", "untwisted", "closed", "joined", "sheet")]
@@ -210,9 +210,9 @@ def held_between():
     """Rods that are held in the middle, by all components and by one, and one that nothing holds."""
     scene = a_scene()
     curve = np.concatenate([CURVE, CURVE[-1] + CURVE[1:]])
-    held = scene.add_rod(curve, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
-    scene.fix(held, [3, 7])
-    scene.fix(held, [5], components="y")
+    rod = scene.add_rod(curve, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
+    scene.fix(rod, [3, 7])
+    scene.fix(rod, [5], components="y")
     scene.add_rod(CURVE + [0.0, 1.0, 0.0], section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     return scene
 

@@ -33,10 +33,10 @@ lagged_once_or_twice = pytest.mark.parametrize("friction_iterations", [1, 2])
 each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
-def differentiated(name: str, law: str, steps: int, speed: float = 0.0, ways=None, **contact):
+def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coefficients=None, **contact):
     scene = scene_of(name, law, **contact)
-    if ways:
-        scene.contact_between("bar", "obstacle", friction=ways)
+    if coefficients:
+        scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
     ranges = model.coupled.touching["range"]
     ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
@@ -50,8 +50,8 @@ def by_number(inputs: list, name: str) -> np.ndarray:
     """Derivatives by a number of contact, symmetric where it is of two groups."""
     if name == "radius":
         return sum(read[-1].radius.numpy() for read in inputs)
-    found = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
-    return 0.5 * (found + found.swapaxes(1, 2))
+    gradient = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
+    return 0.5 * (gradient + gradient.swapaxes(1, 2))
 
 
 def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
@@ -112,20 +112,20 @@ def test_friction_that_rolls_rods(name, friction_iterations):
 def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeypatch):
     """Without the derivative by it gradients are off by a tenth and more of their largest entry."""
 
-    def found():
+    def gradients():
         _, gradient, inputs, _ = differentiated(
             name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
         )
         return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
-    whole, chain = found(), CoupledLinearSolve.chain
+    exact, chain = gradients(), CoupledLinearSolve.chain
 
-    def broken(own, by_lagged, grad_q):
+    def broken(solve, by_lagged, grad_q):
         by_lagged.zero_()
-        chain(own, by_lagged, grad_q)
+        chain(solve, by_lagged, grad_q)
 
     monkeypatch.setattr(CoupledLinearSolve, "chain", broken)
-    for right, wrong in zip(whole, found(), strict=True):
+    for right, wrong in zip(exact, gradients(), strict=True):
         assert np.abs(right - wrong).max() > 0.1 * np.abs(right).max()
 
 
@@ -134,11 +134,11 @@ def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeyp
     speed=(SLIDING, -SLIDING),
     friction_iterations=(1, 2),
 )
-@pytest.mark.parametrize("ways", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
-def test_friction_by_direction(name, speed, ways, friction_iterations):
+@pytest.mark.parametrize("coefficients", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
+def test_friction_by_direction(name, speed, coefficients, friction_iterations):
     """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, speed, ways, friction_iterations=friction_iterations, **RUBBING
+        name, "barrier", 2, speed, coefficients, friction_iterations=friction_iterations, **RUBBING
     )
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
@@ -162,9 +162,9 @@ def test_a_step_by_its_length(name, friction_iterations):
     _, _, (inputs,), difference = differentiated(
         name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
     )
-    own = inputs[0]
-    assert float(own.elements_rate[-1].numpy().sum()) != 0.0
-    check_length(own, difference, DT, 1e-8)
+    step_inputs = inputs[0]
+    assert float(step_inputs.elements_rate[-1].numpy().sum()) != 0.0
+    check_length(step_inputs, difference, DT, 1e-8)
 
 
 @lagged_once_or_twice
@@ -193,7 +193,7 @@ def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
     """Gradients are the same to the bit."""
     model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **RUBBING))
     state = touching(model, along=SLIDING)
-    found = []
+    results = []
     for few in (False, True):
         adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
         after, tape = adjoint.step(state, DT)
@@ -205,8 +205,8 @@ def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
             contact.has_overflow(after.coupled.q)
             for pairs in contact.system.search.lists:
                 assert pairs.capacity < 1024
-        found.append(adjoint.vjp(tape, after)[0].coupled.q.numpy())
-    np.testing.assert_array_equal(*found)
+        results.append(adjoint.vjp(tape, after)[0].coupled.q.numpy())
+    np.testing.assert_array_equal(*results)
 
 
 def test_without_friction_there_is_nothing_to_lag():
@@ -223,9 +223,9 @@ def test_what_is_not_solved_has_no_gradient(friction_iterations, monkeypatch):
     after, tape = adjoint.step(touching(model), DT)
     system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.chain
 
-    def go_on(*given):
+    def go_on(*arguments):
         system.missed = missed
-        chain(*given)
+        chain(*arguments)
 
     monkeypatch.setattr(CoupledLinearSolve, "chain", go_on)
     system.missed = 0.0  # which no solution leaves

@@ -67,20 +67,22 @@ def by_both(model, state, rate: float, **attributes):
         np.arange(coupled.blocks) < coupled.blocks - coupled.host.spins
     )
     right[np.tile(angles, model.worlds), 1:] = 0.0
-    found = wp.zeros(len(right), dtype=coupled.vector, device=coupled.device)
+    solution = wp.zeros(len(right), dtype=coupled.vector, device=coupled.device)
     coefficient, system = rate * (rate + model.scene.mass_damping), ExactSystem(model)
     for name, value in attributes.items():
         setattr(system.krylov, name, value)
     rates = wp.full(model.worlds, rate, dtype=coupled.real, device=coupled.device)
-    system.solve(state.coupled, coefficient, rates, wp.array(right, dtype=coupled.vector, device=coupled.device), found)
+    system.solve(
+        state.coupled, coefficient, rates, wp.array(right, dtype=coupled.vector, device=coupled.device), solution
+    )
     tangent = CoupledTangent(model, 0)
     solve = HostSolve(tangent)
     wanted = solve(SimpleNamespace(coupled=state.coupled), rate, coefficient, None, tangent.into(right.ravel()))
-    return system, found.numpy(), tangent.back(wanted).reshape(-1, 3), tangent
+    return system, solution.numpy(), tangent.back(wanted).reshape(-1, 3), tangent
 
 
-def off(found: np.ndarray, wanted: np.ndarray) -> float:
-    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
+def off(solution: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.abs(solution - expected).max() / np.abs(expected).max())
 
 
 NETS = {name: SCENES[name] for name in ("joined", "hinged", "sheet", "hinges", "midedge", "stiffened", "turned_joined")}
@@ -89,11 +91,11 @@ NETS = {name: SCENES[name] for name in ("joined", "hinged", "sheet", "hinges", "
 @pytest.mark.parametrize("name", [*NETS, "oblique"])
 def test_conjugate_gradients_find_what_factors_do(name):
     model = (NETS | {"oblique": oblique})[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
-    system, found, wanted, tangent = by_both(model, lively(model), RATE)
+    system, solution, wanted, tangent = by_both(model, lively(model), RATE)
     assert not system.failed.numpy().any()
-    assert off(found, wanted) < 1e-9
+    assert off(solution, wanted) < 1e-9
     if name != "oblique":
-        assert np.all(found.ravel()[~tangent.free] == 0.0)
+        assert np.all(solution.ravel()[~tangent.free] == 0.0)
 
 
 def test_rods_that_branch_are_eliminated():
@@ -106,12 +108,12 @@ def test_rods_that_branch_are_eliminated():
 @pytest.mark.parametrize("name", ["strut", "sheet"])
 def test_an_indefinite_matrix(name):
     model, state = squeezed(name)
-    system, found, wanted, tangent = by_both(model, state, 1.0)
+    system, solution, wanted, tangent = by_both(model, state, 1.0)
     matrix = tangent.hessian(SimpleNamespace(coupled=state.coupled)).toarray() + np.diag(tangent.mass)
     spectrum = np.linalg.eigvalsh(matrix[tangent.free][:, tangent.free])
     assert (spectrum < 0.0).sum() > 2
     assert not system.failed.numpy().any()
-    assert off(found, wanted) < 1e-7
+    assert off(solution, wanted) < 1e-7
 
 
 def test_what_rounding_leaves_is_no_failure():
@@ -120,13 +122,13 @@ def test_what_rounding_leaves_is_no_failure():
     hair = ddg.Material(young=4e9, density=1300.0)
     points = np.stack([t, 0.3 * t * t, 0.02 * np.sin(20.0 * t)], 1)
     twig = points[32] + np.outer(t[:32], (0.3, 0.3, 0.2))
-    rods = [scene.add_rod(of, section=ddg.Circle(4e-5), material=hair) for of in (points, twig)]
+    rods = [scene.add_rod(curve, section=ddg.Circle(4e-5), material=hair) for curve in (points, twig)]
     scene.clamp(rods[0])
     scene.join([(rods[0], 32), (rods[1], 0)])
     model = built(scene)
-    system, found, wanted, _ = by_both(model, model.state(), 60.0)
+    system, solution, wanted, _ = by_both(model, model.state(), 60.0)
     assert not system.failed.numpy().any()
-    assert off(found, wanted) < 1e-6
+    assert off(solution, wanted) < 1e-6
 
 
 def test_a_world_without_a_right_hand_side():
@@ -134,22 +136,22 @@ def test_a_world_without_a_right_hand_side():
     state, coupled, system = lively(model), model.coupled, ExactSystem(model)
     right = np.zeros((2 * coupled.blocks, 3))
     right[coupled.blocks + 5] = 1.0
-    found = wp.full(len(right), coupled.vector(1.0, 1.0, 1.0), dtype=coupled.vector, device=coupled.device)
+    solution = wp.full(len(right), coupled.vector(1.0, 1.0, 1.0), dtype=coupled.vector, device=coupled.device)
     rates = wp.full(2, RATE, dtype=coupled.real, device=coupled.device)
-    system.solve(state.coupled, RATE**2, rates, wp.array(right, dtype=coupled.vector, device=coupled.device), found)
-    assert np.all(found.numpy()[: coupled.blocks] == 0.0)
-    assert np.abs(found.numpy()[coupled.blocks :]).max() > 0.0
+    system.solve(state.coupled, RATE**2, rates, wp.array(right, dtype=coupled.vector, device=coupled.device), solution)
+    assert np.all(solution.numpy()[: coupled.blocks] == 0.0)
+    assert np.abs(solution.numpy()[coupled.blocks :]).max() > 0.0
     assert not system.failed.numpy().any()
 
 
-def pulled(model, state, scheme: str, given: dict, **how):
+def pulled(model, state, scheme: str, weights: dict, **how):
     """Derivatives by the state before a step and by parameters, and the reverse that found them."""
     adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
     _, tape = adjoint.step(state, DT)
     s = DT / 2.0 if scheme == "implicit_midpoint" else DT
-    given = cotangent(model, given)
-    adjoint.vjp(tape, given)
-    gradient, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, given, s, **how)
+    weights = cotangent(model, weights)
+    adjoint.vjp(tape, weights)
+    gradient, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, weights, s, **how)
     values = {name: array.numpy() for name, array in entries(gradient).items()}
     return values | {f"parameters {i}": rows.numpy() for i, rows in enumerate(inputs[-1].parameters)}
 
@@ -160,12 +162,12 @@ def test_gradients_are_those_of_factors(name, scheme):
     """The whole reverse of a step, by either; and bit by bit once more."""
     model = built(SCENES[name]())
     state = lively(model, scheme=scheme)
-    given = directions(model, state, 5)
-    found, wanted, again = (pulled(model, state, scheme, given, factors=how) for how in (False, True, False))
+    weights = directions(model, state, 5)
+    solution, wanted, again = (pulled(model, state, scheme, weights, factors=how) for how in (False, True, False))
     for key, value in wanted.items():
-        np.testing.assert_array_equal(found[key], again[key], err_msg=key)
+        np.testing.assert_array_equal(solution[key], again[key], err_msg=key)
         if np.abs(value).max() > 1e-9:
-            assert off(found[key], value) < 1e-9, key
+            assert off(solution[key], value) < 1e-9, key
 
 
 @pytest.fixture
@@ -183,20 +185,20 @@ def hasty(monkeypatch):
 def test_what_does_not_converge_takes_factors(hasty):
     model = built(SCENES["sheet"]())
     state = lively(model)
-    given = directions(model, state, 5)
+    weights = directions(model, state, 5)
     adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
     _, tape = adjoint.step(state, DT)
-    gradient, _ = adjoint.vjp(tape, cotangent(model, given))
-    wanted = pulled(model, state, "implicit_euler", given, factors=True)
+    gradient, _ = adjoint.vjp(tape, cotangent(model, weights))
+    wanted = pulled(model, state, "implicit_euler", weights, factors=True)
     for key, array in entries(gradient).items():
         np.testing.assert_array_equal(array.numpy(), wanted[key], err_msg=key)
 
 
 def test_worlds_of_torch_that_do_not_converge_say_so(hasty):
     """The host does not look at a step of torch: what has no gradient is no number."""
-    own = Simulator(built(SCENES["sheet"]()), DT)
-    velocities = torch.zeros((1, own.model.points_count, 3), dtype=torch.float64, requires_grad=True)
-    after = own.step(own.initial_state(velocities=velocities))
+    simulator = Simulator(built(SCENES["sheet"]()), DT)
+    velocities = torch.zeros((1, simulator.model.points_count, 3), dtype=torch.float64, requires_grad=True)
+    after = simulator.step(simulator.initial_state(velocities=velocities))
     assert torch.isnan(torch.autograd.grad((after.positions**2).sum(), velocities)[0]).any()
 
 
@@ -206,12 +208,12 @@ def test_reverses_of_nets_are_replayed(name, scheme):
     """One captured graph serves all steps of a length, and finds what launches one by one do."""
     gradients = []
     for replayed in (True, False):
-        own = Simulator(built(SCENES[name]()), DT, scheme=scheme, rtol=1e-12)
-        graphs = own.engine(1)._adjoint() and own.engine(1)._graphs
+        simulator = Simulator(built(SCENES[name]()), DT, scheme=scheme, rtol=1e-12)
+        graphs = simulator.engine(1)._adjoint() and simulator.engine(1)._graphs
         if not replayed:
             graphs.replay = lambda name, launch: launch()
-        stiffness = own.parameter(STIFFNESS[name]).requires_grad_()
-        *_, state = own.rollout(own.initial_state(), {STIFFNESS[name]: 1.1 * stiffness}, steps=4)
+        stiffness = simulator.parameter(STIFFNESS[name]).requires_grad_()
+        *_, state = simulator.rollout(simulator.initial_state(), {STIFFNESS[name]: 1.1 * stiffness}, steps=4)
         gradients.append(torch.autograd.grad((state.positions**2).sum(), stiffness)[0].cpu().numpy())
         assert len(graphs._graphs) == 2 * replayed  # with that which puts worlds to rest that failed
     np.testing.assert_array_equal(*gradients)
@@ -222,9 +224,9 @@ def test_mixed_precision(name):
     """Within 1e-4 of float64's, as asked: solved in float64."""
     gradients = []
     for precision in ("float64", "mixed"):
-        own = Simulator(SCENES[name]().build(device=differences.DEVICE, precision=precision), DT, rtol=1e-9)
-        speed = torch.zeros((1, own.model.points_count, 3), dtype=own.initial_state().velocities.dtype)
+        simulator = Simulator(SCENES[name]().build(device=differences.DEVICE, precision=precision), DT, rtol=1e-9)
+        speed = torch.zeros((1, simulator.model.points_count, 3), dtype=simulator.initial_state().velocities.dtype)
         speed.requires_grad_()
-        *_, state = own.rollout(own.initial_state(velocities=speed), steps=5)
+        *_, state = simulator.rollout(simulator.initial_state(velocities=speed), steps=5)
         gradients.append(torch.autograd.grad((state.positions**2).sum(), speed)[0].cpu().numpy())
     assert off(gradients[1], gradients[0]) < 1e-4

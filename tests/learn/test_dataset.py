@@ -41,8 +41,8 @@ def observe(model, state):
 def run(tmp_path_factory, device):
     """A directory with 13 frames of a rod."""
     out = tmp_path_factory.mktemp("run")
-    given = {"device": device, "usd": False, "progress": False, "fields": FIELDS, "observe": observe}
-    simulate(scene(), out=out, provenance={"parameters": {"n": 5, "young": 1e6, "kind": "soft"}}, **given)
+    options = {"device": device, "usd": False, "progress": False, "fields": FIELDS, "observe": observe}
+    simulate(scene(), out=out, provenance={"parameters": {"n": 5, "young": 1e6, "kind": "soft"}}, **options)
     return out
 
 
@@ -230,8 +230,8 @@ def test_files_that_an_index_does_not_fit_are_named(tmp_path):
 def test_data_of_other_files_is_read_where_it_is_allowed(tmp_path, how):
     """By external links, external storage and virtual datasets."""
     record(tmp_path)
-    path, other = tmp_path / "trajectory.h5", tmp_path / "other.h5"
-    with h5py.File(path, "r+") as file, h5py.File(other, "w") as away:
+    path, external = tmp_path / "trajectory.h5", tmp_path / "other.h5"
+    with h5py.File(path, "r+") as file, h5py.File(external, "w") as away:
         points = file["trajectory/points"][:]
         del file["trajectory/points"]
         away["points"] = points
@@ -244,7 +244,7 @@ def test_data_of_other_files_is_read_where_it_is_allowed(tmp_path, how):
             )
         else:
             layout = h5py.VirtualLayout(points.shape, float)
-            layout[:] = h5py.VirtualSource(str(other), "points", points.shape)
+            layout[:] = h5py.VirtualSource(str(external), "points", points.shape)
             file.create_virtual_dataset("trajectory/points", layout)
     for reading in (lambda: Recordings(path, window=2), lambda: read(path)):
         with pytest.raises(TrajectoryError, match=r"trajectory\.h5: .*trajectory/points .*outside=True"):

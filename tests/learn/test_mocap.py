@@ -122,9 +122,9 @@ def test_short_gaps_are_filled():
     markers = steady.copy()
     markers[3:6, 0], markers[8:14, 1], markers[:2, 2], markers[-1, 2] = np.nan, np.nan, np.nan, np.nan
     recording = Recording("a", 0.01 * np.arange(20), markers, ())
-    found = recording.filled(0.05).markers
-    np.testing.assert_allclose(found[:, 0], steady[:, 0], rtol=1e-14)
-    np.testing.assert_array_equal(found[:, 1:], markers[:, 1:])
+    filled = recording.filled(0.05).markers
+    np.testing.assert_allclose(filled[:, 0], steady[:, 0], rtol=1e-14)
+    np.testing.assert_array_equal(filled[:, 1:], markers[:, 1:])
     np.testing.assert_allclose(recording.filled(0.07).markers[:, 1], steady[:, 1], rtol=1e-14)
     assert np.isnan(recording.markers[4, 0]).all()  # it is not changed
     with pytest.raises(SceneError, match="longest"):
@@ -218,8 +218,8 @@ def test_a_recording_starts_a_rod(clone):
 
 
 def test_indices_of_numpy_are_taken(clone):
-    held = tuple(np.array([0, 1, -2, -1]))
-    recording = read("data_set/DLO1/train/1.pkl", held=held, markers=MARKERS)
+    indices = tuple(np.array([0, 1, -2, -1]))
+    recording = read("data_set/DLO1/train/1.pkl", held=indices, markers=MARKERS)
     assert recording.held == (0, 1, 11, 12)
     assert all(type(marker) is int for marker in recording.held)
     assert len(recording.between(np.int64(1), np.int32(-1)).times) == FRAMES - 2

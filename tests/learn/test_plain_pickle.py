@@ -140,8 +140,8 @@ def test_damaged_files_are_named(tmp_path):
 def test_an_array_that_is_referred_to_twice_is_read_once(tmp_path):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps([ARRAY, {"again": ARRAY, 3: [1.0]}]))
-    first, others = load(path)
+    first, rest = load(path)
     np.testing.assert_array_equal(first, ARRAY)
-    assert others["again"] is first
-    assert others[3] == [1.0]
+    assert rest["again"] is first
+    assert rest[3] == [1.0]
     first[0] = 0.0  # writable, of its own

@@ -54,12 +54,12 @@ def test_windows_start_where_frames_have_them():
         np.nan
     )  # too long a gap where a window would start; a grip that is never seen again
     recording = Recording("a", t, markers, (0, 1, COUNT - 2, COUNT - 1))
-    for ahead in (True, False):
-        found = _cable.windows([recording], 15, ahead)
-        assert [round(100 * (window.points[0, 0] / 0.3)) for window in found] == [8, 23]
-        for window, at in zip(found, (8, 23), strict=True):
-            np.testing.assert_allclose(window.points, path[at], atol=1e-12)
-            np.testing.assert_allclose(window.velocities, np.tile([0.3, 4.0 * t[at], -1.0], (COUNT, 1)), atol=1e-10)
+    for centred in (True, False):
+        result = _cable.windows([recording], 15, centred)
+        assert [round(100 * (window.points[0, 0] / 0.3)) for window in result] == [8, 23]
+        for window, frame in zip(result, (8, 23), strict=True):
+            np.testing.assert_allclose(window.points, path[frame], atol=1e-12)
+            np.testing.assert_allclose(window.velocities, np.tile([0.3, 4.0 * t[frame], -1.0], (COUNT, 1)), atol=1e-10)
     with pytest.raises(DataError, match="no window of 80 frames"):
         _cable.windows([recording], 80, True)
     with pytest.raises(DataError, match="grips hold markers"):
@@ -72,11 +72,11 @@ def test_a_folder_of_the_user(tmp_path):
     scene = load_scene("identify_from_recording")
     scene.record(tmp_path)
     assert len(recordings("train", root=tmp_path)) == 2
-    found = simulate(scene.build(folder=str(tmp_path)), device="cpu", progress=False)
-    checks = scene.check(found)
+    result = simulate(scene.build(folder=str(tmp_path)), device="cpu", progress=False)
+    checks = scene.check(result)
     assert sum(bool(check.skipped) for check in checks) == 3
     assert not any(check.failed for check in checks)
-    own = scene.learn("", scene.MASS, 8)["values"]
-    assert found.model.scene.initial.values == own  # the same recordings
+    learned = scene.learn("", scene.MASS, 8)["values"]
+    assert result.model.scene.initial.values == learned  # the same recordings
     with pytest.raises(DataError, match="holds no recordings"):
         scene.build(folder=str(tmp_path / "train"))

@@ -34,9 +34,9 @@ def energy(x, bend, gravity):
 
 def masses():
     """Of nodes, half of the mass of each of their edges."""
-    own = DENSITY * np.pi * RADIUS**2 * rest_lengths()
-    none = torch.zeros(1, dtype=own.dtype)
-    return 0.5 * (torch.cat([own, none]) + torch.cat([none, own]))
+    edge_masses = DENSITY * np.pi * RADIUS**2 * rest_lengths()
+    none = torch.zeros(1, dtype=edge_masses.dtype)
+    return 0.5 * (torch.cat([edge_masses, none]) + torch.cat([none, edge_masses]))
 
 
 def unrolled(bend, velocities, gravity):
@@ -65,31 +65,31 @@ def test_gradients_are_those_of_an_unrolled_tape():
     material = ddg.Material(young=YOUNG, density=DENSITY)
     rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=material, natural="straight")
     scene.clamp(rod)
-    own = Simulator(built(scene), DT, **TIGHT)
+    simulator = Simulator(built(scene), DT, **TIGHT)
     weight = torch.tensor(np.random.default_rng(5).normal(size=POINTS.shape))
-    given = {
+    inputs = {
         "bend": torch.tensor(YOUNG * np.pi * RADIUS**4 / 4.0, dtype=torch.float64),
         "velocities": torch.tensor(np.random.default_rng(6).normal(size=POINTS.shape)) * 0.3,
         "gravity": torch.tensor([1.0, -9.81], dtype=torch.float64),
     }
-    given["velocities"][: FREE // 2] = 0.0
+    inputs["velocities"][: FREE // 2] = 0.0
 
     def stepped(bend, velocities, gravity):
         def in_space(values):
             return torch.stack([values[..., 0], torch.zeros_like(values[..., 0]), values[..., 1]], -1)
 
-        state = own.initial_state(velocities=in_space(velocities))
+        state = simulator.initial_state(velocities=in_space(velocities))
         controls = {"gravity": in_space(gravity)}
-        *_, state = own.rollout(state, {"planar_bend.stiffness": bend}, controls, steps=STEPS)
+        *_, state = simulator.rollout(state, {"planar_bend.stiffness": bend}, controls, steps=STEPS)
         return state.positions[0][:, [0, 2]]
 
-    found = []
+    results = []
     for steps in (unrolled, stepped):
-        leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
+        leaves = {name: value.clone().requires_grad_() for name, value in inputs.items()}
         x = steps(**leaves)
-        found.append((x.detach().cpu(), torch.autograd.grad((weight * x).sum(), list(leaves.values()))))
-    (tape_x, tape), (x, gradients) = found
+        results.append((x.detach().cpu(), torch.autograd.grad((weight * x).sum(), list(leaves.values()))))
+    (tape_x, tape), (x, gradients) = results
     assert x.numpy() == pytest.approx(tape_x.numpy(), abs=1e-12)
-    for name, by_tape, ours in zip(given, tape, gradients, strict=True):
+    for name, by_tape, ours in zip(inputs, tape, gradients, strict=True):
         free = slice(FREE // 2, None) if name == "velocities" else ...
         assert ours[free].cpu().numpy() == pytest.approx(by_tape[free].cpu().numpy(), rel=1e-8, abs=1e-10), name
