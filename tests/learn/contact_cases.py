@@ -1,4 +1,4 @@
-"""Scenes in contact whose steps have gradients, and states in which they touch."""
+"""Scenes and states in contact for the tests of gradients."""
 
 import numpy as np
 
@@ -23,13 +23,13 @@ def bar(scene, height: float, slope: float = 0.003, name: str = "bar") -> int:
 
 
 def crossing(scene):
-    """Edges that cross, of a rod on one that is held at both ends."""
+    """Crossing edges: a rod on another rod that is clamped at both ends."""
     scene.clamp(bar(scene, 0.0, name="lower"), edges=[0, -1])
     rod(scene, np.stack([0.3 * S + 0.004, S, 2.0 * RADIUS + 0.8 * RANGE + WAVE], 1), name="upper")
 
 
 def parallel(scene):
-    """Edges along each other: mollifiers are between 0 and 1."""
+    """Near-parallel edges: mollifiers are between 0 and 1."""
     scene.clamp(bar(scene, 0.0, name="lower"), edges=[0, -1])
     upper = np.stack([S + 0.0031, 0.02 * S + 4e-5, 2.0 * RADIUS + 0.6 * RANGE + 0.7 * WAVE], 1)
     rod(scene, upper, name="upper")
@@ -57,7 +57,7 @@ def sheet_on_ball(scene):
 
 
 def sheets(scene):
-    """Points on triangles and edges on edges, of two sheets."""
+    """Two sheets in contact, with point-triangle and edge-edge pairs."""
     sheet(scene, 0.0, 0.09, "lower")
     scene.hold(0, [0, 3, 12, 15])
     sheet(scene, 2.0 * RADIUS + 0.7 * RANGE, 0.05, "upper", 2)
@@ -103,7 +103,7 @@ def scene_of(name: str, law: str = "barrier", **contact) -> ddg.Scene:
 
 
 def touching(model, speed: float = 0.02, along: float = 0.0, **options):
-    """A state on the way in which things touch, with random velocities, and one along x of all that is free."""
+    """Return a moving state in contact, with random velocities plus `along` in x on free nodes."""
     integrator, state = ddg.Integrator(model, **TIGHT, **options), model.state()
     for _ in range(12 if model.scene.shells and model.scene.batches else 6):  # bounces off first
         state = integrator.step(state, DT)

@@ -9,10 +9,10 @@ import ddg_warp as ddg
 from ddg_warp import device_arrays
 from ddg_warp.adjoint.implicit import Adjoint
 
-DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
+DEVICE = "cpu"  # of the models of these tests; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
 TIGHT = {"rtol": 1e-13}
-CLOSE = 1e-6  # relative error of a gradient, as asked
+CLOSE = 1e-6  # tolerated relative error of a gradient
 # A difference of fourth order: so many steps along a direction, each a world of one model, and the weights of the losses there.
 SIDES, WEIGHTS = (2.0, 1.0, -1.0, -2.0), (-1.0 / 12.0, 2.0 / 3.0, -2.0 / 3.0, 1.0 / 12.0)
 LARGEST = 1e-3  # relative change of a parameter by a step of differences
@@ -29,8 +29,10 @@ def entries(state) -> dict[str, object]:
 
 
 class Meaning:
-    """Which entries of a state mean something and may be perturbed: rates of free dofs, no padding, no joints' rotations, and nothing
-    from which solves only start."""
+    """Mask of the state entries that may be perturbed.
+
+    Left out are rates of fixed dofs, padding, joint rotations, and entries that only serve as initial guesses.
+    """
 
     def __init__(self, model):
         self.model = model
@@ -57,7 +59,7 @@ class Meaning:
                     np.roll(edge, 1 - term.measure.span, axis=0) | kind.closed
                 )
         if name == "frame":
-            values[6] = 0.0  # the lagged twist only says which turn it is of
+            values[6] = 0.0  # the lagged twist only selects the branch of the angle
         return values * edge
 
     def _coupled(self, name: str, values: np.ndarray) -> np.ndarray:
@@ -73,12 +75,12 @@ class Meaning:
             return 0.0 * values
         if name.startswith("lag"):
             part = self.model.coupled.sets[int(name[4:])]
-            values[6 * (len(part.host.lag) // 7) :] = 0.0  # angles, as of chains: of a joint behind its ghost
+            values[6 * (len(part.host.lag) // 7) :] = 0.0  # angles, as of rod groups: of a joint after its ghost
         return values
 
 
 def directions(model, state, seed: int, strains: float = 1e-3) -> dict[str, np.ndarray]:
-    """A random direction in the entries of a state that mean something."""
+    """Return a random direction in the state entries that may be perturbed."""
     random, meaning = np.random.default_rng(seed), Meaning(model)
     result = {}
     for name, array in entries(state).items():
@@ -99,26 +101,26 @@ def product(state, values: dict[str, np.ndarray]) -> float:
 
 
 def cotangent(model, weights: dict[str, np.ndarray]):
-    """A state that holds the derivatives by one of the loss `product(state, weights)`."""
+    """Return the cotangent, a state, of the loss `product(state, weights)`."""
     state = model.empty_state()
     put(state, weights)
     return state
 
 
 def along(gradient: np.ndarray, meant: np.ndarray) -> np.ndarray:
-    """A random direction in the entries that a direction `meant` has, along which nothing in a gradient cancels."""
+    """Return a direction of the magnitudes of `meant` along which no terms of a gradient cancel."""
     return np.where(gradient < 0.0, -1.0, 1.0) * np.abs(meant)
 
 
 @dataclass
 class Shift:
-    """A direction in one array that a step reads.
+    """A direction in one input array of a step.
 
     Attributes:
         name: of the array.
         values: of one world, the world's axis included.
         gradient: derivatives of the loss by the values.
-        direction: of the same shape, along which nothing in the gradient cancels.
+        direction: of the same shape, along which no terms of the gradient cancel.
         write: `write(model, state, values)` puts the values of all worlds into a model of several worlds, or a state of that model.
         axis: of the worlds; None of an array without worlds.
     """
@@ -154,10 +156,10 @@ def world_axis(model, name: str, values: np.ndarray) -> int | None:
 
 
 class Difference:
-    """The loss `product(after, weights)` of steps from a state, as a function of what they read.
+    """The loss `product(after, weights)` of steps from a state, as a function of their inputs.
 
     Args:
-        advance: state -> state after all steps, with a solver of its own.
+        advance: state -> state after all steps, with a separate solver.
         advancing: model -> `advance` of a model with the same scene.
     """
 
@@ -168,7 +170,7 @@ class Difference:
         return product(self.advance(self.state.copy()), self.weights)
 
     def by(self, change, step: float) -> float:
-        """Derivative, of fourth order, by a number that `change(x)` sets to x beyond its value; it is left as it was."""
+        """Return the fourth-order central difference by a number that `change(x)` offsets by x; the number is restored."""
         values = {}
         for side in (2.0, 1.0, -1.0, -2.0):
             change(side * step)
@@ -178,7 +180,7 @@ class Difference:
         return (4.0 * near - far) / 3.0
 
     def along(self, shifts: list[Shift], step: float) -> float:
-        """Derivative, of fourth order, along the sum of directions: SIDES steps of it are the worlds of one model."""
+        """Return the fourth-order central difference along the sum of directions; the worlds of one model take the SIDES steps."""
         wide = self.model.scene.build(device=DEVICE, precision="float64", worlds=len(SIDES))
         state = wide.state()
         state.time = self.state.time
@@ -202,7 +204,7 @@ class Difference:
         return float(losses @ WEIGHTS) / step
 
     def by_length(self, dt: float, step: float, scheme: str = "implicit_euler") -> float:
-        """By the length of the one step from the state, dt long; each length is one integrator's."""
+        """Return the derivative by the length dt of a single step; each length takes a new integrator."""
         before = self.advance
 
         def longer(x):
@@ -214,7 +216,7 @@ class Difference:
 
 
 def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
-    """A state on the way, with random velocities: strains, rates and turns of frames everywhere."""
+    """Return a moving state with random velocities: nonzero strains, rates and frame rotations everywhere."""
     integrator, state = ddg.Integrator(model, **TIGHT, **options), model.state()
     for _ in range(steps):
         state = integrator.step(state, dt)
@@ -231,7 +233,7 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
 
 
 def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
-    """Derivatives of the loss of some steps by the first state, what each step read, the last first, and the loss's `Difference`."""
+    """Return gradients by the first state and by the inputs of each step (last first), and the `Difference` of the loss."""
     weights = directions(model, state, 5)
 
     def advancing(model):
@@ -257,7 +259,7 @@ def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
 
 
 def tables(model) -> list:
-    """Parameter tables of all parts."""
+    """Return the parameter tables of all rod groups and element sets."""
     return [group.parameters for group in model.groups] + (
         [part.parameters for part in model.coupled.sets] if model.coupled else []
     )
@@ -340,7 +342,7 @@ def check_state(model, gradient, difference, *shifts: Shift) -> None:
 
 
 def check_length(step_inputs, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
-    """What one part read of a step, dt long, against the derivative of the loss by its length."""
+    """Check the derivative by the length dt of one step, from the gradients of one subsystem's inputs."""
     grad_inverse_step = sum(
         float(array.numpy().sum()) for array in (step_inputs.rate, *getattr(step_inputs, "elements_rate", ()))
     )

@@ -1,4 +1,4 @@
-"""Gradients of steps against central differences of them, by every entry of the state and every parameter."""
+"""Gradients of steps by state and parameters against central differences."""
 
 import numpy as np
 import pytest
@@ -186,7 +186,7 @@ def test_a_step_in_parts_is_refused():
 
 
 def turned_clamp(joint=False):
-    """A clamp that a motion shifts and turns, out of its plane: its edge's angle is found in the lagged frame."""
+    """A clamp that a motion translates and rotates out of its plane; its edge angle refers to the lagged frame."""
     scene = joined() if joint else twisted()
     scene.supports.clear()
     motion = ddg.Motion(
@@ -207,7 +207,7 @@ def test_steps_under_a_motion_that_turns(name, scheme):
 
 
 def held_between():
-    """Rods that are held in the middle, by all components and by one, and one that nothing holds."""
+    """A rod fixed at inner nodes, by all components and by one, and a free rod."""
     scene = a_scene()
     curve = np.concatenate([CURVE, CURVE[-1] + CURVE[1:]])
     rod = scene.add_rod(curve, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
@@ -218,7 +218,7 @@ def held_between():
 
 
 def rings():
-    """One whose node is held by two components, and one with two nodes held."""
+    """Closed rods: one with two components of a node fixed, one with two nodes fixed."""
     scene, a = a_scene(), np.linspace(0.0, 2.0 * np.pi, 7, endpoint=False)
     for number, (nodes, components) in enumerate((([3], "xz"), ([2, 4], "xyz"))):
         ring = np.stack([0.1 * np.cos(a), 0.1 * np.sin(a) + number, 0.02 * np.sin(2.0 * a)], axis=1)
@@ -228,7 +228,7 @@ def rings():
 
 
 def one_after_another():
-    """Rods that are placed one after another, the last one between two anchors, and two that nothing holds."""
+    """Rods that are placed one after another, the last one between two anchors, and two free rods."""
     scene, end, section = a_scene(), CURVE[-1], ddg.Circle(0.003)
     side = np.stack([0.1 * T, 0.2 * T, 0.1 * T], axis=1)
     back = np.stack([0.1 * T, -0.2 * T, 0.1 * T + 0.02 * np.sin(5.0 * T)], axis=1)
@@ -251,7 +251,7 @@ SCENES |= TURNING
 
 @pytest.mark.parametrize("name", ["twisted", "joined", "stiffened", "turned_clamp", "turned_joined", *TURNING])
 def test_the_midpoint_rule_with_predictors_that_turn_edges(name, monkeypatch):
-    """As those of stiff rods do, whose frames are carried to where turned edges lie."""
+    """Stiff rods: reference frames are transported to the rotated edges of the predictor."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, _, difference = differentiated(name, "implicit_midpoint", 1)
     check_state(model, gradient, difference)
@@ -278,7 +278,7 @@ def pressed():
 
 
 def coupled(name: str):
-    """A couple whose forces follow the edge, on rods in a fluid."""
+    """Rods in a fluid under a follower couple."""
     scene = resisted(name, **FLUID)
     scene.add_couple(0, -1, (0.0, 2e-4, 0.0) if scene.dimension == 2 else (1e-4, 2e-4, -1e-4))
     return scene
@@ -304,7 +304,7 @@ SCENES |= LAGGED
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", LAGGED)
 def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
-    """Both are found at the start of a solve, by velocities there, and by nodes there or where the step is predicted to lead."""
+    """Drag and follower loads are lagged: evaluated at the velocities and nodes of the start, or at the predicted nodes."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, inputs, difference = differentiated(name, scheme, 2)
     check_state(model, gradient, difference, *parameter_shifts(model, inputs))
@@ -323,7 +323,7 @@ def test_drag_over_twenty_steps():
 
 
 def test_a_step_that_leaves_its_predictor_is_refused():
-    """By the midpoint rule frames are carried to the predictor: a solve that starts once more from the last state has others."""
+    """A cold start has other frames than the predictor, to which the midpoint rule transports them."""
     model = built(twisted())
     integrator = ddg.Integrator(model, scheme="implicit_midpoint")
     adjoint = Adjoint(integrator)

@@ -25,7 +25,7 @@ from tests.learn.differences import (
 )
 from tests.pairwise import covering
 
-RUBBING = {"friction": 0.3, "velocity": 0.05}  # what slides does so at twice the velocity, what turns slower
+RUBBING = {"friction": 0.3, "velocity": 0.05}  # slip speeds are twice the stick threshold, those of rotation lower
 SLIDING = 0.1  # [m/s]
 ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
 each_scene = pytest.mark.parametrize("name", SCENES)
@@ -39,7 +39,7 @@ def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coeffici
         scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
     ranges = model.coupled.touching["range"]
-    ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
+    ranges.assign(0.99 * ranges.numpy())  # room to grow, up to the search distance
     state = touching(model, along=speed)
     model.touch.at(state.coupled.q)
     assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
@@ -47,7 +47,7 @@ def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coeffici
 
 
 def by_number(inputs: list, name: str) -> np.ndarray:
-    """Derivatives by a number of contact, symmetric where it is of two groups."""
+    """Return derivatives by a contact parameter, symmetrised over the two contact groups."""
     if name == "radius":
         return sum(read[-1].radius.numpy() for read in inputs)
     gradient = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
@@ -55,7 +55,7 @@ def by_number(inputs: list, name: str) -> np.ndarray:
 
 
 def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
-    """Return a direction in each number of contact."""
+    """Return a direction in each contact parameter."""
     shifts = []
     for name in names:
         values, gradient = model.coupled.touching[name].numpy(), by_number(inputs, name)
@@ -86,7 +86,7 @@ def test_a_step_that_rubs(name, law, form):
 
 @covering(1, name=SCENES, friction_iterations=(2, 3))
 def test_friction_that_is_lagged_anew(name, friction_iterations):
-    """Two steps of some solves each, which lag what is of the one before."""
+    """Two steps of several solves each; every solve lags normal forces and tangents of the previous one."""
     law = "penalty" if friction_iterations == 2 else "barrier"
     model, gradient, inputs, difference = differentiated(
         name, law, 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
@@ -98,7 +98,7 @@ def test_friction_that_is_lagged_anew(name, friction_iterations):
 
 @covering(1, name=[name for name in SCENES if not name.startswith("sheet")], friction_iterations=(1, 2))
 def test_friction_that_rolls_rods(name, friction_iterations):
-    """By angles, and by directions and radii of what rolls, too."""
+    """Rolling adds derivatives by twist angles, edge directions and radii."""
     model, gradient, inputs, difference = differentiated(
         name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **RUBBING
     )
@@ -110,7 +110,7 @@ def test_friction_that_rolls_rods(name, friction_iterations):
 @pytest.mark.parametrize("friction_iterations", [2, 3])
 @pytest.mark.parametrize("name", ["crossing rods", "sheet on ball"])
 def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeypatch):
-    """Without the derivative by it gradients are off by a tenth and more of their largest entry."""
+    """Dropping the derivative by lagged quantities changes gradients by over a tenth of their largest entry."""
 
     def gradients():
         _, gradient, inputs, _ = differentiated(
@@ -136,7 +136,7 @@ def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeyp
 )
 @pytest.mark.parametrize("coefficients", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
 def test_friction_by_direction(name, speed, coefficients, friction_iterations):
-    """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
+    """Anisotropic friction of a rod that slides forwards and backwards, with directions of edges or across nodes."""
     model, gradient, inputs, difference = differentiated(
         name, "barrier", 2, speed, coefficients, friction_iterations=friction_iterations, **RUBBING
     )
@@ -151,7 +151,7 @@ def test_eight_steps_of_sliding(name, law):
 
 @pytest.mark.parametrize("name", ["parallel rods", "rod on plane"])
 def test_what_sticks_creeps(name):
-    """At a tenth of the speed that slides: friction is then all but its bound times the slip."""
+    """Sticking contacts creep well below the stick threshold, where friction is nearly linear in the slip."""
     model, gradient, inputs, difference = differentiated(name, "barrier", 3, friction=0.8, velocity=0.5)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("friction",)))
 
@@ -169,7 +169,7 @@ def test_a_step_by_its_length(name, friction_iterations):
 
 @lagged_once_or_twice
 def test_elements_of_what_touches(friction_iterations):
-    """Stiffnesses of rods and sheets, as without contact."""
+    """Stiffnesses of rods and sheets in contact have gradients."""
     model, _, inputs, difference = differentiated(
         "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
     )
@@ -190,7 +190,7 @@ def test_gradients_repeat_bit_by_bit(friction_iterations):
 
 @lagged_once_or_twice
 def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
-    """Gradients are the same to the bit."""
+    """Regrown pair lists give bitwise equal gradients."""
     model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **RUBBING))
     state = touching(model, along=SLIDING)
     results = []
@@ -217,7 +217,7 @@ def test_without_friction_there_is_nothing_to_lag():
 
 @lagged_once_or_twice
 def test_what_is_not_solved_has_no_gradient(friction_iterations, monkeypatch):
-    """Of several solves it may be the last one alone, which comes first."""
+    """A failed adjoint solve is refused, also if only the last friction solve fails."""
     model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **RUBBING))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)

@@ -22,7 +22,7 @@ WAY = np.linspace(-0.05, 0.05, 7)
 
 
 def _pressed(shape):
-    """A wavy rod, held at both ends, that its weight presses on an obstacle."""
+    """A wavy rod, clamped at both ends, pressed on an obstacle by its weight."""
 
     def build(scene):
         scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), edges=[0, -1])
@@ -32,7 +32,7 @@ def _pressed(shape):
 
 
 def _crossing(scene):
-    """A heavy rod that lies across another one; their ends are held, those of one as joints hold them."""
+    """A heavy rod across another one, with fixed ends, in one of them by joints."""
     scene.clamp(bar(scene, 0.0, name="lower"), edges=[0, -1])
     upper = np.stack([0.3 * WAY + 0.004, WAY, 2.0 * RADIUS + 0.8 * RANGE + 0.05 * WAY], 1)
     scene.clamp(rod(scene, upper, name="upper"), edges=[0])
@@ -61,7 +61,7 @@ def pressed_model(name: str, law: str, coefficients=None, **contact):
         scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
     ranges = model.coupled.touching["range"]
-    ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
+    ranges.assign(0.99 * ranges.numpy())  # room to grow, up to the search distance
     return model
 
 
@@ -92,7 +92,10 @@ def test_an_equilibrium_in_contact_by_a_load(name):
 
 
 def rubbing(name: str, law: str, velocity: float, **contact):
-    """An equilibrium from rest in one load step, whose gradient is that of positions, as angles depend on the way of the search."""
+    """Return an equilibrium with friction from rest in one load step, and its gradient.
+
+    The loss reads positions alone, as edge angles depend on the path of the iterates.
+    """
     model = pressed_model(name, law, friction=0.3, velocity=velocity, **contact)
     state = statics.solve(model, rtol=RTOL)
     weights = {name: values * (name == "net/q") for name, values in position_weights(model, state).items()}
@@ -111,7 +114,7 @@ def rubbing(name: str, law: str, velocity: float, **contact):
 )
 @pytest.mark.parametrize("name", CASES)
 def test_an_equilibrium_that_rubs(name, velocity, law):
-    """Things creep by the larger velocity, and slide by the smaller one where anything does."""
+    """Contacts creep at the larger stick threshold and slip at the smaller one."""
     model, state, inputs, difference = rubbing(name, law, velocity)
     touching = model.contacts(state)
     share = np.linalg.norm(touching.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(touching.force, axis=1), 1e-12)
@@ -125,7 +128,7 @@ def test_an_equilibrium_that_rubs(name, velocity, law):
     ("name", "velocity"), [("plane", 1e-4), ("mesh", 1e-3), ("crossing rods", 1e-2), ("crossing rods", 1e-3)]
 )
 def test_an_equilibrium_with_rods_that_roll(name, velocity):
-    """Edges turn in space on their way, by which frames turn beside those that are carried there straight."""
+    """Edges rotate along a path in space, so that frames differ from a single parallel transport."""
     model, _, inputs, difference = rubbing(name, "barrier", velocity, rolling=True)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
 
@@ -146,7 +149,7 @@ def test_the_way_has_to_be_known():
 
 
 def gripped(shape, velocity: float, coefficients=None, rolling: bool = False, worlds: int = 2):
-    """A bar whose first end a grip draws over a plane or a ball, which another grip moves; poses of both in two worlds."""
+    """Return a bar that a grip draws over a plane or a moved ball, and grip poses of two worlds."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -40.0))
     scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), motion=ddg.Grip(pivot=(0.01, 0.02, 0.0)))
     ball = isinstance(shape, ddg.Sphere)
@@ -172,7 +175,7 @@ GRIPPED = {
     "name", [pytest.param(name, marks=slow if name in ("rolling", "turned ball") else ()) for name in GRIPPED]
 )
 def test_gradients_go_through_all_load_steps(name):
-    """By poses at the end of the way, which all load steps have a part of, by forces, and numbers of contact."""
+    """Gradients by final poses, of which each load step takes a fraction, by forces, and by contact parameters."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
     from tests.learn.test_torch import check as check_along
@@ -265,7 +268,7 @@ def test_a_rod_that_is_drawn():
 
 
 def test_worlds_settle_on_their_own():
-    """What slides in two worlds does so as in one, in as many load steps: one that rounding moves does not hold up the other."""
+    """Two worlds with sliding contacts take the same load steps as each alone; rounding in one does not delay the other."""
     model, poses = gripped(*GRIPPED["plane"])
     path = []
     both = statics.solve(model, controls=ddg.Controls(poses=poses), rtol=RTOL, load_steps=3, way=path)

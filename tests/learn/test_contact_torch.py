@@ -1,4 +1,4 @@
-"""What goes into steps in contact as tensors: numbers of contact of every world, moved obstacles, starts; and what is refused."""
+"""Tensors as inputs of steps in contact: contact parameters of every world, moved obstacles, initial states; and refusals."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ RUBBING = {"friction": 0.3, "velocity": 0.05}
 
 
 def simulator(name: str, law: str = "barrier", worlds: int = 1, **contact) -> tuple[Simulator, object]:
-    """And a state of every world in which things slide on each other."""
+    """Return a simulator and a state of every world with sliding contacts."""
     return simulated(scene_of(name, law, **contact), worlds)
 
 
@@ -45,7 +45,7 @@ def weighed(state):
     ],
 )
 def test_numbers_of_every_world_over_steps(name, law, friction_iterations):
-    """Two worlds with numbers of their own, five steps of sliding."""
+    """Gradients by contact parameters that differ between two worlds, over five sliding steps."""
     sim, start = simulator(name, law, 2, friction_iterations=friction_iterations, **RUBBING)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
     names = [f"contact.{name}" for name in ("stiffness", "range", "friction", "radius")]
@@ -73,7 +73,7 @@ SHAPES = {
 
 @covering(1, shape=SHAPES, solves=(("barrier", 1), ("penalty", 1), ("barrier", 2), ("barrier", 3)))
 def test_moved_obstacles(shape, solves):
-    """Poses of a grip that lifts, shifts and turns what a rod lies on, over four steps, and one that keeps the last pose."""
+    """Four steps with poses of a grip that lifts, shifts and rotates an obstacle under a rod, and one that keeps the last pose."""
     law, friction_iterations = solves
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
     bar(scene, RADIUS + 0.8 * RANGE)
@@ -101,7 +101,7 @@ def test_positions_and_velocities_at_the_start():
 
 
 def test_a_coefficient_of_friction_is_found_again():
-    """From where a rod that slides has come to."""
+    """The end position of a sliding rod identifies its friction coefficient."""
     sim, start = simulator("rod on plane", **RUBBING)
     goal = sim.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
     logarithm = torch.tensor(0.2, dtype=torch.float64).log().requires_grad_()
@@ -124,7 +124,7 @@ def test_a_coefficient_of_friction_is_found_again():
 
 @pytest.mark.parametrize("friction_iterations", [1, 2])
 def test_transforms_and_checkpoints(friction_iterations):
-    """A gradient of a batch of coefficients is that of each, and the same with states made anew."""
+    """Gradients of a batch equal those of each coefficient, with and without checkpointing."""
     sim, start = simulator("rod on ball", friction_iterations=friction_iterations, **RUBBING)
 
     def loss(mu, **kept):
@@ -140,7 +140,7 @@ def test_transforms_and_checkpoints(friction_iterations):
 
 
 def test_a_world_in_which_a_step_fails_has_no_gradient_alone():
-    """It starts in an overlap, which no step leads out of."""
+    """A world that starts in overlap fails and has no gradient; the other world keeps its own."""
     sim, start = simulator("rod on plane", worlds=2)
     k = sim.parameter("contact.stiffness").requires_grad_()
     radius = sim.parameter("contact.radius")
@@ -183,7 +183,7 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_an_equilibrium_by_numbers_of_every_world():
-    """Two worlds with numbers of their own, of a rod that its weight presses on a ball."""
+    """Contact parameters differ between two worlds with a rod pressed on a ball by its weight."""
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), edges=[0, -1])
     scene.add_obstacle(ddg.Sphere((0.001, 0.002, -0.1), 0.1), name="obstacle")
@@ -209,7 +209,7 @@ def test_an_equilibrium_by_numbers_of_every_world():
     ],
 )
 def test_sizes_of_sections_are_those_that_touch(name, module, learned):
-    """Learned radii and thicknesses give what a scene has that is built with them, contact included."""
+    """Learned radii and thicknesses act, also in contact, as in a scene that is built with them."""
     sim, _ = simulator(name, "penalty")
     factors = module(sim, names=(learned,))
     values = factors()
@@ -244,7 +244,7 @@ def test_radii_that_are_given_stay():
 
 
 def test_what_turns_far_has_no_gradient_and_counts_no_more_than_half_a_turn():
-    """A step in substeps that resolve arcs is no single solve; poses say nothing of more than half a turn."""
+    """Substeps that resolve large rotations have no gradient; poses cannot represent more than half a revolution."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_rod(np.linspace((0.1, 0.02, -0.05), (0.1, 0.02, 0.05), 7), section=ddg.Circle(RADIUS), material=SOFT)
     scene.add_obstacle(ddg.Capsule((0.05, 0.0, 0.0), (0.2, 0.0, 0.0), RADIUS), motion=ddg.Grip())

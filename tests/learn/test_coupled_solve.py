@@ -1,4 +1,4 @@
-"""Linear systems of the reverse of nets: conjugate gradients on the device against sparse factors, and gradients by both."""
+"""Linear systems of the coupled adjoint: conjugate gradients on the device against sparse factors."""
 
 from types import SimpleNamespace
 
@@ -37,7 +37,7 @@ def oblique():
 
 
 def strut(density=1000.0):
-    """A straight rod with a twig of its own, between two supports."""
+    """A straight rod with one branch, between two supports."""
     scene, t = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.linspace(0.0, 1.0, 9)
     material = ddg.Material(young=1e6, density=density)
     rods = [
@@ -60,7 +60,7 @@ def squeezed(name: str):
 
 
 def by_both(model, state, rate: float, **attributes):
-    """The system after it has solved for one right-hand side, its solution, that of factors, and their tangent."""
+    """Solve for one right-hand side; return the system, both solutions and the tangent of the factors."""
     coupled = model.coupled
     right = np.random.default_rng(1).normal(size=(model.worlds * coupled.blocks, 3))
     angles = (np.arange(coupled.blocks) >= coupled.host.nodes) & (
@@ -99,7 +99,7 @@ def test_conjugate_gradients_find_what_factors_do(name):
 
 
 def test_rods_that_branch_are_eliminated():
-    """One iteration: chains leave nothing."""
+    """Substructuring is exact for a tree of rods: one iteration."""
     model = built(SCENES["joined"]())
     system, *_ = by_both(model, lively(model), RATE)
     assert system.iterations.numpy()[0] == 1
@@ -172,7 +172,7 @@ def test_gradients_are_those_of_factors(name, scheme):
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Conjugate gradients that end with their first iteration."""
+    """End conjugate gradients after their first iteration."""
     once = PCG.__init__
 
     def cut(self, newton, multilevel, indefinite=False, **options):
@@ -195,7 +195,7 @@ def test_what_does_not_converge_takes_factors(hasty):
 
 
 def test_worlds_of_torch_that_do_not_converge_say_so(hasty):
-    """The host does not look at a step of torch: what has no gradient is no number."""
+    """Undefined gradients are NaN, as the host does not check steps of torch."""
     simulator = Simulator(built(SCENES["sheet"]()), DT)
     velocities = torch.zeros((1, simulator.model.points_count, 3), dtype=torch.float64, requires_grad=True)
     after = simulator.step(simulator.initial_state(velocities=velocities))
@@ -205,7 +205,7 @@ def test_worlds_of_torch_that_do_not_converge_say_so(hasty):
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", ["joined", "sheet"])
 def test_reverses_of_nets_are_replayed(name, scheme):
-    """One captured graph serves all steps of a length, and finds what launches one by one do."""
+    """One captured graph serves all steps of a length, with the results of single launches."""
     gradients = []
     for replayed in (True, False):
         simulator = Simulator(built(SCENES[name]()), DT, scheme=scheme, rtol=1e-12)
@@ -221,7 +221,7 @@ def test_reverses_of_nets_are_replayed(name, scheme):
 
 @pytest.mark.parametrize("name", ["joined", "sheet"])
 def test_mixed_precision(name):
-    """Within 1e-4 of float64's, as asked: solved in float64."""
+    """Gradients agree with float64 within 1e-4, as the adjoint is solved in float64."""
     gradients = []
     for precision in ("float64", "mixed"):
         simulator = Simulator(SCENES[name]().build(device=differences.DEVICE, precision=precision), DT, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Environments: actions move grips, worlds start anew alone, failures are named, gradients go through."""
+"""Environments: actions move grips, worlds reset independently, failures are named, gradients pass."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ WORLDS = 3
 
 
 def gripped(dimension: int = 3, **options) -> Simulator:
-    """A cable held by a grip at one end."""
+    """A cable with a grip at one end."""
     scene = a_scene(dimension=dimension)
     rod = scene.add_rod(POINTS, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
@@ -28,12 +28,12 @@ def gripped(dimension: int = 3, **options) -> Simulator:
 
 
 def observe(episodes):
-    """The tip relative to its goal, and the poses."""
+    """Return the tip relative to its goal, and the poses."""
     return torch.cat([episodes.world.positions[:, -1] - episodes.goals, episodes.poses.flatten(1)], 1)
 
 
 def off(episodes):
-    """How far the tip is from its goal."""
+    """Return the negated squared distance of the tip from its goal."""
     return -((episodes.world.positions[:, -1] - episodes.goals) ** 2).sum(1)
 
 
@@ -47,13 +47,13 @@ def environment(sim: Simulator | None = None, **options) -> Environment:
 
 
 def some_actions(count: int, seed: int = 5) -> torch.Tensor:
-    """Random actions within their bounds (count, worlds, 4)."""
+    """Draw random actions within their bounds (count, worlds, 4)."""
     torch.manual_seed(seed)
     return (2.0 * torch.rand((count, WORLDS, 4), dtype=torch.float64) - 1.0) * torch.tensor([0.5, 0.5, 3.0, 3.0])
 
 
 def same(first, second, worlds) -> None:
-    """Episodes of these worlds are alike to the last bit."""
+    """Assert that episodes of these worlds are bitwise equal."""
     for name in ("positions", "velocities", "angles"):
         a, b = getattr(first.world, name)[worlds], getattr(second.world, name)[worlds]
         torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
@@ -63,7 +63,7 @@ def same(first, second, worlds) -> None:
 
 
 def test_rotations_turn_on():
-    """As matrices do, beyond half a turn, too; from none at all, and with gradients there."""
+    """Rotation vectors compose as matrices, also beyond half a revolution; at zero with finite gradients."""
     torch.manual_seed(0)
     vectors, increments = torch.randn((20, 3), dtype=torch.float64) * 1.5, torch.randn((20, 3), dtype=torch.float64)
     vectors[0], increments[1], vectors[2], increments[2] = 0.0, 0.0, 0.0, 0.0
@@ -74,7 +74,7 @@ def test_rotations_turn_on():
 
 
 def test_actions_are_velocities_of_grips():
-    """Bit for bit the steps of a simulator whose grip goes there, in as many substeps."""
+    """Actions equal, bit for bit, the steps of a simulator with the same grip poses and substeps."""
     sim, actions = gripped(), some_actions(2)
     env = environment(sim, substeps=2)
     episodes, state = env.begin(env.generators(0)), sim.initial_state(WORLDS)
@@ -96,7 +96,7 @@ def test_actions_are_velocities_of_grips():
 
 
 def test_worlds_start_anew_alone():
-    """One is as its second episode in a new simulator would be, the others go on as if nothing had been."""
+    """A reset world equals its second episode in a new simulator; the other worlds continue unchanged."""
     env, actions = environment(steps=9), some_actions(6)
     generators = env.generators(3)
     episodes = env.begin(generators)
@@ -131,7 +131,7 @@ def test_a_world_whose_step_fails_is_terminated_and_rests():
 
 
 def test_gradients_go_through_episodes():
-    """Of the sum of rewards by all actions, along a random direction, against central differences of fourth order."""
+    """The gradient of the sum of rewards by all actions agrees with fourth-order central differences."""
     env, actions = environment(), some_actions(3).requires_grad_()
 
     def total(actions):

@@ -1,4 +1,4 @@
-"""Environments as gymnasium and TorchRL have them: their own checks, episodes that end, seeds, failures, gradients."""
+"""Environments in gymnasium and TorchRL: checkers, ended episodes, seeds, failures, gradients."""
 
 import importlib
 import re
@@ -40,7 +40,7 @@ def vector(**options):
 
 
 def test_gymnasium_finds_nothing_wrong():
-    """Its checker of environments, by one world of a vector environment; it has none of vector environments."""
+    """gymnasium's checker of environments passes for one world of a vector environment; it has none for vectors."""
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
@@ -68,7 +68,7 @@ def test_gymnasium_finds_nothing_wrong():
     with pytest.warns(UserWarning) as warned:
         check_env(One())
     left = [str(warning.message) for warning in warned]
-    # what the author of an environment may mean: observations without bounds, actions in units, no picture
+    # warnings that an author may intend: observations without bounds, actions in units, no picture
     expected = ("minimum value is -infinity", "maximum value is infinity", "symmetric and normalized", "render modes")
     assert not [text for text in left if not any(words in text for words in expected)]
 
@@ -153,7 +153,7 @@ def test_torchrl_finds_nothing_wrong():
 
 
 def test_rollouts_of_torchrl_have_gradients():
-    """A policy's gradient is that of the environment; episodes that end begin anew, by seeds that repeat."""
+    """A policy has the gradient of the environment; ended episodes are reset, with reproducible seeds."""
     pytest.importorskip("torchrl")
     from tensordict.nn import TensorDictModule
 

@@ -19,7 +19,7 @@ from ddg_warp.io.hdf5 import TrajectoryReader
 
 
 def record(directory, frames: int = 3, points: int = 2) -> None:
-    """A trajectory as small as a reader takes it."""
+    """Write the smallest trajectory that the reader accepts."""
     with h5py.File(directory / "trajectory.h5", "w") as file:
         file["trajectory/time"] = 0.1 * np.arange(frames)
         file["trajectory/points"] = np.arange(3.0 * frames * points).reshape(frames, points, 3)

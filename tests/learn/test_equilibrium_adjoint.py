@@ -14,7 +14,7 @@ RTOL = 1e-13
 
 
 def followed():
-    """A couple that follows the edge it bends: its stiffness is not symmetric."""
+    """A follower couple on the edge that it bends: load stiffness is unsymmetric."""
     scene = SCENES["twisted"]()
     scene.fix(1, [-1])
     scene.add_couple(0, -1, (1e-4, 2e-4, -1e-4))
@@ -31,7 +31,7 @@ CASES = {
 
 
 def position_weights(model, state) -> dict:
-    """Weights of positions, angles and frames alone, as velocities and kept strains are no part of an equilibrium."""
+    """Return weights of positions, angles and frames alone; equilibria have no velocities or stored strains."""
     weights = directions(model, state, 5)
     weights = {
         name: values * (name.rpartition("/")[2] in ("x", "q", "theta", "frame")) for name, values in weights.items()
@@ -81,10 +81,10 @@ def test_an_equilibrium_by_its_loads(name):
 
 
 def check_load(host, index: int, gradient: np.ndarray, difference: Difference) -> None:
-    """Derivatives by the components of a dead force at a place."""
+    """Check the derivatives by the components of a dead force at one index."""
     force = np.where(gradient < 0.0, -1.0, 1.0)
     host.add_load(np.array([index]), 0.0 * force, None)
-    del host.constant  # made anew, with it
+    del host.constant  # rebuilt with the force
     added = host.constant
 
     def pull(x):
@@ -94,7 +94,7 @@ def check_load(host, index: int, gradient: np.ndarray, difference: Difference) -
 
 
 def test_a_mechanism_has_no_gradient():
-    """A joined rod that is not held can spin about its hinge."""
+    """A joined rod without support rotates about its hinge: a rigid-body mode."""
     model = built(SCENES["hinged"]())
     state = statics.solve(model)
     weights = directions(model, state, 5)
@@ -111,9 +111,9 @@ def test_velocities_of_an_equilibrium_have_no_effect():
 
 
 def test_neutral_equilibria_are_refused(device):
-    """A straight rod between two points, of a round section, may spin about itself: natural curvature would turn it at once.
+    """A round straight rod between two points has a neutral rotation about its axis.
 
-    Held at one edge it has a gradient.
+    Clamped at one edge it has a gradient.
     """
     for clamped in (False, True):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))

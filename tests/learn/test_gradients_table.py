@@ -1,4 +1,4 @@
-"""The table of gradients: every input is right or refused by name; what the command says of it, and holes that it has found."""
+"""The table of gradients: every input is right or refused by name; output of the command, and past defects."""
 
 import pytest
 
@@ -120,7 +120,7 @@ def test_what_is_wrong_fails(monkeypatch, capsys, device):
 
 
 def test_parameters_of_several_tables_one_after_the_other():
-    """Shells have a table for each term: what one was given ends with the step, whatever another is given next."""
+    """Shells have a table for each term; values of one table end with the step, also if another follows."""
     simulator = Simulator(built(SCENES["sheet"]()), DT, **TIGHT)
     state = simulator.step(simulator.step(simulator.initial_state()))
     usual = simulator.step(state).positions

@@ -40,7 +40,7 @@ def function(sim: Simulator):
 
 
 def test_gradients_in_jax_are_those_of_differences(jax):
-    """In a jitted function, with operations of JAX on both sides, by both inputs."""
+    """Gradients by both inputs through a jitted function with operations of JAX on both sides."""
     from ddg_warp.torch.jax import from_torch
 
     sim = simulator()
@@ -102,7 +102,7 @@ def test_states_of_torch_pass_without_a_copy(jax):
 
 @pytest.mark.parametrize("name", ["twisted", "sheet"])
 def test_arrays_of_states_pass_without_a_copy(name, device):
-    """To torch, and to NumPy on the CPU; what was handed over stays as it is when steps go on."""
+    """Arrays pass to torch, and to NumPy on the CPU; exported arrays are not overwritten by later steps."""
     model = built(SCENES[name]())
     integrator, state = ddg.Integrator(model), model.state()
     state = integrator.step(state, DT)

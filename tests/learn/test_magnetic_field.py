@@ -15,12 +15,12 @@ from tests.learn.test_torch import check, normal  # noqa: E402
 
 @pytest.fixture
 def fields() -> torch.Tensor:
-    """Of two worlds [T], on the device under test."""
+    """Return fields of two worlds [T] on the device under test."""
     return torch.tensor([[1e-2, 2e-2, -3e-2], [0.0, -1e-2, 2e-2]], dtype=torch.float64)
 
 
 def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
-    """A rod magnetised obliquely where it twists, in a field that grows along x and z."""
+    """Return a simulator of an obliquely magnetised rod in a field that grows along x and z."""
     twist = scheme == "implicit_euler" and dimension == 3
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), dimension=dimension)
     points = CURVE if dimension == 3 else CURVE * [1.0, 0.0, 1.0]
@@ -34,7 +34,7 @@ def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 def test_it_is_as_if_the_scene_had_it(scheme, fields):
-    """Of two worlds each moves as in a scene with the sum of both fields, also one that changes with time."""
+    """Each of two worlds moves as in a scene with the sum of both fields, also time-dependent ones."""
     simulator = magnet(scheme, lambda t: (0.0, 0.5 * t, 0.0))
     moved = simulator.rollout(simulator.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
     for world, field in enumerate(fields.tolist()):
@@ -60,7 +60,7 @@ def test_steps_of_an_integrator_take_it(fields):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 def test_gradients_of_every_step(scheme, fields):
-    """Each of three steps has a field of its own, also where the reverse comes after other steps."""
+    """Each of three steps has a different field, also if the backward pass follows other steps."""
     simulator = magnet(scheme)
     torch.manual_seed(0)
     weight = normal(simulator.model.points_count, 3)
@@ -121,7 +121,7 @@ def test_it_is_refused_where_nothing_is_magnetic(fields):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])  # with twist and without
 def test_equilibria_take_it(scheme, fields):
-    """Each world is where a scene with the sum of both fields rests; half of the load parameter means half of the field."""
+    """Each world has the equilibrium of a scene with the sum of both fields; the load parameter scales the field."""
     simulator = magnet(scheme, (1e-2, 0.0, 0.0))
     result = simulator.equilibrium(None, {"field": fields}, batch=2, rtol=1e-11).positions
     half = simulator.equilibrium(None, {"field": fields}, batch=2, end=0.5, rtol=1e-11).positions

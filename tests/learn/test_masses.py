@@ -109,7 +109,7 @@ def test_every_world_has_its_own():
     ],
 )
 def test_masses_under_gravity_that_is_given(name, analysis):
-    """Gradients by masses go by the gravity of their world, and every kind of mass is there."""
+    """Gradients by every kind of mass use the gravity of their world."""
     statics = analysis == "statics"
     sim = Simulator(built(SCENES[name]()), DT, scheme="implicit_euler" if statics else analysis, **TIGHT)
     masses = [n for n in sim.engine(2).tables.names() if n.endswith((".mass", ".inertia"))]
@@ -128,7 +128,7 @@ def test_masses_under_gravity_that_is_given(name, analysis):
         return moved + state.angles.square().sum()
 
     values = {n.replace(".", "__"): sim.parameter(n, 2) for n in masses if not (statics and n == "rod.inertia")}
-    turned = 0.05 if name == "stiffened" else 0.01  # where little depends on it, what rounding leaves counts
+    turned = 0.05 if name == "stiffened" else 0.01  # small derivatives are limited by rounding
     sizes = {key: (turned if "inertia" in key else 1e-3) * float(result.max()) for key, result in values.items()}
     check(loss, {"gravity": gravity} | values, {"gravity": 2e-3} | sizes)
 
@@ -165,7 +165,7 @@ def test_worlds_of_a_map_are_those_of_a_batch():
 
 
 def test_a_rod_and_its_shell_have_masses_of_their_own():
-    """Which add up where they share a node."""
+    """Masses of a rod and its shell add up at common nodes."""
 
     def stiffened(density: float = 1.0) -> ddg.Scene:
         scene = a_scene()
@@ -233,7 +233,7 @@ def test_what_does_not_fit_is_refused(parameters, match):
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("factor", [1.0, 1e3, 1e6])
 def test_mixed_precision_knows_what_is_given(scheme, factor):
-    """Of rods that a tensor makes stiffer by far than the model's, which float32 serves; by 1e6 they are taken in float64."""
+    """A tensor makes rods far stiffer than the model's, for which float32 suffices; a factor 1e6 selects float64."""
     names = [f"rod_bend_twist.stiffness_{k}" for k in (1, 2, 3)] + ["rod_stretch.stiffness"]
 
     def gradient(precision):

@@ -21,7 +21,7 @@ def swung() -> np.ndarray:
 
 @pytest.fixture
 def clone(tmp_path, monkeypatch):
-    """A folder as the authors publish it, which the environment names."""
+    """Write a folder as published by the authors, and set the environment variable to it."""
     for split, names in {"train": (2, 10, 1), "eval": (7,)}.items():
         folder = tmp_path / "data_set" / "DLO1" / split
         folder.mkdir(parents=True)
@@ -83,7 +83,7 @@ def test_grips_follow_their_markers_without_twist(clone):
         identity = np.broadcast_to(np.eye(3), grip.frame.shape)
         np.testing.assert_allclose(np.swapaxes(grip.frame, 1, 2) @ grip.frame, identity, atol=1e-13)
         np.testing.assert_allclose(np.linalg.det(grip.frame), 1.0, atol=1e-13)
-        # The rate of turning, seen by the frame, has no part about the tangent.
+        # The angular velocity in the frame has no component along the tangent.
         step = np.swapaxes(grip.frame[:-1], 1, 2) @ grip.frame[1:]
         assert np.abs(step[:, 2, 1] - step[:, 1, 2]).max() < 1e-4 * np.abs(step[:, 1, 0] - step[:, 0, 1]).max()
 
@@ -117,7 +117,7 @@ def test_lost_markers_are_kept_and_named(tmp_path):
 
 
 def test_short_gaps_are_filled():
-    """By straight lines, exact for steady motion; long gaps and both ends stay lost, and what was seen stays as it was."""
+    """Short gaps are filled linearly; long gaps and both ends stay lost, and seen markers unchanged."""
     steady = np.linspace(0.0, 1.0, 20)[:, None, None] * np.arange(1.0, 10.0).reshape(3, 3)
     markers = steady.copy()
     markers[3:6, 0], markers[8:14, 1], markers[:2, 2], markers[-1, 2] = np.nan, np.nan, np.nan, np.nan

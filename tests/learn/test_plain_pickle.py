@@ -1,4 +1,4 @@
-"""Pickles of arrays by any protocol are read; nothing else that a pickle asks for is done."""
+"""Pickles of arrays by any protocol are read; any other instruction of a pickle is refused."""
 
 import os
 import pickle
@@ -52,7 +52,7 @@ def test_names_of_either_numpy_are_read(tmp_path):
 
 
 class Malicious:
-    """Makes a directory when it is loaded."""
+    """Object whose unpickling makes a directory."""
 
     def __init__(self, path):
         self.path = path

@@ -20,7 +20,7 @@ def straight(directions) -> np.ndarray:
 
 
 def test_twist_is_the_turn_of_frames_that_come_back():
-    """One grip whose tangent goes around a cone by half an angle a, the other in place: twist 2 pi (1 - cos a) of a straight cable."""
+    """A grip's tangent runs around a cone of half angle a, the other grip is fixed: twist 2 pi (1 - cos a)."""
     frames, a = 400, 0.4
     angle = np.linspace(0.0, 2.0 * np.pi, frames)
     cone = np.stack([np.full(frames, np.cos(a)), np.sin(a) * np.cos(angle), np.sin(a) * np.sin(angle)], 1)
@@ -31,7 +31,7 @@ def test_twist_is_the_turn_of_frames_that_come_back():
     whole = Recording("b", 0.01 * np.arange(frames), markers)
     assert _cable.twist_at(recording, 0) == pytest.approx(0.0, abs=1e-12)
     assert abs(_cable.twist_at(recording, frames - 1)) == pytest.approx(2.0 * np.pi * (1.0 - np.cos(a)), rel=1e-3)
-    assert _cable.twist_at(whole, frames - 1) == pytest.approx(0.0, abs=1e-12)  # both ends have turned alike
+    assert _cable.twist_at(whole, frames - 1) == pytest.approx(0.0, abs=1e-12)  # equal rotation of both ends
 
 
 def test_shapes_leave_grips_in_their_direction():
@@ -68,7 +68,7 @@ def test_windows_start_where_frames_have_them():
 
 @pytest.mark.slow
 def test_a_folder_of_the_user(tmp_path):
-    """Recordings that lie somewhere are learned from alike; of them nothing but markers held out is known."""
+    """Learning accepts recordings in a user's folder, of which only held-out markers are known."""
     scene = load_scene("identify_from_recording")
     scene.record(tmp_path)
     assert len(recordings("train", root=tmp_path)) == 2

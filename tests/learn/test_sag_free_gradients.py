@@ -1,4 +1,4 @@
-"""Rest strains that keep rods where they are, and gradients of equilibria by them: two ways to the same derivatives."""
+"""Sag-free rest strains and gradients of equilibria by them: two computations of the same derivatives."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ ALONE = 66  # nodes of the first two rods, which bear their weight alone
 
 
 def test_more_weight_and_the_rest_strains_for_it_move_nothing():
-    """Rods stay under any part of their loads with the rest strains for it, which are linear in it: derivatives cancel."""
+    """Rest strains are linear in the load and keep rods in place: derivatives by both cancel."""
     model = scene_of_all().build(differences.DEVICE, "float64")
     simulator, points = Simulator(model, 0.01), torch.tensor(model.state().points())
     none, half, whole = (rest_strains(model, load=load) for load in (0.0, 0.5, 1.0))
@@ -37,7 +37,7 @@ def test_more_weight_and_the_rest_strains_for_it_move_nothing():
 
 
 def test_a_search_from_there_goes_nowhere():
-    """The gradient of the distance from where rods are drawn vanishes with it; half of the change leaves some of both."""
+    """Distance from the drawn shape and its gradient vanish at sag-free rest strains, not at half of them."""
     model = scene_of_all().build(differences.DEVICE, "float64")
     simulator, points = Simulator(model, 0.01), torch.tensor(model.state().points())
     sizes = []

@@ -1,4 +1,4 @@
-"""Parameters of shells as a module: what it gives is what shells are built with, with gradients through steps and equilibria."""
+"""Parameters of shells as a module: values as in built shells, gradients through steps and equilibria."""
 
 import copy
 import pickle
@@ -27,19 +27,19 @@ def mesh(number: int) -> meshes.Mesh:
 
 
 def forms(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """At rest: grown along an oblique direction, and curved."""
+    """Return metric and curvature at rest: grown along an oblique direction, and curved."""
     points, triangles = mesh(number)
     along = (1.0, 0.4, 0.0)
     return grown_metric(points, triangles, 1.1, 0.9, along), principal_form(points, triangles, 2.0, -1.0, along)
 
 
 def areas(metric: np.ndarray) -> np.ndarray:
-    """Of triangles (T,), twice."""
+    """Return twice the areas of triangles (T,)."""
     return np.sqrt(metric[:, 0] * metric[:, 2] - metric[:, 1] ** 2)
 
 
 def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scene:
-    """Two shells, held along one side, with these quantities (one number a triangle of both) or their own."""
+    """Return two shells, fixed along one side, with the given quantities per triangle or defaults."""
     scene, start = ddg.Scene(gravity=(0.5, 0.0, -9.81)), 0
     for number in range(2):
         points, triangles = mesh(number)
@@ -53,7 +53,7 @@ def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scen
         rest = "flat" if flat else forms(number)
         if values is not None:
             quantities = {name: values[name][0, start : start + len(triangles)] for name in NUMBERS + MASS}
-            if not flat:  # masses are those of the first metric
+            if not flat:  # the first metric sets the masses
                 first, rest = rest, tuple(values[name][0, start : start + len(triangles)] for name in FORMS)
                 quantities["density"] = quantities["density"] * areas(first[0]) / areas(rest[0])
         start += len(triangles)
@@ -68,7 +68,7 @@ def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scen
 
 
 def changed(module: ShellParameters, seed: int = 0, size: float = 0.2) -> ShellParameters:
-    """With random changes."""
+    """Return the module after random changes of its values."""
     torch.manual_seed(seed)
     with torch.no_grad():
         for values in module.changes.values():
@@ -112,7 +112,7 @@ def test_curvatures_and_metrics_are_those_along_the_direction():
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 @pytest.mark.parametrize("statics", [False, True])
 def test_gradients(bending, statics):
-    """By every quantity, in two worlds, through steps and equilibria, against differences."""
+    """Gradients by every quantity, in two worlds, through steps and equilibria, against differences."""
     names = (NUMBERS if bending == "hinge" else NUMBERS + FORMS) + MASS
     simulator = Simulator(built(sheets(bending)), DT, **TIGHT)
     shares = np.column_stack([np.ones(20), np.linspace(-1.0, 1.0, 20)])

@@ -33,7 +33,7 @@ def simulator(name: str, **options) -> Simulator:
 
 
 def gripped(scheme: str = "implicit_euler") -> Simulator:
-    """A rod held at both ends, of which one is moved and turned."""
+    """A rod fixed at both ends, one of which a grip translates and rotates."""
     scene = a_scene()
     rod = scene.add_rod(CURVE, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
@@ -105,7 +105,7 @@ def test_everything_that_goes_in_has_a_gradient(name):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 def test_poses_and_moments_have_gradients(scheme):
-    """Of steps that are given poses, and of one that keeps those of the last."""
+    """Gradients of steps with poses, and of a step that keeps the last poses."""
     sim = gripped(scheme)
 
     def loss(poses, moments):
@@ -146,7 +146,7 @@ def test_elements_are_counted_rod_by_rod():
 
 @pytest.mark.parametrize("name", ["twisted", "joined"])
 def test_transforms(name):
-    """vmap makes worlds of a batch; grad and vmap of grad give what a loop of backward gives."""
+    """vmap maps a batch to worlds; grad and vmap of grad equal a loop of backward passes."""
     sim, term = simulator(name), STIFFNESS[name]
 
     def loss(stiffness, velocities):
@@ -220,7 +220,7 @@ def test_steps_are_those_of_the_integrator():
     ("name", "scheme"), [("twisted", "implicit_euler"), ("joined", "implicit_euler"), ("joined", "implicit_midpoint")]
 )
 def test_a_world_without_a_gradient_says_so_alone(name, scheme):
-    """One of two worlds is thrown so fast that its step is made in parts."""
+    """One of two worlds is thrown so fast that its step takes substeps."""
     sim = Simulator(built(SCENES[name]()), 0.02, max_iterations=4, scheme=scheme)
     points = sim.model.points_count
     speed = torch.zeros((2, points, 3), dtype=torch.float64)
@@ -291,7 +291,7 @@ def test_equilibria_are_those_of_a_new_simulator(name):
 
 @covering(1, name=STIFFNESS, end=(1.0, 0.7))
 def test_equilibria_under_controls(name, end):
-    """Of two worlds under different loads, which the load parameter scales; along with a stiffness."""
+    """Gradients of equilibria of two worlds by loads, scaled by the load parameter, and a stiffness."""
     sim, term = resting(name), STIFFNESS[name]
     points, edges = sim.model.points_count, sim.model.order.edges_count
     flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
@@ -314,7 +314,7 @@ def test_equilibria_under_controls(name, end):
 
 
 def pressed_by_a_grip(scene):
-    """A sheet whose first vertices and normals a grip holds, under pressure, which follows them."""
+    """A sheet under follower pressure, whose first vertices and normals a grip prescribes."""
     points, triangles = meshes.rectangle(3, 2, (0.3, 0.2))
     shell = scene.add_shell(points, triangles, thickness=0.004, material=SOFT)
     scene.clamp_boundary(shell, np.flatnonzero(points[:, 0] <= 0.0), motion=ddg.Grip())
@@ -333,7 +333,7 @@ def gripped_joint(scene):
 
 @pytest.mark.parametrize("hold", [None, gripped_joint, pressed_by_a_grip], ids=["rod", "joined", "sheet"])
 def test_equilibria_by_poses(hold):
-    """Beside moments, which turn with the edges that a grip moves at one end, and loads that follow what it holds."""
+    """Gradients by poses next to moments on edges moved by a grip, and follower loads on them."""
     sim, scene = gripped(), a_scene()
     if hold:
         hold(scene)
@@ -388,7 +388,7 @@ def test_copies_and_pickles():
 
 @pytest.mark.parametrize("name", ["lone", "joined"])
 def test_parameters_of_the_model_go_into_other_worlds(name):
-    """One number an element, set before the simulator was made, is that of all worlds and of what is pickled; never the scene's."""
+    """Element values set before the simulator exists apply to all worlds and pickles, and not to the scene."""
     sim, stiffness = gripped() if name == "lone" else simulator(name), "rod_bend_twist.stiffness_2"
     values = np.linspace(1.0, 2.0, sim.parameter(stiffness).shape[1]) * float(sim.parameter(stiffness)[0, 0])
     sim.model.set_parameter(*stiffness.split("."), values)
@@ -402,7 +402,7 @@ def test_parameters_of_the_model_go_into_other_worlds(name):
 
 
 def test_rest_shapes_of_the_model_go_along():
-    """Into a pickle, one of that, and other worlds; what is learned of shells begins with them."""
+    """Rest shapes go into pickles and other worlds; shell modules start from them."""
     model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64")
     model.set_rest(0, points=model.state().points() * [1.2, 1.1, 0.5])
     sim, usual = Simulator(model, DT, **TIGHT), simulator("sheet")
@@ -420,7 +420,7 @@ def test_rest_shapes_of_the_model_go_along():
 
 
 def test_a_stiffness_is_found_again():
-    """Three stiffnesses of a rod from its motion, by gradients of their logarithms."""
+    """Motion of a rod identifies three stiffnesses by gradients of their logarithms."""
     sim = simulator("twisted")
     truth = {"bending": 0.7, "twisting": 1.4}
     factors = RodParameters(sim, names=tuple(truth))
@@ -488,7 +488,10 @@ def test_what_does_not_fit_is_refused(parameters, controls, message):
 @pytest.mark.parametrize("solver", ["sweep", "partitioned"])
 @pytest.mark.parametrize(("young", "radius", "passes"), [(1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)])
 def test_float32_solves_for_what_inertia_does_not_give(monkeypatch, young, radius, passes, solver):
-    """Within the error of as many solutions; of w itself, dt times those by velocities, float32 leaves 1e-4 of the first gradients."""
+    """Gradients agree within the error of the solutions.
+
+    Alternative: float32 solutions for w itself, dt times the gradients by velocities, leave errors of 1e-4.
+    """
     monkeypatch.setattr(linear_solve, "automatic", lambda group: solver)
     scene, points = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.zeros((24, 3))
     points[:, 0] = np.linspace(0.0, 1.0, len(points))
@@ -512,7 +515,7 @@ def test_float32_solves_for_what_inertia_does_not_give(monkeypatch, young, radiu
 
 @pytest.mark.parametrize("name", ["twisted", "joined", "planar", "sheet"])
 def test_mixed_precision_is_close_to_float64(name):
-    """To 1e-4, as asked: by float32 solutions where these are good enough, else by float64."""
+    """Gradients agree with float64 within 1e-4, by float32 solutions where these suffice."""
     gradients = []
     for precision in ("float64", "mixed"):
         scene = SCENES[name]()
@@ -538,7 +541,7 @@ def test_compiled_functions_go_on_around_steps():
 
 
 def _learn(rank: int, folder: str, out: str, cuda: bool) -> None:
-    """One of two processes that share a parameter and have a world each, on a GPU each: half a step of descent."""
+    """Run one of two processes with a common parameter and one world and GPU each: half a descent step."""
     import torch.distributed as dist
 
     if cuda:
@@ -558,7 +561,7 @@ def _learn(rank: int, folder: str, out: str, cuda: bool) -> None:
 
 
 def test_two_processes_share_a_gradient(tmp_path, device):
-    """DistributedDataParallel takes the mean of what both have found."""
+    """DistributedDataParallel averages the gradients of both processes."""
     cuda = device != "cpu"
     if cuda and torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
@@ -578,7 +581,7 @@ def test_two_processes_share_a_gradient(tmp_path, device):
 
 @pytest.mark.gpu
 def test_steps_run_on_the_stream_that_torch_uses():
-    """What a side stream has yet to write is what a step there reads, and the other way round."""
+    """A side stream orders steps after its pending writes, and its reads after the steps."""
     sim = simulator("twisted")
     first = sim.step(sim.initial_state()).positions
     side = torch.cuda.Stream()
@@ -614,7 +617,7 @@ def test_calls_that_do_not_fit_are_refused():
 
 @pytest.mark.parametrize("name", ["twisted", "joined"])
 def test_states_of_the_model_step_as_its_own(name):
-    """Elsewhere, turned and moving, of damped rods, in two worlds: step by step what the integrator makes of it."""
+    """Translated, rotated and moving states of damped rods in two worlds equal the integrator's step by step."""
     model = SCENES[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
     sim = Simulator(model, DT, **TIGHT)
     random = np.random.default_rng(5)

@@ -1,4 +1,4 @@
-"""Gradients by the implicit function theorem against those of Newton's iteration itself, which torch records."""
+"""Gradients by the implicit function theorem against a Newton iteration unrolled by torch."""
 
 import numpy as np
 import pytest
@@ -12,16 +12,19 @@ from ddg_warp.torch import Simulator  # noqa: E402
 DT, STEPS, ITERATIONS = 0.01, 3, 12
 YOUNG, DENSITY, RADIUS = 1e6, 1000.0, 0.004
 POINTS = np.array([[0.0, 0.0], [0.05, 0.0], [0.095, 0.02], [0.13, 0.055], [0.15, 0.1]])
-FREE = 4  # entries of the first edge, which is held
+FREE = 4  # entries of the first edge, which is clamped
 
 
 def rest_lengths():
-    """Of the edges [m], on the device under test."""
+    """Return the rest lengths of edges [m] on the device under test."""
     return torch.tensor(np.linalg.norm(np.diff(POINTS, axis=0), axis=1))
 
 
 def energy(x, bend, gravity):
-    """Of a planar rod: sum EA/2 l0 (l/l0 - 1)^2 + sum EI/2 w (2 tan(phi/2) / w)^2 - sum m g . x, w the Voronoi lengths."""
+    """Return the energy of a planar rod.
+
+    It is sum EA/2 l0 (l/l0 - 1)^2 + sum EI/2 w (2 tan(phi/2) / w)^2 - sum m g . x, w the Voronoi lengths.
+    """
     area, rest = np.pi * RADIUS**2, rest_lengths()
     edges = x[1:] - x[:-1]
     lengths = torch.sqrt((edges**2).sum(1))
@@ -33,7 +36,7 @@ def energy(x, bend, gravity):
 
 
 def masses():
-    """Of nodes, half of the mass of each of their edges."""
+    """Return node masses: half of the mass of each adjacent edge."""
     edge_masses = DENSITY * np.pi * RADIUS**2 * rest_lengths()
     none = torch.zeros(1, dtype=edge_masses.dtype)
     return 0.5 * (torch.cat([edge_masses, none]) + torch.cat([none, edge_masses]))

@@ -1,4 +1,4 @@
-"""What torch hands over is judged as `Model.set_parameter` judges it; worlds that fail or have no gradient say so."""
+"""Values from torch are validated as by `Model.set_parameter`; failed worlds and missing gradients are reported."""
 
 import copy
 import io
@@ -38,8 +38,10 @@ def gripped(worlds: int = 1, nodes: int = 9, dt: float = 0.02) -> Simulator:
 @pytest.mark.parametrize("value", INVALID)
 @pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "shell, hinge", "rod with drag", "rods in contact"])
 def test_a_value_that_is_refused_takes_its_world_out_of_the_step(name, value):
-    """Every parameter, in the second of three worlds: that one is not a number and names why; the others are, bit for bit, what they
-    are without it. The step after that is good again."""
+    """Invalid values of any parameter fail the second of three worlds with NaN and a named reason.
+
+    The others stay bitwise equal, and the next step succeeds.
+    """
     sim = simulator(name, 3)
     start, engine = sim.initial_state(), sim.engine(3)
     for parameter in engine.tables.names():
@@ -58,7 +60,7 @@ def test_a_value_that_is_refused_takes_its_world_out_of_the_step(name, value):
         assert torch.isnan(failed.positions[1]).all() and torch.isnan(failed.velocities[1]).all()
         torch.testing.assert_close(failed.positions[[0, 2]], good.positions[[0, 2]], rtol=0.0, atol=0.0)
         with torch.no_grad():
-            after = sim.step(failed, {parameter: usual})  # a world that failed stays what it is
+            after = sim.step(failed, {parameter: usual})  # a failed world stays failed
         assert after.outcomes().tolist() == ["converged", "given_up", "converged"]
         again = sim.step(start, {parameter: usual})
         torch.testing.assert_close(again.positions, good.positions, rtol=0.0, atol=0.0)
@@ -105,7 +107,7 @@ def test_a_control_that_is_no_number_fails_its_world_alone():
     sim = simulator("rods joined rigidly", 3)
     forces = torch.zeros(3, sim.model.points_count, 3, dtype=REAL)
     good = sim.step(sim.initial_state(), None, {"forces": forces})
-    forces[1, 0, 2] = torch.nan  # on a node that is held
+    forces[1, 0, 2] = torch.nan  # on a fixed node
     failed = sim.step(sim.initial_state(), None, {"forces": forces})
     assert failed.outcomes().tolist() == ["converged", "invalid_input", "converged"]
     assert torch.isnan(failed.positions[1]).all()
@@ -114,7 +116,7 @@ def test_a_control_that_is_no_number_fails_its_world_alone():
 
 # --- worlds without a gradient ---
 def turned(sim: Simulator, angles, steps: int = 1):
-    """Poses of a grip that turns by an angle (B,) about its own direction of y, and the states of so many steps."""
+    """Return poses of a grip rotated by angles (B,) about its y axis, and the states of `steps` steps."""
     poses = torch.zeros(len(angles), 1, 6, dtype=REAL)
     poses[:, 0, 4] = torch.as_tensor(angles)
     poses.requires_grad_()
@@ -123,7 +125,7 @@ def turned(sim: Simulator, angles, steps: int = 1):
 
 
 def test_worlds_that_lose_their_gradient_are_told_and_left_out():
-    """Turned by more than 90 degrees in a step; of a loss that leaves this world out by the mask, gradients are those of the others."""
+    """A world rotated by over 90 degrees in a step has no gradient; masked losses keep the gradients of the others."""
     sim = gripped()
     with pytest.warns(GradientWarning, match="state.differentiable") as caught:
         poses, (end,) = turned(sim, [0.1, 1.8, 0.2])
@@ -161,7 +163,7 @@ def test_a_lost_gradient_is_remembered_along_a_rollout(checkpoint_every):
     "name", ["rod", "rods joined rigidly", "shell, hinge", "rods in contact", "held rod that rubs a gripped ball"]
 )
 def test_worlds_that_failed_spoil_no_gradient_of_others(name):
-    """A world that is not a number, of which a loss takes nothing: derivatives by what all share are those of the other worlds."""
+    """A NaN world that the loss leaves out does not change derivatives by inputs common to all worlds."""
     sim, parameter = simulator(name, 2), None
     for parameter in sim.engine(2).tables.names():
         if parameter.endswith(("stiffness", "stiffness_1")):
@@ -232,7 +234,7 @@ def test_a_parameter_that_changes_before_the_reverse_is_refused(checkpoint_every
 
 
 def test_tensors_stay_out_of_what_others_step():
-    """A simulator leaves the model that it was made of as it is, for an integrator of that."""
+    """A simulator leaves its model unchanged for other integrators."""
     sim, usual = simulator("rods joined rigidly"), simulator("rods joined rigidly").model
     sim.step(sim.initial_state(), {"rod_stretch.stiffness": 3.0 * sim.parameter("rod_stretch.stiffness")})
     first, second = (ddg.Integrator(model).step(model.state(), 2e-3).points() for model in (sim.model, usual))
@@ -242,7 +244,7 @@ def test_tensors_stay_out_of_what_others_step():
 # --- roll-outs whose controls have a memory ---
 @pytest.mark.parametrize("how", [{"checkpoint_every": 3}, {"memory": 1.1e4}], ids=["checkpoints", "memory"])
 def test_controls_with_a_memory_have_the_same_gradient(how):
-    """A function that draws noise and counts its calls is called once a step, in their order."""
+    """A stateful control function is called once a step, in order."""
     results, called = [], []
     for options in ({}, how):
         sim = gripped()
@@ -294,7 +296,7 @@ def test_states_of_worlds_are_saved_and_go_on_elsewhere():
 
 
 def test_one_simulator_serves_several_threads():
-    """Steps of other values in each, bit for bit as one after the other."""
+    """Concurrent steps with different values equal sequential ones bit for bit."""
     sim = gripped()
     values = [float(factor * sim.parameter("rod_bend_twist.stiffness_1")[0, 0]) for factor in (1.0, 2.0, 3.0)]
 
@@ -314,9 +316,11 @@ def test_one_simulator_serves_several_threads():
 
 
 def test_a_policy_learns_in_worlds_some_of_which_lose_their_gradient():
-    """A network turns the grip of a rod so that its free end gets to a goal, against turns of 0.3 rad (sigma) in every step of 20 ms:
-    of 64 worlds some are turned too far for a gradient, in every round others. They are left out by the mask and told of once; all
-    gradients are finite, and the free ends come twice as close."""
+    """A network learns to rotate a rod's grip so that its free end reaches a goal.
+
+    Noise rotates the grip by 0.3 rad (sigma) in each step of 20 ms. Some of the 64 worlds then rotate too far for a gradient, others in
+    every round. The mask leaves them out with one warning; all gradients are finite, and the error halves.
+    """
     worlds, steps, goal = 64, 10, torch.tensor([0.0, 0.0, 0.25], dtype=REAL)
     scene = ddg.Scene(mass_damping=0.5)
     points = np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 9)
