@@ -145,7 +145,7 @@ def test_a_step_by_its_state_and_parameters(name, scheme):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", ["twisted", "joined", "sheet"])
-def test_a_step_by_what_all_share(name, scheme):
+def test_a_step_by_length_and_mass_damping(name, scheme):
     """The length of the step, damping by mass."""
     model, _, (inputs,), difference = differentiated(name, scheme, 1)
     step_inputs = inputs[0]
@@ -175,7 +175,7 @@ def test_gradients_repeat_bit_by_bit():
         np.testing.assert_array_equal(array.numpy(), entries(second)[name].numpy())
 
 
-def test_a_step_in_parts_is_refused():
+def test_a_step_with_retries_is_refused():
     model = built(twisted())
     integrator = ddg.Integrator(model, max_iterations=3)
     adjoint, state = Adjoint(integrator), lively(model, speed=1.0)
@@ -185,7 +185,7 @@ def test_a_step_in_parts_is_refused():
         adjoint.vjp(tape, after)
 
 
-def turned_clamp(joint=False):
+def moving_clamp(joint=False):
     """A clamp that a motion translates and rotates out of its plane; its edge angle refers to the lagged frame."""
     scene = joined() if joint else twisted()
     scene.supports.clear()
@@ -196,17 +196,17 @@ def turned_clamp(joint=False):
     return scene
 
 
-SCENES |= {"turned_clamp": turned_clamp, "turned_joined": lambda: turned_clamp(joint=True)}
+SCENES |= {"moving_clamp": moving_clamp, "moving_joined": lambda: moving_clamp(joint=True)}
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["turned_clamp", "turned_joined"])
-def test_steps_under_a_motion_that_turns(name, scheme):
+@pytest.mark.parametrize("name", ["moving_clamp", "moving_joined"])
+def test_steps_under_a_motion_that_rotates(name, scheme):
     model, gradient, _, difference = differentiated(name, scheme, 2)
     check_state(model, gradient, difference)
 
 
-def held_between():
+def fixed_between():
     """A rod fixed at inner nodes, by all components and by one, and a free rod."""
     scene = a_scene()
     curve = np.concatenate([CURVE, CURVE[-1] + CURVE[1:]])
@@ -245,12 +245,12 @@ def one_after_another():
     return scene
 
 
-TURNING = {"held_between": held_between, "rings": rings, "one_after_another": one_after_another}
+TURNING = {"fixed_between": fixed_between, "rings": rings, "one_after_another": one_after_another}
 SCENES |= TURNING
 
 
-@pytest.mark.parametrize("name", ["twisted", "joined", "stiffened", "turned_clamp", "turned_joined", *TURNING])
-def test_the_midpoint_rule_with_predictors_that_turn_edges(name, monkeypatch):
+@pytest.mark.parametrize("name", ["twisted", "joined", "stiffened", "moving_clamp", "moving_joined", *TURNING])
+def test_the_midpoint_rule_with_predictors_that_rotate_edges(name, monkeypatch):
     """Stiff rods: reference frames are transported to the rotated edges of the predictor."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, _, difference = differentiated(name, "implicit_midpoint", 1)
@@ -303,7 +303,7 @@ SCENES |= LAGGED
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", LAGGED)
-def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
+def test_drag_and_follower_loads(name, scheme, monkeypatch):
     """Drag and follower loads are lagged: evaluated at the velocities and nodes of the start, or at the predicted nodes."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, inputs, difference = differentiated(name, scheme, 2)
@@ -312,7 +312,7 @@ def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", ["couple, twisted", "sand, joined", "pressure"])
-def test_drag_and_loads_that_follow_by_the_length_of_the_step(name, scheme):
+def test_drag_and_follower_loads_by_the_length_of_the_step(name, scheme):
     _, _, (inputs,), difference = differentiated(name, scheme, 1)
     check_length(inputs[0], difference, DT, 1e-7, scheme)
 

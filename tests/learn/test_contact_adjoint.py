@@ -77,7 +77,7 @@ def test_a_step_by_its_state_and_numbers(name, law):
 @each_law
 @pytest.mark.parametrize("form", ["logistic", pytest.param("polynomial", marks=pytest.mark.slow)])
 @each_scene
-def test_a_step_that_rubs(name, law, form):
+def test_a_step_with_friction(name, law, form):
     model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **RUBBING)
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -85,7 +85,7 @@ def test_a_step_that_rubs(name, law, form):
 
 
 @covering(1, name=SCENES, friction_iterations=(2, 3))
-def test_friction_that_is_lagged_anew(name, friction_iterations):
+def test_friction_with_several_lag_iterations(name, friction_iterations):
     """Two steps of several solves each; every solve lags normal forces and tangents of the previous one."""
     law = "penalty" if friction_iterations == 2 else "barrier"
     model, gradient, inputs, difference = differentiated(
@@ -97,7 +97,7 @@ def test_friction_that_is_lagged_anew(name, friction_iterations):
 
 
 @covering(1, name=[name for name in SCENES if not name.startswith("sheet")], friction_iterations=(1, 2))
-def test_friction_that_rolls_rods(name, friction_iterations):
+def test_friction_with_rolling_contact(name, friction_iterations):
     """Rolling adds derivatives by twist angles, edge directions and radii."""
     model, gradient, inputs, difference = differentiated(
         name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **RUBBING
@@ -109,7 +109,7 @@ def test_friction_that_rolls_rods(name, friction_iterations):
 
 @pytest.mark.parametrize("friction_iterations", [2, 3])
 @pytest.mark.parametrize("name", ["crossing rods", "sheet on ball"])
-def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeypatch):
+def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_iterations, monkeypatch):
     """Dropping the derivative by lagged quantities changes gradients by over a tenth of their largest entry."""
 
     def gradients():
@@ -150,7 +150,7 @@ def test_eight_steps_of_sliding(name, law):
 
 
 @pytest.mark.parametrize("name", ["parallel rods", "rod on plane"])
-def test_what_sticks_creeps(name):
+def test_sticking_contacts_creep(name):
     """Sticking contacts creep well below the stick threshold, where friction is nearly linear in the slip."""
     model, gradient, inputs, difference = differentiated(name, "barrier", 3, friction=0.8, velocity=0.5)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("friction",)))
@@ -168,7 +168,7 @@ def test_a_step_by_its_length(name, friction_iterations):
 
 
 @lagged_once_or_twice
-def test_elements_of_what_touches(friction_iterations):
+def test_element_parameters_in_contact(friction_iterations):
     """Stiffnesses of rods and sheets in contact have gradients."""
     model, _, inputs, difference = differentiated(
         "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
@@ -189,7 +189,7 @@ def test_gradients_repeat_bit_by_bit(friction_iterations):
 
 
 @lagged_once_or_twice
-def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
+def test_pair_lists_regrow(friction_iterations):
     """Regrown pair lists give bitwise equal gradients."""
     model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **RUBBING))
     state = touching(model, along=SLIDING)
@@ -216,7 +216,7 @@ def test_without_friction_there_is_nothing_to_lag():
 
 
 @lagged_once_or_twice
-def test_what_is_not_solved_has_no_gradient(friction_iterations, monkeypatch):
+def test_unconverged_adjoint_solves_are_refused(friction_iterations, monkeypatch):
     """A failed adjoint solve is refused, also if only the last friction solve fails."""
     model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **RUBBING))
     adjoint = Adjoint(ddg.Integrator(model))

@@ -113,7 +113,7 @@ def rubbing(name: str, law: str, velocity: float, **contact):
     ],
 )
 @pytest.mark.parametrize("name", CASES)
-def test_an_equilibrium_that_rubs(name, velocity, law):
+def test_an_equilibrium_with_friction(name, velocity, law):
     """Contacts creep at the larger stick threshold and slip at the smaller one."""
     model, state, inputs, difference = rubbing(name, law, velocity)
     touching = model.contacts(state)
@@ -127,19 +127,19 @@ def test_an_equilibrium_that_rubs(name, velocity, law):
 @pytest.mark.parametrize(
     ("name", "velocity"), [("plane", 1e-4), ("mesh", 1e-3), ("crossing rods", 1e-2), ("crossing rods", 1e-3)]
 )
-def test_an_equilibrium_with_rods_that_roll(name, velocity):
+def test_an_equilibrium_with_rolling_contact(name, velocity):
     """Edges rotate along a path in space, so that frames differ from a single parallel transport."""
     model, _, inputs, difference = rubbing(name, "barrier", velocity, rolling=True)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
 
 
 @pytest.mark.parametrize("name", ["plane", "ball"])
-def test_an_equilibrium_that_rubs_by_direction(name):
+def test_an_equilibrium_with_anisotropic_friction(name):
     model, _, inputs, difference = rubbing(name, "barrier", 1e-4, coefficients=(0.2, 0.5, 0.3))
     check(difference, number_shifts(model, [inputs], ("stiffness", "radius", "friction")))
 
 
-def test_the_way_has_to_be_known():
+def test_the_load_path_has_to_be_known():
     model, state, _, difference = rubbing("plane", "barrier", 1e-3)
     state.sliding = None
     with pytest.raises(
@@ -267,7 +267,7 @@ def test_a_rod_that_is_drawn():
     )
 
 
-def test_worlds_settle_on_their_own():
+def test_worlds_converge_independently():
     """Two worlds with sliding contacts take the same load steps as each alone; rounding in one does not delay the other."""
     model, poses = gripped(*GRIPPED["plane"])
     path = []

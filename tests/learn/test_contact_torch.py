@@ -44,7 +44,7 @@ def weighed(state):
         ("sheets", "barrier", 1),
     ],
 )
-def test_numbers_of_every_world_over_steps(name, law, friction_iterations):
+def test_parameters_of_every_world_over_steps(name, law, friction_iterations):
     """Gradients by contact parameters that differ between two worlds, over five sliding steps."""
     sim, start = simulator(name, law, 2, friction_iterations=friction_iterations, **RUBBING)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
@@ -100,7 +100,7 @@ def test_positions_and_velocities_at_the_start():
     check(loss, {"positions": points, "velocities": start.velocities.clone()}, {"positions": 1e-8, "velocities": 1e-5})
 
 
-def test_a_coefficient_of_friction_is_found_again():
+def test_a_coefficient_of_friction_is_identified():
     """The end position of a sliding rod identifies its friction coefficient."""
     sim, start = simulator("rod on plane", **RUBBING)
     goal = sim.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
@@ -152,7 +152,7 @@ def test_a_world_in_which_a_step_fails_has_no_gradient_alone():
     assert sim.outcomes()[0] == "converged" != sim.outcomes()[1]
 
 
-def test_names_of_what_has_numbers():
+def test_names_of_contact_parameters():
     sim, _ = simulator("rod on sheet")
     assert contact_elements(sim.model, "contact.stiffness") == [("bar", "bar"), ("bar", "lower"), ("lower", "lower")]
     assert contact_elements(sim.model, "contact.radius") == ["rod 0", "shell 0"]
@@ -162,7 +162,7 @@ def test_names_of_what_has_numbers():
     assert contact_elements(sim.model, "contact.radius") == ["rod 0"]
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_inputs_are_refused():
     sim, start = simulator("rod on plane", worlds=2)
     wide = sim.parameter("contact.range").clone()
     wide[1, 1] *= 1.5
@@ -182,7 +182,7 @@ def test_what_does_not_fit_is_refused():
         sim.initial_state(positions=points)
 
 
-def test_an_equilibrium_by_numbers_of_every_world():
+def test_an_equilibrium_by_parameters_of_every_world():
     """Contact parameters differ between two worlds with a rod pressed on a ball by its weight."""
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), edges=[0, -1])
@@ -208,7 +208,7 @@ def test_an_equilibrium_by_numbers_of_every_world():
         ("rod on sheet", RodParameters, "radius"),
     ],
 )
-def test_sizes_of_sections_are_those_that_touch(name, module, learned):
+def test_learned_sections_act_in_contact(name, module, learned):
     """Learned radii and thicknesses act, also in contact, as in a scene that is built with them."""
     sim, _ = simulator(name, "penalty")
     factors = module(sim, names=(learned,))
@@ -233,7 +233,7 @@ def test_learned_radii_have_gradients():
     check(loss, {"change": torch.zeros((1, 1), dtype=torch.float64)}, {"change": 1e-6})
 
 
-def test_radii_that_are_given_stay():
+def test_explicit_contact_radii_are_kept():
     sim, _ = simulated(scene_of("crossing rods", "penalty", radius={"upper": 1.2 * RADIUS}))
     factors = RodParameters(sim, names=("radius",))
     (change,) = factors.parameters()
@@ -243,7 +243,7 @@ def test_radii_that_are_given_stay():
     torch.testing.assert_close(factor, torch.tensor([[1.1, 1.2]], dtype=torch.float64), rtol=1e-12, atol=0.0)
 
 
-def test_what_turns_far_has_no_gradient_and_counts_no_more_than_half_a_turn():
+def test_large_rotations_have_no_gradient_and_count_at_most_half_a_revolution():
     """Substeps that resolve large rotations have no gradient; poses cannot represent more than half a revolution."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_rod(np.linspace((0.1, 0.02, -0.05), (0.1, 0.02, 0.05), 7), section=ddg.Circle(RADIUS), material=SOFT)

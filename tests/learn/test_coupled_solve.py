@@ -85,12 +85,14 @@ def off(solution: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs(solution - expected).max() / np.abs(expected).max())
 
 
-NETS = {name: SCENES[name] for name in ("joined", "hinged", "sheet", "hinges", "midedge", "stiffened", "turned_joined")}
+SYSTEMS = {
+    name: SCENES[name] for name in ("joined", "hinged", "sheet", "hinges", "midedge", "stiffened", "moving_joined")
+}
 
 
-@pytest.mark.parametrize("name", [*NETS, "oblique"])
-def test_conjugate_gradients_find_what_factors_do(name):
-    model = (NETS | {"oblique": oblique})[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
+@pytest.mark.parametrize("name", [*SYSTEMS, "oblique"])
+def test_conjugate_gradients_agree_with_factors(name):
+    model = (SYSTEMS | {"oblique": oblique})[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
     system, solution, wanted, tangent = by_both(model, lively(model), RATE)
     assert not system.failed.numpy().any()
     assert off(solution, wanted) < 1e-9
@@ -116,7 +118,7 @@ def test_an_indefinite_matrix(name):
     assert off(solution, wanted) < 1e-7
 
 
-def test_what_rounding_leaves_is_no_failure():
+def test_rounding_errors_are_no_failure():
     """Rods as thin as hair, in long steps: stretching is 1e13 times as stiff as inertia."""
     scene, t = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.linspace(0.0, 0.2, 65)
     hair = ddg.Material(young=4e9, density=1300.0)
@@ -157,7 +159,7 @@ def pulled(model, state, scheme: str, weights: dict, **how):
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["sheet", "stiffened", "turned_joined", "sand, joined", "pressure"])
+@pytest.mark.parametrize("name", ["sheet", "stiffened", "moving_joined", "sand, joined", "pressure"])
 def test_gradients_are_those_of_factors(name, scheme):
     """The whole reverse of a step, by either; and bit by bit once more."""
     model = built(SCENES[name]())
@@ -182,7 +184,7 @@ def hasty(monkeypatch):
     monkeypatch.setattr(PCG, "__init__", cut)
 
 
-def test_what_does_not_converge_takes_factors(hasty):
+def test_unconverged_solves_fall_back_to_factors(hasty):
     model = built(SCENES["sheet"]())
     state = lively(model)
     weights = directions(model, state, 5)
@@ -194,7 +196,7 @@ def test_what_does_not_converge_takes_factors(hasty):
         np.testing.assert_array_equal(array.numpy(), wanted[key], err_msg=key)
 
 
-def test_worlds_of_torch_that_do_not_converge_say_so(hasty):
+def test_unconverged_worlds_of_torch_are_reported(hasty):
     """Undefined gradients are NaN, as the host does not check steps of torch."""
     simulator = Simulator(built(SCENES["sheet"]()), DT)
     velocities = torch.zeros((1, simulator.model.points_count, 3), dtype=torch.float64, requires_grad=True)
@@ -204,7 +206,7 @@ def test_worlds_of_torch_that_do_not_converge_say_so(hasty):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", ["joined", "sheet"])
-def test_reverses_of_nets_are_replayed(name, scheme):
+def test_coupled_adjoint_solves_are_replayed(name, scheme):
     """One captured graph serves all steps of a length, with the results of single launches."""
     gradients = []
     for replayed in (True, False):

@@ -62,7 +62,7 @@ def same(first, second, worlds) -> None:
         torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
 
 
-def test_rotations_turn_on():
+def test_rotation_vectors_compose():
     """Rotation vectors compose as matrices, also beyond half a revolution; at zero with finite gradients."""
     torch.manual_seed(0)
     vectors, increments = torch.randn((20, 3), dtype=torch.float64) * 1.5, torch.randn((20, 3), dtype=torch.float64)
@@ -95,7 +95,7 @@ def test_actions_are_velocities_of_grips():
     np.testing.assert_allclose(grip_node, moved, atol=1e-14)
 
 
-def test_worlds_start_anew_alone():
+def test_worlds_reset_independently():
     """A reset world equals its second episode in a new simulator; the other worlds continue unchanged."""
     env, actions = environment(steps=9), some_actions(6)
     generators = env.generators(3)
@@ -178,13 +178,13 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("options", "message"), REFUSED)
-def test_what_does_not_fit_is_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     usual = {"rates": RATES, "observe": observe, "reward": off, "draw": draw, "steps": 4}
     with pytest.raises(SceneError, match=message):
         Environment(gripped(), WORLDS, **usual | options)
 
 
-def test_actions_and_rewards_that_do_not_fit_are_refused():
+def test_invalid_actions_and_rewards_are_refused():
     env = environment(reward=lambda episodes: episodes.goals, terminated=lambda episodes: True)
     episodes = env.begin(env.generators(0))
     for actions, message in (

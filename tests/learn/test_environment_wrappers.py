@@ -22,7 +22,7 @@ from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripp
         ("torch.jax", "jax", "jax"),
     ],
 )
-def test_what_is_not_installed_is_told_with_its_extra(module, package, extra, monkeypatch):
+def test_missing_packages_are_reported_with_their_extra(module, package, extra, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, f"ddg_warp.{module}", raising=False)
     with pytest.raises(ModuleNotFoundError, match=rf"pip install 'ddg-warp\[{extra}\]'"):
@@ -39,7 +39,7 @@ def vector(**options):
     return VectorEnvironment(environment(**options))
 
 
-def test_gymnasium_finds_nothing_wrong():
+def test_gymnasium_checker_passes():
     """gymnasium's checker of environments passes for one world of a vector environment; it has none for vectors."""
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
@@ -121,7 +121,7 @@ def test_seeds_of_gymnasium_repeat_bit_by_bit():
     assert len({*one[:, 0].tolist()}) == WORLDS  # streams of worlds differ
 
 
-def test_gymnasium_is_told_of_failures():
+def test_gymnasium_reports_failures():
     envs = vector(sim=gripped(retry_limit=0, max_iterations=4, rtol=1e-5), steps=9)
     with pytest.raises(SceneError, match="no episode has begun"):
         envs.step(np.zeros((WORLDS, 4)))
@@ -143,7 +143,7 @@ def test_gymnasium_is_told_of_failures():
 # TorchRL
 
 
-def test_torchrl_finds_nothing_wrong():
+def test_torchrl_checker_passes():
     pytest.importorskip("torchrl")
     from torchrl.envs.utils import check_env_specs
 
@@ -187,7 +187,7 @@ def test_rollouts_of_torchrl_have_gradients():
 @pytest.mark.parametrize(
     ("module", "wrapper"), [("gymnasium_env", "VectorEnvironment"), ("torchrl_env", "TorchRLEnvironment")]
 )
-def test_what_is_no_environment_is_refused(module, wrapper):
+def test_other_objects_are_refused(module, wrapper):
     pytest.importorskip({"gymnasium_env": "gymnasium", "torchrl_env": "torchrl"}[module])
     made = getattr(importlib.import_module(f"ddg_warp.rl.{module}"), wrapper)
     for invalid in (None, 3, gripped()):

@@ -65,7 +65,7 @@ def test_every_input_is_right_or_refused(device, name, analysis):
 
 
 @pytest.mark.parametrize("analysis", ["implicit_euler", "statics"])
-def test_a_law_of_ones_own(device, analysis, monkeypatch):
+def test_a_user_defined_law(device, analysis, monkeypatch):
     from tests.test_laws import saturating
 
     law = {"rod_bend_twist": ddg.Law(saturating, modulus=1e-4, limit=5.0)}
@@ -103,7 +103,7 @@ def test_the_command_prints_it(tmp_path, capsys, device):
     assert "there is no 'balloon'; there are rod" in capsys.readouterr().err
 
 
-def test_what_is_wrong_fails(monkeypatch, capsys, device):
+def test_wrong_gradients_fail(monkeypatch, capsys, device):
     """A gradient that is lost, and one that is off."""
     usual = gradient_check.derivatives
     spoilt = {"velocities": 0.0, "gravity": 1.01}

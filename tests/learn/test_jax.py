@@ -133,7 +133,7 @@ def test_arrays_of_states_pass_without_a_copy(name, device):
         ((abs, None), "shape"),
     ],
 )
-def test_what_is_no_function_or_shape_is_refused(jax, arguments, said):
+def test_invalid_functions_and_shapes_are_refused(jax, arguments, said):
     from ddg_warp.torch.jax import from_torch
 
     with pytest.raises(SceneError, match=f"from_torch: .*{said}"):

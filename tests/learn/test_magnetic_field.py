@@ -33,7 +33,7 @@ def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-def test_it_is_as_if_the_scene_had_it(scheme, fields):
+def test_the_field_adds_to_that_of_the_scene(scheme, fields):
     """Each of two worlds moves as in a scene with the sum of both fields, also time-dependent ones."""
     simulator = magnet(scheme, lambda t: (0.0, 0.5 * t, 0.0))
     moved = simulator.rollout(simulator.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
@@ -47,7 +47,7 @@ def test_it_is_as_if_the_scene_had_it(scheme, fields):
     torch.testing.assert_close(again, moved, rtol=0.0, atol=0.0)
 
 
-def test_steps_of_an_integrator_take_it(fields):
+def test_steps_of_an_integrator_take_a_field(fields):
     simulator = magnet("implicit_euler")
     moved = simulator.rollout(simulator.initial_state(1), None, {"field": fields[0]}, steps=3)[-1].positions[0]
     integrator, state = ddg.Integrator(simulator.model, **TIGHT), simulator.model.state()
@@ -101,7 +101,7 @@ def test_planar_rods(fields):
     check(loss, {"field": fields[0] * torch.tensor([1.0, 0.0, 1.0])}, {"field": 1e-3})
 
 
-def test_it_is_refused_where_nothing_is_magnetic(fields):
+def test_a_field_without_magnets_is_refused(fields):
     scene = ddg.Scene()
     rod = scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT)
     plain = Simulator(built(scene), DT)
@@ -120,7 +120,7 @@ def test_it_is_refused_where_nothing_is_magnetic(fields):
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])  # with twist and without
-def test_equilibria_take_it(scheme, fields):
+def test_equilibria_take_a_field(scheme, fields):
     """Each world has the equilibrium of a scene with the sum of both fields; the load parameter scales the field."""
     simulator = magnet(scheme, (1e-2, 0.0, 0.0))
     result = simulator.equilibrium(None, {"field": fields}, batch=2, rtol=1e-11).positions

@@ -82,7 +82,7 @@ def test_density_and_radius_are_those_that_rods_are_built_with(name, statics):
         torch.testing.assert_close(values.detach(), reference.parameter(parameter), rtol=1e-12, atol=1e-18)
 
 
-def test_every_world_has_its_own():
+def test_masses_of_every_world():
     """Twice all masses, inertia, stiffnesses and drag move alike; half the mass alone does not."""
     for name in ("circle in a fluid", "joined circle in a fluid"):
         sim = simulator(scene_of(name))
@@ -108,7 +108,7 @@ def test_every_world_has_its_own():
         ("stiffened", "statics"),
     ],
 )
-def test_masses_under_gravity_that_is_given(name, analysis):
+def test_masses_under_gravity_of_every_world(name, analysis):
     """Gradients by every kind of mass use the gravity of their world."""
     statics = analysis == "statics"
     sim = Simulator(built(SCENES[name]()), DT, scheme="implicit_euler" if statics else analysis, **TIGHT)
@@ -133,7 +133,7 @@ def test_masses_under_gravity_that_is_given(name, analysis):
     check(loss, {"gravity": gravity} | values, {"gravity": 2e-3} | sizes)
 
 
-def test_it_repeats_and_leaves_nothing():
+def test_gradients_repeat_without_side_effects():
     for name in ("circle in a fluid", "joined circle"):
         sim = simulator(scene_of(name))
         plain = end(sim)
@@ -164,7 +164,7 @@ def test_worlds_of_a_map_are_those_of_a_batch():
         torch.testing.assert_close(one, torch.func.grad(loss)(mass[None]), rtol=1e-9, atol=1e-12)
 
 
-def test_a_rod_and_its_shell_have_masses_of_their_own():
+def test_masses_of_a_rod_and_its_shell_add_up():
     """Masses of a rod and its shell add up at common nodes."""
 
     def stiffened(density: float = 1.0) -> ddg.Scene:
@@ -197,7 +197,7 @@ def _magnetise(scene: ddg.Scene) -> None:
         (lambda s: None, ("mass",), "no rod has 'mass'; there is stretching, bending, twisting, density, radius"),
     ],
 )
-def test_what_no_rod_has_is_refused(change, names, match):
+def test_missing_parameters_are_refused(change, names, match):
     scene = ddg.Scene()
     scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT)
     change(scene)
@@ -224,7 +224,7 @@ def test_densities_that_are_none_are_refused():
         ({"drag.normal": "thick"}, "drag.normal is 'thick', no array of numbers; give numbers"),
     ],
 )
-def test_what_does_not_fit_is_refused(parameters, match):
+def test_invalid_values_are_refused(parameters, match):
     sim = simulator(scene_of("circle in a fluid"))
     with pytest.raises(SceneError, match=match):
         sim.step(sim.initial_state(), parameters)
@@ -232,7 +232,7 @@ def test_what_does_not_fit_is_refused(parameters, match):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("factor", [1.0, 1e3, 1e6])
-def test_mixed_precision_knows_what_is_given(scheme, factor):
+def test_mixed_precision_follows_the_given_stiffness(scheme, factor):
     """A tensor makes rods far stiffer than the model's, for which float32 suffices; a factor 1e6 selects float64."""
     names = [f"rod_bend_twist.stiffness_{k}" for k in (1, 2, 3)] + ["rod_stretch.stiffness"]
 

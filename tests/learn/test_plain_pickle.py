@@ -33,7 +33,7 @@ def test_arrays_are_read(tmp_path, name, protocol):
     np.testing.assert_array_equal(load(path), VALUES[name])
 
 
-def test_what_holds_arrays_is_read(tmp_path):
+def test_containers_of_arrays_are_read(tmp_path):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({"markers": (ARRAY, ARRAY), "name": "rope", "rate": 100}))
     content = load(path)
@@ -114,7 +114,7 @@ def test_objects_outside_are_refused(tmp_path):
     ids=["objects", "texts", "records", "dates", "raw"],
 )
 @pytest.mark.parametrize("protocol", [2, 5])
-def test_arrays_of_other_things_are_refused(tmp_path, value, protocol):
+def test_arrays_of_other_types_are_refused(tmp_path, value, protocol):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps(value, protocol))
     with pytest.raises(ValueError, match="not of numbers"):

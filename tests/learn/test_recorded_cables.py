@@ -19,7 +19,7 @@ def straight(directions) -> np.ndarray:
     return 0.08 * np.arange(COUNT)[:, None] * np.asarray(directions)[:, None]
 
 
-def test_twist_is_the_turn_of_frames_that_come_back():
+def test_twist_is_the_rotation_of_returning_frames():
     """A grip's tangent runs around a cone of half angle a, the other grip is fixed: twist 2 pi (1 - cos a)."""
     frames, a = 400, 0.4
     angle = np.linspace(0.0, 2.0 * np.pi, frames)

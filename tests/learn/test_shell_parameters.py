@@ -78,7 +78,7 @@ def changed(module: ShellParameters, seed: int = 0, size: float = 0.2) -> ShellP
 
 @pytest.mark.parametrize("bending", BENDING)
 @pytest.mark.parametrize("resolution", ["shell", "element"])
-def test_what_it_gives_is_what_shells_are_built_with(bending, resolution):
+def test_values_are_those_of_built_shells(bending, resolution):
     names = (NUMBERS if bending in ("hinge", "isometric") else NUMBERS + FORMS) + MASS
     simulator = Simulator(built(sheets(bending)), DT)
     module = ShellParameters(simulator, names, by=resolution)
@@ -167,7 +167,7 @@ def test_copies_and_states():
         ({"by": np.full((20, 1), np.nan)}, "finite numbers"),
     ],
 )
-def test_what_there_is_not_is_refused(options, words):
+def test_missing_quantities_are_refused(options, words):
     with pytest.raises(SceneError) as error:
         ShellParameters(Simulator(built(sheets()), DT), **options)
     assert words in str(error.value)

@@ -172,7 +172,7 @@ def test_a_function_is_swept_and_failures_are_kept(tmp_path):
     assert [episode.name for episode in episodes.select()] == ["000000"]
 
 
-def test_a_mistake_ends_the_sweep_and_keeps_what_is_finished(tmp_path):
+def test_an_error_ends_the_sweep_and_keeps_finished_runs(tmp_path):
     def run(directory, load):
         if load == 2 and not (tmp_path / "mended").exists():
             return {}["missing"]

@@ -79,7 +79,7 @@ def check(loss, values: dict, sizes: dict) -> None:
 
 
 @pytest.mark.parametrize("name", STIFFNESS)
-def test_everything_that_goes_in_has_a_gradient(name):
+def test_every_input_has_a_gradient(name):
     sim, term = simulator(name), STIFFNESS[name]
     first = torch.tensor(sim.model.state().points())
     flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
@@ -121,7 +121,7 @@ def test_poses_and_moments_have_gradients(scheme):
 
 
 @pytest.mark.parametrize("shape", [(), (2, 1), (1, 9), (2, 9)])
-def test_gradients_have_the_shape_of_what_was_given(shape):
+def test_gradients_have_the_shape_of_the_input(shape):
     sim = simulator("twisted")
     values = sim.parameter("rod_stretch.stiffness", 2).mean() * torch.ones(shape, dtype=torch.float64)
     values.requires_grad_()
@@ -177,7 +177,7 @@ def test_checkpoints_change_nothing():
     assert result[0] == result[1] == result[2]
 
 
-def test_roll_outs_keep_what_memory_allows():
+def test_rollouts_store_as_much_as_memory_allows():
     sim = simulator("twisted")
     state, steps = sim.initial_state(batch=3), 30
     all_of_it = sim.plan(state, steps=steps).memory
@@ -247,7 +247,7 @@ def test_twice_and_forward_mode_are_refused():
         )
 
 
-def test_what_is_not_given_is_as_the_model_has_it():
+def test_missing_inputs_default_to_the_model():
     sim = simulator("twisted")
     usual = sim.step(sim.initial_state()).positions
     soft = sim.step(sim.initial_state(), {STIFFNESS["twisted"]: 1e-6}).positions
@@ -419,7 +419,7 @@ def test_rest_shapes_of_the_model_go_along():
     torch.testing.assert_close(metrics[1], metrics[0], rtol=0.0, atol=0.0)
 
 
-def test_a_stiffness_is_found_again():
+def test_stiffnesses_are_identified():
     """Motion of a rod identifies three stiffnesses by gradients of their logarithms."""
     sim = simulator("twisted")
     truth = {"bending": 0.7, "twisting": 1.4}
@@ -479,7 +479,7 @@ def test_a_stiffness_is_found_again():
         (None, {"forces": "none"}, "controls: forces is 'none', no array of numbers; give numbers or a tensor"),
     ],
 )
-def test_what_does_not_fit_is_refused(parameters, controls, message):
+def test_invalid_inputs_are_refused(parameters, controls, message):
     sim = simulator("twisted")
     with pytest.raises(SceneError, match=message):
         sim.step(sim.initial_state(2), parameters, controls)
@@ -487,7 +487,7 @@ def test_what_does_not_fit_is_refused(parameters, controls, message):
 
 @pytest.mark.parametrize("solver", ["sweep", "partitioned"])
 @pytest.mark.parametrize(("young", "radius", "passes"), [(1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)])
-def test_float32_solves_for_what_inertia_does_not_give(monkeypatch, young, radius, passes, solver):
+def test_float32_solves_for_the_noninertial_gradient(monkeypatch, young, radius, passes, solver):
     """Gradients agree within the error of the solutions.
 
     Alternative: float32 solutions for w itself, dt times the gradients by velocities, leave errors of 1e-4.
@@ -616,7 +616,7 @@ def test_calls_that_do_not_fit_are_refused():
 
 
 @pytest.mark.parametrize("name", ["twisted", "joined"])
-def test_states_of_the_model_step_as_its_own(name):
+def test_states_of_the_model_step_as_in_its_integrator(name):
     """Translated, rotated and moving states of damped rods in two worlds equal the integrator's step by step."""
     model = SCENES[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
     sim = Simulator(model, DT, **TIGHT)

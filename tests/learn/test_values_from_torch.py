@@ -124,7 +124,7 @@ def turned(sim: Simulator, angles, steps: int = 1):
     return poses, states
 
 
-def test_worlds_that_lose_their_gradient_are_told_and_left_out():
+def test_worlds_that_lose_their_gradient_are_reported_and_left_out():
     """A world rotated by over 90 degrees in a step has no gradient; masked losses keep the gradients of the others."""
     sim = gripped()
     with pytest.warns(GradientWarning, match="state.differentiable") as caught:
@@ -233,7 +233,7 @@ def test_a_parameter_that_changes_before_the_reverse_is_refused(checkpoint_every
         end.positions.sum().backward()
 
 
-def test_tensors_stay_out_of_what_others_step():
+def test_tensors_do_not_change_the_model():
     """A simulator leaves its model unchanged for other integrators."""
     sim, usual = simulator("rods joined rigidly"), simulator("rods joined rigidly").model
     sim.step(sim.initial_state(), {"rod_stretch.stiffness": 3.0 * sim.parameter("rod_stretch.stiffness")})
