@@ -4,13 +4,13 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from tests.learn.differences import TIGHT, Meaning, entries, put
+from tests.learn.differences import TIGHT, StateMask, entries, put
 
 RADIUS, RANGE, DT = 2e-3, 1e-3, 0.002
 SOFT = ddg.Material(young=1e6, density=1000.0, viscosity=0.01)
 S = np.linspace(-0.05, 0.05, 7)
 WAVE = 3e-4 * np.cos(55.0 * S + 0.4)
-HELD = {"gravity": (1.0, 0.7, -40.0), "mass_damping": 0.7}
+SCENE_OPTIONS = {"gravity": (1.0, 0.7, -40.0), "mass_damping": 0.7}
 
 
 def rod(scene, points, **options) -> int:
@@ -95,7 +95,7 @@ SCENES = {
 
 
 def scene_of(name: str, law: str = "barrier", **contact) -> ddg.Scene:
-    scene = ddg.Scene(**HELD)
+    scene = ddg.Scene(**SCENE_OPTIONS)
     SCENES[name](scene)
     stiffness = 2000.0 if scene.shells else 50.0
     scene.contact(law=law, range=RANGE, stiffness=stiffness, **contact)
@@ -107,9 +107,9 @@ def touching(model, speed: float = 0.02, along: float = 0.0, **options):
     integrator, state = ddg.Integrator(model, **TIGHT, **options), model.state()
     for _ in range(12 if model.scene.shells and model.scene.batches else 6):  # bounces off first
         state = integrator.step(state, DT)
-    state, meaning, random = state.copy(), Meaning(model), np.random.default_rng(3)
+    state, mask, random = state.copy(), StateMask(model), np.random.default_rng(3)
     values = random.normal(size=(len(state.coupled.q), 3)) * speed
     values[np.arange(len(values)) % model.coupled.blocks < model.coupled.host.nodes, 0] += along
     more = {name: np.zeros(array.shape) for name, array in entries(state).items() if name != "net/v"}
-    put(state, {**{n: np.zeros(1) for n in more}, "net/v": meaning.keep("net/v", values)})
+    put(state, {**{n: np.zeros(1) for n in more}, "net/v": mask.keep("net/v", values)})
     return state

@@ -28,7 +28,7 @@ def entries(state) -> dict[str, object]:
     return {name: array for name, array in state.arrays().items() if array.size > 1}
 
 
-class Meaning:
+class StateMask:
     """Mask of the state entries that may be perturbed.
 
     Left out are rates of fixed dofs, padding, joint rotations, and entries that only serve as initial guesses.
@@ -81,11 +81,11 @@ class Meaning:
 
 def directions(model, state, seed: int, strains: float = 1e-3) -> dict[str, np.ndarray]:
     """Return a random direction in the state entries that may be perturbed."""
-    random, meaning = np.random.default_rng(seed), Meaning(model)
+    random, mask = np.random.default_rng(seed), StateMask(model)
     result = {}
     for name, array in entries(state).items():
         size = strains if "last" in name else 1.0
-        result[name] = size * meaning.keep(name, random.normal(size=device_arrays.download(array).shape))
+        result[name] = size * mask.keep(name, random.normal(size=device_arrays.download(array).shape))
     return result
 
 
@@ -107,9 +107,9 @@ def cotangent(model, weights: dict[str, np.ndarray]):
     return state
 
 
-def along(gradient: np.ndarray, meant: np.ndarray) -> np.ndarray:
-    """Return a direction of the magnitudes of `meant` along which no terms of a gradient cancel."""
-    return np.where(gradient < 0.0, -1.0, 1.0) * np.abs(meant)
+def along(gradient: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return a direction of the magnitudes of `direction` along which no terms of a gradient cancel."""
+    return np.where(gradient < 0.0, -1.0, 1.0) * np.abs(direction)
 
 
 @dataclass
@@ -215,12 +215,12 @@ class Difference:
         return derivative
 
 
-def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
+def moving_state(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
     """Return a moving state with random velocities: nonzero strains, rates and frame rotations everywhere."""
     integrator, state = ddg.Integrator(model, **TIGHT, **options), model.state()
     for _ in range(steps):
         state = integrator.step(state, dt)
-    state, random, meaning = state.copy(), np.random.default_rng(3), Meaning(model)
+    state, random, mask = state.copy(), np.random.default_rng(3), StateMask(model)
     for name, array in entries(state).items():
         rate = name.rpartition("/")[2]
         if rate in ("v", "omega"):
@@ -228,11 +228,11 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
             more = random.normal(size=values.shape) * (spin if rate == "omega" else speed)
             if name == "net/v":
                 more[model.coupled.host.nodes :] *= spin / speed
-            device_arrays.assign(array, values + meaning.keep(name, more))
+            device_arrays.assign(array, values + mask.keep(name, more))
     return state
 
 
-def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
+def vjp_of_steps(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
     """Return gradients by the first state and by the inputs of each step (last first), and the `Difference` of the loss."""
     weights = directions(model, state, 5)
 
@@ -282,13 +282,13 @@ def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
 def state_shifts(model, gradient, state) -> list[Shift]:
     """Return a direction in every array of the first state."""
     shifts = []
-    for name, meant in directions(model, state, 7).items():
+    for name, direction in directions(model, state, 7).items():
         values, slopes = device_arrays.download(entries(state)[name]), device_arrays.download(entries(gradient)[name])
 
         def write(_model, wide, new, name=name):
             device_arrays.assign(wide.arrays()[name], new)
 
-        shifts.append(Shift(name, values, slopes, along(slopes, meant), write, world_axis(model, name, values)))
+        shifts.append(Shift(name, values, slopes, along(slopes, direction), write, world_axis(model, name, values)))
     return shifts
 
 

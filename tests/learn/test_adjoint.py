@@ -15,9 +15,9 @@ from tests.learn.differences import (
     check_state,
     close,
     entries,
-    lively,
+    moving_state,
     parameter_shifts,
-    pulled,
+    vjp_of_steps,
 )
 
 DT = 0.01
@@ -131,7 +131,7 @@ SCENES = {
 
 def differentiated(name: str, scheme: str, steps: int):
     model = built(SCENES[name]())
-    return model, *pulled(model, lively(model, scheme=scheme), DT, steps, scheme)
+    return model, *vjp_of_steps(model, moving_state(model, scheme=scheme), DT, steps, scheme)
 
 
 CASES = [(name, scheme) for name in SCENES for scheme in ("implicit_euler", "implicit_midpoint")]
@@ -178,7 +178,7 @@ def test_gradients_repeat_bit_by_bit():
 def test_a_step_with_retries_is_refused():
     model = built(twisted())
     integrator = ddg.Integrator(model, max_iterations=3)
-    adjoint, state = Adjoint(integrator), lively(model, speed=1.0)
+    adjoint, state = Adjoint(integrator), moving_state(model, speed=1.0)
     after, tape = adjoint.step(state, 0.02)
     assert integrator.statistics()["retries"] > 1
     with pytest.raises(SolverError, match=r"rod \d .*took the step in parts.*take a smaller dt"):
@@ -327,7 +327,7 @@ def test_a_step_that_leaves_its_predictor_is_refused():
     model = built(twisted())
     integrator = ddg.Integrator(model, scheme="implicit_midpoint")
     adjoint = Adjoint(integrator)
-    after, tape = adjoint.step(lively(model, scheme="implicit_midpoint"), DT)
+    after, tape = adjoint.step(moving_state(model, scheme="implicit_midpoint"), DT)
     tape.parts[0].retries.fill_(1)
     with pytest.raises(SolverError, match=r"rod \d .*started the step once more.*take a smaller dt"):
         adjoint.vjp(tape, after)

@@ -21,11 +21,14 @@ from tests.learn.differences import (
     check_state,
     entries,
     parameter_shifts,
-    pulled,
+    vjp_of_steps,
 )
 from tests.pairwise import covering
 
-RUBBING = {"friction": 0.3, "velocity": 0.05}  # slip speeds are twice the stick threshold, those of rotation lower
+WITH_FRICTION = {
+    "friction": 0.3,
+    "velocity": 0.05,
+}  # slip speeds are twice the stick threshold, those of rotation lower
 SLIDING = 0.1  # [m/s]
 ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
 each_scene = pytest.mark.parametrize("name", SCENES)
@@ -43,7 +46,7 @@ def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coeffici
     state = touching(model, along=speed)
     model.touch.at(state.coupled.q)
     assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
-    return model, *pulled(model, state, DT, steps)
+    return model, *vjp_of_steps(model, state, DT, steps)
 
 
 def by_number(inputs: list, name: str) -> np.ndarray:
@@ -78,7 +81,7 @@ def test_a_step_by_its_state_and_numbers(name, law):
 @pytest.mark.parametrize("form", ["logistic", pytest.param("polynomial", marks=pytest.mark.slow)])
 @each_scene
 def test_a_step_with_friction(name, law, form):
-    model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **RUBBING)
+    model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **WITH_FRICTION)
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
     )
@@ -89,7 +92,7 @@ def test_friction_with_several_lag_iterations(name, friction_iterations):
     """Two steps of several solves each; every solve lags normal forces and tangents of the previous one."""
     law = "penalty" if friction_iterations == 2 else "barrier"
     model, gradient, inputs, difference = differentiated(
-        name, law, 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        name, law, 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -100,7 +103,7 @@ def test_friction_with_several_lag_iterations(name, friction_iterations):
 def test_friction_with_rolling_contact(name, friction_iterations):
     """Rolling adds derivatives by twist angles, edge directions and radii."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **RUBBING
+        name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **WITH_FRICTION
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -114,7 +117,7 @@ def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_itera
 
     def gradients():
         _, gradient, inputs, _ = differentiated(
-            name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
+            name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
         )
         return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
@@ -138,14 +141,14 @@ def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_itera
 def test_friction_by_direction(name, speed, coefficients, friction_iterations):
     """Anisotropic friction of a rod that slides forwards and backwards, with directions of edges or across nodes."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, speed, coefficients, friction_iterations=friction_iterations, **RUBBING
+        name, "barrier", 2, speed, coefficients, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
 @covering(1, name=("crossing rods", "rod on ball", "rod on mesh", "sheets"), law=("barrier", "penalty"))
 def test_eight_steps_of_sliding(name, law):
-    model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **RUBBING)
+    model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **WITH_FRICTION)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "radius", "friction")))
 
 
@@ -160,7 +163,7 @@ def test_sticking_contacts_creep(name):
 @pytest.mark.parametrize("name", ["crossing rods", "rod on sheet"])
 def test_a_step_by_its_length(name, friction_iterations):
     _, _, (inputs,), difference = differentiated(
-        name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     step_inputs = inputs[0]
     assert float(step_inputs.elements_rate[-1].numpy().sum()) != 0.0
@@ -171,7 +174,7 @@ def test_a_step_by_its_length(name, friction_iterations):
 def test_element_parameters_in_contact(friction_iterations):
     """Stiffnesses of rods and sheets in contact have gradients."""
     model, _, inputs, difference = differentiated(
-        "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check(difference, parameter_shifts(model, inputs))
 
@@ -179,7 +182,7 @@ def test_element_parameters_in_contact(friction_iterations):
 @lagged_once_or_twice
 def test_gradients_repeat_bit_by_bit(friction_iterations):
     first, second = (
-        differentiated("sheets", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING)[1:3]
+        differentiated("sheets", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION)[1:3]
         for _ in range(2)
     )
     for name, array in entries(first[0]).items():
@@ -191,7 +194,7 @@ def test_gradients_repeat_bit_by_bit(friction_iterations):
 @lagged_once_or_twice
 def test_pair_lists_regrow(friction_iterations):
     """Regrown pair lists give bitwise equal gradients."""
-    model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **RUBBING))
+    model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **WITH_FRICTION))
     state = touching(model, along=SLIDING)
     results = []
     for few in (False, True):
@@ -218,7 +221,7 @@ def test_without_friction_there_is_nothing_to_lag():
 @lagged_once_or_twice
 def test_unconverged_adjoint_solves_are_refused(friction_iterations, monkeypatch):
     """A failed adjoint solve is refused, also if only the last friction solve fails."""
-    model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **RUBBING))
+    model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **WITH_FRICTION))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)
     system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.chain

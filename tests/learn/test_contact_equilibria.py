@@ -91,7 +91,7 @@ def test_an_equilibrium_in_contact_by_a_load(name):
     check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
 
 
-def rubbing(name: str, law: str, velocity: float, **contact):
+def equilibrium_with_friction(name: str, law: str, velocity: float, **contact):
     """Return an equilibrium with friction from rest in one load step, and its gradient.
 
     The loss reads positions alone, as edge angles depend on the path of the iterates.
@@ -115,10 +115,10 @@ def rubbing(name: str, law: str, velocity: float, **contact):
 @pytest.mark.parametrize("name", CASES)
 def test_an_equilibrium_with_friction(name, velocity, law):
     """Contacts creep at the larger stick threshold and slip at the smaller one."""
-    model, state, inputs, difference = rubbing(name, law, velocity)
-    touching = model.contacts(state)
-    share = np.linalg.norm(touching.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(touching.force, axis=1), 1e-12)
-    assert share.max() > (0.05 if velocity == 1e-4 else 1e-3)
+    model, state, inputs, difference = equilibrium_with_friction(name, law, velocity)
+    contacts = model.contacts(state)
+    ratio = np.linalg.norm(contacts.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(contacts.force, axis=1), 1e-12)
+    assert ratio.max() > (0.05 if velocity == 1e-4 else 1e-3)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
     place = model.coupled.host.rods[-1].nodes[3] if model.coupled.host.rods else model.coupled.host.shells[0].nodes[-1]
     check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
@@ -129,18 +129,18 @@ def test_an_equilibrium_with_friction(name, velocity, law):
 )
 def test_an_equilibrium_with_rolling_contact(name, velocity):
     """Edges rotate along a path in space, so that frames differ from a single parallel transport."""
-    model, _, inputs, difference = rubbing(name, "barrier", velocity, rolling=True)
+    model, _, inputs, difference = equilibrium_with_friction(name, "barrier", velocity, rolling=True)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
 
 
 @pytest.mark.parametrize("name", ["plane", "ball"])
 def test_an_equilibrium_with_anisotropic_friction(name):
-    model, _, inputs, difference = rubbing(name, "barrier", 1e-4, coefficients=(0.2, 0.5, 0.3))
+    model, _, inputs, difference = equilibrium_with_friction(name, "barrier", 1e-4, coefficients=(0.2, 0.5, 0.3))
     check(difference, number_shifts(model, [inputs], ("stiffness", "radius", "friction")))
 
 
 def test_the_load_path_has_to_be_known():
-    model, state, _, difference = rubbing("plane", "barrier", 1e-3)
+    model, state, _, difference = equilibrium_with_friction("plane", "barrier", 1e-3)
     state.sliding = None
     with pytest.raises(
         SceneError, match=r"contact: by friction an equilibrium depends on the way there.*statics.solve"
@@ -209,10 +209,10 @@ def test_equilibria_are_those_of_a_new_solver(name):
     model, poses = gripped(*GRIPPED[name])
     simulator = Simulator(model, 0.01)
 
-    def positions(share: float, friction: float, **options):
+    def positions(ratio: float, friction: float, **options):
         numbers = {"contact.friction": friction * simulator.parameter("contact.friction", 2)}
         return simulator.equilibrium(
-            numbers, {"poses": share * torch.tensor(poses)}, batch=2, rtol=RTOL, **options
+            numbers, {"poses": ratio * torch.tensor(poses)}, batch=2, rtol=RTOL, **options
         ).positions
 
     first = positions(1.0, 1.0)

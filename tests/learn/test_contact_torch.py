@@ -15,7 +15,7 @@ from ddg_warp.torch.contact_parameters import contact_elements  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
 from tests.pairwise import covering  # noqa: E402
 
-RUBBING = {"friction": 0.3, "velocity": 0.05}
+WITH_FRICTION = {"friction": 0.3, "velocity": 0.05}
 
 
 def simulator(name: str, law: str = "barrier", worlds: int = 1, **contact) -> tuple[Simulator, object]:
@@ -46,7 +46,7 @@ def weighed(state):
 )
 def test_parameters_of_every_world_over_steps(name, law, friction_iterations):
     """Gradients by contact parameters that differ between two worlds, over five sliding steps."""
-    sim, start = simulator(name, law, 2, friction_iterations=friction_iterations, **RUBBING)
+    sim, start = simulator(name, law, 2, friction_iterations=friction_iterations, **WITH_FRICTION)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
     names = [f"contact.{name}" for name in ("stiffness", "range", "friction", "radius")]
     usual = {name: sim.parameter(name, 2) for name in names}
@@ -78,7 +78,7 @@ def test_moved_obstacles(shape, solves):
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
     bar(scene, RADIUS + 0.8 * RANGE)
     scene.add_obstacle(SHAPES[shape], motion=ddg.Grip(pivot=(0.01, 0.0, -0.02)), name="obstacle")
-    scene.contact(law=law, range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **RUBBING)
+    scene.contact(law=law, range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **WITH_FRICTION)
     sim, start = simulated(scene)
     poses = torch.tensor([[[1e-4, 2e-4, 1e-4, 2e-3, -1e-3, 4e-3]]], dtype=torch.float64)
 
@@ -90,7 +90,7 @@ def test_moved_obstacles(shape, solves):
 
 
 def test_positions_and_velocities_at_the_start():
-    sim, start = simulator("crossing rods", "penalty", **RUBBING)
+    sim, start = simulator("crossing rods", "penalty", **WITH_FRICTION)
 
     def loss(positions, velocities):
         state = sim.initial_state(positions=positions, velocities=velocities)
@@ -102,7 +102,7 @@ def test_positions_and_velocities_at_the_start():
 
 def test_a_coefficient_of_friction_is_identified():
     """The end position of a sliding rod identifies its friction coefficient."""
-    sim, start = simulator("rod on plane", **RUBBING)
+    sim, start = simulator("rod on plane", **WITH_FRICTION)
     goal = sim.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
     logarithm = torch.tensor(0.2, dtype=torch.float64).log().requires_grad_()
     optimiser = torch.optim.LBFGS(
@@ -125,7 +125,7 @@ def test_a_coefficient_of_friction_is_identified():
 @pytest.mark.parametrize("friction_iterations", [1, 2])
 def test_transforms_and_checkpoints(friction_iterations):
     """Gradients of a batch equal those of each coefficient, with and without checkpointing."""
-    sim, start = simulator("rod on ball", friction_iterations=friction_iterations, **RUBBING)
+    sim, start = simulator("rod on ball", friction_iterations=friction_iterations, **WITH_FRICTION)
 
     def loss(mu, **kept):
         return weighed(sim.rollout(start, {"contact.friction": mu}, steps=4, **kept)[-1])
@@ -157,7 +157,7 @@ def test_names_of_contact_parameters():
     assert contact_elements(sim.model, "contact.stiffness") == [("bar", "bar"), ("bar", "lower"), ("lower", "lower")]
     assert contact_elements(sim.model, "contact.radius") == ["rod 0", "shell 0"]
     assert sim.parameter("contact.radius").tolist() == [[RADIUS, RADIUS]]
-    sim, _ = simulator("rod on plane", **RUBBING)
+    sim, _ = simulator("rod on plane", **WITH_FRICTION)
     assert contact_elements(sim.model, "contact.friction") == [("bar", "bar"), ("bar", "obstacle")]
     assert contact_elements(sim.model, "contact.radius") == ["rod 0"]
 
@@ -216,14 +216,14 @@ def test_learned_sections_act_in_contact(name, module, learned):
     (change,) = factors.parameters()
     with torch.no_grad():
         change += np.log(1.1)
-    touching = factors()["contact.radius"] / sim.parameter("contact.radius")
+    radius_ratio = factors()["contact.radius"] / sim.parameter("contact.radius")
     wanted = {"crossing rods": [1.1, 1.1], "sheets": [1.1, 1.1], "rod on sheet": [1.1, 1.0]}[name]
-    torch.testing.assert_close(touching, torch.tensor([wanted], dtype=torch.float64), rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(radius_ratio, torch.tensor([wanted], dtype=torch.float64), rtol=1e-12, atol=0.0)
     torch.testing.assert_close(values["contact.radius"], sim.parameter("contact.radius"), rtol=1e-14, atol=0.0)
 
 
 def test_learned_radii_have_gradients():
-    sim, start = simulator("crossing rods", "penalty", **RUBBING)
+    sim, start = simulator("crossing rods", "penalty", **WITH_FRICTION)
     factors = RodParameters(sim, names=("radius",))
 
     def loss(change):

@@ -16,7 +16,7 @@ from ddg_warp.solve.linear.exact_system import ExactSystem
 from ddg_warp.solve.linear.pcg import PCG
 from ddg_warp.torch import Simulator
 from tests.learn import differences
-from tests.learn.differences import TIGHT, built, cotangent, directions, entries, lively
+from tests.learn.differences import TIGHT, built, cotangent, directions, entries, moving_state
 from tests.learn.test_adjoint import DT, SCENES, SOFT
 from tests.learn.test_torch import STIFFNESS
 
@@ -93,7 +93,7 @@ SYSTEMS = {
 @pytest.mark.parametrize("name", [*SYSTEMS, "oblique"])
 def test_conjugate_gradients_agree_with_factors(name):
     model = (SYSTEMS | {"oblique": oblique})[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
-    system, solution, wanted, tangent = by_both(model, lively(model), RATE)
+    system, solution, wanted, tangent = by_both(model, moving_state(model), RATE)
     assert not system.failed.numpy().any()
     assert off(solution, wanted) < 1e-9
     if name != "oblique":
@@ -103,7 +103,7 @@ def test_conjugate_gradients_agree_with_factors(name):
 def test_rods_that_branch_are_eliminated():
     """Substructuring is exact for a tree of rods: one iteration."""
     model = built(SCENES["joined"]())
-    system, *_ = by_both(model, lively(model), RATE)
+    system, *_ = by_both(model, moving_state(model), RATE)
     assert system.iterations.numpy()[0] == 1
 
 
@@ -135,7 +135,7 @@ def test_rounding_errors_are_no_failure():
 
 def test_a_world_without_a_right_hand_side():
     model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64", worlds=2)
-    state, coupled, system = lively(model), model.coupled, ExactSystem(model)
+    state, coupled, system = moving_state(model), model.coupled, ExactSystem(model)
     right = np.zeros((2 * coupled.blocks, 3))
     right[coupled.blocks + 5] = 1.0
     solution = wp.full(len(right), coupled.vector(1.0, 1.0, 1.0), dtype=coupled.vector, device=coupled.device)
@@ -146,7 +146,7 @@ def test_a_world_without_a_right_hand_side():
     assert not system.failed.numpy().any()
 
 
-def pulled(model, state, scheme: str, weights: dict, **how):
+def vjp_of_step(model, state, scheme: str, weights: dict, **how):
     """Derivatives by the state before a step and by parameters, and the reverse that found them."""
     adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
     _, tape = adjoint.step(state, DT)
@@ -163,9 +163,9 @@ def pulled(model, state, scheme: str, weights: dict, **how):
 def test_gradients_are_those_of_factors(name, scheme):
     """The whole reverse of a step, by either; and bit by bit once more."""
     model = built(SCENES[name]())
-    state = lively(model, scheme=scheme)
+    state = moving_state(model, scheme=scheme)
     weights = directions(model, state, 5)
-    solution, wanted, again = (pulled(model, state, scheme, weights, factors=how) for how in (False, True, False))
+    solution, wanted, again = (vjp_of_step(model, state, scheme, weights, factors=how) for how in (False, True, False))
     for key, value in wanted.items():
         np.testing.assert_array_equal(solution[key], again[key], err_msg=key)
         if np.abs(value).max() > 1e-9:
@@ -173,7 +173,7 @@ def test_gradients_are_those_of_factors(name, scheme):
 
 
 @pytest.fixture
-def hasty(monkeypatch):
+def truncated_solver(monkeypatch):
     """End conjugate gradients after their first iteration."""
     once = PCG.__init__
 
@@ -184,19 +184,19 @@ def hasty(monkeypatch):
     monkeypatch.setattr(PCG, "__init__", cut)
 
 
-def test_unconverged_solves_fall_back_to_factors(hasty):
+def test_unconverged_solves_fall_back_to_factors(truncated_solver):
     model = built(SCENES["sheet"]())
-    state = lively(model)
+    state = moving_state(model)
     weights = directions(model, state, 5)
     adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
     _, tape = adjoint.step(state, DT)
     gradient, _ = adjoint.vjp(tape, cotangent(model, weights))
-    wanted = pulled(model, state, "implicit_euler", weights, factors=True)
+    wanted = vjp_of_step(model, state, "implicit_euler", weights, factors=True)
     for key, array in entries(gradient).items():
         np.testing.assert_array_equal(array.numpy(), wanted[key], err_msg=key)
 
 
-def test_unconverged_worlds_of_torch_are_reported(hasty):
+def test_unconverged_worlds_of_torch_are_reported(truncated_solver):
     """Undefined gradients are NaN, as the host does not check steps of torch."""
     simulator = Simulator(built(SCENES["sheet"]()), DT)
     velocities = torch.zeros((1, simulator.model.points_count, 3), dtype=torch.float64, requires_grad=True)
