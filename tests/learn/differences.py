@@ -41,9 +41,13 @@ class StateMask:
         part, _, name = name.partition("/")
         if name in ("a", "alpha"):
             return 0.0 * values
-        return self._coupled(name, values) if part == "net" else self._chain(self.model.groups[int(part)], name, values)
+        return (
+            self._coupled(name, values)
+            if part == "net"
+            else self._rod_group(self.model.groups[int(part)], name, values)
+        )
 
-    def _chain(self, group, name: str, values: np.ndarray) -> np.ndarray:
+    def _rod_group(self, group, name: str, values: np.ndarray) -> np.ndarray:
         host, kind = group.host, group.kind
         fixed = np.tile(host.fixed, (1, group.worlds))
         node = np.arange(group.nodes)[:, None] < np.tile(host.count, group.worlds)

@@ -167,12 +167,12 @@ GRIPPED = {
     "plane": (ddg.Plane(), 1e-3),
     "by direction": (ddg.Plane(), 1e-3, (0.2, 0.5, 0.3)),
     "rolling": (ddg.Plane(), 1e-3, None, True),
-    "turned ball": (ddg.Sphere((0.001, 0.002, -0.1), 0.1), 1e-2),
+    "rotated ball": (ddg.Sphere((0.001, 0.002, -0.1), 0.1), 1e-2),
 }
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=slow if name in ("rolling", "turned ball") else ()) for name in GRIPPED]
+    "name", [pytest.param(name, marks=slow if name in ("rolling", "rotated ball") else ()) for name in GRIPPED]
 )
 def test_gradients_go_through_all_load_steps(name):
     """Gradients by final poses, of which each load step takes a fraction, by forces, and by contact parameters."""
@@ -209,10 +209,10 @@ def test_equilibria_are_those_of_a_new_solver(name):
     model, poses = gripped(*GRIPPED[name])
     simulator = Simulator(model, 0.01)
 
-    def positions(ratio: float, friction: float, **options):
+    def positions(fraction: float, friction: float, **options):
         numbers = {"contact.friction": friction * simulator.parameter("contact.friction", 2)}
         return simulator.equilibrium(
-            numbers, {"poses": ratio * torch.tensor(poses)}, batch=2, rtol=RTOL, **options
+            numbers, {"poses": fraction * torch.tensor(poses)}, batch=2, rtol=RTOL, **options
         ).positions
 
     first = positions(1.0, 1.0)

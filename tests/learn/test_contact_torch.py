@@ -250,8 +250,8 @@ def test_large_rotations_have_no_gradient_and_count_at_most_half_a_revolution():
     scene.add_obstacle(ddg.Capsule((0.05, 0.0, 0.0), (0.2, 0.0, 0.0), RADIUS), motion=ddg.Grip())
     scene.contact(stiffness=1e4)
     sim = Simulator(scene.build(device=differences.DEVICE, precision="float64"), 0.1)
-    for turn, finite in ((0.01, True), (0.5, False)):
-        poses = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, turn]], dtype=torch.float64, requires_grad=True)
+    for angle, finite in ((0.01, True), (0.5, False)):
+        poses = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, angle]], dtype=torch.float64, requires_grad=True)
         end = sim.step(sim.initial_state(), controls={"poses": poses})
         assert torch.isfinite(end.positions).all()
         assert sim.outcomes().tolist() == ["converged" if finite else "no_gradient"]

@@ -128,8 +128,8 @@ def test_masses_under_gravity_of_every_world(name, analysis):
         return moved + state.angles.square().sum()
 
     values = {n.replace(".", "__"): sim.parameter(n, 2) for n in masses if not (statics and n == "rod.inertia")}
-    turned = 0.05 if name == "stiffened" else 0.01  # small derivatives are limited by rounding
-    sizes = {key: (turned if "inertia" in key else 1e-3) * float(result.max()) for key, result in values.items()}
+    inertia_step = 0.05 if name == "stiffened" else 0.01  # small derivatives are limited by rounding
+    sizes = {key: (inertia_step if "inertia" in key else 1e-3) * float(result.max()) for key, result in values.items()}
     check(loss, {"gravity": gravity} | values, {"gravity": 2e-3} | sizes)
 
 

@@ -51,10 +51,10 @@ def test_recordings_are_found_and_read(clone):
 def test_up_becomes_z_and_frames_stay_right_handed(tmp_path, up):
     markers = np.random.default_rng(1).random((4, 5, 3))
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(markers.transpose(0, 2, 1)))
-    turned = read(tmp_path / "a.pkl", up=up).markers
-    np.testing.assert_array_equal(turned[..., 2], markers[..., "xyz".index(up)])
+    rotated = read(tmp_path / "a.pkl", up=up).markers
+    np.testing.assert_array_equal(rotated[..., 2], markers[..., "xyz".index(up)])
     volume = np.linalg.det(markers[0, 1:4] - markers[0, 0])
-    assert np.linalg.det(turned[0, 1:4] - turned[0, 0]) == pytest.approx(volume, rel=1e-12)
+    assert np.linalg.det(rotated[0, 1:4] - rotated[0, 0]) == pytest.approx(volume, rel=1e-12)
 
 
 def test_axes_in_any_order(tmp_path):

@@ -556,7 +556,7 @@ def _learn(rank: int, folder: str, out: str, cuda: bool) -> None:
     torch.save(module.module.logarithms["bending"].grad.cpu(), f"{out}{rank}")
     while not all(os.path.exists(f"{out}{second}") for second in range(2)):
         time.sleep(0.01)
-    # torch 2.13 can wait for ever where it takes a group apart: that holds the lock that a thread of gloo's asks for
+    # torch 2.13 can wait for ever where it takes a group apart: that holds the lock that a thread of gloo's waits for
     os._exit(0)
 
 

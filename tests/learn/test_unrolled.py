@@ -31,8 +31,8 @@ def energy(x, bend, gravity):
     stretch = 0.5 * YOUNG * area * (rest * (lengths / rest - 1.0) ** 2).sum()
     e, f, w = edges[:-1], edges[1:], 0.5 * (rest[:-1] + rest[1:])
     cross = e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]
-    turn = 2.0 * cross / (lengths[:-1] * lengths[1:] + (e * f).sum(1))
-    return stretch + (0.5 * bend * turn**2 / w).sum() - (masses() * (x @ gravity)).sum()
+    angles = 2.0 * cross / (lengths[:-1] * lengths[1:] + (e * f).sum(1))
+    return stretch + (0.5 * bend * angles**2 / w).sum() - (masses() * (x @ gravity)).sum()
 
 
 def masses():

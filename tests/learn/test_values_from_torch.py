@@ -115,7 +115,7 @@ def test_a_control_that_is_no_number_fails_its_world_alone():
 
 
 # --- worlds without a gradient ---
-def turned(sim: Simulator, angles, steps: int = 1):
+def rotated_grip(sim: Simulator, angles, steps: int = 1):
     """Return poses of a grip rotated by angles (B,) about its y axis, and the states of `steps` steps."""
     poses = torch.zeros(len(angles), 1, 6, dtype=REAL)
     poses[:, 0, 4] = torch.as_tensor(angles)
@@ -128,9 +128,9 @@ def test_worlds_that_lose_their_gradient_are_reported_and_left_out():
     """A world rotated by over 90 degrees in a step has no gradient; masked losses keep the gradients of the others."""
     sim = gripped()
     with pytest.warns(GradientWarning, match="state.differentiable") as caught:
-        poses, (end,) = turned(sim, [0.1, 1.8, 0.2])
+        poses, (end,) = rotated_grip(sim, [0.1, 1.8, 0.2])
         assert sim.outcomes().tolist() == ["converged", "no_gradient", "converged"]  # which waits for the device
-        turned(sim, [0.1, 1.8, 0.2])
+        rotated_grip(sim, [0.1, 1.8, 0.2])
     assert len(caught) == 1  # once
     assert end.differentiable.tolist() == [True, False, True]
     assert torch.isfinite(end.positions).all() and not end.failed.any()
@@ -146,13 +146,13 @@ def test_worlds_that_lose_their_gradient_are_reported_and_left_out():
 def test_a_lost_gradient_is_remembered_along_a_rollout(checkpoint_every):
     sim = gripped(dt=0.05)
     poses = torch.zeros(2, 1, 6, dtype=REAL, requires_grad=True)
-    turns = torch.zeros(4, 2, 1, 6, dtype=REAL)
-    turns[1:, 1, 0, 4] = 1.8  # in the second step alone
+    rotations = torch.zeros(4, 2, 1, 6, dtype=REAL)
+    rotations[1:, 1, 0, 4] = 1.8  # in the second step alone
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GradientWarning)
         start = sim.initial_state(2)
         values = {"steps": 4, "checkpoint_every": checkpoint_every}
-        states = sim.rollout(start, None, lambda k: {"poses": poses + turns[k]}, **values)
+        states = sim.rollout(start, None, lambda k: {"poses": poses + rotations[k]}, **values)
     assert [state.differentiable.tolist() for state in states] == [[True, True], *3 * [[True, False]]]
     (result,) = torch.autograd.grad((states[-1].positions.sum((1, 2)) * states[-1].differentiable).sum(), poses)
     assert torch.isfinite(result).all() and (result[1] == 0.0).all() and (result[0] != 0.0).any()
