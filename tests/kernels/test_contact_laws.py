@@ -1,4 +1,4 @@
-"""Laws of contact and friction on their strains: published forms, derivatives, limits."""
+"""Contact and friction densities against published forms, with derivatives and limits."""
 
 from functools import cache
 
@@ -65,7 +65,7 @@ def differences(function, strains: np.ndarray, step) -> np.ndarray:
 
 
 def agree(value, reference, tolerance=1e-6):
-    """Assert agreement of each row relative to its largest component."""
+    """Compare rows, each relative to its largest component."""
     value, reference = (np.reshape(v, (len(v), -1)) for v in (value, reference))
     assert (np.abs(value - reference).max(1) <= tolerance * np.abs(reference).max(1)).all()
 

@@ -147,7 +147,7 @@ def test_every_term_has_every_check():
 def test_every_day_has_every_kind():
     """Daily terms cover every density, every kind of collision, and every measure with few exceptions.
 
-    Exceptions: curvature by the turning angle and of rods without twist. Mid-edge normals are covered by shell_stretch_curved, magnets
+    Exceptions: curvature by rotation angles and of rods without twist. Mid-edge normals are covered by shell_stretch_curved, magnets
     by closed forms in test_magnets.
     """
     terms = {name: term for name, term in ALL.items() if not name.startswith(("magnetic", "dipoles"))}

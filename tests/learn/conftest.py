@@ -1,4 +1,4 @@
-"""Models and tensors of these tests are on the device under test."""
+"""Put models and tensors of the tests of gradients on the device under test."""
 
 import pytest
 

@@ -1,16 +1,16 @@
-"""Scenes in contact whose steps have gradients, and states in which they touch."""
+"""Scenes and states in contact for the tests of gradients."""
 
 import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from tests.learn.differences import TIGHT, Meaning, entries, put
+from tests.learn.differences import TIGHT, StateMask, entries, put
 
 RADIUS, RANGE, DT = 2e-3, 1e-3, 0.002
 SOFT = ddg.Material(young=1e6, density=1000.0, viscosity=0.01)
 S = np.linspace(-0.05, 0.05, 7)
 WAVE = 3e-4 * np.cos(55.0 * S + 0.4)
-HELD = {"gravity": (1.0, 0.7, -40.0), "mass_damping": 0.7}
+SCENE_OPTIONS = {"gravity": (1.0, 0.7, -40.0), "mass_damping": 0.7}
 
 
 def rod(scene, points, **options) -> int:
@@ -23,13 +23,13 @@ def bar(scene, height: float, slope: float = 0.003, name: str = "bar") -> int:
 
 
 def crossing(scene):
-    """Edges that cross, of a rod on one that is held at both ends."""
+    """Crossing edges: a rod on another rod that is clamped at both ends."""
     scene.clamp(bar(scene, 0.0, name="lower"), edges=[0, -1])
     rod(scene, np.stack([0.3 * S + 0.004, S, 2.0 * RADIUS + 0.8 * RANGE + WAVE], 1), name="upper")
 
 
 def parallel(scene):
-    """Edges along each other: mollifiers are between 0 and 1."""
+    """Near-parallel edges: mollifiers are between 0 and 1."""
     scene.clamp(bar(scene, 0.0, name="lower"), edges=[0, -1])
     upper = np.stack([S + 0.0031, 0.02 * S + 4e-5, 2.0 * RADIUS + 0.6 * RANGE + 0.7 * WAVE], 1)
     rod(scene, upper, name="upper")
@@ -57,7 +57,7 @@ def sheet_on_ball(scene):
 
 
 def sheets(scene):
-    """Points on triangles and edges on edges, of two sheets."""
+    """Two sheets in contact, with point-triangle and edge-edge pairs."""
     sheet(scene, 0.0, 0.09, "lower")
     scene.hold(0, [0, 3, 12, 15])
     sheet(scene, 2.0 * RADIUS + 0.7 * RANGE, 0.05, "upper", 2)
@@ -95,7 +95,7 @@ SCENES = {
 
 
 def scene_of(name: str, law: str = "barrier", **contact) -> ddg.Scene:
-    scene = ddg.Scene(**HELD)
+    scene = ddg.Scene(**SCENE_OPTIONS)
     SCENES[name](scene)
     stiffness = 2000.0 if scene.shells else 50.0
     scene.contact(law=law, range=RANGE, stiffness=stiffness, **contact)
@@ -103,13 +103,13 @@ def scene_of(name: str, law: str = "barrier", **contact) -> ddg.Scene:
 
 
 def touching(model, speed: float = 0.02, along: float = 0.0, **options):
-    """A state on the way in which things touch, with random velocities, and one along x of all that is free."""
+    """Return a moving state in contact, with random velocities plus `along` in x on free nodes."""
     integrator, state = ddg.Integrator(model, **TIGHT, **options), model.state()
     for _ in range(12 if model.scene.shells and model.scene.batches else 6):  # bounces off first
         state = integrator.step(state, DT)
-    state, meaning, random = state.copy(), Meaning(model), np.random.default_rng(3)
+    state, mask, random = state.copy(), StateMask(model), np.random.default_rng(3)
     values = random.normal(size=(len(state.coupled.q), 3)) * speed
     values[np.arange(len(values)) % model.coupled.blocks < model.coupled.host.nodes, 0] += along
     more = {name: np.zeros(array.shape) for name, array in entries(state).items() if name != "net/v"}
-    put(state, {**{n: np.zeros(1) for n in more}, "net/v": meaning.keep("net/v", values)})
+    put(state, {**{n: np.zeros(1) for n in more}, "net/v": mask.keep("net/v", values)})
     return state

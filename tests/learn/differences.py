@@ -9,10 +9,10 @@ import ddg_warp as ddg
 from ddg_warp import device_arrays
 from ddg_warp.adjoint.implicit import Adjoint
 
-DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
+DEVICE = "cpu"  # of the models of these tests; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
 TIGHT = {"rtol": 1e-13}
-CLOSE = 1e-6  # relative error of a gradient, as asked
+CLOSE = 1e-6  # tolerated relative error of a gradient
 # A difference of fourth order: so many steps along a direction, each a world of one model, and the weights of the losses there.
 SIDES, WEIGHTS = (2.0, 1.0, -1.0, -2.0), (-1.0 / 12.0, 2.0 / 3.0, -2.0 / 3.0, 1.0 / 12.0)
 LARGEST = 1e-3  # relative change of a parameter by a step of differences
@@ -28,9 +28,11 @@ def entries(state) -> dict[str, object]:
     return {name: array for name, array in state.arrays().items() if array.size > 1}
 
 
-class Meaning:
-    """Which entries of a state mean something and may be perturbed: rates of free dofs, no padding, no joints' rotations, and nothing
-    from which solves only start."""
+class StateMask:
+    """Mask of the state entries that may be perturbed.
+
+    Left out are rates of fixed dofs, padding, joint rotations, and entries that only serve as initial guesses.
+    """
 
     def __init__(self, model):
         self.model = model
@@ -39,16 +41,20 @@ class Meaning:
         part, _, name = name.partition("/")
         if name in ("a", "alpha"):
             return 0.0 * values
-        return self._coupled(name, values) if part == "net" else self._chain(self.model.groups[int(part)], name, values)
+        return (
+            self._coupled(name, values)
+            if part == "net"
+            else self._rod_group(self.model.groups[int(part)], name, values)
+        )
 
-    def _chain(self, group, name: str, values: np.ndarray) -> np.ndarray:
+    def _rod_group(self, group, name: str, values: np.ndarray) -> np.ndarray:
         host, kind = group.host, group.kind
         fixed = np.tile(host.fixed, (1, group.worlds))
         node = np.arange(group.nodes)[:, None] < np.tile(host.count, group.worlds)
         edge = np.arange(group.nodes)[:, None] < np.tile(host.count - (0 if kind.closed else 1), group.worlds)
         if name in ("x", "v"):
-            held = np.stack([(fixed >> d) & 1 for d in range(kind.dim)], -1) == 1
-            return np.where(held & (name == "v"), 0.0, values) * node[..., None]
+            fixed_components = np.stack([(fixed >> d) & 1 for d in range(kind.dim)], -1) == 1
+            return np.where(fixed_components & (name == "v"), 0.0, values) * node[..., None]
         if name == "omega":
             return np.where((fixed >> kind.dim) & 1, 0.0, values) * edge
         if name == "last":
@@ -57,33 +63,33 @@ class Meaning:
                     np.roll(edge, 1 - term.measure.span, axis=0) | kind.closed
                 )
         if name == "frame":
-            values[6] = 0.0  # the lagged twist only says which turn it is of
+            values[6] = 0.0  # the lagged twist only selects the branch of the angle
         return values * edge
 
     def _coupled(self, name: str, values: np.ndarray) -> np.ndarray:
         host = self.model.coupled.host
         if name in ("q", "v"):
-            felt = np.ones((host.blocks, 3), bool)
-            felt[host.nodes :, 1:] = False
-            felt[host.blocks - host.spins :] = False
+            active = np.ones((host.blocks, 3), bool)
+            active[host.nodes :, 1:] = False
+            active[host.blocks - host.spins :] = False
             if name == "v":
-                felt &= ~host.fixed & (host.mass > 0.0)
-            return np.where(np.tile(felt, (self.model.worlds, 1)), values, 0.0)
+                active &= ~host.fixed & (host.mass > 0.0)
+            return np.where(np.tile(active, (self.model.worlds, 1)), values, 0.0)
         if name.startswith("data") or (name == "frame" and not self.model.coupled.edges):
             return 0.0 * values
         if name.startswith("lag"):
             part = self.model.coupled.sets[int(name[4:])]
-            values[6 * (len(part.host.lag) // 7) :] = 0.0  # angles, as of chains: of a joint behind its ghost
+            values[6 * (len(part.host.lag) // 7) :] = 0.0  # angles, as of rod groups: of a joint after its ghost
         return values
 
 
 def directions(model, state, seed: int, strains: float = 1e-3) -> dict[str, np.ndarray]:
-    """A random direction in the entries of a state that mean something."""
-    random, meaning = np.random.default_rng(seed), Meaning(model)
+    """Return a random direction in the state entries that may be perturbed."""
+    random, mask = np.random.default_rng(seed), StateMask(model)
     result = {}
     for name, array in entries(state).items():
         size = strains if "last" in name else 1.0
-        result[name] = size * meaning.keep(name, random.normal(size=device_arrays.download(array).shape))
+        result[name] = size * mask.keep(name, random.normal(size=device_arrays.download(array).shape))
     return result
 
 
@@ -99,26 +105,26 @@ def product(state, values: dict[str, np.ndarray]) -> float:
 
 
 def cotangent(model, weights: dict[str, np.ndarray]):
-    """A state that holds the derivatives by one of the loss `product(state, weights)`."""
+    """Return the cotangent, a state, of the loss `product(state, weights)`."""
     state = model.empty_state()
     put(state, weights)
     return state
 
 
-def along(gradient: np.ndarray, meant: np.ndarray) -> np.ndarray:
-    """A random direction in the entries that a direction `meant` has, along which nothing in a gradient cancels."""
-    return np.where(gradient < 0.0, -1.0, 1.0) * np.abs(meant)
+def along(gradient: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return a direction of the magnitudes of `direction` along which no terms of a gradient cancel."""
+    return np.where(gradient < 0.0, -1.0, 1.0) * np.abs(direction)
 
 
 @dataclass
 class Shift:
-    """A direction in one array that a step reads.
+    """A direction in one input array of a step.
 
     Attributes:
         name: of the array.
         values: of one world, the world's axis included.
         gradient: derivatives of the loss by the values.
-        direction: of the same shape, along which nothing in the gradient cancels.
+        direction: of the same shape, along which no terms of the gradient cancel.
         write: `write(model, state, values)` puts the values of all worlds into a model of several worlds, or a state of that model.
         axis: of the worlds; None of an array without worlds.
     """
@@ -154,10 +160,10 @@ def world_axis(model, name: str, values: np.ndarray) -> int | None:
 
 
 class Difference:
-    """The loss `product(after, weights)` of steps from a state, as a function of what they read.
+    """The loss `product(after, weights)` of steps from a state, as a function of their inputs.
 
     Args:
-        advance: state -> state after all steps, with a solver of its own.
+        advance: state -> state after all steps, with a separate solver.
         advancing: model -> `advance` of a model with the same scene.
     """
 
@@ -168,7 +174,7 @@ class Difference:
         return product(self.advance(self.state.copy()), self.weights)
 
     def by(self, change, step: float) -> float:
-        """Derivative, of fourth order, by a number that `change(x)` sets to x beyond its value; it is left as it was."""
+        """Return the fourth-order central difference by a number that `change(x)` offsets by x; the number is restored."""
         values = {}
         for side in (2.0, 1.0, -1.0, -2.0):
             change(side * step)
@@ -178,7 +184,7 @@ class Difference:
         return (4.0 * near - far) / 3.0
 
     def along(self, shifts: list[Shift], step: float) -> float:
-        """Derivative, of fourth order, along the sum of directions: SIDES steps of it are the worlds of one model."""
+        """Return the fourth-order central difference along the sum of directions; the worlds of one model take the SIDES steps."""
         wide = self.model.scene.build(device=DEVICE, precision="float64", worlds=len(SIDES))
         state = wide.state()
         state.time = self.state.time
@@ -202,23 +208,23 @@ class Difference:
         return float(losses @ WEIGHTS) / step
 
     def by_length(self, dt: float, step: float, scheme: str = "implicit_euler") -> float:
-        """By the length of the one step from the state, dt long; each length is one integrator's."""
+        """Return the derivative by the length dt of a single step; each length takes a new integrator."""
         before = self.advance
 
         def longer(x):
             self.advance = lambda start: ddg.Integrator(self.model, scheme=scheme, **TIGHT).step(start, dt + x)
 
-        found = self.by(longer, step)
+        derivative = self.by(longer, step)
         self.advance = before
-        return found
+        return derivative
 
 
-def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
-    """A state on the way, with random velocities: strains, rates and turns of frames everywhere."""
+def moving_state(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: float = 3.0, **options):
+    """Return a moving state with random velocities: nonzero strains, rates and frame rotations everywhere."""
     integrator, state = ddg.Integrator(model, **TIGHT, **options), model.state()
     for _ in range(steps):
         state = integrator.step(state, dt)
-    state, random, meaning = state.copy(), np.random.default_rng(3), Meaning(model)
+    state, random, mask = state.copy(), np.random.default_rng(3), StateMask(model)
     for name, array in entries(state).items():
         rate = name.rpartition("/")[2]
         if rate in ("v", "omega"):
@@ -226,12 +232,12 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
             more = random.normal(size=values.shape) * (spin if rate == "omega" else speed)
             if name == "net/v":
                 more[model.coupled.host.nodes :] *= spin / speed
-            device_arrays.assign(array, values + meaning.keep(name, more))
+            device_arrays.assign(array, values + mask.keep(name, more))
     return state
 
 
-def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
-    """Derivatives of the loss of some steps by the first state, what each step read, the last first, and the loss's `Difference`."""
+def vjp_of_steps(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
+    """Return gradients by the first state and by the inputs of each step (last first), and the `Difference` of the loss."""
     weights = directions(model, state, 5)
 
     def advancing(model):
@@ -245,19 +251,19 @@ def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
         return advance
 
     adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
-    tapes, at = [], state
+    tapes, current = [], state
     for _ in range(steps):
-        at, tape = adjoint.step(at, dt)
+        current, tape = adjoint.step(current, dt)
         tapes.append(tape)
-    given, inputs = cotangent(model, weights), []
+    grad_state, inputs = cotangent(model, weights), []
     for tape in reversed(tapes):
-        given, read = adjoint.vjp(tape, given)
+        grad_state, read = adjoint.vjp(tape, grad_state)
         inputs.append(read)
-    return given, inputs, Difference(model, state.copy(), weights, advancing(model), advancing)
+    return grad_state, inputs, Difference(model, state.copy(), weights, advancing(model), advancing)
 
 
 def tables(model) -> list:
-    """Parameter tables of all parts."""
+    """Return the parameter tables of all rod groups and element sets."""
     return [group.parameters for group in model.groups] + (
         [part.parameters for part in model.coupled.sets] if model.coupled else []
     )
@@ -265,8 +271,8 @@ def tables(model) -> list:
 
 def by_parameters(model, inputs: list) -> list[np.ndarray]:
     """Derivatives by the parameters of each table, (rows, ...)."""
-    found = [device_arrays.download(own.parameters) for own in inputs[: len(model.groups)]]
-    return found + ([rows.numpy() for rows in inputs[-1].parameters] if model.coupled else [])
+    gradients = [device_arrays.download(group_inputs.parameters) for group_inputs in inputs[: len(model.groups)]]
+    return gradients + ([rows.numpy() for rows in inputs[-1].parameters] if model.coupled else [])
 
 
 def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
@@ -280,13 +286,13 @@ def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
 def state_shifts(model, gradient, state) -> list[Shift]:
     """Return a direction in every array of the first state."""
     shifts = []
-    for name, meant in directions(model, state, 7).items():
+    for name, direction in directions(model, state, 7).items():
         values, slopes = device_arrays.download(entries(state)[name]), device_arrays.download(entries(gradient)[name])
 
         def write(_model, wide, new, name=name):
             device_arrays.assign(wide.arrays()[name], new)
 
-        shifts.append(Shift(name, values, slopes, along(slopes, meant), write, world_axis(model, name, values)))
+        shifts.append(Shift(name, values, slopes, along(slopes, direction), write, world_axis(model, name, values)))
     return shifts
 
 
@@ -300,11 +306,11 @@ def parameter_shifts(model, inputs: list, names=None, seed: int = 11) -> list[Sh
         for row, (name, values) in enumerate(table.values.items()):
             if names is not None and name not in names:
                 continue
-            own = total[row] if of_rods else total[row].reshape(model.worlds, -1)
+            by_element = total[row] if of_rods else total[row].reshape(model.worlds, -1)
             worlds = 1 if of_rods else 0
             if of_rods:  # a column a rod, of every world
-                values = np.broadcast_to(values, (values.shape[0], own.shape[1]))
-            slopes = shared(own, values.shape)
+                values = np.broadcast_to(values, (values.shape[0], by_element.shape[1]))
+            slopes = shared(by_element, values.shape)
             size = random.uniform(0.5, 1.0, values.shape) * (np.abs(values).max() or 1.0)
 
             def write(wide, _state, new, number=number, name=name):
@@ -324,23 +330,25 @@ def check(difference: "Difference", shifts: list[Shift]) -> None:
         largest = LARGEST / CHANGE if ":" in shift.name else np.inf
         shift.direction = shift.direction * (min(1.0 / slope, largest) if slope > 1e-9 else 1.0)
     wanted = sum(shift.slope for shift in shifts)
-    found = difference.along(shifts, CHANGE)
-    if not close(wanted, found):
+    slope_difference = difference.along(shifts, CHANGE)
+    if not close(wanted, slope_difference):
         alone = {shift.name: (shift.slope, difference.along([shift], CHANGE)) for shift in shifts}
-        raise AssertionError(f"gradient {wanted:.12g}, difference {found:.12g}; each alone: {alone}")
+        raise AssertionError(f"gradient {wanted:.12g}, difference {slope_difference:.12g}; each alone: {alone}")
 
 
-def close(found: float, wanted: float, scale: float = 0.0) -> bool:
-    return abs(found - wanted) <= CLOSE * max(abs(wanted), scale)
+def close(value: float, expected: float, scale: float = 0.0) -> bool:
+    return abs(value - expected) <= CLOSE * max(abs(expected), scale)
 
 
-def check_state(model, gradient, difference, *others: Shift) -> None:
+def check_state(model, gradient, difference, *shifts: Shift) -> None:
     """Check the derivatives by every array of the first state, and by others."""
-    check(difference, [*state_shifts(model, gradient, difference.state), *others])
+    check(difference, [*state_shifts(model, gradient, difference.state), *shifts])
 
 
-def check_length(own, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
-    """What one part read of a step, dt long, against the derivative of the loss by its length."""
-    grad_inverse_step = sum(float(array.numpy().sum()) for array in (own.rate, *getattr(own, "elements_rate", ())))
+def check_length(step_inputs, difference: Difference, dt: float, step: float, scheme: str = "implicit_euler") -> None:
+    """Check the derivative by the length dt of one step, from the gradients of one subsystem's inputs."""
+    grad_inverse_step = sum(
+        float(array.numpy().sum()) for array in (step_inputs.rate, *getattr(step_inputs, "elements_rate", ()))
+    )
     per_step = 2.0 if scheme == "implicit_midpoint" else 1.0  # rate of the implicit Euler step that is solved, times dt
     assert close(-per_step * grad_inverse_step / dt**2, difference.by_length(dt, step, scheme))

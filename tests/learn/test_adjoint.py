@@ -1,4 +1,4 @@
-"""Gradients of steps against central differences of them, by every entry of the state and every parameter."""
+"""Gradients of steps by state and parameters against central differences."""
 
 import numpy as np
 import pytest
@@ -15,9 +15,9 @@ from tests.learn.differences import (
     check_state,
     close,
     entries,
-    lively,
+    moving_state,
     parameter_shifts,
-    pulled,
+    vjp_of_steps,
 )
 
 DT = 0.01
@@ -131,7 +131,7 @@ SCENES = {
 
 def differentiated(name: str, scheme: str, steps: int):
     model = built(SCENES[name]())
-    return model, *pulled(model, lively(model, scheme=scheme), DT, steps, scheme)
+    return model, *vjp_of_steps(model, moving_state(model, scheme=scheme), DT, steps, scheme)
 
 
 CASES = [(name, scheme) for name in SCENES for scheme in ("implicit_euler", "implicit_midpoint")]
@@ -145,18 +145,18 @@ def test_a_step_by_its_state_and_parameters(name, scheme):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", ["twisted", "joined", "sheet"])
-def test_a_step_by_what_all_share(name, scheme):
+def test_a_step_by_length_and_mass_damping(name, scheme):
     """The length of the step, damping by mass."""
     model, _, (inputs,), difference = differentiated(name, scheme, 1)
-    own = inputs[0]
-    check_length(own, difference, DT, 1e-7, scheme)
+    step_inputs = inputs[0]
+    check_length(step_inputs, difference, DT, 1e-7, scheme)
     damping = model.scene.mass_damping
 
     def damped(x):  # which an integrator takes when it is made
         model.scene.mass_damping = damping + x
         difference.advance = lambda start: ddg.Integrator(model, scheme=scheme, **TIGHT).step(start, DT)
 
-    assert close(float(own.damping.numpy().sum()), difference.by(damped, 1e-3))
+    assert close(float(step_inputs.damping.numpy().sum()), difference.by(damped, 1e-3))
 
 
 LONG = [(name, "implicit_euler") for name in ("twisted", "untwisted", "closed", "joined", "sheet")]
@@ -175,18 +175,18 @@ def test_gradients_repeat_bit_by_bit():
         np.testing.assert_array_equal(array.numpy(), entries(second)[name].numpy())
 
 
-def test_a_step_in_parts_is_refused():
+def test_a_step_with_retries_is_refused():
     model = built(twisted())
     integrator = ddg.Integrator(model, max_iterations=3)
-    adjoint, state = Adjoint(integrator), lively(model, speed=1.0)
+    adjoint, state = Adjoint(integrator), moving_state(model, speed=1.0)
     after, tape = adjoint.step(state, 0.02)
     assert integrator.statistics()["retries"] > 1
     with pytest.raises(SolverError, match=r"rod \d .*took the step in parts.*take a smaller dt"):
         adjoint.vjp(tape, after)
 
 
-def turned_clamp(joint=False):
-    """A clamp that a motion shifts and turns, out of its plane: its edge's angle is found in the lagged frame."""
+def moving_clamp(joint=False):
+    """A clamp that a motion translates and rotates out of its plane; its edge angle refers to the lagged frame."""
     scene = joined() if joint else twisted()
     scene.supports.clear()
     motion = ddg.Motion(
@@ -196,29 +196,29 @@ def turned_clamp(joint=False):
     return scene
 
 
-SCENES |= {"turned_clamp": turned_clamp, "turned_joined": lambda: turned_clamp(joint=True)}
+SCENES |= {"moving_clamp": moving_clamp, "moving_joined": lambda: moving_clamp(joint=True)}
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["turned_clamp", "turned_joined"])
-def test_steps_under_a_motion_that_turns(name, scheme):
+@pytest.mark.parametrize("name", ["moving_clamp", "moving_joined"])
+def test_steps_under_a_motion_that_rotates(name, scheme):
     model, gradient, _, difference = differentiated(name, scheme, 2)
     check_state(model, gradient, difference)
 
 
-def held_between():
-    """Rods that are held in the middle, by all components and by one, and one that nothing holds."""
+def fixed_between():
+    """A rod fixed at inner nodes, by all components and by one, and a free rod."""
     scene = a_scene()
     curve = np.concatenate([CURVE, CURVE[-1] + CURVE[1:]])
-    held = scene.add_rod(curve, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
-    scene.fix(held, [3, 7])
-    scene.fix(held, [5], components="y")
+    rod = scene.add_rod(curve, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
+    scene.fix(rod, [3, 7])
+    scene.fix(rod, [5], components="y")
     scene.add_rod(CURVE + [0.0, 1.0, 0.0], section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     return scene
 
 
 def rings():
-    """One whose node is held by two components, and one with two nodes held."""
+    """Closed rods: one with two components of a node fixed, one with two nodes fixed."""
     scene, a = a_scene(), np.linspace(0.0, 2.0 * np.pi, 7, endpoint=False)
     for number, (nodes, components) in enumerate((([3], "xz"), ([2, 4], "xyz"))):
         ring = np.stack([0.1 * np.cos(a), 0.1 * np.sin(a) + number, 0.02 * np.sin(2.0 * a)], axis=1)
@@ -228,7 +228,7 @@ def rings():
 
 
 def one_after_another():
-    """Rods that are placed one after another, the last one between two anchors, and two that nothing holds."""
+    """Rods that are placed one after another, the last one between two anchors, and two free rods."""
     scene, end, section = a_scene(), CURVE[-1], ddg.Circle(0.003)
     side = np.stack([0.1 * T, 0.2 * T, 0.1 * T], axis=1)
     back = np.stack([0.1 * T, -0.2 * T, 0.1 * T + 0.02 * np.sin(5.0 * T)], axis=1)
@@ -245,13 +245,13 @@ def one_after_another():
     return scene
 
 
-TURNING = {"held_between": held_between, "rings": rings, "one_after_another": one_after_another}
+TURNING = {"fixed_between": fixed_between, "rings": rings, "one_after_another": one_after_another}
 SCENES |= TURNING
 
 
-@pytest.mark.parametrize("name", ["twisted", "joined", "stiffened", "turned_clamp", "turned_joined", *TURNING])
-def test_the_midpoint_rule_with_predictors_that_turn_edges(name, monkeypatch):
-    """As those of stiff rods do, whose frames are carried to where turned edges lie."""
+@pytest.mark.parametrize("name", ["twisted", "joined", "stiffened", "moving_clamp", "moving_joined", *TURNING])
+def test_the_midpoint_rule_with_predictors_that_rotate_edges(name, monkeypatch):
+    """Stiff rods: reference frames are transported to the rotated edges of the predictor."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, _, difference = differentiated(name, "implicit_midpoint", 1)
     check_state(model, gradient, difference)
@@ -278,7 +278,7 @@ def pressed():
 
 
 def coupled(name: str):
-    """A couple whose forces follow the edge, on rods in a fluid."""
+    """Rods in a fluid under a follower couple."""
     scene = resisted(name, **FLUID)
     scene.add_couple(0, -1, (0.0, 2e-4, 0.0) if scene.dimension == 2 else (1e-4, 2e-4, -1e-4))
     return scene
@@ -303,8 +303,8 @@ SCENES |= LAGGED
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", LAGGED)
-def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
-    """Both are found at the start of a solve, by velocities there, and by nodes there or where the step is predicted to lead."""
+def test_drag_and_follower_loads(name, scheme, monkeypatch):
+    """Drag and follower loads are lagged: evaluated at the velocities and nodes of the start, or at the predicted nodes."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
     model, gradient, inputs, difference = differentiated(name, scheme, 2)
     check_state(model, gradient, difference, *parameter_shifts(model, inputs))
@@ -312,7 +312,7 @@ def test_drag_and_loads_that_follow(name, scheme, monkeypatch):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("name", ["couple, twisted", "sand, joined", "pressure"])
-def test_drag_and_loads_that_follow_by_the_length_of_the_step(name, scheme):
+def test_drag_and_follower_loads_by_the_length_of_the_step(name, scheme):
     _, _, (inputs,), difference = differentiated(name, scheme, 1)
     check_length(inputs[0], difference, DT, 1e-7, scheme)
 
@@ -323,11 +323,11 @@ def test_drag_over_twenty_steps():
 
 
 def test_a_step_that_leaves_its_predictor_is_refused():
-    """By the midpoint rule frames are carried to the predictor: a solve that starts once more from the last state has others."""
+    """A cold start has other frames than the predictor, to which the midpoint rule transports them."""
     model = built(twisted())
     integrator = ddg.Integrator(model, scheme="implicit_midpoint")
     adjoint = Adjoint(integrator)
-    after, tape = adjoint.step(lively(model, scheme="implicit_midpoint"), DT)
+    after, tape = adjoint.step(moving_state(model, scheme="implicit_midpoint"), DT)
     tape.parts[0].retries.fill_(1)
     with pytest.raises(SolverError, match=r"rod \d .*started the step once more.*take a smaller dt"):
         adjoint.vjp(tape, after)

@@ -21,11 +21,14 @@ from tests.learn.differences import (
     check_state,
     entries,
     parameter_shifts,
-    pulled,
+    vjp_of_steps,
 )
 from tests.pairwise import covering
 
-RUBBING = {"friction": 0.3, "velocity": 0.05}  # what slides does so at twice the velocity, what turns slower
+WITH_FRICTION = {
+    "friction": 0.3,
+    "velocity": 0.05,
+}  # slip speeds are twice the stick threshold, those of rotation lower
 SLIDING = 0.1  # [m/s]
 ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
 each_scene = pytest.mark.parametrize("name", SCENES)
@@ -33,29 +36,29 @@ lagged_once_or_twice = pytest.mark.parametrize("friction_iterations", [1, 2])
 each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
-def differentiated(name: str, law: str, steps: int, speed: float = 0.0, ways=None, **contact):
+def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coefficients=None, **contact):
     scene = scene_of(name, law, **contact)
-    if ways:
-        scene.contact_between("bar", "obstacle", friction=ways)
+    if coefficients:
+        scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
     ranges = model.coupled.touching["range"]
-    ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
+    ranges.assign(0.99 * ranges.numpy())  # room to grow, up to the search distance
     state = touching(model, along=speed)
     model.touch.at(state.coupled.q)
     assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
-    return model, *pulled(model, state, DT, steps)
+    return model, *vjp_of_steps(model, state, DT, steps)
 
 
 def by_number(inputs: list, name: str) -> np.ndarray:
-    """Derivatives by a number of contact, symmetric where it is of two groups."""
+    """Return derivatives by a contact parameter, symmetrised over the two contact groups."""
     if name == "radius":
         return sum(read[-1].radius.numpy() for read in inputs)
-    found = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
-    return 0.5 * (found + found.swapaxes(1, 2))
+    gradient = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
+    return 0.5 * (gradient + gradient.swapaxes(1, 2))
 
 
 def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
-    """Return a direction in each number of contact."""
+    """Return a direction in each contact parameter."""
     shifts = []
     for name in names:
         values, gradient = model.coupled.touching[name].numpy(), by_number(inputs, name)
@@ -77,19 +80,19 @@ def test_a_step_by_its_state_and_numbers(name, law):
 @each_law
 @pytest.mark.parametrize("form", ["logistic", pytest.param("polynomial", marks=pytest.mark.slow)])
 @each_scene
-def test_a_step_that_rubs(name, law, form):
-    model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **RUBBING)
+def test_a_step_with_friction(name, law, form):
+    model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **WITH_FRICTION)
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
     )
 
 
 @covering(1, name=SCENES, friction_iterations=(2, 3))
-def test_friction_that_is_lagged_anew(name, friction_iterations):
-    """Two steps of some solves each, which lag what is of the one before."""
+def test_friction_with_several_lag_iterations(name, friction_iterations):
+    """Two steps of several solves each; every solve lags normal forces and tangents of the previous one."""
     law = "penalty" if friction_iterations == 2 else "barrier"
     model, gradient, inputs, difference = differentiated(
-        name, law, 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        name, law, 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -97,10 +100,10 @@ def test_friction_that_is_lagged_anew(name, friction_iterations):
 
 
 @covering(1, name=[name for name in SCENES if not name.startswith("sheet")], friction_iterations=(1, 2))
-def test_friction_that_rolls_rods(name, friction_iterations):
-    """By angles, and by directions and radii of what rolls, too."""
+def test_friction_with_rolling_contact(name, friction_iterations):
+    """Rolling adds derivatives by twist angles, edge directions and radii."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **RUBBING
+        name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **WITH_FRICTION
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -109,23 +112,23 @@ def test_friction_that_rolls_rods(name, friction_iterations):
 
 @pytest.mark.parametrize("friction_iterations", [2, 3])
 @pytest.mark.parametrize("name", ["crossing rods", "sheet on ball"])
-def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeypatch):
-    """Without the derivative by it gradients are off by a tenth and more of their largest entry."""
+def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_iterations, monkeypatch):
+    """Dropping the derivative by lagged quantities changes gradients by over a tenth of their largest entry."""
 
-    def found():
+    def gradients():
         _, gradient, inputs, _ = differentiated(
-            name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
+            name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
         )
         return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
-    whole, chain = found(), CoupledLinearSolve.chain
+    exact, chain = gradients(), CoupledLinearSolve.chain
 
-    def broken(own, by_lagged, grad_q):
+    def broken(solve, by_lagged, grad_q):
         by_lagged.zero_()
-        chain(own, by_lagged, grad_q)
+        chain(solve, by_lagged, grad_q)
 
     monkeypatch.setattr(CoupledLinearSolve, "chain", broken)
-    for right, wrong in zip(whole, found(), strict=True):
+    for right, wrong in zip(exact, gradients(), strict=True):
         assert np.abs(right - wrong).max() > 0.1 * np.abs(right).max()
 
 
@@ -134,24 +137,24 @@ def test_what_was_lagged_at_a_solution_counts(name, friction_iterations, monkeyp
     speed=(SLIDING, -SLIDING),
     friction_iterations=(1, 2),
 )
-@pytest.mark.parametrize("ways", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
-def test_friction_by_direction(name, speed, ways, friction_iterations):
-    """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
+@pytest.mark.parametrize("coefficients", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
+def test_friction_by_direction(name, speed, coefficients, friction_iterations):
+    """Anisotropic friction of a rod that slides forwards and backwards, with directions of edges or across nodes."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, speed, ways, friction_iterations=friction_iterations, **RUBBING
+        name, "barrier", 2, speed, coefficients, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
 @covering(1, name=("crossing rods", "rod on ball", "rod on mesh", "sheets"), law=("barrier", "penalty"))
 def test_eight_steps_of_sliding(name, law):
-    model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **RUBBING)
+    model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **WITH_FRICTION)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "radius", "friction")))
 
 
 @pytest.mark.parametrize("name", ["parallel rods", "rod on plane"])
-def test_what_sticks_creeps(name):
-    """At a tenth of the speed that slides: friction is then all but its bound times the slip."""
+def test_sticking_contacts_creep(name):
+    """Sticking contacts creep well below the stick threshold, where friction is nearly linear in the slip."""
     model, gradient, inputs, difference = differentiated(name, "barrier", 3, friction=0.8, velocity=0.5)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("friction",)))
 
@@ -160,18 +163,18 @@ def test_what_sticks_creeps(name):
 @pytest.mark.parametrize("name", ["crossing rods", "rod on sheet"])
 def test_a_step_by_its_length(name, friction_iterations):
     _, _, (inputs,), difference = differentiated(
-        name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
-    own = inputs[0]
-    assert float(own.elements_rate[-1].numpy().sum()) != 0.0
-    check_length(own, difference, DT, 1e-8)
+    step_inputs = inputs[0]
+    assert float(step_inputs.elements_rate[-1].numpy().sum()) != 0.0
+    check_length(step_inputs, difference, DT, 1e-8)
 
 
 @lagged_once_or_twice
-def test_elements_of_what_touches(friction_iterations):
-    """Stiffnesses of rods and sheets, as without contact."""
+def test_element_parameters_in_contact(friction_iterations):
+    """Stiffnesses of rods and sheets in contact have gradients."""
     model, _, inputs, difference = differentiated(
-        "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING
+        "rod on sheet", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check(difference, parameter_shifts(model, inputs))
 
@@ -179,7 +182,7 @@ def test_elements_of_what_touches(friction_iterations):
 @lagged_once_or_twice
 def test_gradients_repeat_bit_by_bit(friction_iterations):
     first, second = (
-        differentiated("sheets", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **RUBBING)[1:3]
+        differentiated("sheets", "barrier", 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION)[1:3]
         for _ in range(2)
     )
     for name, array in entries(first[0]).items():
@@ -189,11 +192,11 @@ def test_gradients_repeat_bit_by_bit(friction_iterations):
 
 
 @lagged_once_or_twice
-def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
-    """Gradients are the same to the bit."""
-    model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **RUBBING))
+def test_pair_lists_regrow(friction_iterations):
+    """Regrown pair lists give bitwise equal gradients."""
+    model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **WITH_FRICTION))
     state = touching(model, along=SLIDING)
-    found = []
+    results = []
     for few in (False, True):
         adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
         after, tape = adjoint.step(state, DT)
@@ -205,8 +208,8 @@ def test_pairs_that_do_not_fit_are_made_room_for(friction_iterations):
             contact.has_overflow(after.coupled.q)
             for pairs in contact.system.search.lists:
                 assert pairs.capacity < 1024
-        found.append(adjoint.vjp(tape, after)[0].coupled.q.numpy())
-    np.testing.assert_array_equal(*found)
+        results.append(adjoint.vjp(tape, after)[0].coupled.q.numpy())
+    np.testing.assert_array_equal(*results)
 
 
 def test_without_friction_there_is_nothing_to_lag():
@@ -216,16 +219,16 @@ def test_without_friction_there_is_nothing_to_lag():
 
 
 @lagged_once_or_twice
-def test_what_is_not_solved_has_no_gradient(friction_iterations, monkeypatch):
-    """Of several solves it may be the last one alone, which comes first."""
-    model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **RUBBING))
+def test_unconverged_adjoint_solves_are_refused(friction_iterations, monkeypatch):
+    """A failed adjoint solve is refused, also if only the last friction solve fails."""
+    model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **WITH_FRICTION))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)
     system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.chain
 
-    def go_on(*given):
+    def go_on(*arguments):
         system.missed = missed
-        chain(*given)
+        chain(*arguments)
 
     monkeypatch.setattr(CoupledLinearSolve, "chain", go_on)
     system.missed = 0.0  # which no solution leaves

@@ -22,7 +22,7 @@ WAY = np.linspace(-0.05, 0.05, 7)
 
 
 def _pressed(shape):
-    """A wavy rod, held at both ends, that its weight presses on an obstacle."""
+    """A wavy rod, clamped at both ends, pressed on an obstacle by its weight."""
 
     def build(scene):
         scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), edges=[0, -1])
@@ -32,7 +32,7 @@ def _pressed(shape):
 
 
 def _crossing(scene):
-    """A heavy rod that lies across another one; their ends are held, those of one as joints hold them."""
+    """A heavy rod across another one, with fixed ends, in one of them by joints."""
     scene.clamp(bar(scene, 0.0, name="lower"), edges=[0, -1])
     upper = np.stack([0.3 * WAY + 0.004, WAY, 2.0 * RADIUS + 0.8 * RANGE + 0.05 * WAY], 1)
     scene.clamp(rod(scene, upper, name="upper"), edges=[0])
@@ -53,15 +53,15 @@ CASES = {
 }
 
 
-def pressed_model(name: str, law: str, ways=None, **contact):
+def pressed_model(name: str, law: str, coefficients=None, **contact):
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     CASES[name](scene)
     scene.contact(law=law, range=RANGE, stiffness=2000.0 if scene.shells else 50.0, **contact)
-    if ways:
-        scene.contact_between("bar", "obstacle", friction=ways)
+    if coefficients:
+        scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
     ranges = model.coupled.touching["range"]
-    ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
+    ranges.assign(0.99 * ranges.numpy())  # room to grow, up to the search distance
     return model
 
 
@@ -91,8 +91,11 @@ def test_an_equilibrium_in_contact_by_a_load(name):
     check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
 
 
-def rubbing(name: str, law: str, velocity: float, **contact):
-    """An equilibrium from rest in one load step, whose gradient is that of positions, as angles depend on the way of the search."""
+def equilibrium_with_friction(name: str, law: str, velocity: float, **contact):
+    """Return an equilibrium with friction from rest in one load step, and its gradient.
+
+    The loss reads positions alone, as edge angles depend on the path of the iterates.
+    """
     model = pressed_model(name, law, friction=0.3, velocity=velocity, **contact)
     state = statics.solve(model, rtol=RTOL)
     weights = {name: values * (name == "net/q") for name, values in position_weights(model, state).items()}
@@ -106,16 +109,16 @@ def rubbing(name: str, law: str, velocity: float, **contact):
     [
         (1e-2, "barrier"),
         (1e-4, "penalty"),
-        *(pytest.param(*of, marks=slow) for of in ((1e-2, "penalty"), (1e-4, "barrier"))),
+        *(pytest.param(*case, marks=slow) for case in ((1e-2, "penalty"), (1e-4, "barrier"))),
     ],
 )
 @pytest.mark.parametrize("name", CASES)
-def test_an_equilibrium_that_rubs(name, velocity, law):
-    """Things creep by the larger velocity, and slide by the smaller one where anything does."""
-    model, state, inputs, difference = rubbing(name, law, velocity)
-    touching = model.contacts(state)
-    share = np.linalg.norm(touching.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(touching.force, axis=1), 1e-12)
-    assert share.max() > (0.05 if velocity == 1e-4 else 1e-3)
+def test_an_equilibrium_with_friction(name, velocity, law):
+    """Contacts creep at the larger stick threshold and slip at the smaller one."""
+    model, state, inputs, difference = equilibrium_with_friction(name, law, velocity)
+    contacts = model.contacts(state)
+    ratio = np.linalg.norm(contacts.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(contacts.force, axis=1), 1e-12)
+    assert ratio.max() > (0.05 if velocity == 1e-4 else 1e-3)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
     place = model.coupled.host.rods[-1].nodes[3] if model.coupled.host.rods else model.coupled.host.shells[0].nodes[-1]
     check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
@@ -124,20 +127,20 @@ def test_an_equilibrium_that_rubs(name, velocity, law):
 @pytest.mark.parametrize(
     ("name", "velocity"), [("plane", 1e-4), ("mesh", 1e-3), ("crossing rods", 1e-2), ("crossing rods", 1e-3)]
 )
-def test_an_equilibrium_with_rods_that_roll(name, velocity):
-    """Edges turn in space on their way, by which frames turn beside those that are carried there straight."""
-    model, _, inputs, difference = rubbing(name, "barrier", velocity, rolling=True)
+def test_an_equilibrium_with_rolling_contact(name, velocity):
+    """Edges rotate along a path in space, so that frames differ from a single parallel transport."""
+    model, _, inputs, difference = equilibrium_with_friction(name, "barrier", velocity, rolling=True)
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
 
 
 @pytest.mark.parametrize("name", ["plane", "ball"])
-def test_an_equilibrium_that_rubs_by_direction(name):
-    model, _, inputs, difference = rubbing(name, "barrier", 1e-4, ways=(0.2, 0.5, 0.3))
+def test_an_equilibrium_with_anisotropic_friction(name):
+    model, _, inputs, difference = equilibrium_with_friction(name, "barrier", 1e-4, coefficients=(0.2, 0.5, 0.3))
     check(difference, number_shifts(model, [inputs], ("stiffness", "radius", "friction")))
 
 
-def test_the_way_has_to_be_known():
-    model, state, _, difference = rubbing("plane", "barrier", 1e-3)
+def test_the_load_path_has_to_be_known():
+    model, state, _, difference = equilibrium_with_friction("plane", "barrier", 1e-3)
     state.sliding = None
     with pytest.raises(
         SceneError, match=r"contact: by friction an equilibrium depends on the way there.*statics.solve"
@@ -145,15 +148,15 @@ def test_the_way_has_to_be_known():
         EquilibriumAdjoint(model).vjp(state, cotangent(model, difference.weights))
 
 
-def gripped(shape, velocity: float, ways=None, rolling: bool = False, worlds: int = 2):
-    """A bar whose first end a grip draws over a plane or a ball, which another grip moves; poses of both in two worlds."""
+def gripped(shape, velocity: float, coefficients=None, rolling: bool = False, worlds: int = 2):
+    """Return a bar that a grip draws over a plane or a moved ball, and grip poses of two worlds."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -40.0))
     scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), motion=ddg.Grip(pivot=(0.01, 0.02, 0.0)))
     ball = isinstance(shape, ddg.Sphere)
     scene.add_obstacle(shape, name="obstacle", motion=ddg.Grip(pivot=(0.0, 0.01, -0.1)) if ball else None)
     scene.contact(range=RANGE, stiffness=50.0, friction=0.3, velocity=velocity, rolling=rolling)
-    if ways:
-        scene.contact_between("bar", "obstacle", friction=ways)
+    if coefficients:
+        scene.contact_between("bar", "obstacle", friction=coefficients)
     poses = np.array([[[0.003, 0.002, 0.0, 0.0, 0.0, 0.3]], [[0.0, 0.004, 0.0001, 0.0, 0.0, 0.2]]])
     if ball:
         poses = np.concatenate([poses, [[[0.001, -0.002, -0.001, 0.2, 0.1, -0.3]]] * 2], axis=1)
@@ -164,36 +167,37 @@ GRIPPED = {
     "plane": (ddg.Plane(), 1e-3),
     "by direction": (ddg.Plane(), 1e-3, (0.2, 0.5, 0.3)),
     "rolling": (ddg.Plane(), 1e-3, None, True),
-    "turned ball": (ddg.Sphere((0.001, 0.002, -0.1), 0.1), 1e-2),
+    "rotated ball": (ddg.Sphere((0.001, 0.002, -0.1), 0.1), 1e-2),
 }
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=slow if name in ("rolling", "turned ball") else ()) for name in GRIPPED]
+    "name", [pytest.param(name, marks=slow if name in ("rolling", "rotated ball") else ()) for name in GRIPPED]
 )
 def test_gradients_go_through_all_load_steps(name):
-    """By poses at the end of the way, which all load steps have a part of, by forces, and numbers of contact."""
+    """Gradients by final poses, of which each load step takes a fraction, by forces, and by contact parameters."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
     from tests.learn.test_torch import check as check_along
 
     model, poses = gripped(*GRIPPED[name])
-    own = Simulator(model, 0.01)
+    simulator = Simulator(model, 0.01)
     torch.manual_seed(0)
     weight, force = (torch.randn(*shape, 3, dtype=torch.float64) for shape in ((7,), (2, 7)))
 
     def loss(poses, forces, **numbers):
         numbers = {name.replace("_", "."): value for name, value in numbers.items()}
         controls = {"poses": poses, "forces": forces}
-        found = own.equilibrium(numbers, controls, batch=2, rtol=RTOL, load_steps=3)
-        return (weight * found.positions).sum()
+        result = simulator.equilibrium(numbers, controls, batch=2, rtol=RTOL, load_steps=3)
+        return (weight * result.positions).sum()
 
-    given = {
-        f"contact_{number}": own.parameter(f"contact.{number}", 2) for number in ("stiffness", "friction", "radius")
+    inputs = {
+        f"contact_{number}": simulator.parameter(f"contact.{number}", 2)
+        for number in ("stiffness", "friction", "radius")
     }
-    given |= {"poses": torch.tensor(poses), "forces": 1e-4 * force}
+    inputs |= {"poses": torch.tensor(poses), "forces": 1e-4 * force}
     sizes = {"contact_stiffness": 0.05, "contact_friction": 1e-3, "contact_radius": 1e-6 * RADIUS}
-    check_along(loss, given, sizes | {"poses": 1e-5, "forces": 1e-6})
+    check_along(loss, inputs, sizes | {"poses": 1e-5, "forces": 1e-6})
 
 
 @pytest.mark.parametrize("name", ["plane", "rolling"])
@@ -203,11 +207,13 @@ def test_equilibria_are_those_of_a_new_solver(name):
     from ddg_warp.torch import Simulator
 
     model, poses = gripped(*GRIPPED[name])
-    own = Simulator(model, 0.01)
+    simulator = Simulator(model, 0.01)
 
-    def positions(share: float, friction: float, **options):
-        numbers = {"contact.friction": friction * own.parameter("contact.friction", 2)}
-        return own.equilibrium(numbers, {"poses": share * torch.tensor(poses)}, batch=2, rtol=RTOL, **options).positions
+    def positions(fraction: float, friction: float, **options):
+        numbers = {"contact.friction": friction * simulator.parameter("contact.friction", 2)}
+        return simulator.equilibrium(
+            numbers, {"poses": fraction * torch.tensor(poses)}, batch=2, rtol=RTOL, **options
+        ).positions
 
     first = positions(1.0, 1.0)
     assert (positions(0.5, 2.0, load_steps=2) != first).any()
@@ -233,21 +239,21 @@ def test_a_rod_that_is_drawn():
     scene.add_rod(points, section=ddg.Circle(radius), material=material)
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -1e-3)))
     scene.contact(friction=mu, velocity=1e-7, range=1e-3)
-    own = Simulator(built(scene), 0.01)
-    lying = own.equilibrium(start=999.0, end=1000.0).detach()
+    simulator = Simulator(built(scene), 0.01)
+    lying = simulator.equilibrium(start=999.0, end=1000.0).detach()
     forces = torch.zeros((1, 101, 3), dtype=torch.float64)
     forces[0, -1, 0] = 0.5 * mu * weight / 1001.0  # half of it slides
-    given = {name: own.parameter(name) for name in ("contact.friction", "rod_stretch.stiffness")}
-    leaves = [value.clone().requires_grad_() for value in (*given.values(), forces)]
-    found = own.equilibrium(
-        dict(zip(given, leaves, strict=False)),
+    inputs = {name: simulator.parameter(name) for name in ("contact.friction", "rod_stretch.stiffness")}
+    leaves = [value.clone().requires_grad_() for value in (*inputs.values(), forces)]
+    result = simulator.equilibrium(
+        dict(zip(inputs, leaves, strict=False)),
         {"forces": leaves[-1]},
         state=lying,
         start=1000.0,
         end=1001.0,
         load_steps=2,
     )
-    u = found.positions[0, -1, 0] - lying.positions[0, -1, 0]
+    u = result.positions[0, -1, 0] - lying.positions[0, -1, 0]
     np.testing.assert_allclose(
         float(u.detach()), (0.5 * mu * weight) ** 2 / (2.0 * young * area * mu * weight), rtol=3e-3
     )
@@ -261,14 +267,14 @@ def test_a_rod_that_is_drawn():
     )
 
 
-def test_worlds_settle_on_their_own():
-    """What slides in two worlds does so as in one, in as many load steps: one that rounding moves does not hold up the other."""
+def test_worlds_converge_independently():
+    """Two worlds with sliding contacts take the same load steps as each alone; rounding in one does not delay the other."""
     model, poses = gripped(*GRIPPED["plane"])
-    way = []
-    both = statics.solve(model, controls=ddg.Controls(poses=poses), rtol=RTOL, load_steps=3, way=way)
-    assert [state.time for state in way] == pytest.approx([1.0 / 3.0, 2.0 / 3.0, 1.0])
-    assert way[-1] is both
+    path = []
+    both = statics.solve(model, controls=ddg.Controls(poses=poses), rtol=RTOL, load_steps=3, way=path)
+    assert [state.time for state in path] == pytest.approx([1.0 / 3.0, 2.0 / 3.0, 1.0])
+    assert path[-1] is both
     for world in range(2):
-        one, _ = gripped(*GRIPPED["plane"], worlds=1)
-        alone = statics.solve(one, controls=ddg.Controls(poses=poses[world]), rtol=RTOL, load_steps=3)
+        single, _ = gripped(*GRIPPED["plane"], worlds=1)
+        alone = statics.solve(single, controls=ddg.Controls(poses=poses[world]), rtol=RTOL, load_steps=3)
         np.testing.assert_allclose(both.points()[world], alone.points(), rtol=0.0, atol=1e-10)

@@ -1,4 +1,4 @@
-"""What goes into steps in contact as tensors: numbers of contact of every world, moved obstacles, starts; and what is refused."""
+"""Tensors as inputs of steps in contact: contact parameters of every world, moved obstacles, initial states; and refusals."""
 
 import numpy as np
 import pytest
@@ -15,18 +15,18 @@ from ddg_warp.torch.contact_parameters import contact_elements  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
 from tests.pairwise import covering  # noqa: E402
 
-RUBBING = {"friction": 0.3, "velocity": 0.05}
+WITH_FRICTION = {"friction": 0.3, "velocity": 0.05}
 
 
 def simulator(name: str, law: str = "barrier", worlds: int = 1, **contact) -> tuple[Simulator, object]:
-    """And a state of every world in which things slide on each other."""
+    """Return a simulator and a state of every world with sliding contacts."""
     return simulated(scene_of(name, law, **contact), worlds)
 
 
 def simulated(scene, worlds: int = 1):
     model = scene.build(device=differences.DEVICE, precision="float64", worlds=worlds)
-    own = Simulator(model, DT, **TIGHT)
-    return own, own.world_state(touching(model, along=0.1))
+    sim = Simulator(model, DT, **TIGHT)
+    return sim, sim.world_state(touching(model, along=0.1))
 
 
 def weighed(state):
@@ -44,23 +44,23 @@ def weighed(state):
         ("sheets", "barrier", 1),
     ],
 )
-def test_numbers_of_every_world_over_steps(name, law, friction_iterations):
-    """Two worlds with numbers of their own, five steps of sliding."""
-    own, start = simulator(name, law, 2, friction_iterations=friction_iterations, **RUBBING)
+def test_parameters_of_every_world_over_steps(name, law, friction_iterations):
+    """Gradients by contact parameters that differ between two worlds, over five sliding steps."""
+    sim, start = simulator(name, law, 2, friction_iterations=friction_iterations, **WITH_FRICTION)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
     names = [f"contact.{name}" for name in ("stiffness", "range", "friction", "radius")]
-    usual = {name: own.parameter(name, 2) for name in names}
+    usual = {name: sim.parameter(name, 2) for name in names}
     changed = {name: value * (factor if "radius" not in name else 1.0) for name, value in usual.items()}
     changed["contact.range"] = 0.99 * changed["contact.range"]
 
-    def loss(**given):
-        given = {name.replace("_", "."): value for name, value in given.items()}
-        return weighed(own.rollout(start, given, steps=5)[-1])
+    def loss(**inputs):
+        inputs = {name.replace("_", "."): value for name, value in inputs.items()}
+        return weighed(sim.rollout(start, inputs, steps=5)[-1])
 
-    given = {name.replace(".", "_"): value for name, value in changed.items()}
+    inputs = {name.replace(".", "_"): value for name, value in changed.items()}
     sizes = {"stiffness": 1e-4 * 50.0, "range": 3e-4 * RANGE, "friction": 1e-4, "radius": 1e-5 * RADIUS}
-    check(loss, given, {name: sizes[name.partition("_")[2]] for name in given})
-    torch.testing.assert_close(own.parameter("contact.stiffness", 2), usual["contact.stiffness"])
+    check(loss, inputs, {name: sizes[name.partition("_")[2]] for name in inputs})
+    torch.testing.assert_close(sim.parameter("contact.stiffness", 2), usual["contact.stiffness"])
 
 
 SHAPES = {
@@ -73,37 +73,37 @@ SHAPES = {
 
 @covering(1, shape=SHAPES, solves=(("barrier", 1), ("penalty", 1), ("barrier", 2), ("barrier", 3)))
 def test_moved_obstacles(shape, solves):
-    """Poses of a grip that lifts, shifts and turns what a rod lies on, over four steps, and one that keeps the last pose."""
+    """Four steps with poses of a grip that lifts, shifts and rotates an obstacle under a rod, and one that keeps the last pose."""
     law, friction_iterations = solves
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
     bar(scene, RADIUS + 0.8 * RANGE)
     scene.add_obstacle(SHAPES[shape], motion=ddg.Grip(pivot=(0.01, 0.0, -0.02)), name="obstacle")
-    scene.contact(law=law, range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **RUBBING)
-    own, start = simulated(scene)
+    scene.contact(law=law, range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **WITH_FRICTION)
+    sim, start = simulated(scene)
     poses = torch.tensor([[[1e-4, 2e-4, 1e-4, 2e-3, -1e-3, 4e-3]]], dtype=torch.float64)
 
     def loss(poses):
-        states = own.rollout(start, None, lambda number: {"poses": poses * (number + 1)}, steps=4)
-        return weighed(own.step(states[-1]))
+        states = sim.rollout(start, None, lambda number: {"poses": poses * (number + 1)}, steps=4)
+        return weighed(sim.step(states[-1]))
 
     check(loss, {"poses": poses}, {"poses": 1e-7})
 
 
 def test_positions_and_velocities_at_the_start():
-    own, start = simulator("crossing rods", "penalty", **RUBBING)
+    sim, start = simulator("crossing rods", "penalty", **WITH_FRICTION)
 
     def loss(positions, velocities):
-        state = own.initial_state(positions=positions, velocities=velocities)
-        return weighed(own.rollout(state, steps=3)[-1])
+        state = sim.initial_state(positions=positions, velocities=velocities)
+        return weighed(sim.rollout(state, steps=3)[-1])
 
     points = start.positions.clone()
     check(loss, {"positions": points, "velocities": start.velocities.clone()}, {"positions": 1e-8, "velocities": 1e-5})
 
 
-def test_a_coefficient_of_friction_is_found_again():
-    """From where a rod that slides has come to."""
-    own, start = simulator("rod on plane", **RUBBING)
-    goal = own.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
+def test_a_coefficient_of_friction_is_identified():
+    """The end position of a sliding rod identifies its friction coefficient."""
+    sim, start = simulator("rod on plane", **WITH_FRICTION)
+    goal = sim.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
     logarithm = torch.tensor(0.2, dtype=torch.float64).log().requires_grad_()
     optimiser = torch.optim.LBFGS(
         [logarithm], lr=1.0, line_search_fn="strong_wolfe", max_iter=30, tolerance_change=1e-14
@@ -113,7 +113,7 @@ def test_a_coefficient_of_friction_is_found_again():
         optimiser.zero_grad()
         loss = (
             1e10
-            * ((own.rollout(start, {"contact.friction": logarithm.exp()}, steps=8)[-1].positions - goal) ** 2).sum()
+            * ((sim.rollout(start, {"contact.friction": logarithm.exp()}, steps=8)[-1].positions - goal) ** 2).sum()
         )
         loss.backward()
         return loss
@@ -124,80 +124,80 @@ def test_a_coefficient_of_friction_is_found_again():
 
 @pytest.mark.parametrize("friction_iterations", [1, 2])
 def test_transforms_and_checkpoints(friction_iterations):
-    """A gradient of a batch of coefficients is that of each, and the same with states made anew."""
-    own, start = simulator("rod on ball", friction_iterations=friction_iterations, **RUBBING)
+    """Gradients of a batch equal those of each coefficient, with and without checkpointing."""
+    sim, start = simulator("rod on ball", friction_iterations=friction_iterations, **WITH_FRICTION)
 
     def loss(mu, **kept):
-        return weighed(own.rollout(start, {"contact.friction": mu}, steps=4, **kept)[-1])
+        return weighed(sim.rollout(start, {"contact.friction": mu}, steps=4, **kept)[-1])
 
-    given = torch.tensor([0.1, 0.25, 0.4], dtype=torch.float64)
-    single = [torch.func.grad(loss)(mu) for mu in given]
-    together = torch.func.vmap(torch.func.grad(loss))(given)
+    coefficients = torch.tensor([0.1, 0.25, 0.4], dtype=torch.float64)
+    single = [torch.func.grad(loss)(mu) for mu in coefficients]
+    together = torch.func.vmap(torch.func.grad(loss))(coefficients)
     torch.testing.assert_close(together, torch.stack(single), rtol=1e-8, atol=0.0)
-    mu = given[0].clone().requires_grad_()
+    mu = coefficients[0].clone().requires_grad_()
     (again,) = torch.autograd.grad(loss(mu, checkpoint_every=2), mu)
     torch.testing.assert_close(again, single[0], rtol=0.0, atol=0.0)
 
 
 def test_a_world_in_which_a_step_fails_has_no_gradient_alone():
-    """It starts in an overlap, which no step leads out of."""
-    own, start = simulator("rod on plane", worlds=2)
-    k = own.parameter("contact.stiffness").requires_grad_()
-    radius = own.parameter("contact.radius")
+    """A world that starts in overlap fails and has no gradient; the other world keeps its own."""
+    sim, start = simulator("rod on plane", worlds=2)
+    k = sim.parameter("contact.stiffness").requires_grad_()
+    radius = sim.parameter("contact.radius")
     radius[1] *= 2.0
-    state = own.step(start, {"contact.stiffness": k, "contact.radius": radius})
-    (found,) = torch.autograd.grad((state.positions**2).sum((1, 2)).sum(), k)
-    assert torch.isfinite(found[0]).all()
-    assert torch.isnan(found[1]).all()
-    assert own.outcomes()[0] == "converged" != own.outcomes()[1]
+    state = sim.step(start, {"contact.stiffness": k, "contact.radius": radius})
+    (gradient,) = torch.autograd.grad((state.positions**2).sum((1, 2)).sum(), k)
+    assert torch.isfinite(gradient[0]).all()
+    assert torch.isnan(gradient[1]).all()
+    assert sim.outcomes()[0] == "converged" != sim.outcomes()[1]
 
 
-def test_names_of_what_has_numbers():
-    own, _ = simulator("rod on sheet")
-    assert contact_elements(own.model, "contact.stiffness") == [("bar", "bar"), ("bar", "lower"), ("lower", "lower")]
-    assert contact_elements(own.model, "contact.radius") == ["rod 0", "shell 0"]
-    assert own.parameter("contact.radius").tolist() == [[RADIUS, RADIUS]]
-    own, _ = simulator("rod on plane", **RUBBING)
-    assert contact_elements(own.model, "contact.friction") == [("bar", "bar"), ("bar", "obstacle")]
-    assert contact_elements(own.model, "contact.radius") == ["rod 0"]
+def test_names_of_contact_parameters():
+    sim, _ = simulator("rod on sheet")
+    assert contact_elements(sim.model, "contact.stiffness") == [("bar", "bar"), ("bar", "lower"), ("lower", "lower")]
+    assert contact_elements(sim.model, "contact.radius") == ["rod 0", "shell 0"]
+    assert sim.parameter("contact.radius").tolist() == [[RADIUS, RADIUS]]
+    sim, _ = simulator("rod on plane", **WITH_FRICTION)
+    assert contact_elements(sim.model, "contact.friction") == [("bar", "bar"), ("bar", "obstacle")]
+    assert contact_elements(sim.model, "contact.radius") == ["rod 0"]
 
 
-def test_what_does_not_fit_is_refused():
-    own, start = simulator("rod on plane", worlds=2)
-    wide = own.parameter("contact.range").clone()
+def test_invalid_inputs_are_refused():
+    sim, start = simulator("rod on plane", worlds=2)
+    wide = sim.parameter("contact.range").clone()
     wide[1, 1] *= 1.5
     with pytest.raises(
         SceneError, match=r"contact.range of 'bar' and 'obstacle' is 0.0015 m in world 1.*largest range"
     ):
-        own.step(start, {"contact.range": wide})
+        sim.step(start, {"contact.range": wide})
     with pytest.raises(
         SceneError, match=r"nothing has 'contact.friction'; this model has .*contact.stiffness, contact.range"
     ):
-        own.step(start, {"contact.friction": 0.1})
+        sim.step(start, {"contact.friction": 0.1})
     with pytest.raises(SceneError, match=r"contact.radius.*positive"):
-        own.step(start, {"contact.radius": 0.0})
+        sim.step(start, {"contact.radius": 0.0})
     points = start.positions.clone()
     points[:, 2, 2] = 0.5 * RADIUS
     with pytest.raises(SceneError, match=r"obstacle 0 .*overlap by"):
-        own.initial_state(positions=points)
+        sim.initial_state(positions=points)
 
 
-def test_an_equilibrium_by_numbers_of_every_world():
-    """Two worlds with numbers of their own, of a rod that its weight presses on a ball."""
+def test_an_equilibrium_by_parameters_of_every_world():
+    """Contact parameters differ between two worlds with a rod pressed on a ball by its weight."""
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), edges=[0, -1])
     scene.add_obstacle(ddg.Sphere((0.001, 0.002, -0.1), 0.1), name="obstacle")
     scene.contact(range=RANGE, stiffness=50.0)
-    own = Simulator(scene.build(device=differences.DEVICE, precision="float64", worlds=2), DT)
+    sim = Simulator(scene.build(device=differences.DEVICE, precision="float64", worlds=2), DT)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
-    stiffness, radius = (own.parameter(f"contact.{name}", 2) for name in ("stiffness", "radius"))
+    stiffness, radius = (sim.parameter(f"contact.{name}", 2) for name in ("stiffness", "radius"))
 
-    def loss(**given):
-        given = {name.replace("_", "."): value for name, value in given.items()}
-        return weighed(own.equilibrium(given, batch=2, rtol=1e-13))
+    def loss(**inputs):
+        inputs = {name.replace("_", "."): value for name, value in inputs.items()}
+        return weighed(sim.equilibrium(inputs, batch=2, rtol=1e-13))
 
-    given = {"contact_stiffness": factor * stiffness, "contact_radius": radius}
-    check(loss, given, {"contact_stiffness": 1e-4 * 50.0, "contact_radius": 1e-6 * RADIUS})
+    inputs = {"contact_stiffness": factor * stiffness, "contact_radius": radius}
+    check(loss, inputs, {"contact_stiffness": 1e-4 * 50.0, "contact_radius": 1e-6 * RADIUS})
 
 
 @pytest.mark.parametrize(
@@ -208,55 +208,55 @@ def test_an_equilibrium_by_numbers_of_every_world():
         ("rod on sheet", RodParameters, "radius"),
     ],
 )
-def test_sizes_of_sections_are_those_that_touch(name, module, learned):
-    """Learned radii and thicknesses give what a scene has that is built with them, contact included."""
-    own, _ = simulator(name, "penalty")
-    factors = module(own, names=(learned,))
+def test_learned_sections_act_in_contact(name, module, learned):
+    """Learned radii and thicknesses act, also in contact, as in a scene that is built with them."""
+    sim, _ = simulator(name, "penalty")
+    factors = module(sim, names=(learned,))
     values = factors()
     (change,) = factors.parameters()
     with torch.no_grad():
         change += np.log(1.1)
-    touching = factors()["contact.radius"] / own.parameter("contact.radius")
+    radius_ratio = factors()["contact.radius"] / sim.parameter("contact.radius")
     wanted = {"crossing rods": [1.1, 1.1], "sheets": [1.1, 1.1], "rod on sheet": [1.1, 1.0]}[name]
-    torch.testing.assert_close(touching, torch.tensor([wanted], dtype=torch.float64), rtol=1e-12, atol=0.0)
-    torch.testing.assert_close(values["contact.radius"], own.parameter("contact.radius"), rtol=1e-14, atol=0.0)
+    torch.testing.assert_close(radius_ratio, torch.tensor([wanted], dtype=torch.float64), rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(values["contact.radius"], sim.parameter("contact.radius"), rtol=1e-14, atol=0.0)
 
 
 def test_learned_radii_have_gradients():
-    own, start = simulator("crossing rods", "penalty", **RUBBING)
-    factors = RodParameters(own, names=("radius",))
+    sim, start = simulator("crossing rods", "penalty", **WITH_FRICTION)
+    factors = RodParameters(sim, names=("radius",))
 
     def loss(change):
-        given = torch.func.functional_call(factors, {"logarithms.radius": change}, ())
-        return weighed(own.rollout(start, given, steps=3)[-1])
+        inputs = torch.func.functional_call(factors, {"logarithms.radius": change}, ())
+        return weighed(sim.rollout(start, inputs, steps=3)[-1])
 
     check(loss, {"change": torch.zeros((1, 1), dtype=torch.float64)}, {"change": 1e-6})
 
 
-def test_radii_that_are_given_stay():
-    own, _ = simulated(scene_of("crossing rods", "penalty", radius={"upper": 1.2 * RADIUS}))
-    factors = RodParameters(own, names=("radius",))
+def test_explicit_contact_radii_are_kept():
+    sim, _ = simulated(scene_of("crossing rods", "penalty", radius={"upper": 1.2 * RADIUS}))
+    factors = RodParameters(sim, names=("radius",))
     (change,) = factors.parameters()
     with torch.no_grad():
         change += np.log(1.1)
-    found = factors()["contact.radius"] / RADIUS
-    torch.testing.assert_close(found, torch.tensor([[1.1, 1.2]], dtype=torch.float64), rtol=1e-12, atol=0.0)
+    factor = factors()["contact.radius"] / RADIUS
+    torch.testing.assert_close(factor, torch.tensor([[1.1, 1.2]], dtype=torch.float64), rtol=1e-12, atol=0.0)
 
 
-def test_what_turns_far_has_no_gradient_and_counts_no_more_than_half_a_turn():
-    """A step in substeps that resolve arcs is no single solve; poses say nothing of more than half a turn."""
+def test_large_rotations_have_no_gradient_and_count_at_most_half_a_revolution():
+    """Substeps that resolve large rotations have no gradient; poses cannot represent more than half a revolution."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_rod(np.linspace((0.1, 0.02, -0.05), (0.1, 0.02, 0.05), 7), section=ddg.Circle(RADIUS), material=SOFT)
     scene.add_obstacle(ddg.Capsule((0.05, 0.0, 0.0), (0.2, 0.0, 0.0), RADIUS), motion=ddg.Grip())
     scene.contact(stiffness=1e4)
-    own = Simulator(scene.build(device=differences.DEVICE, precision="float64"), 0.1)
-    for turn, finite in ((0.01, True), (0.5, False)):
-        poses = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, turn]], dtype=torch.float64, requires_grad=True)
-        end = own.step(own.initial_state(), controls={"poses": poses})
+    sim = Simulator(scene.build(device=differences.DEVICE, precision="float64"), 0.1)
+    for angle, finite in ((0.01, True), (0.5, False)):
+        poses = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, angle]], dtype=torch.float64, requires_grad=True)
+        end = sim.step(sim.initial_state(), controls={"poses": poses})
         assert torch.isfinite(end.positions).all()
-        assert own.outcomes().tolist() == ["converged" if finite else "no_gradient"]
+        assert sim.outcomes().tolist() == ["converged" if finite else "no_gradient"]
         assert end.differentiable.tolist() == [finite]
         end.positions.sum().backward()
         assert bool(torch.isfinite(poses.grad).all()) == finite
     with pytest.raises(ddg.SolverError, match=r"poses of grip 0 differ by 0\.7 turns"):
-        own.step(own.initial_state(), controls={"poses": torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 1.4 * np.pi]])})
+        sim.step(sim.initial_state(), controls={"poses": torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 1.4 * np.pi]])})

@@ -1,4 +1,4 @@
-"""Windows of recorded runs: the right frames, in workers of both kinds, and a clear word about what cannot be read."""
+"""Windows of recorded runs: frames, worker processes of both kinds, and errors of unreadable files."""
 
 import pickle
 from importlib import import_module
@@ -21,7 +21,7 @@ FIELDS = ["velocities", "directors", "axial_force"]
 
 
 def scene(surface: bool = False) -> ddg.Scene:
-    """A rod, clamped at its first edge, and beside it a sheet, if wanted."""
+    """A rod, clamped at its first edge, and optionally a sheet next to it."""
     result = ddg.Scene(analysis=ddg.Dynamics(dt=0.01, duration=0.12))
     points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 5)
     rod = result.add_rod(points, section=ddg.Circle(0.01), material=ddg.Material(1e6))
@@ -41,8 +41,8 @@ def observe(model, state):
 def run(tmp_path_factory, device):
     """A directory with 13 frames of a rod."""
     out = tmp_path_factory.mktemp("run")
-    given = {"device": device, "usd": False, "progress": False, "fields": FIELDS, "observe": observe}
-    simulate(scene(), out=out, provenance={"parameters": {"n": 5, "young": 1e6, "kind": "soft"}}, **given)
+    options = {"device": device, "usd": False, "progress": False, "fields": FIELDS, "observe": observe}
+    simulate(scene(), out=out, provenance={"parameters": {"n": 5, "young": 1e6, "kind": "soft"}}, **options)
     return out
 
 
@@ -119,7 +119,7 @@ def test_workers_read_for_themselves(tmp_path, kind):
         assert torch.equal(values, torch.stack([torch.as_tensor(item[name]) for item in expected]))
     loads = torch.cat([batch["parameters"]["load"] for batch in batches])
     assert loads.tolist() == [0.1 * k for k in range(6) for _ in range(2)]
-    assert torch.equal(data[5]["points"], expected[5]["points"])  # and those of this process still are
+    assert torch.equal(data[5]["points"], expected[5]["points"])  # and data in this process stay the same
     data.close()
     assert torch.equal(data[5]["points"], expected[5]["points"])
 
@@ -160,7 +160,7 @@ def test_several_folders_are_one_data_set(tmp_path, run):
     assert len(data) == 3 + 11
     assert data[2]["file"] == 2
     assert data[3]["points"].shape == (3, 5, 3)
-    assert data[0]["parameters"] == {}  # they share none
+    assert data[0]["parameters"] == {}  # none in common
 
 
 def test_failed_episodes_are_left_out(tmp_path):
@@ -228,10 +228,10 @@ def test_files_that_an_index_does_not_fit_are_named(tmp_path):
 
 @pytest.mark.parametrize("how", ["link", "storage", "virtual"])
 def test_data_of_other_files_is_read_where_it_is_allowed(tmp_path, how):
-    """By external links, external storage and virtual datasets."""
+    """External links, external storage and virtual datasets are followed where allowed."""
     record(tmp_path)
-    path, other = tmp_path / "trajectory.h5", tmp_path / "other.h5"
-    with h5py.File(path, "r+") as file, h5py.File(other, "w") as away:
+    path, external = tmp_path / "trajectory.h5", tmp_path / "other.h5"
+    with h5py.File(path, "r+") as file, h5py.File(external, "w") as away:
         points = file["trajectory/points"][:]
         del file["trajectory/points"]
         away["points"] = points
@@ -244,7 +244,7 @@ def test_data_of_other_files_is_read_where_it_is_allowed(tmp_path, how):
             )
         else:
             layout = h5py.VirtualLayout(points.shape, float)
-            layout[:] = h5py.VirtualSource(str(other), "points", points.shape)
+            layout[:] = h5py.VirtualSource(str(external), "points", points.shape)
             file.create_virtual_dataset("trajectory/points", layout)
     for reading in (lambda: Recordings(path, window=2), lambda: read(path)):
         with pytest.raises(TrajectoryError, match=r"trajectory\.h5: .*trajectory/points .*outside=True"):

@@ -1,4 +1,4 @@
-"""Environments: actions move grips, worlds start anew alone, failures are named, gradients go through."""
+"""Environments: actions move grips, worlds reset independently, failures are named, gradients pass."""
 
 import numpy as np
 import pytest
@@ -20,184 +20,184 @@ WORLDS = 3
 
 
 def gripped(dimension: int = 3, **options) -> Simulator:
-    """A cable held by a grip at one end."""
+    """A cable with a grip at one end."""
     scene = a_scene(dimension=dimension)
     rod = scene.add_rod(POINTS, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
     return Simulator(built(scene), DT, **TIGHT | options)
 
 
-def observe(now):
-    """The tip relative to its goal, and the poses."""
-    return torch.cat([now.world.positions[:, -1] - now.goals, now.poses.flatten(1)], 1)
+def observe(episodes):
+    """Return the tip relative to its goal, and the poses."""
+    return torch.cat([episodes.world.positions[:, -1] - episodes.goals, episodes.poses.flatten(1)], 1)
 
 
-def off(now):
-    """How far the tip is from its goal."""
-    return -((now.world.positions[:, -1] - now.goals) ** 2).sum(1)
+def off(episodes):
+    """Return the negated squared distance of the tip from its goal."""
+    return -((episodes.world.positions[:, -1] - episodes.goals) ** 2).sum(1)
 
 
 def draw(random):
     return random.uniform(-0.2, 0.2, 3)
 
 
-def environment(own: Simulator | None = None, **options) -> Environment:
+def environment(sim: Simulator | None = None, **options) -> Environment:
     usual = {"observe": observe, "reward": off, "draw": draw, "steps": 4}
-    return Environment(own or gripped(), WORLDS, RATES, **usual | options)
+    return Environment(sim or gripped(), WORLDS, RATES, **usual | options)
 
 
 def some_actions(count: int, seed: int = 5) -> torch.Tensor:
-    """Random actions within their bounds (count, worlds, 4)."""
+    """Draw random actions within their bounds (count, worlds, 4)."""
     torch.manual_seed(seed)
     return (2.0 * torch.rand((count, WORLDS, 4), dtype=torch.float64) - 1.0) * torch.tensor([0.5, 0.5, 3.0, 3.0])
 
 
-def same(one, other, worlds) -> None:
-    """Episodes of these worlds are alike to the last bit."""
+def same(first, second, worlds) -> None:
+    """Assert that episodes of these worlds are bitwise equal."""
     for name in ("positions", "velocities", "angles"):
-        a, b = getattr(one.world, name)[worlds], getattr(other.world, name)[worlds]
+        a, b = getattr(first.world, name)[worlds], getattr(second.world, name)[worlds]
         torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
     for name in ("poses", "goals", "actions", "steps"):
-        a, b = getattr(one, name)[worlds], getattr(other, name)[worlds]
+        a, b = getattr(first, name)[worlds], getattr(second, name)[worlds]
         torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
 
 
-def test_rotations_turn_on():
-    """As matrices do, beyond half a turn, too; from none at all, and with gradients there."""
+def test_rotation_vectors_compose():
+    """Rotation vectors compose as matrices, also beyond half a revolution; at zero with finite gradients."""
     torch.manual_seed(0)
-    vectors, by = torch.randn((20, 3), dtype=torch.float64) * 1.5, torch.randn((20, 3), dtype=torch.float64)
-    vectors[0], by[1], vectors[2], by[2] = 0.0, 0.0, 0.0, 0.0
-    wanted = Rotation.from_rotvec(by.cpu().numpy()) * Rotation.from_rotvec(vectors.cpu().numpy())
-    np.testing.assert_allclose(turned(vectors, by).cpu().numpy(), wanted.as_rotvec(), atol=1e-14)
-    vectors, by = vectors[:6].requires_grad_(), by[:6].requires_grad_()
-    assert torch.autograd.gradcheck(turned, (vectors, by), eps=1e-5, atol=1e-9)
+    vectors, increments = torch.randn((20, 3), dtype=torch.float64) * 1.5, torch.randn((20, 3), dtype=torch.float64)
+    vectors[0], increments[1], vectors[2], increments[2] = 0.0, 0.0, 0.0, 0.0
+    wanted = Rotation.from_rotvec(increments.cpu().numpy()) * Rotation.from_rotvec(vectors.cpu().numpy())
+    np.testing.assert_allclose(turned(vectors, increments).cpu().numpy(), wanted.as_rotvec(), atol=1e-14)
+    vectors, increments = vectors[:6].requires_grad_(), increments[:6].requires_grad_()
+    assert torch.autograd.gradcheck(turned, (vectors, increments), eps=1e-5, atol=1e-9)
 
 
 def test_actions_are_velocities_of_grips():
-    """Bit for bit the steps of a simulator whose grip goes there, in as many substeps."""
-    own, actions = gripped(), some_actions(2)
-    found = environment(own, substeps=2)
-    now, state = found.begin(found.generators(0)), own.initial_state(WORLDS)
+    """Actions equal, bit for bit, the steps of a simulator with the same grip poses and substeps."""
+    sim, actions = gripped(), some_actions(2)
+    env = environment(sim, substeps=2)
+    episodes, state = env.begin(env.generators(0)), sim.initial_state(WORLDS)
     poses = torch.zeros((WORLDS, 1, 6), dtype=torch.float64)
     for action in actions:
-        now = found.step(now, action)
+        episodes = env.step(episodes, action)
         for _ in range(2):
             poses[:, 0, [0, 2]] += DT * action[:, :2]
             spin = torch.cat([torch.zeros((WORLDS, 1)), action[:, 2:]], 1)
             poses[:, 0, 3:] = turned(poses[:, 0, 3:], DT * spin)
-            state = own.step(state, None, {"poses": poses.clone()})
-    torch.testing.assert_close(now.world.positions, state.positions, rtol=0.0, atol=0.0)
-    torch.testing.assert_close(now.poses, poses, rtol=0.0, atol=0.0)
-    assert now.steps.tolist() == [2] * WORLDS
-    held = now.world.positions[0, 0].cpu().numpy()
+            state = sim.step(state, None, {"poses": poses.clone()})
+    torch.testing.assert_close(episodes.world.positions, state.positions, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(episodes.poses, poses, rtol=0.0, atol=0.0)
+    assert episodes.steps.tolist() == [2] * WORLDS
+    grip_node = episodes.world.positions[0, 0].cpu().numpy()
     pivot, pose = np.array([0.1, 0.0, 0.0]), poses[0, 0].cpu().numpy()
     moved = pivot + Rotation.from_rotvec(pose[3:]).apply(POINTS[0] - pivot) + pose[:3]
-    np.testing.assert_allclose(held, moved, atol=1e-14)
+    np.testing.assert_allclose(grip_node, moved, atol=1e-14)
 
 
-def test_worlds_start_anew_alone():
-    """One is as its second episode in a new simulator would be, the others go on as if nothing had been."""
-    found, actions = environment(steps=9), some_actions(6)
-    generators = found.generators(3)
-    now = found.begin(generators)
+def test_worlds_reset_independently():
+    """A reset world equals its second episode in a new simulator; the other worlds continue unchanged."""
+    env, actions = environment(steps=9), some_actions(6)
+    generators = env.generators(3)
+    episodes = env.begin(generators)
     for action in actions[:3]:
-        now = found.step(now, action)
-    alone, mask = now, torch.tensor([False, True, False])
-    now = found.begin(generators, now, mask)
+        episodes = env.step(episodes, action)
+    alone, mask = episodes, torch.tensor([False, True, False])
+    episodes = env.begin(generators, episodes, mask)
     fresh = environment()
     generators = fresh.generators(3)
     fresh.begin(generators)
-    other = fresh.begin(generators)  # the second episode of each world
-    same(now, other, [1])
+    reference = fresh.begin(generators)  # the second episode of each world
+    same(episodes, reference, [1])
     for action in actions[3:]:
-        now, alone, other = found.step(now, action), found.step(alone, action), fresh.step(other, action)
-    same(now, other, [1])
-    same(now, alone, [0, 2])
-    assert now.steps.tolist() == [6, 3, 6]
-    assert not torch.equal(now.world.positions[1], alone.world.positions[1])
+        episodes, alone, reference = env.step(episodes, action), env.step(alone, action), fresh.step(reference, action)
+    same(episodes, reference, [1])
+    same(episodes, alone, [0, 2])
+    assert episodes.steps.tolist() == [6, 3, 6]
+    assert not torch.equal(episodes.world.positions[1], alone.world.positions[1])
 
 
 def test_a_world_whose_step_fails_is_terminated_and_rests():
-    found = environment(gripped(retry_limit=0, max_iterations=4, rtol=1e-5), substeps=2, steps=9)
-    start = found.begin(found.generators(0))
+    env = environment(gripped(retry_limit=0, max_iterations=4, rtol=1e-5), substeps=2, steps=9)
+    start = env.begin(env.generators(0))
     actions = torch.zeros((WORLDS, 4), dtype=torch.float64)
     actions[1] = torch.tensor([0.5, 0.5, 3.0, 3.0])
-    now = found.step(start, actions)
-    terminated, truncated = found.ended(now)
-    assert now.outcomes[1] != "converged" and now.outcomes[[0, 2]].tolist() == ["converged"] * 2
+    episodes = env.step(start, actions)
+    terminated, truncated = env.ended(episodes)
+    assert episodes.outcomes[1] != "converged" and episodes.outcomes[[0, 2]].tolist() == ["converged"] * 2
     assert terminated.tolist() == [False, True, False] and not truncated.any()
-    torch.testing.assert_close(now.world.positions[1], start.world.positions[1], rtol=0.0, atol=0.0)
-    torch.testing.assert_close(now.poses[1], start.poses[1], rtol=0.0, atol=0.0)
+    torch.testing.assert_close(episodes.world.positions[1], start.world.positions[1], rtol=0.0, atol=0.0)
+    torch.testing.assert_close(episodes.poses[1], start.poses[1], rtol=0.0, atol=0.0)
 
 
 def test_gradients_go_through_episodes():
-    """Of the sum of rewards by all actions, along a random direction, against central differences of fourth order."""
-    found, actions = environment(), some_actions(3).requires_grad_()
+    """The gradient of the sum of rewards by all actions agrees with fourth-order central differences."""
+    env, actions = environment(), some_actions(3).requires_grad_()
 
     def total(actions):
-        now, result = found.begin(found.generators(0)), 0.0
+        episodes, result = env.begin(env.generators(0)), 0.0
         for action in actions:
-            now = found.step(now, action)
-            result = result + found.reward(now).sum()
+            episodes = env.step(episodes, action)
+            result = result + env.reward(episodes).sum()
         return result
 
     (gradient,) = torch.autograd.grad(total(actions), actions)
     assert (gradient != 0.0).all()
     direction, step = torch.sign(gradient) * torch.rand_like(gradient) / 4.0, 1e-3
     with torch.no_grad():
-        at = {x: float(total(0.9 * actions + x * step * direction)) for x in (2.0, 1.0, -1.0, -2.0)}
+        totals = {x: float(total(0.9 * actions + x * step * direction)) for x in (2.0, 1.0, -1.0, -2.0)}
     (gradient,) = torch.autograd.grad(total(0.9 * actions), actions)
-    near, far = ((at[x] - at[-x]) / (2.0 * x * step) for x in (1.0, 2.0))
+    near, far = ((totals[x] - totals[-x]) / (2.0 * x * step) for x in (1.0, 2.0))
     assert float((gradient * direction).sum()) / 0.9 == pytest.approx((4.0 * near - far) / 3.0, rel=CLOSE)
 
 
 def test_episodes_begin_where_the_user_says():
-    own = gripped()
+    sim = gripped()
 
     def start(goals):
         speed = torch.zeros((WORLDS, len(POINTS), 3), dtype=torch.float64)
         speed[:, 2:] = goals[:, None]
-        return own.initial_state(velocities=speed)
+        return sim.initial_state(velocities=speed)
 
-    found = environment(own, start=start)
-    now = found.begin(found.generators(0))
-    torch.testing.assert_close(now.world.velocities[:, -1], now.goals, rtol=0.0, atol=0.0)
-    settled = own.step(own.initial_state(WORLDS), controls={"poses": torch.full((WORLDS, 1, 6), 0.25**4)})
-    now = environment(own, start=settled).begin(found.generators(0))
-    assert (now.poses == 0.25**4).all()
+    env = environment(sim, start=start)
+    episodes = env.begin(env.generators(0))
+    torch.testing.assert_close(episodes.world.velocities[:, -1], episodes.goals, rtol=0.0, atol=0.0)
+    settled = sim.step(sim.initial_state(WORLDS), controls={"poses": torch.full((WORLDS, 1, 6), 0.25**4)})
+    episodes = environment(sim, start=settled).begin(env.generators(0))
+    assert (episodes.poses == 0.25**4).all()
 
 
 REFUSED = [
     ({"rates": GripRates(1, axes="x")}, r"grip 1: velocity x \[m/s\]: the model has 1 grips"),
     ({"rates": [GripRates(axes="x"), GripRates(axes="xy")]}, r"velocity x \[m/s\] is given twice"),
-    ({"observe": lambda now: now.poses}, r"observe gives shape \(3, 1, 6\); give a tensor \(3, n\)"),
+    ({"observe": lambda episodes: episodes.poses}, r"observe gives shape \(3, 1, 6\); give a tensor \(3, n\)"),
     ({"draw": lambda random: [np.nan]}, r"draw gives .*; give finite numbers"),
     ({"start": lambda goals: goals}, "start is no WorldState of 3 worlds"),
     ({"steps": 0}, "steps = 0"),
 ]
 
 
-@pytest.mark.parametrize(("given", "message"), REFUSED)
-def test_what_does_not_fit_is_refused(given, message):
+@pytest.mark.parametrize(("options", "message"), REFUSED)
+def test_invalid_options_are_refused(options, message):
     usual = {"rates": RATES, "observe": observe, "reward": off, "draw": draw, "steps": 4}
     with pytest.raises(SceneError, match=message):
-        Environment(gripped(), WORLDS, **usual | given)
+        Environment(gripped(), WORLDS, **usual | options)
 
 
-def test_actions_and_rewards_that_do_not_fit_are_refused():
-    found = environment(reward=lambda now: now.goals, terminated=lambda now: True)
-    now = found.begin(found.generators(0))
+def test_invalid_actions_and_rewards_are_refused():
+    env = environment(reward=lambda episodes: episodes.goals, terminated=lambda episodes: True)
+    episodes = env.begin(env.generators(0))
     for actions, message in (
         (torch.zeros(4), r"actions have shape \(4,\); they are \(3, 4\): grip 0: velocity x"),
         (torch.tensor([[0.0, 0.0, 0.0, 0.0]] * 2 + [[0.0, 0.0, -3.1, 0.0]]), r"spin y \[rad/s\] is -3.1 in world 2"),
         (torch.full((3, 4), torch.nan), "is nan in world 0, but at most 0.5"),
     ):
         with pytest.raises(SceneError, match=message):
-            found.step(now, actions)
+            env.step(episodes, actions)
     with pytest.raises(SceneError, match=r"reward gives shape \(3, 3\); give a tensor \(3,\)"):
-        found.reward(now)
+        env.reward(episodes)
     with pytest.raises(SceneError, match="terminated gives True"):
-        found.ended(now)
+        env.ended(episodes)
 
 
 def test_scenes_that_do_not_fit_are_refused():
@@ -214,7 +214,7 @@ def test_scenes_that_do_not_fit_are_refused():
 
 
 def test_seeds_are_as_large_as_those_of_numpy():
-    own = environment()
+    sim = environment()
     seed = np.random.SeedSequence().entropy | 1 << 127
-    one, other = (own.generators(seed)[2].random() for _ in range(2))
-    assert one == other != own.generators(seed - 1)[2].random()
+    first, second = (sim.generators(seed)[2].random() for _ in range(2))
+    assert first == second != sim.generators(seed - 1)[2].random()

@@ -1,4 +1,4 @@
-"""Environments as gymnasium and TorchRL have them: their own checks, episodes that end, seeds, failures, gradients."""
+"""Environments in gymnasium and TorchRL: checkers, ended episodes, seeds, failures, gradients."""
 
 import importlib
 import re
@@ -22,7 +22,7 @@ from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripp
         ("torch.jax", "jax", "jax"),
     ],
 )
-def test_what_is_not_installed_is_told_with_its_extra(module, package, extra, monkeypatch):
+def test_missing_packages_are_reported_with_their_extra(module, package, extra, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, f"ddg_warp.{module}", raising=False)
     with pytest.raises(ModuleNotFoundError, match=rf"pip install 'ddg-warp\[{extra}\]'"):
@@ -39,8 +39,8 @@ def vector(**options):
     return VectorEnvironment(environment(**options))
 
 
-def test_gymnasium_finds_nothing_wrong():
-    """Its checker of environments, by one world of a vector environment; it has none of vector environments."""
+def test_gymnasium_checker_passes():
+    """gymnasium's checker of environments passes for one world of a vector environment; it has none for vectors."""
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
@@ -61,14 +61,14 @@ def test_gymnasium_finds_nothing_wrong():
             return observations[0], infos
 
         def step(self, action):
-            *found, infos = self.envs.step(action[None])
-            observation, reward, terminated, truncated = (values[0] for values in found)
+            *env, infos = self.envs.step(action[None])
+            observation, reward, terminated, truncated = (values[0] for values in env)
             return observation, float(reward), bool(terminated), bool(truncated), infos
 
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as warned:
         check_env(One())
-    left = [str(warning.message) for warning in told]
-    # what the author of an environment may mean: observations without bounds, actions in units, no picture
+    left = [str(warning.message) for warning in warned]
+    # warnings that an author may intend: observations without bounds, actions in units, no picture
     expected = ("minimum value is -infinity", "maximum value is infinity", "symmetric and normalized", "render modes")
     assert not [text for text in left if not any(words in text for words in expected)]
 
@@ -84,7 +84,7 @@ def test_seeds_of_gymnasium_are_whole_numbers(seed):
 
 
 def test_episodes_of_gymnasium_end_and_begin_in_the_same_step():
-    envs = vector(terminated=lambda now: (now.steps >= 2) & (torch.arange(WORLDS) == 1))
+    envs = vector(terminated=lambda episodes: (episodes.steps >= 2) & (torch.arange(WORLDS) == 1))
     from gymnasium.vector import AutoresetMode
 
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
@@ -107,13 +107,13 @@ def test_episodes_of_gymnasium_end_and_begin_in_the_same_step():
 
 def test_seeds_of_gymnasium_repeat_bit_by_bit():
     def run(seed: int):
-        envs, seen = vector(), []
-        seen.append(envs.reset(seed=seed)[0])
+        envs, observed = vector(), []
+        observed.append(envs.reset(seed=seed)[0])
         envs.action_space.seed(0)
         for _ in range(6):
             observations, rewards, *_ = envs.step(envs.action_space.sample())
-            seen += [observations, rewards[:, None]]
-        return np.concatenate(seen, 1)
+            observed += [observations, rewards[:, None]]
+        return np.concatenate(observed, 1)
 
     one = run(11)
     np.testing.assert_array_equal(one, run(11))
@@ -121,8 +121,8 @@ def test_seeds_of_gymnasium_repeat_bit_by_bit():
     assert len({*one[:, 0].tolist()}) == WORLDS  # streams of worlds differ
 
 
-def test_gymnasium_is_told_of_failures():
-    envs = vector(own=gripped(retry_limit=0, max_iterations=4, rtol=1e-5), steps=9)
+def test_gymnasium_reports_failures():
+    envs = vector(sim=gripped(retry_limit=0, max_iterations=4, rtol=1e-5), steps=9)
     with pytest.raises(SceneError, match="no episode has begun"):
         envs.step(np.zeros((WORLDS, 4)))
     with pytest.raises(SceneError, match="options are"):
@@ -143,7 +143,7 @@ def test_gymnasium_is_told_of_failures():
 # TorchRL
 
 
-def test_torchrl_finds_nothing_wrong():
+def test_torchrl_checker_passes():
     pytest.importorskip("torchrl")
     from torchrl.envs.utils import check_env_specs
 
@@ -153,29 +153,29 @@ def test_torchrl_finds_nothing_wrong():
 
 
 def test_rollouts_of_torchrl_have_gradients():
-    """A policy's gradient is that of the environment; episodes that end begin anew, by seeds that repeat."""
+    """A policy has the gradient of the environment; ended episodes are reset, with reproducible seeds."""
     pytest.importorskip("torchrl")
     from tensordict.nn import TensorDictModule
 
     from ddg_warp.rl.torchrl_env import TorchRLEnvironment
 
-    found = environment()
+    direct = environment()
     torch.manual_seed(0)
-    network = torch.nn.Linear(found.observations, 4).double()
-    bounds = found.bounds
-    policy = TensorDictModule(lambda seen: bounds * torch.tanh(network(seen)), ["observation"], ["action"])
-    env = TorchRLEnvironment(found, differentiable=True)
+    network = torch.nn.Linear(direct.observations, 4).double()
+    bounds = direct.bounds
+    policy = TensorDictModule(lambda observed: bounds * torch.tanh(network(observed)), ["observation"], ["action"])
+    env = TorchRLEnvironment(direct, differentiable=True)
     env.set_seed(4)
     rollout = env.rollout(3, policy)
     parameters = list(network.parameters())
     gradients = torch.autograd.grad(rollout["next", "reward"].sum(), parameters)
     env.set_seed(4)
-    now, total = found.begin(env._generators), 0.0
+    episodes, total = direct.begin(env._generators), 0.0
     for _ in range(3):
-        now = found.step(now, bounds * torch.tanh(network(found.observe(now))))
-        total = total + found.reward(now).sum()
+        episodes = direct.step(episodes, bounds * torch.tanh(network(direct.observe(episodes))))
+        total = total + direct.reward(episodes).sum()
     torch.testing.assert_close(gradients, torch.autograd.grad(total, parameters), rtol=1e-12, atol=0.0)
-    env = TorchRLEnvironment(found)
+    env = TorchRLEnvironment(direct)
     env.set_seed(4)
     rollout = env.rollout(6, policy, break_when_any_done=False)
     assert not rollout["next", "reward"].requires_grad
@@ -187,9 +187,9 @@ def test_rollouts_of_torchrl_have_gradients():
 @pytest.mark.parametrize(
     ("module", "wrapper"), [("gymnasium_env", "VectorEnvironment"), ("torchrl_env", "TorchRLEnvironment")]
 )
-def test_what_is_no_environment_is_refused(module, wrapper):
+def test_other_objects_are_refused(module, wrapper):
     pytest.importorskip({"gymnasium_env": "gymnasium", "torchrl_env": "torchrl"}[module])
     made = getattr(importlib.import_module(f"ddg_warp.rl.{module}"), wrapper)
-    for other in (None, 3, gripped()):
+    for invalid in (None, 3, gripped()):
         with pytest.raises(SceneError, match=f"{wrapper}: .* is no environment"):
-            made(other)
+            made(invalid)

@@ -19,7 +19,7 @@ from ddg_warp.io.hdf5 import TrajectoryReader
 
 
 def record(directory, frames: int = 3, points: int = 2) -> None:
-    """A trajectory as small as a reader takes it."""
+    """Write the smallest trajectory that the reader accepts."""
     with h5py.File(directory / "trajectory.h5", "w") as file:
         file["trajectory/time"] = 0.1 * np.arange(frames)
         file["trajectory/points"] = np.arange(3.0 * frames * points).reshape(frames, points, 3)
@@ -38,7 +38,7 @@ def filled(folder, count: int = 4, **options) -> Episodes:
     return Episodes(folder)
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_written_episodes_are_read(tmp_path):
     episodes = filled(tmp_path)
     assert len(episodes) == 4
     episode = episodes["run_3"]
@@ -206,7 +206,7 @@ def test_a_file_lies_outside_where_it_is_allowed(tmp_path):
         assert len(reader) == 3
 
 
-def test_what_is_refused_leaves_the_index_as_it_was(tmp_path):
+def test_refused_episodes_leave_the_index_unchanged(tmp_path):
     with EpisodeWriter(tmp_path) as writer:
         writer.add("good", parameters={"load": np.float32(0.5), "sizes": np.arange(2)}, outcome="no_room")
         for mistake in ({"parameters": {"load": object()}}, {"seed": -1}, {"seconds": "long"}, {"outcome": 3}):

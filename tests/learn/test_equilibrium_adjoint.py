@@ -14,7 +14,7 @@ RTOL = 1e-13
 
 
 def followed():
-    """A couple that follows the edge it bends: its stiffness is not symmetric."""
+    """A follower couple on the edge that it bends: load stiffness is unsymmetric."""
     scene = SCENES["twisted"]()
     scene.fix(1, [-1])
     scene.add_couple(0, -1, (1e-4, 2e-4, -1e-4))
@@ -31,7 +31,7 @@ CASES = {
 
 
 def position_weights(model, state) -> dict:
-    """Weights of positions, angles and frames alone, as velocities and kept strains are no part of an equilibrium."""
+    """Return weights of positions, angles and frames alone; equilibria have no velocities or stored strains."""
     weights = directions(model, state, 5)
     weights = {
         name: values * (name.rpartition("/")[2] in ("x", "q", "theta", "frame")) for name, values in weights.items()
@@ -73,28 +73,28 @@ def test_an_equilibrium_by_its_loads(name):
     model, _, inputs, difference = solved(name)
     if model.groups:
         host, (k, column) = model.groups[0].host, (3, 0)
-        found, place = device_arrays.download(inputs[0].load)[:3, k, column], k * len(host.rods) + column
+        gradient, place = device_arrays.download(inputs[0].load)[:3, k, column], k * len(host.rods) + column
     else:
         host, place = model.coupled.host, model.coupled.host.nodes - 1
-        found = inputs[-1].load.numpy()[place]
-    check_load(host, place, found, difference)
+        gradient = inputs[-1].load.numpy()[place]
+    check_load(host, place, gradient, difference)
 
 
-def check_load(host, place: int, found: np.ndarray, difference: Difference) -> None:
-    """Derivatives by the components of a dead force at a place."""
-    force = np.where(found < 0.0, -1.0, 1.0)
-    host.add_load(np.array([place]), 0.0 * force, None)
-    del host.constant  # made anew, with it
+def check_load(host, index: int, gradient: np.ndarray, difference: Difference) -> None:
+    """Check the derivatives by the components of a dead force at one index."""
+    force = np.where(gradient < 0.0, -1.0, 1.0)
+    host.add_load(np.array([index]), 0.0 * force, None)
+    del host.constant  # rebuilt with the force
     added = host.constant
 
     def pull(x):
         added.force[-1] = x * force
 
-    assert close(float(found @ force), difference.by(pull, 1e-6))
+    assert close(float(gradient @ force), difference.by(pull, 1e-6))
 
 
 def test_a_mechanism_has_no_gradient():
-    """A joined rod that is not held can spin about its hinge."""
+    """A joined rod without support rotates about its hinge: a rigid-body mode."""
     model = built(SCENES["hinged"]())
     state = statics.solve(model)
     weights = directions(model, state, 5)
@@ -111,11 +111,11 @@ def test_velocities_of_an_equilibrium_have_no_effect():
 
 
 def test_neutral_equilibria_are_refused(device):
-    """A straight rod between two points, of a round section, may spin about itself: natural curvature would turn it at once.
+    """A round straight rod between two points has a neutral rotation about its axis.
 
-    Held at one edge it has a gradient.
+    Clamped at one edge it has a gradient.
     """
-    for held in (False, True):
+    for clamped in (False, True):
         scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
         rod = scene.add_rod(
             np.linspace((0, 0, 0), (1, 0, 0), 11),
@@ -125,14 +125,14 @@ def test_neutral_equilibria_are_refused(device):
         )
         scene.fix(rod, [0, -1])
         scene.add_force(rod, 5, (0.0, 0.0, -0.1))
-        if held:
+        if clamped:
             scene.fix_twist(rod, [0])
         model = scene.build(device, "float64")
         state = statics.solve(model)
-        given = cotangent(model, position_weights(model, state))
-        if held:
-            EquilibriumAdjoint(model).vjp(state, given)
+        weights = cotangent(model, position_weights(model, state))
+        if clamped:
+            EquilibriumAdjoint(model).vjp(state, weights)
             continue
         with pytest.raises(SolverError, match=r"spin of .* of rod 0 is neutral.*fix_twist") as caught:
-            EquilibriumAdjoint(model).vjp(state, given)
+            EquilibriumAdjoint(model).vjp(state, weights)
         assert caught.value.outcome == "neutral"

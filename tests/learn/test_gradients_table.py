@@ -1,4 +1,4 @@
-"""The table of gradients: every input is right or refused by name; what the command says of it, and holes that it has found."""
+"""The table of gradients: every input is right or refused by name; output of the command, and past defects."""
 
 import pytest
 
@@ -34,11 +34,11 @@ WORDS = ("no gradient goes", "does not differentiate", "serves statics and spect
 
 
 def right(rows: list[dict]) -> None:
-    bad = [
+    wrong = [
         row for row in rows if row["result"] not in (gradient_check.RIGHT, gradient_check.NONE, gradient_check.REFUSED)
     ]
     assert rows
-    assert not bad
+    assert not wrong
     for row in rows:
         assert row["result"] != gradient_check.REFUSED or any(word in row["reason"] for word in WORDS), row
 
@@ -65,7 +65,7 @@ def test_every_input_is_right_or_refused(device, name, analysis):
 
 
 @pytest.mark.parametrize("analysis", ["implicit_euler", "statics"])
-def test_a_law_of_ones_own(device, analysis, monkeypatch):
+def test_a_user_defined_law(device, analysis, monkeypatch):
     from tests.test_laws import saturating
 
     law = {"rod_bend_twist": ddg.Law(saturating, modulus=1e-4, limit=5.0)}
@@ -103,7 +103,7 @@ def test_the_command_prints_it(tmp_path, capsys, device):
     assert "there is no 'balloon'; there are rod" in capsys.readouterr().err
 
 
-def test_what_is_wrong_fails(monkeypatch, capsys, device):
+def test_wrong_gradients_fail(monkeypatch, capsys, device):
     """A gradient that is lost, and one that is off."""
     usual = gradient_check.derivatives
     spoilt = {"velocities": 0.0, "gravity": 1.01}
@@ -120,22 +120,22 @@ def test_what_is_wrong_fails(monkeypatch, capsys, device):
 
 
 def test_parameters_of_several_tables_one_after_the_other():
-    """Shells have a table for each term: what one was given ends with the step, whatever another is given next."""
-    own = Simulator(built(SCENES["sheet"]()), DT, **TIGHT)
-    state = own.step(own.step(own.initial_state()))
-    usual = own.step(state).positions
+    """Shells have a table for each term; values of one table end with the step, also if another follows."""
+    simulator = Simulator(built(SCENES["sheet"]()), DT, **TIGHT)
+    state = simulator.step(simulator.step(simulator.initial_state()))
+    usual = simulator.step(state).positions
     stretch, bend = (
-        next(n for n in own.engine(1).tables.names() if n.startswith(k)) for k in ("shell_stretch", "shell_bend")
+        next(n for n in simulator.engine(1).tables.names() if n.startswith(k)) for k in ("shell_stretch", "shell_bend")
     )
-    own.step(state, {stretch: 2.0 * own.parameter(stretch)})
-    bent = own.step(state, {bend: own.parameter(bend)}).positions
+    simulator.step(state, {stretch: 2.0 * simulator.parameter(stretch)})
+    bent = simulator.step(state, {bend: simulator.parameter(bend)}).positions
     torch.testing.assert_close(bent, usual, rtol=0.0, atol=0.0)
 
 
 def test_an_equilibrium_refuses_a_history():
-    own = Simulator(built(SCENES["planar"]()), DT)
-    points = torch.tensor(own.model.state().points()).requires_grad_()
-    state = own.initial_state(positions=points)
+    simulator = Simulator(built(SCENES["planar"]()), DT)
+    points = torch.tensor(simulator.model.state().points()).requires_grad_()
+    state = simulator.initial_state(positions=points)
     with pytest.raises(SceneError, match=r"no gradient goes to the state where the search begins.*detach"):
-        own.equilibrium(state=state)
-    assert torch.isfinite(own.equilibrium(state=state.detach()).positions).all()
+        simulator.equilibrium(state=state)
+    assert torch.isfinite(simulator.equilibrium(state=state.detach()).positions).all()

@@ -15,12 +15,12 @@ from tests.learn.test_torch import check, normal  # noqa: E402
 
 @pytest.fixture
 def fields() -> torch.Tensor:
-    """Of two worlds [T], on the device under test."""
+    """Return fields of two worlds [T] on the device under test."""
     return torch.tensor([[1e-2, 2e-2, -3e-2], [0.0, -1e-2, 2e-2]], dtype=torch.float64)
 
 
 def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
-    """A rod magnetised obliquely where it twists, in a field that grows along x and z."""
+    """Return a simulator of an obliquely magnetised rod in a field that grows along x and z."""
     twist = scheme == "implicit_euler" and dimension == 3
     scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), dimension=dimension)
     points = CURVE if dimension == 3 else CURVE * [1.0, 0.0, 1.0]
@@ -33,24 +33,24 @@ def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-def test_it_is_as_if_the_scene_had_it(scheme, fields):
-    """Of two worlds each moves as in a scene with the sum of both fields, also one that changes with time."""
-    own = magnet(scheme, lambda t: (0.0, 0.5 * t, 0.0))
-    moved = own.rollout(own.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
+def test_the_field_adds_to_that_of_the_scene(scheme, fields):
+    """Each of two worlds moves as in a scene with the sum of both fields, also time-dependent ones."""
+    simulator = magnet(scheme, lambda t: (0.0, 0.5 * t, 0.0))
+    moved = simulator.rollout(simulator.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
     for world, field in enumerate(fields.tolist()):
-        other = magnet(scheme, lambda t, field=field: np.add(field, (0.0, 0.5 * t, 0.0)))
-        usual = other.rollout(other.initial_state(1), steps=4)[-1].positions[0]
+        reference = magnet(scheme, lambda t, field=field: np.add(field, (0.0, 0.5 * t, 0.0)))
+        usual = reference.rollout(reference.initial_state(1), steps=4)[-1].positions[0]
         torch.testing.assert_close(moved[world], usual, rtol=1e-9, atol=1e-12)
-    without = own.rollout(own.initial_state(2), steps=4)[-1].positions
+    without = simulator.rollout(simulator.initial_state(2), steps=4)[-1].positions
     assert (moved - without).abs().max() > 1e-5
-    again = own.rollout(own.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
+    again = simulator.rollout(simulator.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
     torch.testing.assert_close(again, moved, rtol=0.0, atol=0.0)
 
 
-def test_steps_of_an_integrator_take_it(fields):
-    own = magnet("implicit_euler")
-    moved = own.rollout(own.initial_state(1), None, {"field": fields[0]}, steps=3)[-1].positions[0]
-    integrator, state = ddg.Integrator(own.model, **TIGHT), own.model.state()
+def test_steps_of_an_integrator_take_a_field(fields):
+    simulator = magnet("implicit_euler")
+    moved = simulator.rollout(simulator.initial_state(1), None, {"field": fields[0]}, steps=3)[-1].positions[0]
+    integrator, state = ddg.Integrator(simulator.model, **TIGHT), simulator.model.state()
     for _ in range(3):
         state = integrator.step(state, DT, ddg.Controls(field=fields[0].tolist()))
     np.testing.assert_array_equal(state.points(), moved.cpu().numpy())
@@ -60,48 +60,48 @@ def test_steps_of_an_integrator_take_it(fields):
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 def test_gradients_of_every_step(scheme, fields):
-    """Each of three steps has a field of its own, also where the reverse comes after other steps."""
-    own = magnet(scheme)
+    """Each of three steps has a different field, also if the backward pass follows other steps."""
+    simulator = magnet(scheme)
     torch.manual_seed(0)
-    weight = normal(own.model.points_count, 3)
+    weight = normal(simulator.model.points_count, 3)
 
-    def loss(given):
-        state = own.initial_state(2)
-        for field in given:
-            state = own.step(state, None, {"field": field})
-        found = (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
-        own.step(own.initial_state(2), None, {"field": 10.0 * fields})
-        return found
+    def loss(inputs):
+        state = simulator.initial_state(2)
+        for field in inputs:
+            state = simulator.step(state, None, {"field": field})
+        result = (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
+        simulator.step(simulator.initial_state(2), None, {"field": 10.0 * fields})
+        return result
 
-    check(loss, {"given": torch.stack([fields, -fields, 2.0 * fields])}, {"given": 1e-3})
+    check(loss, {"inputs": torch.stack([fields, -fields, 2.0 * fields])}, {"inputs": 1e-3})
 
 
 def test_one_field_of_all_worlds_and_vmap(fields):
-    own = magnet("implicit_euler")
+    simulator = magnet("implicit_euler")
 
     def loss(field, worlds):
-        state = own.step(own.initial_state(worlds), None, {"field": field})
+        state = simulator.step(simulator.initial_state(worlds), None, {"field": field})
         return (state.positions**2).sum()
 
     (wide,) = torch.autograd.grad(loss(fields.requires_grad_(), 2), fields)
     fields.requires_grad_(False)
-    found = torch.func.vmap(torch.func.grad(lambda field: loss(field, 1)))(fields)
-    torch.testing.assert_close(found, wide, rtol=1e-9, atol=0.0)
+    result = torch.func.vmap(torch.func.grad(lambda field: loss(field, 1)))(fields)
+    torch.testing.assert_close(result, wide, rtol=1e-9, atol=0.0)
     one = fields[0].clone().requires_grad_()
     (shared,) = torch.autograd.grad(loss(one, 2), one)
     torch.testing.assert_close(shared, 2.0 * wide[0], rtol=1e-9, atol=0.0)
 
 
 def test_planar_rods(fields):
-    own = magnet("implicit_euler", dimension=2)
+    simulator = magnet("implicit_euler", dimension=2)
 
     def loss(field):
-        return (own.rollout(own.initial_state(), None, {"field": field}, steps=3)[-1].positions ** 2).sum()
+        return (simulator.rollout(simulator.initial_state(), None, {"field": field}, steps=3)[-1].positions ** 2).sum()
 
     check(loss, {"field": fields[0] * torch.tensor([1.0, 0.0, 1.0])}, {"field": 1e-3})
 
 
-def test_it_is_refused_where_nothing_is_magnetic(fields):
+def test_a_field_without_magnets_is_refused(fields):
     scene = ddg.Scene()
     rod = scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT)
     plain = Simulator(built(scene), DT)
@@ -109,38 +109,38 @@ def test_it_is_refused_where_nothing_is_magnetic(fields):
     scene.add_dipoles()
     dipoles = Simulator(built(scene), DT)
     for field in (fields[0], (0.0, 0.0, 0.1)):
-        for own in (plain, dipoles):
+        for simulator in (plain, dipoles):
             with pytest.raises(
                 SceneError, match=r"a magnetic field acts on nothing; magnetise rods by scene\.magnetize"
             ):
-                own.step(own.initial_state(), None, {"field": field})
-    own = magnet("implicit_euler")
+                simulator.step(simulator.initial_state(), None, {"field": field})
+    simulator = magnet("implicit_euler")
     with pytest.raises(SceneError, match=r"field have shape \(2,\); they are \(3,\) or \(1, 3\)"):
-        own.step(own.initial_state(), None, {"field": fields[0, :2]})
+        simulator.step(simulator.initial_state(), None, {"field": fields[0, :2]})
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])  # with twist and without
-def test_equilibria_take_it(scheme, fields):
-    """Each world is where a scene with the sum of both fields rests; half of the load parameter means half of the field."""
-    own = magnet(scheme, (1e-2, 0.0, 0.0))
-    found = own.equilibrium(None, {"field": fields}, batch=2, rtol=1e-11).positions
-    half = own.equilibrium(None, {"field": fields}, batch=2, end=0.5, rtol=1e-11).positions
+def test_equilibria_take_a_field(scheme, fields):
+    """Each world has the equilibrium of a scene with the sum of both fields; the load parameter scales the field."""
+    simulator = magnet(scheme, (1e-2, 0.0, 0.0))
+    result = simulator.equilibrium(None, {"field": fields}, batch=2, rtol=1e-11).positions
+    half = simulator.equilibrium(None, {"field": fields}, batch=2, end=0.5, rtol=1e-11).positions
     for world, field in enumerate(fields.tolist()):
-        other = magnet(scheme, np.add(field, (1e-2, 0.0, 0.0)))
-        usual = other.equilibrium(rtol=1e-11).positions[0]
-        torch.testing.assert_close(found[world], usual, rtol=1e-8, atol=1e-11)
-        usual = other.equilibrium(end=0.5, rtol=1e-11).positions[0]
+        reference = magnet(scheme, np.add(field, (1e-2, 0.0, 0.0)))
+        usual = reference.equilibrium(rtol=1e-11).positions[0]
+        torch.testing.assert_close(result[world], usual, rtol=1e-8, atol=1e-11)
+        usual = reference.equilibrium(end=0.5, rtol=1e-11).positions[0]
         torch.testing.assert_close(half[world], usual, rtol=1e-8, atol=1e-11)
-    rest = own.equilibrium(batch=2, rtol=1e-11).positions
-    assert (found - rest).abs().max() > 1e-5
+    rest = simulator.equilibrium(batch=2, rtol=1e-11).positions
+    assert (result - rest).abs().max() > 1e-5
     torch.testing.assert_close(rest[1], rest[0], rtol=1e-12, atol=1e-14)  # and nothing is left of the field
 
 
 def test_gradients_of_equilibria(fields):
-    own = magnet("implicit_euler", (1e-2, 0.0, 0.0))
-    weight = normal(own.model.points_count, 3)
+    simulator = magnet("implicit_euler", (1e-2, 0.0, 0.0))
+    weight = normal(simulator.model.points_count, 3)
 
     def loss(field):
-        return (weight * own.equilibrium(None, {"field": field}, batch=2, end=0.7, **TIGHT).positions).sum()
+        return (weight * simulator.equilibrium(None, {"field": field}, batch=2, end=0.7, **TIGHT).positions).sum()
 
     check(loss, {"field": fields}, {"field": 1e-5})

@@ -35,7 +35,7 @@ def scene_of(name: str, radius: float = 1.0, density: float = 1.0) -> ddg.Scene:
     flat, fluid = "planar" in name, "fluid" in name
     scene = ddg.Scene(gravity=(0.3, 0.0, -9.81), mass_damping=0.7, dimension=2 if flat else 3)
     material = ddg.Material(1e6, density=1000.0 * density, viscosity=0.01)
-    section = next(make for own, make in SECTIONS.items() if own in name)(radius)
+    section = next(make for sim, make in SECTIONS.items() if sim in name)(radius)
 
     def rod(points):
         return scene.add_rod(points * ([1.0, 0.0, 1.0] if flat else 1.0), section=section, material=material)
@@ -50,16 +50,16 @@ def scene_of(name: str, radius: float = 1.0, density: float = 1.0) -> ddg.Scene:
         scene.add_mass(rods[2], 0, 0.002)  # on the joint
     if fluid:
         scene.drag(rods[:1], ddg.Viscous(3.0))
-        for other in rods[1:]:
-            scene.drag(other, tangential=0.1, normal=0.2)
+        for reference in rods[1:]:
+            scene.drag(reference, tangential=0.1, normal=0.2)
     return scene
 
 
-def end(own: Simulator, parameters=None, statics: bool = False, worlds: int = 1) -> torch.Tensor:
+def end(sim: Simulator, parameters=None, statics: bool = False, worlds: int = 1) -> torch.Tensor:
     """Positions and velocities after five steps, or positions at rest."""
     if statics:
-        return own.equilibrium(parameters, batch=worlds, **TIGHT).positions
-    *_, state = own.rollout(own.initial_state(worlds), parameters, steps=5)
+        return sim.equilibrium(parameters, batch=worlds, **TIGHT).positions
+    *_, state = sim.rollout(sim.initial_state(worlds), parameters, steps=5)
     return torch.cat([state.positions, state.velocities], -1)
 
 
@@ -70,31 +70,31 @@ def simulator(scene: ddg.Scene, scheme: str = "implicit_midpoint") -> Simulator:
 @pytest.mark.parametrize("statics", [False, True])
 @pytest.mark.parametrize("name", OBJECTS)
 def test_density_and_radius_are_those_that_rods_are_built_with(name, statics):
-    own = simulator(scene_of(name))
-    factors = RodParameters(own, names=("density", "radius"))
+    sim = simulator(scene_of(name))
+    factors = RodParameters(sim, names=("density", "radius"))
     with torch.no_grad():
         factors.logarithms["density"].fill_(np.log(DENSITY))
         factors.logarithms["radius"].fill_(np.log(RADIUS))
-        found, other = end(own, factors(), statics), simulator(scene_of(name, RADIUS, DENSITY))
-        torch.testing.assert_close(found, end(other, None, statics), rtol=1e-9, atol=1e-11)
-        assert float((found - end(own, None, statics)).abs().max()) > 1e-3
+        result, reference = end(sim, factors(), statics), simulator(scene_of(name, RADIUS, DENSITY))
+        torch.testing.assert_close(result, end(reference, None, statics), rtol=1e-9, atol=1e-11)
+        assert float((result - end(sim, None, statics)).abs().max()) > 1e-3
     for parameter, values in factors().items():
-        torch.testing.assert_close(values.detach(), other.parameter(parameter), rtol=1e-12, atol=1e-18)
+        torch.testing.assert_close(values.detach(), reference.parameter(parameter), rtol=1e-12, atol=1e-18)
 
 
-def test_every_world_has_its_own():
+def test_masses_of_every_world():
     """Twice all masses, inertia, stiffnesses and drag move alike; half the mass alone does not."""
     for name in ("circle in a fluid", "joined circle in a fluid"):
-        own = simulator(scene_of(name))
-        parameters = [n for n in own.engine(3).tables.names() if n.startswith(("rod.", "drag.")) or "stiffness" in n]
+        sim = simulator(scene_of(name))
+        parameters = [n for n in sim.engine(3).tables.names() if n.startswith(("rod.", "drag.")) or "stiffness" in n]
         factor = torch.tensor([[1.0], [2.0], [1.0]], dtype=torch.float64)
-        given = {n: own.parameter(n, 3) * factor for n in parameters}
-        given["rod.mass"][2] *= 0.5
+        inputs = {n: sim.parameter(n, 3) * factor for n in parameters}
+        inputs["rod.mass"][2] *= 0.5
         for statics in (False, True):
-            found = end(own, given, statics, 3)
-            torch.testing.assert_close(found[1], found[0], rtol=1e-8, atol=1e-11)
-            torch.testing.assert_close(found[0], end(own, None, statics, 3)[0], rtol=1e-8, atol=1e-11)
-            assert float((found[2] - found[0]).abs().max()) > 1e-4
+            result = end(sim, inputs, statics, 3)
+            torch.testing.assert_close(result[1], result[0], rtol=1e-8, atol=1e-11)
+            torch.testing.assert_close(result[0], end(sim, None, statics, 3)[0], rtol=1e-8, atol=1e-11)
+            assert float((result[2] - result[0]).abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize(
@@ -108,80 +108,80 @@ def test_every_world_has_its_own():
         ("stiffened", "statics"),
     ],
 )
-def test_masses_under_gravity_that_is_given(name, analysis):
-    """Gradients by masses go by the gravity of their world, and every kind of mass is there."""
+def test_masses_under_gravity_of_every_world(name, analysis):
+    """Gradients by every kind of mass use the gravity of their world."""
     statics = analysis == "statics"
-    own = Simulator(built(SCENES[name]()), DT, scheme="implicit_euler" if statics else analysis, **TIGHT)
-    masses = [n for n in own.engine(2).tables.names() if n.endswith((".mass", ".inertia"))]
+    sim = Simulator(built(SCENES[name]()), DT, scheme="implicit_euler" if statics else analysis, **TIGHT)
+    masses = [n for n in sim.engine(2).tables.names() if n.endswith((".mass", ".inertia"))]
     assert masses
     torch.manual_seed(2)
-    weight = normal(2, own.model.points_count, 3)
+    weight = normal(2, sim.model.points_count, 3)
     gravity = torch.tensor([[2.0, 0.0, -12.0], [-1.0, 0.0, -3.0]], dtype=torch.float64)
 
-    def loss(gravity, **given):
-        given = {key.replace("__", "."): values for key, values in given.items()}
+    def loss(gravity, **inputs):
+        inputs = {key.replace("__", "."): values for key, values in inputs.items()}
         if statics:
-            return (weight * own.equilibrium(given, {"gravity": gravity}, batch=2, **TIGHT).positions).sum()
-        state = own.initial_state(2)
-        *_, state = own.rollout(state, given, {"gravity": gravity}, steps=3)
+            return (weight * sim.equilibrium(inputs, {"gravity": gravity}, batch=2, **TIGHT).positions).sum()
+        state = sim.initial_state(2)
+        *_, state = sim.rollout(state, inputs, {"gravity": gravity}, steps=3)
         moved = (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
         return moved + state.angles.square().sum()
 
-    values = {n.replace(".", "__"): own.parameter(n, 2) for n in masses if not (statics and n == "rod.inertia")}
-    turned = 0.05 if name == "stiffened" else 0.01  # where little depends on it, what rounding leaves counts
-    sizes = {key: (turned if "inertia" in key else 1e-3) * float(found.max()) for key, found in values.items()}
+    values = {n.replace(".", "__"): sim.parameter(n, 2) for n in masses if not (statics and n == "rod.inertia")}
+    inertia_step = 0.05 if name == "stiffened" else 0.01  # small derivatives are limited by rounding
+    sizes = {key: (inertia_step if "inertia" in key else 1e-3) * float(result.max()) for key, result in values.items()}
     check(loss, {"gravity": gravity} | values, {"gravity": 2e-3} | sizes)
 
 
-def test_it_repeats_and_leaves_nothing():
+def test_gradients_repeat_without_side_effects():
     for name in ("circle in a fluid", "joined circle"):
-        own = simulator(scene_of(name))
-        plain = end(own)
-        mass = 2.0 * own.parameter("rod.mass")
+        sim = simulator(scene_of(name))
+        plain = end(sim)
+        mass = 2.0 * sim.parameter("rod.mass")
 
-        def once(own=own, mass=mass):
-            given = mass.clone().requires_grad_()
-            found = end(own, {"rod.mass": given})
-            return found.detach(), *torch.autograd.grad((found**2).sum(), given)
+        def once(sim=sim, mass=mass):
+            inputs = mass.clone().requires_grad_()
+            result = end(sim, {"rod.mass": inputs})
+            return result.detach(), *torch.autograd.grad((result**2).sum(), inputs)
 
-        for one, other in zip(once(), once(), strict=True):
-            torch.testing.assert_close(one, other, rtol=0.0, atol=0.0)
-        torch.testing.assert_close(end(own), plain, rtol=0.0, atol=0.0)
-        rest = end(own, None, statics=True)
-        assert (end(own, {"rod.mass": mass}, statics=True) != rest).any()
-        torch.testing.assert_close(end(own, None, statics=True), rest, rtol=0.0, atol=0.0)
+        for one, reference in zip(once(), once(), strict=True):
+            torch.testing.assert_close(one, reference, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(end(sim), plain, rtol=0.0, atol=0.0)
+        rest = end(sim, None, statics=True)
+        assert (end(sim, {"rod.mass": mass}, statics=True) != rest).any()
+        torch.testing.assert_close(end(sim, None, statics=True), rest, rtol=0.0, atol=0.0)
 
 
 def test_worlds_of_a_map_are_those_of_a_batch():
-    own = simulator(scene_of("circle"))
-    masses = own.parameter("rod.mass") * torch.tensor([[1.0], [1.5]], dtype=torch.float64)
+    sim = simulator(scene_of("circle"))
+    masses = sim.parameter("rod.mass") * torch.tensor([[1.0], [1.5]], dtype=torch.float64)
 
     def loss(mass):
-        return (end(own, {"rod.mass": mass}) ** 2).sum()
+        return (end(sim, {"rod.mass": mass}) ** 2).sum()
 
-    found = torch.func.vmap(torch.func.grad(loss))(masses[:, None])
-    for one, mass in zip(found, masses, strict=True):
+    result = torch.func.vmap(torch.func.grad(loss))(masses[:, None])
+    for one, mass in zip(result, masses, strict=True):
         torch.testing.assert_close(one, torch.func.grad(loss)(mass[None]), rtol=1e-9, atol=1e-12)
 
 
-def test_a_rod_and_its_shell_have_masses_of_their_own():
-    """Which add up where they share a node."""
+def test_masses_of_a_rod_and_its_shell_add_up():
+    """Masses of a rod and its shell add up at common nodes."""
 
     def stiffened(density: float = 1.0) -> ddg.Scene:
         scene = a_scene()
         gradient_check_scenes.OBJECTS["rod on a shell"][1](scene, gradient_check_scenes.soft(density))
         return scene
 
-    own = simulator(stiffened())
-    assert own.parameter("rod.mass").shape[1] + own.parameter("shell.mass").shape[1] == own.model.points_count
-    rod, shell = RodParameters(own, names=("density",)), ShellParameters(own, ("density",))
+    sim = simulator(stiffened())
+    assert sim.parameter("rod.mass").shape[1] + sim.parameter("shell.mass").shape[1] == sim.model.points_count
+    rod, shell = RodParameters(sim, names=("density",)), ShellParameters(sim, ("density",))
     with torch.no_grad():
         rod.logarithms["density"].fill_(np.log(2.0))
         shell.changes["density"].fill_(np.log(2.0))
-        both = end(own, rod() | shell())
+        both = end(sim, rod() | shell())
         torch.testing.assert_close(both, end(simulator(stiffened(2.0))), rtol=1e-8, atol=1e-10)
-        assert float((both - end(own, shell())).abs().max()) > 1e-6
-        assert float((both - end(own, rod())).abs().max()) > 1e-6
+        assert float((both - end(sim, shell())).abs().max()) > 1e-6
+        assert float((both - end(sim, rod())).abs().max()) > 1e-6
 
 
 def _magnetise(scene: ddg.Scene) -> None:
@@ -197,7 +197,7 @@ def _magnetise(scene: ddg.Scene) -> None:
         (lambda s: None, ("mass",), "no rod has 'mass'; there is stretching, bending, twisting, density, radius"),
     ],
 )
-def test_what_no_rod_has_is_refused(change, names, match):
+def test_missing_parameters_are_refused(change, names, match):
     scene = ddg.Scene()
     scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT)
     change(scene)
@@ -213,7 +213,7 @@ def test_densities_that_are_none_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("given", "match"),
+    ("parameters", "match"),
     [
         ({"rod.mass": 0.0}, "rod.mass: value 0 is 0; it is finite and positive"),
         ({"rod.mass": [[np.nan]]}, "rod.mass: value 0 is nan; it is finite and positive"),
@@ -224,16 +224,16 @@ def test_densities_that_are_none_are_refused():
         ({"drag.normal": "thick"}, "drag.normal is 'thick', no array of numbers; give numbers"),
     ],
 )
-def test_what_does_not_fit_is_refused(given, match):
-    own = simulator(scene_of("circle in a fluid"))
+def test_invalid_values_are_refused(parameters, match):
+    sim = simulator(scene_of("circle in a fluid"))
     with pytest.raises(SceneError, match=match):
-        own.step(own.initial_state(), given)
+        sim.step(sim.initial_state(), parameters)
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 @pytest.mark.parametrize("factor", [1.0, 1e3, 1e6])
-def test_mixed_precision_knows_what_is_given(scheme, factor):
-    """Of rods that a tensor makes stiffer by far than the model's, which float32 serves; by 1e6 they are taken in float64."""
+def test_mixed_precision_follows_the_given_stiffness(scheme, factor):
+    """A tensor makes rods far stiffer than the model's, for which float32 suffices; a factor 1e6 selects float64."""
     names = [f"rod_bend_twist.stiffness_{k}" for k in (1, 2, 3)] + ["rod_stretch.stiffness"]
 
     def gradient(precision):
@@ -241,10 +241,10 @@ def test_mixed_precision_knows_what_is_given(scheme, factor):
         curve = np.stack([0.3 * along, 0.05 * np.sin(3.0 * along), 0.04 * np.cos(5.0 * along)], axis=1)
         scene = ddg.Scene(gravity=(0.3, 0.2, -9.81))
         scene.clamp(scene.add_rod(curve, section=ddg.Circle(0.004), material=ddg.Material(1e4, density=1000.0)))
-        own = Simulator(scene.build(differences.DEVICE, precision), DT, scheme=scheme, **TIGHT)
-        given = {name: (factor * own.parameter(name)).requires_grad_() for name in names}
-        *_, state = own.rollout(own.initial_state(), given, steps=5)
-        return torch.cat(torch.autograd.grad(state.positions[0, -1, 2], list(given.values())), 1)
+        sim = Simulator(scene.build(differences.DEVICE, precision), DT, scheme=scheme, **TIGHT)
+        inputs = {name: (factor * sim.parameter(name)).requires_grad_() for name in names}
+        *_, state = sim.rollout(sim.initial_state(), inputs, steps=5)
+        return torch.cat(torch.autograd.grad(state.positions[0, -1, 2], list(inputs.values())), 1)
 
     exact, mixed = gradient("float64"), gradient("mixed")
     assert float((mixed - exact).norm()) < 1e-6 * float(exact.norm())

@@ -21,7 +21,7 @@ def swung() -> np.ndarray:
 
 @pytest.fixture
 def clone(tmp_path, monkeypatch):
-    """A folder as the authors publish it, which the environment names."""
+    """Write a folder as published by the authors, and set the environment variable to it."""
     for split, names in {"train": (2, 10, 1), "eval": (7,)}.items():
         folder = tmp_path / "data_set" / "DLO1" / split
         folder.mkdir(parents=True)
@@ -51,10 +51,10 @@ def test_recordings_are_found_and_read(clone):
 def test_up_becomes_z_and_frames_stay_right_handed(tmp_path, up):
     markers = np.random.default_rng(1).random((4, 5, 3))
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(markers.transpose(0, 2, 1)))
-    turned = read(tmp_path / "a.pkl", up=up).markers
-    np.testing.assert_array_equal(turned[..., 2], markers[..., "xyz".index(up)])
+    rotated = read(tmp_path / "a.pkl", up=up).markers
+    np.testing.assert_array_equal(rotated[..., 2], markers[..., "xyz".index(up)])
     volume = np.linalg.det(markers[0, 1:4] - markers[0, 0])
-    assert np.linalg.det(turned[0, 1:4] - turned[0, 0]) == pytest.approx(volume, rel=1e-12)
+    assert np.linalg.det(rotated[0, 1:4] - rotated[0, 0]) == pytest.approx(volume, rel=1e-12)
 
 
 def test_axes_in_any_order(tmp_path):
@@ -83,7 +83,7 @@ def test_grips_follow_their_markers_without_twist(clone):
         identity = np.broadcast_to(np.eye(3), grip.frame.shape)
         np.testing.assert_allclose(np.swapaxes(grip.frame, 1, 2) @ grip.frame, identity, atol=1e-13)
         np.testing.assert_allclose(np.linalg.det(grip.frame), 1.0, atol=1e-13)
-        # The rate of turning, seen by the frame, has no part about the tangent.
+        # The angular velocity in the frame has no component along the tangent.
         step = np.swapaxes(grip.frame[:-1], 1, 2) @ grip.frame[1:]
         assert np.abs(step[:, 2, 1] - step[:, 1, 2]).max() < 1e-4 * np.abs(step[:, 1, 0] - step[:, 0, 1]).max()
 
@@ -117,14 +117,14 @@ def test_lost_markers_are_kept_and_named(tmp_path):
 
 
 def test_short_gaps_are_filled():
-    """By straight lines, exact for steady motion; long gaps and both ends stay lost, and what was seen stays as it was."""
+    """Short gaps are filled linearly; long gaps and both ends stay lost, and seen markers unchanged."""
     steady = np.linspace(0.0, 1.0, 20)[:, None, None] * np.arange(1.0, 10.0).reshape(3, 3)
     markers = steady.copy()
     markers[3:6, 0], markers[8:14, 1], markers[:2, 2], markers[-1, 2] = np.nan, np.nan, np.nan, np.nan
     recording = Recording("a", 0.01 * np.arange(20), markers, ())
-    found = recording.filled(0.05).markers
-    np.testing.assert_allclose(found[:, 0], steady[:, 0], rtol=1e-14)
-    np.testing.assert_array_equal(found[:, 1:], markers[:, 1:])
+    filled = recording.filled(0.05).markers
+    np.testing.assert_allclose(filled[:, 0], steady[:, 0], rtol=1e-14)
+    np.testing.assert_array_equal(filled[:, 1:], markers[:, 1:])
     np.testing.assert_allclose(recording.filled(0.07).markers[:, 1], steady[:, 1], rtol=1e-14)
     assert np.isnan(recording.markers[4, 0]).all()  # it is not changed
     with pytest.raises(SceneError, match="longest"):
@@ -218,8 +218,8 @@ def test_a_recording_starts_a_rod(clone):
 
 
 def test_indices_of_numpy_are_taken(clone):
-    held = tuple(np.array([0, 1, -2, -1]))
-    recording = read("data_set/DLO1/train/1.pkl", held=held, markers=MARKERS)
+    indices = tuple(np.array([0, 1, -2, -1]))
+    recording = read("data_set/DLO1/train/1.pkl", held=indices, markers=MARKERS)
     assert recording.held == (0, 1, 11, 12)
     assert all(type(marker) is int for marker in recording.held)
     assert len(recording.between(np.int64(1), np.int32(-1)).times) == FRAMES - 2

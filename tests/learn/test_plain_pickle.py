@@ -1,4 +1,4 @@
-"""Pickles of arrays by any protocol are read; nothing else that a pickle asks for is done."""
+"""Pickles of arrays by any protocol are read; any other instruction of a pickle is refused."""
 
 import os
 import pickle
@@ -33,7 +33,7 @@ def test_arrays_are_read(tmp_path, name, protocol):
     np.testing.assert_array_equal(load(path), VALUES[name])
 
 
-def test_what_holds_arrays_is_read(tmp_path):
+def test_containers_of_arrays_are_read(tmp_path):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({"markers": (ARRAY, ARRAY), "name": "rope", "rate": 100}))
     content = load(path)
@@ -52,7 +52,7 @@ def test_names_of_either_numpy_are_read(tmp_path):
 
 
 class Malicious:
-    """Makes a directory when it is loaded."""
+    """Object whose unpickling makes a directory."""
 
     def __init__(self, path):
         self.path = path
@@ -114,7 +114,7 @@ def test_objects_outside_are_refused(tmp_path):
     ids=["objects", "texts", "records", "dates", "raw"],
 )
 @pytest.mark.parametrize("protocol", [2, 5])
-def test_arrays_of_other_things_are_refused(tmp_path, value, protocol):
+def test_arrays_of_other_types_are_refused(tmp_path, value, protocol):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps(value, protocol))
     with pytest.raises(ValueError, match="not of numbers"):
@@ -140,8 +140,8 @@ def test_damaged_files_are_named(tmp_path):
 def test_an_array_that_is_referred_to_twice_is_read_once(tmp_path):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps([ARRAY, {"again": ARRAY, 3: [1.0]}]))
-    first, others = load(path)
+    first, rest = load(path)
     np.testing.assert_array_equal(first, ARRAY)
-    assert others["again"] is first
-    assert others[3] == [1.0]
+    assert rest["again"] is first
+    assert rest[3] == [1.0]
     first[0] = 0.0  # writable, of its own

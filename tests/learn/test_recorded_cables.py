@@ -19,8 +19,8 @@ def straight(directions) -> np.ndarray:
     return 0.08 * np.arange(COUNT)[:, None] * np.asarray(directions)[:, None]
 
 
-def test_twist_is_the_turn_of_frames_that_come_back():
-    """One grip whose tangent goes around a cone by half an angle a, the other in place: twist 2 pi (1 - cos a) of a straight cable."""
+def test_twist_is_the_rotation_of_returning_frames():
+    """A grip's tangent runs around a cone of half angle a, the other grip is fixed: twist 2 pi (1 - cos a)."""
     frames, a = 400, 0.4
     angle = np.linspace(0.0, 2.0 * np.pi, frames)
     cone = np.stack([np.full(frames, np.cos(a)), np.sin(a) * np.cos(angle), np.sin(a) * np.sin(angle)], 1)
@@ -31,7 +31,7 @@ def test_twist_is_the_turn_of_frames_that_come_back():
     whole = Recording("b", 0.01 * np.arange(frames), markers)
     assert _cable.twist_at(recording, 0) == pytest.approx(0.0, abs=1e-12)
     assert abs(_cable.twist_at(recording, frames - 1)) == pytest.approx(2.0 * np.pi * (1.0 - np.cos(a)), rel=1e-3)
-    assert _cable.twist_at(whole, frames - 1) == pytest.approx(0.0, abs=1e-12)  # both ends have turned alike
+    assert _cable.twist_at(whole, frames - 1) == pytest.approx(0.0, abs=1e-12)  # equal rotation of both ends
 
 
 def test_shapes_leave_grips_in_their_direction():
@@ -54,12 +54,12 @@ def test_windows_start_where_frames_have_them():
         np.nan
     )  # too long a gap where a window would start; a grip that is never seen again
     recording = Recording("a", t, markers, (0, 1, COUNT - 2, COUNT - 1))
-    for ahead in (True, False):
-        found = _cable.windows([recording], 15, ahead)
-        assert [round(100 * (window.points[0, 0] / 0.3)) for window in found] == [8, 23]
-        for window, at in zip(found, (8, 23), strict=True):
-            np.testing.assert_allclose(window.points, path[at], atol=1e-12)
-            np.testing.assert_allclose(window.velocities, np.tile([0.3, 4.0 * t[at], -1.0], (COUNT, 1)), atol=1e-10)
+    for centred in (True, False):
+        result = _cable.windows([recording], 15, centred)
+        assert [round(100 * (window.points[0, 0] / 0.3)) for window in result] == [8, 23]
+        for window, frame in zip(result, (8, 23), strict=True):
+            np.testing.assert_allclose(window.points, path[frame], atol=1e-12)
+            np.testing.assert_allclose(window.velocities, np.tile([0.3, 4.0 * t[frame], -1.0], (COUNT, 1)), atol=1e-10)
     with pytest.raises(DataError, match="no window of 80 frames"):
         _cable.windows([recording], 80, True)
     with pytest.raises(DataError, match="grips hold markers"):
@@ -68,15 +68,15 @@ def test_windows_start_where_frames_have_them():
 
 @pytest.mark.slow
 def test_a_folder_of_the_user(tmp_path):
-    """Recordings that lie somewhere are learned from alike; of them nothing but markers held out is known."""
+    """Learning accepts recordings in a user's folder, of which only held-out markers are known."""
     scene = load_scene("identify_from_recording")
     scene.record(tmp_path)
     assert len(recordings("train", root=tmp_path)) == 2
-    found = simulate(scene.build(folder=str(tmp_path)), device="cpu", progress=False)
-    checks = scene.check(found)
+    result = simulate(scene.build(folder=str(tmp_path)), device="cpu", progress=False)
+    checks = scene.check(result)
     assert sum(bool(check.skipped) for check in checks) == 3
     assert not any(check.failed for check in checks)
-    own = scene.learn("", scene.MASS, 8)["values"]
-    assert found.model.scene.initial.values == own  # the same recordings
+    learned = scene.learn("", scene.MASS, 8)["values"]
+    assert result.model.scene.initial.values == learned  # the same recordings
     with pytest.raises(DataError, match="holds no recordings"):
         scene.build(folder=str(tmp_path / "train"))

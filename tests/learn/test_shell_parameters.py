@@ -1,4 +1,4 @@
-"""Parameters of shells as a module: what it gives is what shells are built with, with gradients through steps and equilibria."""
+"""Parameters of shells as a module: values as in built shells, gradients through steps and equilibria."""
 
 import copy
 import pickle
@@ -27,43 +27,48 @@ def mesh(number: int) -> meshes.Mesh:
 
 
 def forms(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """At rest: grown along an oblique direction, and curved."""
+    """Return metric and curvature at rest: grown along an oblique direction, and curved."""
     points, triangles = mesh(number)
     along = (1.0, 0.4, 0.0)
     return grown_metric(points, triangles, 1.1, 0.9, along), principal_form(points, triangles, 2.0, -1.0, along)
 
 
 def areas(metric: np.ndarray) -> np.ndarray:
-    """Of triangles (T,), twice."""
+    """Return twice the areas of triangles (T,)."""
     return np.sqrt(metric[:, 0] * metric[:, 2] - metric[:, 1] ** 2)
 
 
 def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scene:
-    """Two shells, held along one side, with these quantities (one number a triangle of both) or their own."""
+    """Return two shells, fixed along one side, with the given quantities per triangle or defaults."""
     scene, start = ddg.Scene(gravity=(0.5, 0.0, -9.81)), 0
     for number in range(2):
         points, triangles = mesh(number)
         flat = bending in ("hinge", "isometric")
-        own = {"young": 1e7 * (1.0 + number), "thickness": 0.01, "poisson": 0.3 - 0.1 * number, "density": 1000.0}
+        quantities = {
+            "young": 1e7 * (1.0 + number),
+            "thickness": 0.01,
+            "poisson": 0.3 - 0.1 * number,
+            "density": 1000.0,
+        }
         rest = "flat" if flat else forms(number)
         if values is not None:
-            own = {name: values[name][0, start : start + len(triangles)] for name in NUMBERS + MASS}
-            if not flat:  # masses are those of the first metric
+            quantities = {name: values[name][0, start : start + len(triangles)] for name in NUMBERS + MASS}
+            if not flat:  # the first metric sets the masses
                 first, rest = rest, tuple(values[name][0, start : start + len(triangles)] for name in FORMS)
-                own["density"] = own["density"] * areas(first[0]) / areas(rest[0])
+                quantities["density"] = quantities["density"] * areas(first[0]) / areas(rest[0])
         start += len(triangles)
-        thickness, poisson = own.pop("thickness"), own.pop("poisson")
-        material = ddg.Material(own["young"], poisson, density=own["density"], viscosity=0.01)
+        thickness, poisson = quantities.pop("thickness"), quantities.pop("poisson")
+        material = ddg.Material(quantities["young"], poisson, density=quantities["density"], viscosity=0.01)
         shell = scene.add_shell(points, triangles, thickness=thickness, material=material, bending=bending, rest=rest)
-        held = np.flatnonzero(points[:, 0] <= (0.16 if bending == "isometric" else 0.0))
-        scene.hold(shell, [*held, len(points) - 1])
+        fixed = np.flatnonzero(points[:, 0] <= (0.16 if bending == "isometric" else 0.0))
+        scene.hold(shell, [*fixed, len(points) - 1])
         if bending in ("midedge_dof", "hinge"):
-            scene.clamp_boundary(shell, held)
+            scene.clamp_boundary(shell, fixed)
     return scene
 
 
 def changed(module: ShellParameters, seed: int = 0, size: float = 0.2) -> ShellParameters:
-    """With random changes."""
+    """Return the module after random changes of its values."""
     torch.manual_seed(seed)
     with torch.no_grad():
         for values in module.changes.values():
@@ -72,21 +77,21 @@ def changed(module: ShellParameters, seed: int = 0, size: float = 0.2) -> ShellP
 
 
 @pytest.mark.parametrize("bending", BENDING)
-@pytest.mark.parametrize("by", ["shell", "element"])
-def test_what_it_gives_is_what_shells_are_built_with(bending, by):
+@pytest.mark.parametrize("resolution", ["shell", "element"])
+def test_values_are_those_of_built_shells(bending, resolution):
     names = (NUMBERS if bending in ("hinge", "isometric") else NUMBERS + FORMS) + MASS
-    own = Simulator(built(sheets(bending)), DT)
-    module = ShellParameters(own, names, by=by)
+    simulator = Simulator(built(sheets(bending)), DT)
+    module = ShellParameters(simulator, names, by=resolution)
     for name, values in module().items():
-        torch.testing.assert_close(values, own.parameter(name), rtol=1e-13, atol=1e-18)
-    values = {name: found.detach().cpu().numpy() for name, found in changed(module).quantities().items()}
-    values = {name: np.broadcast_to(found, (1, 20, *found.shape[2:])) for name, found in values.items()}
+        torch.testing.assert_close(values, simulator.parameter(name), rtol=1e-13, atol=1e-18)
+    values = {name: quantity.detach().cpu().numpy() for name, quantity in changed(module).quantities().items()}
+    values = {name: np.broadcast_to(quantity, (1, 20, *quantity.shape[2:])) for name, quantity in values.items()}
     again = Simulator(built(sheets(bending, values)), DT)
     moved = module()
     assert moved
-    for name, found in moved.items():
-        assert (found != own.parameter(name)).any(), name
-        torch.testing.assert_close(found, again.parameter(name), rtol=1e-12, atol=1e-18)
+    for name, quantity in moved.items():
+        assert (quantity != simulator.parameter(name)).any(), name
+        torch.testing.assert_close(quantity, again.parameter(name), rtol=1e-12, atol=1e-18)
 
 
 def test_curvatures_and_metrics_are_those_along_the_direction():
@@ -99,28 +104,30 @@ def test_curvatures_and_metrics_are_those_along_the_direction():
     with torch.no_grad():
         module.changes["curvature"][:] = torch.tensor([3.0 * size, 0.0, -2.0 * size])
         module.changes["metric"][:] = torch.tensor([np.log(1.2), 0.0, np.log(0.9)])
-    found = {name: values[0].detach().cpu().numpy() for name, values in module.quantities().items()}
-    np.testing.assert_allclose(found["curvature"], principal_form(points, triangles, 3.0, -2.0, along), atol=1e-15)
-    np.testing.assert_allclose(found["metric"], grown_metric(points, triangles, 1.2, 0.9, along), atol=1e-15)
+    quantities = {name: values[0].detach().cpu().numpy() for name, values in module.quantities().items()}
+    np.testing.assert_allclose(quantities["curvature"], principal_form(points, triangles, 3.0, -2.0, along), atol=1e-15)
+    np.testing.assert_allclose(quantities["metric"], grown_metric(points, triangles, 1.2, 0.9, along), atol=1e-15)
 
 
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 @pytest.mark.parametrize("statics", [False, True])
 def test_gradients(bending, statics):
-    """By every quantity, in two worlds, through steps and equilibria, against differences."""
+    """Gradients by every quantity, in two worlds, through steps and equilibria, against differences."""
     names = (NUMBERS if bending == "hinge" else NUMBERS + FORMS) + MASS
-    own = Simulator(built(sheets(bending)), DT, **TIGHT)
+    simulator = Simulator(built(sheets(bending)), DT, **TIGHT)
     shares = np.column_stack([np.ones(20), np.linspace(-1.0, 1.0, 20)])
     # sheets that grow by a fifth are thrown about: differences then meet other solutions
-    module = changed(ShellParameters(own, names, by=shares, batch=2), seed=5, size=0.05)
-    first = own.equilibrium(module(), batch=2).detach() if statics else None
-    weight = normal(own.model.points_count, 3)
+    module = changed(ShellParameters(simulator, names, by=shares, batch=2), seed=5, size=0.05)
+    first = simulator.equilibrium(module(), batch=2).detach() if statics else None
+    weight = normal(simulator.model.points_count, 3)
 
     def loss(**changes):
-        given = torch.func.functional_call(module, {f"changes.{name}": values for name, values in changes.items()})
-        state = own.equilibrium(given, state=first, start=1.0, rtol=1e-12) if statics else own.initial_state(2)
+        inputs = torch.func.functional_call(module, {f"changes.{name}": values for name, values in changes.items()})
+        state = (
+            simulator.equilibrium(inputs, state=first, start=1.0, rtol=1e-12) if statics else simulator.initial_state(2)
+        )
         if not statics:
-            *_, state = own.rollout(state, given, steps=3)
+            *_, state = simulator.rollout(state, inputs, steps=3)
         return (weight * state.positions).sum()
 
     check(
@@ -131,23 +138,23 @@ def test_gradients(bending, statics):
 
 
 def test_one_of_two_shells_is_learned():
-    own = Simulator(built(sheets()), DT)
-    module = changed(ShellParameters(own, NUMBERS + FORMS, shells=1, by="element"))
+    simulator = Simulator(built(sheets()), DT)
+    module = changed(ShellParameters(simulator, NUMBERS + FORMS, shells=1, by="element"))
     assert module.changes["metric"].shape == (1, 8, 3)
     for name, values in module().items():
-        usual = own.parameter(name)
+        usual = simulator.parameter(name)
         torch.testing.assert_close(values[:, :12], usual[:, :12], rtol=0.0, atol=0.0)
         assert (values[:, 12:] != usual[:, 12:]).any(1).all()
 
 
 def test_copies_and_states():
-    own = Simulator(built(sheets()), DT)
-    module = changed(ShellParameters(own, FORMS))
-    again = ShellParameters(own, FORMS)
+    simulator = Simulator(built(sheets()), DT)
+    module = changed(ShellParameters(simulator, FORMS))
+    again = ShellParameters(simulator, FORMS)
     again.load_state_dict(module.state_dict())
-    for other in (copy.deepcopy(module), pickle.loads(pickle.dumps(module)), again):
+    for copied in (copy.deepcopy(module), pickle.loads(pickle.dumps(module)), again):
         for name, values in module().items():
-            torch.testing.assert_close(other()[name], values, rtol=0.0, atol=0.0)
+            torch.testing.assert_close(copied()[name], values, rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +167,7 @@ def test_copies_and_states():
         ({"by": np.full((20, 1), np.nan)}, "finite numbers"),
     ],
 )
-def test_what_there_is_not_is_refused(options, words):
+def test_missing_quantities_are_refused(options, words):
     with pytest.raises(SceneError) as error:
         ShellParameters(Simulator(built(sheets()), DT), **options)
     assert words in str(error.value)

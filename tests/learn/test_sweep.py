@@ -59,7 +59,7 @@ def noted(directory, load: float, seed: int) -> None:
 
 
 def bare(folder) -> list[tuple]:
-    """Episodes without the time that they took."""
+    """Return episodes without their run times."""
     return [(e.name, e.split, e.outcome, e.seed, e.parameters, e.frames) for e in Episodes(folder)]
 
 
@@ -82,7 +82,7 @@ def test_a_scene_is_swept(scene, device):
     with TrajectoryReader(episodes.path(episode)) as reader:
         assert len(reader) == episode.frames == 4
         assert reader.points.shape[1] == episode.parameters["n"]
-        # The scene's own numbers are those of the sample's seed.
+        # The scene draws its numbers from the sample's seed.
         assert reader.points[0][0, 1] == np.random.default_rng(episode.seed).random()
         assert reader.velocities is not None
         assert reader.series["z"][-1] < 0.0
@@ -168,11 +168,11 @@ def test_a_function_is_swept_and_failures_are_kept(tmp_path):
     episodes = sweep(noted, loads, 1, design="grid", out=tmp_path, progress=False)
     assert [episode.outcome for episode in episodes] == ["converged", "refused", "line_search_failed"]
     assert "smaller load" in episodes["000002"].failure
-    assert episodes["000002"].frames == 3  # what was recorded until then
+    assert episodes["000002"].frames == 3  # recorded until then
     assert [episode.name for episode in episodes.select()] == ["000000"]
 
 
-def test_a_mistake_ends_the_sweep_and_keeps_what_is_finished(tmp_path):
+def test_an_error_ends_the_sweep_and_keeps_finished_runs(tmp_path):
     def run(directory, load):
         if load == 2 and not (tmp_path / "mended").exists():
             return {}["missing"]
