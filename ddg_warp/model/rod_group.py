@@ -22,7 +22,7 @@ class RodGroup:
     """
 
     def __init__(self, host: RodGroupData, scene, worlds: int, device, real):
-        kind = replace(host.kind, serial=device_arrays.serial(device))
+        kind = replace(host.kind, serial=device_arrays.serial(device), rod_major=wp.get_device(device).is_cpu)
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
         self.rods = self.world_columns = len(host.rods)

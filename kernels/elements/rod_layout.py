@@ -28,6 +28,7 @@ class RodKind:
     closed: bool
     terms: tuple[Term, ...]
     serial: bool = False  # True if a thread takes all nodes of its rod; see `until_function`
+    rod_major: bool = False  # True if memory holds rod after rod, as on the CPU; see `device_arrays.allocate`
     drag: bool = False  # True with drag; see `kernels.forces.drag`
 
     @property
@@ -275,11 +276,11 @@ def _term_access(kind: RodKind, index: int, real) -> TermAccess:
 @cache
 def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
     """Return the storage of uncoupled rods: an island is a rod, and all terms have one window."""
-    Inputs, missing, closed, serial = (
+    Inputs, missing, closed, rod_major = (
         rod_elements_type(kind.dim, real),
         0 if kind.closed else 1,
         kind.closed,
-        kind.serial,
+        kind.rod_major,
     )
     (_, window, lagged, _), displaced = gather_functions(kind, real), displaced_function(kind, real)
 
@@ -297,7 +298,7 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
 
         It is nonnegative, as in `first_of`.
         """
-        if wp.static(serial):
+        if wp.static(rod_major):
             return wp.max(r * inputs.x.shape[0] + k, 0)
         return wp.max(k * inputs.x.shape[1] + r, 0)
 
