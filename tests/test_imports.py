@@ -1,7 +1,7 @@
 """Imports run downwards: no folder imports from a higher layer."""
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -33,21 +33,26 @@ def layer(module: str) -> int:
     return LAYERS.index(folder) if folder in LAYERS else -1
 
 
-def imports(path: Path, lazy: bool) -> Iterator[str]:
-    """Yield package imports of a file, at module level or `lazy`, inside functions."""
-    tree = ast.parse(path.read_text())
-    inside = {
-        id(node)
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef)
-        for node in ast.walk(function)
-        if node is not function
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (id(node) in inside) == lazy:
-            parts = (node.module or "").split(".")
-            if parts[0] == "ddg_warp":
-                yield from (".".join([*parts[1:], name.name]) for name in node.names)
+@cache
+def all_imports(path: Path) -> tuple[list[str], list[str]]:
+    """Return package imports of a file: at module level, inside functions."""
+    at_import, in_functions = [], []
+
+    def visit(node: ast.AST, names: list[str]) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.ImportFrom):
+                parts = (child.module or "").split(".")
+                if parts[0] == "ddg_warp":
+                    names += [".".join([*parts[1:], name.name]) for name in child.names]
+            visit(child, in_functions if isinstance(child, ast.FunctionDef) else names)
+
+    visit(ast.parse(path.read_text()), at_import)
+    return at_import, in_functions
+
+
+def imports(path: Path, lazy: bool) -> list[str]:
+    """Return package imports of a file, at module level or `lazy`, inside functions."""
+    return all_imports(path)[lazy]
 
 
 FILES = sorted(path for folder in LAYERS for path in (PACKAGE / folder).rglob("*.py"))
