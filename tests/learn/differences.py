@@ -175,13 +175,12 @@ class Difference:
 
     def by(self, change, step: float) -> float:
         """Return the fourth-order central difference by a number that `change(x)` offsets by x; the number is restored."""
-        values = {}
-        for side in (2.0, 1.0, -1.0, -2.0):
+        losses = []
+        for side in SIDES:
             change(side * step)
-            values[side] = self.loss()
+            losses.append(self.loss())
         change(0.0)
-        near, far = ((values[side] - values[-side]) / (2.0 * side * step) for side in (1.0, 2.0))
-        return (4.0 * near - far) / 3.0
+        return float(np.dot(losses, WEIGHTS)) / step
 
     def along(self, shifts: list[Shift], step: float) -> float:
         """Return the fourth-order central difference along the sum of directions; the worlds of one model take the SIDES steps."""
@@ -296,16 +295,14 @@ def state_shifts(model, gradient, state) -> list[Shift]:
     return shifts
 
 
-def parameter_shifts(model, inputs: list, names=None, seed: int = 11) -> list[Shift]:
-    """Return a direction in every parameter of every table, or in the named ones; `inputs` were read by the steps."""
-    shifts, random = [], np.random.default_rng(seed)
+def parameter_shifts(model, inputs: list) -> list[Shift]:
+    """Return a direction in every parameter of every table; `inputs` were read by the steps."""
+    shifts, random = [], np.random.default_rng(11)
     per_step = [by_parameters(model, read) for read in inputs]
     for number, table in enumerate(tables(model)):
         total = sum(read[number] for read in per_step)
         of_rods = number < len(model.groups)
         for row, (name, values) in enumerate(table.values.items()):
-            if names is not None and name not in names:
-                continue
             by_element = total[row] if of_rods else total[row].reshape(model.worlds, -1)
             worlds = 1 if of_rods else 0
             if of_rods:  # a column a rod, of every world
