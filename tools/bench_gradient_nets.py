@@ -93,7 +93,7 @@ def by_factors(model) -> dict:
     gradients, seconds = [], []
     for factors in (False, True, True):
         began = time.perf_counter()
-        start, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, cotangent, DT, factors)
+        start, inputs = adjoint.vjp_of_parts(tape.before, tape.after, tape.parts, cotangent, DT, factors)
         wp.synchronize_device(model.wp_device)
         seconds.append(time.perf_counter() - began)
         gradients.append(

@@ -44,7 +44,7 @@ class Adjoint:
 
         adjoint = Adjoint(integrator)
         after, tape = adjoint.step(state, dt=0.01)
-        gradient, inputs = adjoint.pull(tape, loss_by_after)
+        gradient, inputs = adjoint.vjp(tape, loss_by_after)
 
     Args:
         integrator: an `Integrator`, which makes the steps. A step is differentiable if a single solve made it.
@@ -98,17 +98,17 @@ class Adjoint:
         Raises:
             SolverError: a failed solve split the step, frames were updated during the step, or the solution is no minimum.
         """
-        check_state("pull", self.model, cotangent)
+        check_state("vjp", self.model, cotangent)
         self.upload(tape.before.time, tape.dt)
         ends = tape.before, tape.after
         for adjoint, kept, part in zip(self.parts, tape.parts, self.integrator._parts, strict=True):
             _require_one_solve(adjoint, kept, ends, part)
         arguments = tape.before, tape.after, tape.parts, cotangent, self.integrator._solved(tape.dt)
-        gradients = self.pull_parts(*arguments)
+        gradients = self.vjp_of_parts(*arguments)
         while self.has_overflow(tape.parts):
-            gradients = self.pull_parts(*arguments)
+            gradients = self.vjp_of_parts(*arguments)
         if self.coupled and self.coupled.solve.failed is not None and self.coupled.solve.failed.numpy().any():
-            gradients = self.pull_parts(*arguments, factors=True)
+            gradients = self.vjp_of_parts(*arguments, factors=True)
         gradients = _copied(*gradients)
         for adjoint, part in zip(self.chains, self.integrator._chains, strict=True):
             _require_minimum(adjoint, part)
@@ -127,10 +127,10 @@ class Adjoint:
         return changed
 
     def has_overflow(self, parts: list) -> bool:
-        """Return True if contact pairs of the last `pull_parts` exceeded the capacity; see `CoupledStepAdjoint.has_overflow`."""
+        """Return True if contact pairs of the last `vjp_of_parts` exceeded the capacity; see `CoupledStepAdjoint.has_overflow`."""
         return self.coupled is not None and self.coupled.has_overflow(parts[-1].solved.q)
 
-    def pull_parts(
+    def vjp_of_parts(
         self, before: State, after: State, parts: list, cotangent: State, s: float, factors: bool = False
     ) -> tuple[State, list]:
         """Return the result of `vjp` without checks, for solves of length s [s], in memory that the next call overwrites.
@@ -201,8 +201,8 @@ class EquilibriumAdjoint:
             SolverError: the tangent of the equilibrium is singular (a limit point, a bifurcation).
             SceneError: there is friction, and the state has no load history (`State.sliding`).
         """
-        check_state("pull", self.model, state)
-        check_state("pull", self.model, cotangent)
+        check_state("vjp", self.model, state)
+        check_state("vjp", self.model, cotangent)
         control_values, inputs = checked(controls, self.model, "pull"), []
         for adjoint in self.parts:
             adjoint.solve.tangent.give(control_values)

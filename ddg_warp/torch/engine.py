@@ -216,7 +216,7 @@ class Engine:
             parts.append(self._net_kept(start, dt))
 
         def launch():
-            self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
+            self._found = adjoint.vjp_of_parts(self.before, self.after, parts, self._given, s)
             self._judge()
 
         self._graphs.replay(dt, launch)

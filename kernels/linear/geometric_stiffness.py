@@ -77,19 +77,19 @@ def project_kernel(kind: RodKind, real, linear):
                         s = t * c
                         for i in range(n):
                             left = a[i, p]
-                            rhs = a[i, q]
-                            a[i, p] = c * left - s * rhs
-                            a[i, q] = s * left + c * rhs
+                            right = a[i, q]
+                            a[i, p] = c * left - s * right
+                            a[i, q] = s * left + c * right
                         for i in range(n):
                             left = a[p, i]
-                            rhs = a[q, i]
-                            a[p, i] = c * left - s * rhs
-                            a[q, i] = s * left + c * rhs
+                            right = a[q, i]
+                            a[p, i] = c * left - s * right
+                            a[q, i] = s * left + c * right
                         for i in range(n):
                             left = v[i, p]
-                            rhs = v[i, q]
-                            v[i, p] = c * left - s * rhs
-                            v[i, q] = s * left + c * rhs
+                            right = v[i, q]
+                            v[i, p] = c * left - s * right
+                            v[i, q] = s * left + c * right
             sweep += 1
             if off <= wp.static(eps) * on:
                 sweep = wp.static(SWEEPS)

@@ -153,7 +153,7 @@ def vjp_of_step(model, state, scheme: str, weights: dict, **how):
     s = DT / 2.0 if scheme == "implicit_midpoint" else DT
     weights = cotangent(model, weights)
     adjoint.vjp(tape, weights)
-    gradient, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, weights, s, **how)
+    gradient, inputs = adjoint.vjp_of_parts(tape.before, tape.after, tape.parts, weights, s, **how)
     values = {name: array.numpy() for name, array in entries(gradient).items()}
     return values | {f"parameters {i}": rows.numpy() for i, rows in enumerate(inputs[-1].parameters)}
 
