@@ -129,7 +129,7 @@ def number(name: str, value, rule: str = "one finite number", holds: Callable = 
 
 def part(name: str, value) -> float:
     """Return one number from 0 to less than 1; refuse anything else."""
-    return number(name, value, "a part of all, from 0 to less than 1", lambda v: 0.0 <= v < 1.0)
+    return number(name, value, "a fraction from 0 to less than 1", lambda v: 0.0 <= v < 1.0)
 
 
 def positive(name: str, value, unit: str = "") -> float:

@@ -34,7 +34,7 @@ def build(mismatch: float = 4e-3, width: float = 0.1, cells: int = 8, mesh: str 
         mesh: right, crossed, alternating, equilateral or jittered
     """
     if cells < 2 or cells % 2:
-        raise ValueError(f"cells = {cells}; it is an even number, 2 at least: the strip is held on its middle line")
+        raise ValueError(f"cells = {cells}; it is an even number, 2 at least: the strip is clamped on its middle line")
     kappa = bilayer_curvature(mismatch, 0.5 * THICKNESS, 0.5 * THICKNESS)
     along = 2 * max(1, round(0.5 * cells * LENGTH / width))
     size = (LENGTH, width)

@@ -52,7 +52,7 @@ def build(
         seed: seed of the initial jitter of nodes, a fifth of the activation distance; no jitter below 0
     """
     if not friction > 0.0:
-        raise ValueError(f"friction = {friction}; what slides without is not held by anything")
+        raise ValueError(f"friction = {friction}; without friction no force restrains the rod, give more than 0")
     if load_steps < 10 or load_steps % 10:
         raise ValueError(
             f"load_steps = {load_steps}; the rod is laid down and let back at tenths of the run, so give a multiple of 10"

@@ -71,7 +71,7 @@ def build(
     if n not in SIGMA:
         raise ValueError(f"n = {n}; there are references for 1 and 2 turns")
     if not friction > 0.0:
-        raise ValueError(f"friction = {friction}; a knot that nothing holds slides off the rod, give more than 0")
+        raise ValueError(f"friction = {friction}; a knot without friction slides off the rod, give more than 0")
     if not tighter > 1.0:
         raise ValueError(f"tighter = {tighter}; R shrinks by more than 1")
     if not 0.0 < edge <= 8.0:

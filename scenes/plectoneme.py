@@ -49,8 +49,8 @@ def build(
     """
     if not 0.3 <= angle <= 0.5:
         raise ValueError(
-            f"angle = {angle}; strands are found at 0.3 to 0.5 to the axis: a weaker tension does not hold the loop until they touch, "
-            "a stronger one opens it"
+            f"angle = {angle}; strands are found at 0.3 to 0.5 to the axis: a weaker tension does not keep the loop until they are in "
+            "contact, a stronger one opens it"
         )
     longest = min(2.0, FINE / np.sin(angle) ** 2)
     if not 0.0 < edge <= longest:

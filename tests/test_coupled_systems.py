@@ -449,7 +449,7 @@ def test_massless_vertices_are_refused(device):
 
 @pytest.mark.parametrize("options", [{"linear": "sweep"}, {"psd": "project"}])
 def test_options_of_uncoupled_rods_are_refused(device, options):
-    with pytest.raises(ddg.SceneError, match="is of rods on their own"):
+    with pytest.raises(ddg.SceneError, match="is for uncoupled rods"):
         ddg.Integrator(sheet(2).build(device), **options)
 
 

@@ -216,7 +216,7 @@ def test_two_motions_of_an_edge_are_refused():
 
 
 def test_rotation_out_of_the_plane_is_refused():
-    with pytest.raises(ddg.SceneError, match=r"turns about \(0.0, 0.0, 1.0\), out of the plane .* axis=\(0, 1, 0\)"):
+    with pytest.raises(ddg.SceneError, match=r"rotates about \(0.0, 0.0, 1.0\), out of the plane .* axis=\(0, 1, 0\)"):
         one_rod(False, False, 2).clamp(0, motion=ddg.Motion(angle=lambda t: t))
 
 

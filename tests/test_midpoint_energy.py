@@ -122,7 +122,7 @@ def test_unbounded_drift_fails_by_name(device, name):
         for _ in range(20):
             state = integrator.step(state, 1.0 / RATE)
             kept.append(energies(model, state))
-    message, object_named = str(raised.value), "rod 0" if name == "rod" else "the net (world 0)"
+    message, object_named = str(raised.value), "rod 0" if name == "rod" else "the coupled system (world 0)"
     for phrase in (object_named, "energy_drift", "J of", "t =", "smaller dt", "implicit_euler", "energy_bound"):
         assert phrase in message
     assert raised.value.outcome == "energy_drift"
@@ -132,7 +132,7 @@ def test_unbounded_drift_fails_by_name(device, name):
 
 def test_retries_that_do_not_help_end_by_name(device):
     model, state = free("shell of revolution", device)
-    with pytest.raises(ddg.SolverError, match=r"the net \(world 0\).*energy_drift"):
+    with pytest.raises(ddg.SolverError, match=r"the coupled system \(world 0\).*energy_drift"):
         advance(model, state, 1.0 / RATE, 20, check_every=1, rtol=1e-8)
 
 

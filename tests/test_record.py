@@ -463,7 +463,7 @@ def test_unwritable_paths_are_named(tmp_path, monkeypatch):
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(FileExistsError, match=rf"{path}: .*file is a file.*give another one"):
             Recorder(model, path)
-    with pytest.raises(OSError, match=r"/proc/x: .*give another place") as caught:
+    with pytest.raises(OSError, match=r"/proc/x: .*give another path") as caught:
         Recorder(model, "/proc/x")
     assert "free some space" not in str(caught.value)
     with pytest.raises(OSError, match="give a shorter name"):

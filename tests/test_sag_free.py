@@ -221,12 +221,12 @@ REFUSED = {
     ),
     "hinged": (
         lambda s: s.fix(s.add_rod(LEVEL, section=SECTION), [0]),
-        "nothing balances the loads at node 1 of rod 0",
+        "no rest strains balance the loads at node 1 of rod 0",
     ),
-    "free": (lambda s: s.add_rod(LEVEL, section=SECTION), "nothing balances the loads at node 0 of rod 0"),
+    "free": (lambda s: s.add_rod(LEVEL, section=SECTION), "no rest strains balance the loads at node 0 of rod 0"),
     "chain": (
         lambda s: s.clamp(s.add_rod(LEVEL, section=SECTION, bend=False)),
-        "nothing balances the loads at node 2 of rod 0",
+        "no rest strains balance the loads at node 2 of rod 0",
     ),
 }
 

@@ -53,7 +53,7 @@ def test_translation_within_a_symmetry_plane():
     ],
 )
 def test_motion_along_the_normal_is_refused(motion):
-    with pytest.raises(ddg.SceneError, match="held still by one support and moved by another along y"):
+    with pytest.raises(ddg.SceneError, match="fixed by one support and moved by another along y"):
         sheet(motion).build("cpu")
 
 

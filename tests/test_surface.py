@@ -178,8 +178,8 @@ REFUSED = {
     "orientation": (SQUARE, [[0, 1, 2], [0, 3, 2]], "triangles 0 and 1", "vertices 0 and 2", "same direction", "swap"),
     "triangle twice": (SQUARE[:3], [[0, 1, 2], [1, 2, 0]], "triangles 0 and 1", "same direction"),
     "back to back": (SQUARE[:3], [[0, 1, 2], [0, 2, 1]], "triangles 0 and 1", "same three vertices", "remove"),
-    "bow tie": (BOW, [[0, 1, 2], [0, 3, 4]], "vertex 0", "touch", "vertex of its own"),
-    "two closed fans": (CORNERS, TWO_TETRAHEDRA, "vertex 0", "touch", "vertex of its own"),
+    "bow tie": (BOW, [[0, 1, 2], [0, 3, 4]], "vertex 0", "meet", "a separate vertex"),
+    "two closed fans": (CORNERS, TWO_TETRAHEDRA, "vertex 0", "meet", "a separate vertex"),
 }
 
 

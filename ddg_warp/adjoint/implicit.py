@@ -244,8 +244,8 @@ class EquilibriumAdjoint:
         """Return the coupled state of the equilibrium before."""
         if state.sliding is None:
             raise SceneError(
-                "contact: by friction an equilibrium depends on the way there, which this state does not know; take the one that "
-                "statics.solve returned, not one made of its positions"
+                "contact: an equilibrium with friction depends on its load path, which this state has not stored; give the state "
+                "that statics.solve returned, not one made of its positions"
             )
         return replace(state.coupled, q=state.sliding.begun(state.coupled.q))
 
@@ -282,11 +282,14 @@ def _require_one_solve(
     changed = (lagged.numpy() != solved_frame.numpy()).any(0)
     changed = changed.any(0) if changed.ndim == 2 else changed.reshape(len(part.islands), -1).any(1)
     for refused, reason in (
-        (kept.whole.numpy() < 1.0, "took the step in parts, as a solve failed or what turns in contact sweeps arcs"),
-        ((kept.retries.numpy() > 0) & (adjoint.predictor is not None), "started the step once more, as a solve failed"),
+        (
+            kept.whole.numpy() < 1.0,
+            "took the step in substeps, because a solve failed or rotating supports in contact move along arcs",
+        ),
+        ((kept.retries.numpy() > 0) & (adjoint.predictor is not None), "restarted the step, because a solve failed"),
         (
             changed,
-            "turned an edge by more than 90 degrees in the step, so that its frames were renewed on the way",
+            "rotated an edge by more than 90 degrees in the step, which updated its frames",
         ),
     ):
         if refused.any():

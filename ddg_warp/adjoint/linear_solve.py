@@ -102,8 +102,8 @@ class HostSolve:
             kind = "the spin of" if spins else "a motion of"
             where = tangent.where(int(np.argmax(np.abs(mode))))
             raise SolverError(
-                f"no gradient goes through the equilibrium: {kind} {where} is neutral, as nothing holds it, so that it would jump with "
-                f"parameters; {'hold it by scene.fix_twist(...)' if spins else 'hold it'}",
+                f"no gradient goes through the equilibrium: {kind} {where} is neutral, as no support restrains it: it would jump "
+                f"with parameters; {'fix it by scene.fix_twist(...)' if spins else 'support it'}",
                 outcome="neutral",
             )
 
@@ -138,8 +138,8 @@ class HostSolve:
     def _singular(self, dof: np.ndarray | int) -> SolverError:
         where = self.tangent.where(int(np.ravel(dof)[0]))
         return SolverError(
-            f"no gradient goes through the solution: {where} can move without any stiffness, along what the loss depends on; hold it, "
-            "or stay off limit points and bifurcations",
+            f"no gradient goes through the solution: {where} can move without any stiffness, in a direction that changes the "
+            "loss; support it, or stay off limit points and bifurcations",
             outcome="singular",
         )
 

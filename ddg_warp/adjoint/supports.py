@@ -34,7 +34,7 @@ class Supports:
         loose = np.flatnonzero(~host.holding(ends).all((1, 2)))
         if loose.size:
             raise SceneError(
-                f"no gradient goes through a motion that turns {host.name(int(turning[loose[0]]))} and does not hold both of its "
+                f"no gradient goes through a motion that rotates {host.name(int(turning[loose[0]]))} and does not support both of its "
                 "nodes; clamp the edge"
             )
         self.by_director = wp.zeros(

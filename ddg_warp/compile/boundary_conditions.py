@@ -140,7 +140,7 @@ class ConstraintRegistry:
         where, axis = self.storage.name(index), f" along {'xyz'[component]}" if index < self.storage.nodes else ""
         if still:
             raise SceneError(
-                f"{where} is held still by one support and moved by another{axis}; leave one of them out, give the moving one "
+                f"{where} is fixed by one support and moved by another{axis}; leave one of them out, give the moving one "
                 "other components, or give both the same motion"
             )
         raise SceneError(f"{where} has two motions{axis}; give it one that does both")

@@ -143,8 +143,8 @@ def contact_law(contact, stiffness: np.ndarray, ranges: np.ndarray, explicit: bo
         for quantity, samples in (("energy", energy), ("force", slope)):
             if abs(samples[5]) > ENDS * abs(samples[4]):
                 raise SceneError(
-                    f"{where} has the {quantity} {abs(samples[5]):.3g} at the range, {activation:.3g} m, from which on nothing pushes; "
-                    "let both end there, or give contact(range=...)"
+                    f"{where} has the {quantity} {abs(samples[5]):.3g} at the range, {activation:.3g} m, beyond which contact does "
+                    "not act; let both end there, or give contact(range=...)"
                 )
         keep = max(keep, float(np.isposinf(energy[6])))
     fixed = (0.0 if name in ("stiffness", "range") else value for name, value in zip(names, constants, strict=True))

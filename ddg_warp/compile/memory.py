@@ -31,10 +31,10 @@ def require(scene, is_coupled: bool, worlds: int, precision: str, device) -> Non
     free = free_bytes(device)
     if worlds * each > free:
         fits = int(free // each)
-        fewer = f"build {fits} worlds at most" if fits else "coarsen what is in the scene"
+        fewer = f"build {fits} worlds at most" if fits else "coarsen the scene"
         raise SceneError(
             f"worlds = {worlds}: the model and an integrator of it need {_size(worlds * each)} at least, and {device} has "
-            f"{_size(free)} left; {fewer}, take precision 'mixed' or 'float32', or free what is held"
+            f"{_size(free)} left; {fewer}, take precision 'mixed' or 'float32', or free other arrays"
         )
 
 
@@ -54,7 +54,7 @@ def named(label: str, device) -> Iterator[None]:
             raise
         raise SceneError(
             f"{label}: out of memory ({error}); {device} has {_size(free_bytes(device))} left; build fewer worlds, take precision "
-            "'mixed' or 'float32', or free what is held"
+            "'mixed' or 'float32', or free other arrays"
         ) from error
 
 

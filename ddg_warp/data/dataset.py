@@ -210,7 +210,7 @@ class Recordings(torch.utils.data.Dataset):
         if len(reader) < source.frames or worlds != source.worlds:
             raise DataError(
                 f"{path} has {len(reader)} frames of {worlds} worlds, its index says {source.frames} of {source.worlds}; take a copy "
-                "of file and index, or record the run anew"
+                "of file and index, or record the run again"
             )
         recorded = {name for name in VECTORS if getattr(reader, name) is not None}
         recorded |= reader.fields.keys() | reader.series.keys()

@@ -95,7 +95,7 @@ class Episodes:
             if len(self._episodes) < len(entries):
                 raise ValueError("two episodes have one name")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise DataError(f"{path} is damaged ({error}); take a copy of it, or write the episodes anew") from error
+            raise DataError(f"{path} is damaged ({error}); take a copy of it, or write the episodes again") from error
 
     def __len__(self) -> int:
         return len(self._episodes)

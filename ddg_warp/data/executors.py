@@ -12,7 +12,7 @@ from functools import partial
 
 from ddg_warp.errors import SceneError
 
-KEPT = "what is finished is kept, and the same call goes on from there"
+KEPT = "finished runs are kept, and the same call continues from there"
 AHEAD = 2  # tasks in flight per worker, so that none is inactive between tasks
 
 

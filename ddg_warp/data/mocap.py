@@ -90,7 +90,7 @@ class Recording:
         lost = ~(length(edges) > 0.0)
         if lost.any():
             raise DataError(
-                f"{self.name}: frame {np.argmax(lost)}: markers {start} and {end} of a grip are lost, or in one place; "
+                f"{self.name}: frame {np.argmax(lost)}: markers {start} and {end} of a grip are lost, or coincide; "
                 "take other frames, or other markers as held"
             )
         tangents = unit(edges)
@@ -299,6 +299,6 @@ def _checked_held(markers, count: int, path: Path) -> tuple[int, ...]:
     if markers and not (fits and len({int(marker) % count for marker in markers}) == len(markers) == 4):
         raise DataError(
             f"{path} has {count} markers; held = {original!r} is not four of them, two of each grip; give four whole numbers, or "
-            "() where nothing is held"
+            "() without grips"
         )
     return tuple(int(marker) % count for marker in markers)

@@ -223,7 +223,7 @@ class _Reader:
 
     def _unsafe(self, request: str) -> UnsafePickleError:
         return UnsafePickleError(
-            f"{self._path}: the pickle asks for {request}, which arrays of numbers do not need; nothing of it has run. "
+            f"{self._path}: the pickle asks for {request}, which arrays of numbers do not need; none of it has run. "
             "Load it where you trust it, and save its arrays"
         )
 
@@ -243,12 +243,12 @@ class _Reader:
 
     def _extend(self, items: list) -> None:
         if not isinstance(self._stack[-1], list):
-            raise ValueError("items are added to what is no list")
+            raise ValueError("items are added to an object that is no list")
         self._stack[-1].extend(items)
 
     def _update(self, items: list) -> None:
         if not isinstance(self._stack[-1], dict):
-            raise ValueError("items are set in what is no dict")
+            raise ValueError("items are set in an object that is no dict")
         for key in items[::2]:  # other keys may be slow to hash or crafted to collide
             if not isinstance(key, str) and not (isinstance(key, int) and abs(key) < 2**32):
                 raise ValueError("the keys of a dict are no texts or whole numbers below 2^32")

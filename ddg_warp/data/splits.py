@@ -31,7 +31,5 @@ def checked_fractions(fractions) -> tuple[float, float, float]:
     """Return fractions of train, validation and test, refused if negative or of another sum than one."""
     values = argument_checks.floats(fractions)
     if values.shape != (3,) or not (values >= 0.0).all() or abs(values.sum() - 1.0) > 1e-9:
-        raise DataError(
-            f"fractions = {fractions!r}; give the shares of train, validation and test, which are 1 together"
-        )
+        raise DataError(f"fractions = {fractions!r}; give the fractions of train, validation and test, which sum to 1")
     return tuple(values.tolist())

@@ -216,7 +216,7 @@ def _runner(subject: str | Callable, ranges: Mapping, options: Mapping) -> Scene
             signature = [*inspect.signature(subject).parameters.items()]
         except ValueError:
             raise SceneError(
-                f"sweep: {subject!r} tells no parameters; write a function run(directory, **parameters)"
+                f"sweep: {subject!r} has no signature; write a function run(directory, **parameters)"
             ) from None
         signature_parameters = dict(signature[1:])
         if not signature:

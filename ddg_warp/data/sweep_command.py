@@ -44,14 +44,16 @@ def add_flags(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--samples", type=int, default=1, metavar="N", help="how many; on a grid along each range")
     command.add_argument("--design", default="random", help="random, latin_hypercube, sobol or grid (default: random)")
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="what samples are drawn with (default: 0)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     command.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the scene's)")
     command.add_argument("--duration", type=float, metavar="S", help="end of each run [s] (default: the scene's)")
     command.add_argument("--fields", metavar="NAME,...", help="record these too, such as velocities,directors")
     command.add_argument("--out", type=Path, metavar="DIR", help="folder of the episodes (default: out/sweep/SCENE)")
     command.add_argument("--workers", type=int, metavar="N", help="processes at work at once (default: this one)")
     command.add_argument("--ray", action="store_true", help="work on Ray")
-    command.add_argument("--gpus", type=float, default=0.0, metavar="N", help="share of a GPU for each sample on Ray")
+    command.add_argument(
+        "--gpus", type=float, default=0.0, metavar="N", help="fraction of a GPU for each sample on Ray"
+    )
 
 
 def sweep_scene(chosen: argparse.Namespace) -> int:

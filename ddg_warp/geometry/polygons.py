@@ -40,7 +40,7 @@ def triangulate(corners: np.ndarray) -> tuple[np.ndarray, str]:
     while len(left) > 3:
         ear = _best_ear(flat[left])
         if ear < 0:
-            return none, "touches itself"
+            return none, "intersects itself"
         triangles.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
     triangles = np.array([*triangles, left])

@@ -228,8 +228,8 @@ class Surface:
             half_edge = following[half_edge]
         for vertex in np.flatnonzero(visited != np.bincount(vertex_of))[:1]:
             raise SceneError(
-                f"{self._name}: only parts of the surface touch at vertex {vertex}, they share no edge there; "
-                "give each part a vertex of its own"
+                f"{self._name}: triangles of the surface meet at vertex {vertex} only and have no common edge there; "
+                "give each side a separate vertex"
             )
 
     def _ends(self, edge: int) -> str:

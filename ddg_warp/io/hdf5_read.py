@@ -54,7 +54,7 @@ def undamaged(path: Path) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         raise TrajectoryError(
-            f"{path}: the file is cut short or damaged ({' '.join(str(error).split())}); take a copy of it, or record the run anew"
+            f"{path}: the file is cut short or damaged ({' '.join(str(error).split())}); take a copy of it, or record the run again"
         ) from error
 
 
@@ -106,8 +106,8 @@ def _described(dataset: h5py.Dataset, path: Path) -> TrajectoryError:
     intact = f"{_ranges(~mask)} can be read" if not mask.all() else "no others can be read"
     kind = "pairs" if "/contacts/" in dataset.name and not dataset.name.endswith("/ends") else "frames"
     return TrajectoryError(
-        f"{path}: {dataset.name} is damaged: the checksum of {kind} {_ranges(mask)} is not that of what was written; {intact}. Take a "
-        "copy of the file, or record the run anew"
+        f"{path}: {dataset.name} is damaged: the checksum of {kind} {_ranges(mask)} differs from the one written; {intact}. Take a "
+        "copy of the file, or record the run again"
     )
 
 
@@ -143,8 +143,8 @@ def check_seal(group: h5py.Group, path: Path) -> None:
     """Refuse a group with datasets changed since `seal`; groups of older files have no seal."""
     if "crc32" in group.attrs and group.attrs["crc32"] != checksum(all_arrays(group)):
         raise TrajectoryError(
-            f"{path}: {group.name} is damaged: its checksum is not that of what was written; take a copy of the file, or record the "
-            "run anew"
+            f"{path}: {group.name} is damaged: its checksum differs from the one written; take a copy of the file, or record the "
+            "run again"
         )
 
 
@@ -157,7 +157,7 @@ def _check_size(dataset: h5py.Dataset) -> None:
     size = dataset.size * dataset.dtype.itemsize
     if size > RATIO * 2**20 and size > RATIO * dataset.file.id.get_filesize():
         raise MemoryError(
-            f"{dataset.name} of shape {dataset.shape} is said to have {size} bytes, more than the file can hold"
+            f"{dataset.name} of shape {dataset.shape} has {size} bytes by its header, more than the file can hold"
         )
 
 

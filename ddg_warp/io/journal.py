@@ -224,7 +224,7 @@ def no_link(path, flags: int) -> int:
             raise
         raise TrajectoryError(
             f"{path} is a link to {os.readlink(path)}, and links are not written through: use the directory that the file lies "
-            "in, or put the file itself in the place of the link"
+            "in, or replace the link by the file itself"
         ) from None
 
 
@@ -278,7 +278,7 @@ def recover(path) -> None:
         version, pages = journal
         if not _belongs(path, version):
             raise TrajectoryError(
-                f"{_journal_of(path)} belongs to another file, or to another version of {path.name}: move it back beside its own "
+                f"{_journal_of(path)} belongs to another file, or to another version of {path.name}: move it back next to its own "
                 f"file, or remove it to go on with {path.name} as it is"
             )
         with open(path, "r+b", buffering=0, opener=no_link) as file:

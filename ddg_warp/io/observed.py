@@ -28,7 +28,7 @@ def checked_observed(observed, names=None) -> dict[str, float]:
         numbers[name] = argument_checks.number(f"observed {name!r}", value)
     if names is not None and numbers.keys() != set(names):
         raise SceneError(
-            f"observed {sorted(numbers)}, before {sorted(names)}; give the same names at every call, or record the run anew"
+            f"observed {sorted(numbers)}, before {sorted(names)}; give the same names at every call, or record the run again"
         )
     return numbers
 

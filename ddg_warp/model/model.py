@@ -87,9 +87,9 @@ class Model:
         if coupled:
             rods, shells, turned = len(coupled.host.rods), len(coupled.host.shells), len(scene.axisymmetric_shells)
             lines.append(
-                f"a net of {rods} rods, {shells} shells, {turned} shells of revolution ({coupled.host.blocks} blocks);"
+                f"a coupled system of {rods} rods, {shells} shells, {turned} shells of revolution ({coupled.host.blocks} blocks);"
             )
-        return "\n ".join([*lines, "model.report() says more>"])
+        return "\n ".join([*lines, "see model.report()>"])
 
     def __reduce__(self):
         """Have pickle, torch.save and copy.deepcopy rebuild the scene with the current parameters and rest shapes."""
@@ -353,7 +353,7 @@ class Model:
                 if values is not None:
                     array.assign(self.order.put_blocks(values, array.numpy(), label))
             if angles is not None and self.scene.attachments:
-                raise ValueError("angles: edges that are glued to a shell turn with it; leave angles out")
+                raise ValueError("angles: edges attached to a shell rotate with it; leave angles out")
             for edge_values, array, label in ((spins, state.coupled.v, "spins"), (angles, state.coupled.q, "angles")):
                 if edge_values is not None:
                     values, start = self.order.of_edges(edge_values, label)

@@ -163,9 +163,13 @@ def set_rest_strains(model, strains: dict) -> None:
     for name, values in strains.items():
         if name not in allowed:
             why = (
-                "rods that are joined, glued or magnetised have it too" if name in uncoupled else f"there is {allowed}"
+                "rods that are joined, attached to a shell or magnetised have it too"
+                if name in uncoupled
+                else f"there is {allowed}"
             )
-            raise ValueError(f"set_rest_strains: {name!r} is no rest strain of rods that are all on their own; {why}")
+            raise ValueError(
+                f"set_rest_strains: {name!r} is no rest strain of a model whose rods are all uncoupled; {why}"
+            )
         count, groups = model.order.elements(name)
         values = model.valid_values(*name.rsplit(".", 1), values)
         if values.shape not in ((count,), (model.worlds, count)):

@@ -46,8 +46,8 @@ def refuse_friction(model) -> None:
         return
     first, second = (contact.names[g] for g in rough)
     raise SceneError(
-        f"contact: stability and paths of equilibria know no friction, and it is {contact.friction[rough]:g} between {first!r} "
-        f"and {second!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
+        f"contact: stability and paths of equilibria do not support friction, and it is {contact.friction[rough]:g} between {first!r} "
+        f"and {second!r}, where equilibria depend on the load path; set friction=0, or compute single equilibria by "
         "statics.solve, and for their gradients"
     )
 

@@ -161,8 +161,8 @@ def _need_quadratic(model) -> None:
     for batch in model.scene.batches:
         for term, law in batch.laws.items():
             raise ValueError(
-                f"energy_density: {term} of rod {batch.first} ('{batch.name}') has the law {law.density.name!r}, and the field knows "
-                "the quadratic one; quantities.energies tells"
+                f"energy_density: {term} of rod {batch.first} ('{batch.name}') has the law {law.density.name!r}, and the field is "
+                "for the quadratic one; use quantities.energies"
             )
 
 

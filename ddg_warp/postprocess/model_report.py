@@ -17,8 +17,8 @@ from ddg_warp.solve.stepping.rod_step import DIRECT
 from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, choose_solver
 
 SOLVERS = {
-    "chain": "PCG (closed chains)",
-    "sweep": "chain sweep, one Newton loop a rod",
+    "chain": "PCG (closed rods)",
+    "sweep": "block LDL^T sweep, one Newton loop a rod",
     "partitioned": "cyclic reduction (few long rods), one Newton loop a rod",
 }
 
@@ -75,7 +75,7 @@ def step_lines(model, errors_of: Callable) -> list[str]:
     means = choose_solver(
         model.precision, LinearSolverChoice(model.types.linear), *(each.max(initial=0.0) for each in errors)
     )
-    taken = ["edges turned, second derivatives"] * means.stiff
+    taken = ["edge-rotation update, exact Hessian"] * means.stiff
     taken += [f"linear algebra in {means}"] * (means.linear is not model.types.linear or means.split)
     return [f"  over steps of {analysis.dt:g} s: {', '.join(taken)}"] if taken else []
 
@@ -89,7 +89,7 @@ def contact_lines(touching) -> list[str]:
         (touching.friction[..., None] * touching.ways, "friction", ""),
     )
     said = [f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers]
-    said += ["which rolls rods"] * law.rolling
+    said += ["rolling"] * law.rolling
     return [
         f"contact: {law.name} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
     ]
@@ -116,7 +116,7 @@ def coupled_lines(model) -> list[str]:
     chains = RodSubstructuring.of(coupled, name)
     table = SparseSystem(coupled, chains and chains.kept)
     lines = [
-        f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
+        f"coupled system: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
         f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "
         f"{int((~host.fixed).sum())} free dofs"
     ]
@@ -128,18 +128,18 @@ def coupled_lines(model) -> list[str]:
     reals, solver, bands, split = 9 * table.positions, f"PCG ({name})", "", False
     if chains and chains.banded:
         chains.plan.bind(host, table.rows.numpy(), table.columns.numpy(), chains.kept)
-        solver = "elimination along rods, exact" if chains.plan.complete and not host.touching else solver
+        solver = "substructuring, exact" if chains.plan.complete and not host.touching else solver
         split = chains.splits
         places, block = int(chains.plan.count.sum()), chains.plan.block
         reals += 3 * block**2 * chains.plan.chain.size
-        bands = f" and {places} places of rods in bands of {block} x {block}"
+        bands = f" and {places} path nodes in bands of {block} x {block}"
     size = reals * model.worlds * (4 if linear.__name__ == "float32" else 8)
     lines.append(
         f"  solver: {solver}, one Newton loop a world, linear algebra in {linear.__name__}; "
         f"H: {table.entries} blocks of 3 x 3{bands}, {size / 1e6:.3g} MB"
     )
     if uncoupled(model):
-        lines.append("  in steps in which nothing comes near: rods on their own, one Newton loop a rod")
+        lines.append("  in steps without pairs in range: uncoupled rods, one Newton loop a rod")
     return lines + step_lines(
         model, lambda s: (model.coupled.rod_errors(s), model.coupled.split_errors(s) if split else np.array([np.inf]))
     )

@@ -43,7 +43,7 @@ def resolve_overlaps(model, state, gap: float | None = None):
     )
     if least > touch.search.reach:
         raise SceneError(
-            f"resolve_overlaps: gap is {least:.6g} m; contact is within {touch.search.reach:.6g} m, which it may not exceed"
+            f"resolve_overlaps: gap is {least:.6g} m; it may not exceed the search distance, {touch.search.reach:.6g} m"
         )
     new = state.copy()
     start = new.coupled.q.numpy().reshape(-1, 3).astype(float)
@@ -61,8 +61,8 @@ def resolve_overlaps(model, state, gap: float | None = None):
         gap, pair = touch.closest(new.coupled.q)
         raise SolverError(
             f"resolve_overlaps: {pair} are still {gap:.3g} m apart, less than {least:.3g} m, after {ROUNDS} rounds; "
-            "move them apart, free "
-            "what holds them, or give them a smaller radius",
+            "separate them, free "
+            "one of their supports, or give them a smaller radius",
             outcome="no_room",
         )
     moved = float(np.linalg.norm(x - start, axis=1).max(initial=0.0))

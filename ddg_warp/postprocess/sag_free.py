@@ -122,12 +122,10 @@ def _refuse(call: str, model) -> None:
         host, body = model.coupled.host, "a shell of revolution"
         if host.rods:
             rod = min(each.rod for each in host.rods)
-            body = f"rod {rod} ('{model.curves.names[rod]}'), which is joined, glued or magnetised"
+            body = f"rod {rod} ('{model.curves.names[rod]}'), which is joined, attached to a shell or magnetised"
         elif scene.shells:
             body = f"shell 0 ('{scene.shells[0].name}')"
-        raise SceneError(
-            f"{start}the scene has {body}; rest strains are those of rods on their own, in a scene of these"
-        )
+        raise SceneError(f"{start}the scene has {body}; sag-free rest strains need a scene of uncoupled rods")
     for group in model.groups:
         rod = int(group.host.rods[0])
         named = f"{start}rod {rod} ('{model.curves.names[rod]}')"
@@ -140,7 +138,7 @@ def _refuse(call: str, model) -> None:
                 )
             if term.name == "rod_bend":
                 raise SceneError(
-                    f"{named} has no twist, and so no natural curvature that turns with it; add it with twist=True"
+                    f"{named} has no twist, and so no natural curvature that rotates with it; add it with twist=True"
                 )
 
 
@@ -184,7 +182,7 @@ def _of_group(part, state, outer: np.ndarray) -> dict[str, np.ndarray]:
     allowed = RTOL * part.allowed(part.body_loads(outer, inner))
     for dof in np.flatnonzero(part.free & ~(np.abs(outer - inner) <= allowed))[:1]:
         raise SceneError(
-            f"rest_strains: whatever is at rest, nothing balances the loads at {part.where(dof)}; clamp an edge of the rod, or hold "
+            f"rest_strains: no rest strains balance the loads at {part.where(dof)}; clamp an edge of the rod, or support "
             "more of it"
         )
     root = np.sqrt(elements.stiffness * elements.measures)

@@ -41,7 +41,7 @@ class GripRates:
         argument_checks.positive("GripRates: speed", self.speed, "m/s")
         argument_checks.positive("GripRates: spin", self.spin, "rad/s")
         if isinstance(self.axes, str) and isinstance(self.about, str) and not self.axes + self.about:
-            raise SceneError("GripRates: nothing moves; give axes='xyz' to move along, or about='z' to turn about")
+            raise SceneError("GripRates: no axes; give axes='xyz' to translate along, or about='z' to rotate about")
         for name in ("axes", "about"):
             letters = getattr(self, name)
             if not isinstance(letters, str) or letters:
@@ -143,7 +143,7 @@ class Environment:
         self.dtype, self.device = wp.dtype_to_torch(model.types.real), str(wp.device_to_torch(model.wp_device))
         if len(model.grips) < len(model.motions):
             raise SceneError(
-                "Environment: a Motion goes on with time, which worlds share; hold what it moves by a Grip"
+                "Environment: a Motion depends on time, which is common to all worlds; move its supports by a Grip"
             )
         rate_list = [rates] if isinstance(rates, GripRates) or not np.iterable(rates) else list(rates)
         for one in rate_list:

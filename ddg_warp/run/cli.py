@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"ddg-warp: {_of_location(error)}", file=sys.stderr)
         return FAILED if getattr(error, "errno", None) in FULL else MISTAKE
     except KeyboardInterrupt:
-        print("\nddg-warp: interrupted; what was recorded is kept", file=sys.stderr)
+        print("\nddg-warp: interrupted; recorded frames are kept", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -127,7 +127,7 @@ def parser(arguments: list[str]) -> Parser:
     bench = commands.add_parser("bench", help="measure a scene's error against its time")
     bench.set_defaults(command=bench_scene)
     bench.add_argument("scene", nargs="?", metavar="NAME", help="a scene (default: list them)")
-    bench.add_argument("--all", action="store_true", help="every scene in turn, and an overview of them")
+    bench.add_argument("--all", action="store_true", help="all scenes one after the other, and an overview")
     add_settings(bench)
     bench.add_argument("--out", type=Path, default=Path("out/bench"), metavar="DIR", help="default: out/bench")
     if arguments[:1] == ["bench"] and len(arguments) > 1 and not arguments[1].startswith("-"):
@@ -139,7 +139,7 @@ def parser(arguments: list[str]) -> Parser:
     export.add_argument("--to", type=Path, metavar="FILE", help="a .usdc or .usda file (default: DIR/export.usdc)")
     export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
     export.add_argument(
-        "--revolve", type=int, default=0, metavar="N", help="turn meridians into surfaces of revolution of N sides"
+        "--revolve", type=int, default=0, metavar="N", help="convert meridians to surfaces of revolution of N sides"
     )
 
     info = commands.add_parser("info", help="show versions, devices and machine")
@@ -276,8 +276,8 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
     )
     if "counted_from" in content:
         print(
-            f"counts and times are of the steps after {content['counted_from']:g} s: the file that was resumed does not say what was "
-            "counted before, nor the energy at the start"
+            f"counts and times are of the steps after {content['counted_from']:g} s: the resumed file stores neither earlier counts "
+            "nor the energy at the start"
         )
     if "contact" in content:
         print(contact_line(content["contact"]))
@@ -285,7 +285,7 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         verdicts = {
             True: "stable",
             False: "UNSTABLE",
-            None: "not asked whether stable: ddg_warp.solve.equilibrium.stability.spectrum tells, but of friction",
+            None: "stability not computed: use ddg_warp.solve.equilibrium.stability.spectrum, except with friction",
         }
         print(f"last equilibrium: {verdicts[content['stable']]}")
     if checks:

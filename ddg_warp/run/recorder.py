@@ -165,15 +165,15 @@ class Recorder:
         available = {*reader.recorded, *reader.fields, *(["contacts"] if reader.contacts is not None else [])}
         if missing := [name for name in requested if name not in available]:
             raise ValueError(
-                f"{reader.path} has no {missing[0]}, and a resumed run goes on with what it has: leave {missing[0]} out, or record "
-                "the run anew"
+                f"{reader.path} has no {missing[0]}, and a resumed run continues with the recorded fields: leave {missing[0]} out, or "
+                "record the run again"
             )
         if time not in (None, reader.time_is):
             raise ValueError(
-                f"{reader.path} has time={reader.time_is!r}, not {time!r}: leave it out, or record the run anew"
+                f"{reader.path} has time={reader.time_is!r}, not {time!r}: leave it out, or record the run again"
             )
         if wanted["attributes"] and not _same_attributes(wanted["attributes"], reader.attributes):
-            raise ValueError(f"{reader.path} has other attributes: leave them out, or record the run anew")
+            raise ValueError(f"{reader.path} has other attributes: leave them out, or record the run again")
 
     def _open_scene(self, block: int, tube: bool, attributes: Mapping) -> None:
         from ddg_warp.io.usd import CurvesWriter
@@ -298,11 +298,7 @@ class Recorder:
         if not isinstance(error, OSError) or isinstance(error, RecordError) or error.errno is None:
             return error
         kept = "the run cannot be recorded any further. "
-        kept += (
-            "Its complete blocks of frames are kept: "
-            if error.errno in FULL
-            else "What was complete is kept where it is; "
-        )
+        kept += "Its complete blocks of frames are kept: " if error.errno in FULL else "Complete frames are kept; "
         return told(self.directory, error, kept)
 
     def _replay(self) -> None:

@@ -44,13 +44,13 @@ def told(path, error: OSError, kept: str = "") -> RecordError:
     elif error.errno in (errno.ENOENT, errno.ESTALE) and not _is_somewhere():
         reason, remedy = "the working directory was removed", "change to one that exists, or give an absolute path"
     elif error.errno == errno.ENOENT:
-        remedy = "the directory that it was in was removed, or cannot be made; give another place"
+        remedy = "the directory that it was in was removed, or cannot be made; give another path"
     elif error.errno in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
-        remedy = "give another place, or move away what is there"
+        remedy = "give another path, or move the existing file or folder"
     elif error.errno == errno.ENAMETOOLONG:
         remedy = "give a shorter name"
     else:
-        remedy = "give another place, which can be written to"
+        remedy = "give another path, which can be written to"
     result = RecordError(f"{path}: {reason}: {kept}{remedy}")
     result.errno = error.errno
     return result

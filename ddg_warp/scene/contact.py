@@ -116,7 +116,7 @@ class Contacts:
             SceneError: an invalid argument, or a second call.
         """
         if self.touching is not None:
-            raise SceneError("contact: this scene has contact already; use contact_between for what differs")
+            raise SceneError("contact: this scene has contact already; use contact_between for exceptions")
         call = "contact: "
         range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
         stiffness = None if stiffness is None else argument_checks.positive(f"{call}stiffness", stiffness, "N/m")
@@ -186,11 +186,9 @@ class Contacts:
             if value is not None
         ]
         if ignore and overrides:
-            raise SceneError(
-                f"{call}what passes through each other has no {overrides[0]}; give ignore or {overrides[0]}"
-            )
+            raise SceneError(f"{call}ignored pairs have no {overrides[0]}; give ignore or {overrides[0]}")
         if not (ignore or overrides):
-            raise SceneError(f"{call}nothing is different; give ignore=True, friction, stiffness or range")
+            raise SceneError(f"{call}no exception; give ignore=True, friction, stiffness or range")
         self.betweens.append(Between((one, other), ignore, friction, stiffness, range))
 
     def add_obstacle(
@@ -236,16 +234,14 @@ def check_contact(scene) -> None:
     """
     if scene.touching is None:
         if scene.obstacles:
-            raise SceneError(f"obstacle 0 ('{scene.obstacles[0].name}') touches nothing; add scene.contact()")
+            raise SceneError(f"obstacle 0 ('{scene.obstacles[0].name}') has no contact; add scene.contact()")
         if scene.betweens:
             raise SceneError("contact_between: this scene has no contact; add scene.contact()")
         return
     if scene.dimension == 2:
         raise SceneError("contact: a scene with contact has dimension 3; leave dimension=2 to scenes without")
     if scene.axisymmetric_shells:
-        raise SceneError(
-            f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything"
-        )
+        raise SceneError(f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') has no contact")
     if not any(np.any(between.friction) for between in (scene.touching, *scene.betweens) if between.friction):
         for name in ("friction_law", "velocity", "friction_iterations"):
             if getattr(scene.touching, name) != getattr(Contact, name):
@@ -261,12 +257,14 @@ def check_contact(scene) -> None:
     for label, name, valid in named:
         if name not in valid:
             raise SceneError(
-                f"contact: {label} names {name!r}; what can touch is {', '.join(map(repr, sorted(valid)))}"
+                f"contact: {label} names {name!r}; objects with contact are {', '.join(map(repr, sorted(valid)))}"
             )
     for between in scene.betweens:
         if not moving & set(between.names):
             raise SceneError(
-                "contact_between {!r} and {!r}: obstacles never touch each other; leave it out".format(*between.names)
+                "contact_between {!r} and {!r}: there is no contact between obstacles; leave it out".format(
+                    *between.names
+                )
             )
         if isinstance(between.friction, tuple):
             _check_directed(scene, between, obstacles)

@@ -182,7 +182,7 @@ class StopCriterion:
             if not (isinstance(entry, tuple | list) and len(entry) == 3 and isinstance(entry[0], str)):
                 shown = argument_checks.shown(entry)
                 raise SceneError(
-                    f"StopCriterion: displacement is {shown}; give (name of what is watched, lowest, highest value)"
+                    f"StopCriterion: displacement is {shown}; give (name of a watched displacement, lowest, highest value)"
                 )
             bounds["displacement"] = entry[1:]
         for name, bound in bounds.items():

@@ -85,7 +85,7 @@ def stiffness_of(label: str, section, material: Material | None) -> Stiffness:
             f"{label}: section {argument_checks.shown(section)} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
         )
     if isinstance(section, Stiffness) and material is not None:
-        raise SceneError(f"{label}: a Stiffness is given outright, and takes nothing of a material; leave material out")
+        raise SceneError(f"{label}: a Stiffness needs no material; leave material out")
     if not isinstance(material, Material) and not isinstance(section, Stiffness):
         raise SceneError(f"{label}: a {type(section).__name__} needs a material; give material=Material(...)")
     try:

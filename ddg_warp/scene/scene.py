@@ -378,7 +378,7 @@ class Scene(Structures):
         validate.check_motion(call, motion, planar=self.dimension == 2)
         if motion is not None and motion.count is not None:
             if call != "fix":
-                raise SceneError(f"{call}: the motion has a displacement for each node, which turns no edge; use fix")
+                raise SceneError(f"{call}: the motion has a displacement for each node, which rotates no edge; use fix")
             if motion.count != (count := len(rods) * len(dofs["nodes"])):
                 raise SceneError(
                     f"fix: the motion has {motion.count} displacements of {count} nodes; give one for each"

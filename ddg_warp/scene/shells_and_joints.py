@@ -144,7 +144,7 @@ class Structures(Meridians, Magnets, Contacts):
         self._need_edges("symmetry", shell, vertices, surface.boundary_edges, "boundary edge", "hold")
         if motion is not None and (not axis or getattr(motion, "turns", False)):
             raise SceneError(
-                "symmetry: a plane that moves is across an axis of space and does not turn; give 'x', 'y' or 'z' and "
+                "symmetry: a moving plane is normal to a coordinate axis and does not rotate; give 'x', 'y' or 'z' and "
                 "Motion(translation=...)"
             )
         self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()), motion=motion)

@@ -80,7 +80,7 @@ def check_scene(scene) -> None:
         if abs(angle) > STARTS:
             raise SceneError(
                 f"{support.call}: the motion's angle at t = 0 is {angle:g} rad; supports start as they are at rest, so subtract its "
-                "value at 0, or turn the points"
+                "value at 0, or rotate the points"
             )
 
 
@@ -88,15 +88,15 @@ def _check_magnets(scene) -> None:
     """Refuse a field or dipoles without magnetised rods, and magnets without field or dipoles."""
     magnetised = np.concatenate([np.zeros(0, int), *(magnet.rods for magnet in scene.magnets)])
     if scene.applied_field is not None and not magnetised.size:
-        raise SceneError("magnetic_field: nothing is magnetised; add scene.magnetize(rod, ...), or leave the field out")
+        raise SceneError("magnetic_field: no rod is magnetised; add scene.magnetize(rod, ...), or leave the field out")
     for pairs in scene.dipoles:
         if pairs.rods is None and not magnetised.size:
-            raise SceneError("add_dipoles: nothing is magnetised; add scene.magnetize(rod, ...)")
+            raise SceneError("add_dipoles: no rod is magnetised; add scene.magnetize(rod, ...)")
         for rod in [] if pairs.rods is None else np.setdiff1d(pairs.rods, magnetised)[:1]:
             raise SceneError(f"add_dipoles: rod {rod} is not magnetised; add scene.magnetize({rod}, ...)")
     if magnetised.size and scene.applied_field is None and not scene.dipoles:
         raise SceneError(
-            f"magnetize: nothing acts on rod {magnetised[0]}; add scene.magnetic_field(...) or scene.add_dipoles(...)"
+            f"magnetize: no field or dipole acts on rod {magnetised[0]}; add scene.magnetic_field(...) or scene.add_dipoles(...)"
         )
 
 
@@ -106,7 +106,7 @@ def check_motion(call: str, motion, planar: bool) -> None:
         raise SceneError(f"{call}: motion is {motion!r}; give Motion(translation=..., angle=...) or Grip(pivot=...)")
     if motion is not None and planar and not motion.planar:
         raise SceneError(
-            f"{call}: the motion turns about {tuple(motion.axis)}, out of the plane of x and z; give axis=(0, 1, 0)"
+            f"{call}: the motion rotates about {tuple(motion.axis)}, out of the plane of x and z; give axis=(0, 1, 0)"
         )
 
 

@@ -47,7 +47,7 @@ class Call:
         if self.version != self.simulator.model.version:
             raise SceneError(
                 "backward: parameters or rest shapes of the model were changed (set_parameter, set_rest) after the step whose gradient "
-                "is asked for; call backward before, or hand what changes to steps as tensors"
+                "is requested; call backward before, or pass changing values to steps as tensors"
             )
         return self.engine
 

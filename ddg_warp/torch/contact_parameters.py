@@ -82,8 +82,8 @@ class ContactParameterView:
             world, pair = (int(i) for i in torch.nonzero(values > self._reach)[0])
             one, second = contact_elements(self.model, self.name)[pair]
             raise SceneError(
-                f"parameters: contact.range of {one!r} and {second!r} is {float(values[world, pair]):.6g} m in world {world}, but what "
-                f"may touch is searched for within {self._reach:.6g} m; build the scene with the largest range that is to be used"
+                f"parameters: contact.range of {one!r} and {second!r} is {float(values[world, pair]):.6g} m in world {world}, beyond "
+                f"the search distance {self._reach:.6g} m; build the scene with the largest range in use"
             )
         usual = torch.as_tensor(self._usual, dtype=values.dtype, device=values.device)
         # Collision detection runs over all worlds at once, refused ones included.

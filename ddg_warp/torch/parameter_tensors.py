@@ -41,7 +41,7 @@ class ParameterTensors:
                 else self._of_terms(name)
             )
             if not storage[1]:
-                raise SceneError(f"parameters: nothing has {name!r}; this model has {', '.join(self.names())}")
+                raise SceneError(f"parameters: no object has {name!r}; this model has {', '.join(self.names())}")
             self._found[name] = storage
         return self._found[name]
 

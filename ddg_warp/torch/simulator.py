@@ -64,7 +64,7 @@ class Simulator(torch.nn.Module):
         argument_checks.choice("scheme", scheme, SCHEMES)
         self.dt = argument_checks.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         for name in SETTLED & options.keys():
-            raise SceneError(f"Simulator: {name} is settled, as worlds that fail are told by outcomes(); leave it out")
+            raise SceneError(f"Simulator: {name} is fixed, as outcomes() reports failed worlds; leave it out")
         integrator_names = set(argument_checks.names(Integrator)) - SETTLED - {"model", "scheme"}
         newton_options = {name: value for name, value in options.items() if name not in integrator_names}
         argument_checks.options("Simulator", NewtonOptions, newton_options, integrator_names)
@@ -275,7 +275,7 @@ class Simulator(torch.nn.Module):
         argument_checks.options("Simulator.equilibrium", statics.StaticsOptions, solver_options, LOAD)
         if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
             raise SceneError(
-                "equilibrium: no gradient goes to the state where the search begins, which places what is held, yet; give "
+                "equilibrium: no gradient goes to the initial state of the search, which sets positions of supports; give "
                 "state.detach()"
             )
         if (
@@ -383,9 +383,9 @@ class Simulator(torch.nn.Module):
         if engine.lost and not self._warned:
             self._warned = True
             warnings.warn(
-                "worlds have no gradient by what came before a step that failed, was made in parts or turned edges by more than 90 "
-                "degrees, or whose reverse was not solved: there gradients are not numbers; leave these worlds out by "
-                "state.differentiable (outcomes() names what became of them), or take shorter steps",
+                "worlds have no gradient through a step that failed, was taken in substeps or rotated edges by more than 90 "
+                "degrees, or whose reverse was not solved: their gradients are not numbers; leave these worlds out by "
+                "state.differentiable (outcomes() names their outcomes), or take shorter steps",
                 GradientWarning,
                 stacklevel=4,
             )

@@ -348,7 +348,7 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
         (lambda s: s.ignore(s.rod([0, 1], 0.1), 1), "there is no object 1"),
         (
             lambda s: s.spin(s.rod([0, 1], 0.1), [0, 1, 3, 4]),
-            "rod 0 spins: that is of an obstacle, and told by 4 nodes",
+            "rod 0 spins: only obstacles spin, given by 4 nodes",
         ),
         (lambda s: s.spin(s.ball(0, 0.1, still=True), [0, 1, 3, 4]), "ball 0 spins: markers are at right angles about"),
         (lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), reach=1.0, margin=1.0), "no objects"),

@@ -256,7 +256,7 @@ def test_refusals(device):
     rough = scene_of("ball", "barrier", 0.3).build(device, "float64")
     for call in (lambda: Continuation(rough), lambda: statics.solve(rough, mode="follow")):
         with pytest.raises(
-            ddg.SceneError, match=r"paths .* know no friction, and it is 0.3 between .*; set friction=0"
+            ddg.SceneError, match=r"paths .* do not support friction, and it is 0.3 between .*; set friction=0"
         ):
             call()
     smooth = scene_of("ball", "barrier").build(device, "float64")

@@ -337,7 +337,7 @@ def test_statistics_of_decoupled_steps(device):
     assert statistics["contact"]["contacts"] == {"mean": 0.0, "last": 0}
     assert statistics["contact"]["smallest_gap"] == np.inf
     model = state.model
-    assert "rods on their own" in model.report()
+    assert "uncoupled rods" in model.report()
     assert len(model.contacts(state)) == 0 and model.energies(state)["kinetic"] > 0.0
 
 

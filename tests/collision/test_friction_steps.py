@@ -95,7 +95,7 @@ def test_growing_lists_require_a_new_lag(device):
     result.search.search(positions)
     assert np.isinf(step()[0]).all()
     assert result.search.fit(positions) and result.fit()
-    with pytest.raises(SolverError, match=r"call lag\(\) there, anew after fit\(\)"):
+    with pytest.raises(SolverError, match=r"call lag\(\) there, and again after fit\(\)"):
         result.evaluate(shifted, rates(result))
     assert all((a == b).all() for a, b in zip(step(), before, strict=True))
 

@@ -293,9 +293,12 @@ def test_float32_positions(device, case):
         ),
         (
             {"range": 0.005},
-            r"shell 3 and shell 3 push each other up to 0.009 m apart, but .* within 0.008; .* reach of 0.005 m",
+            r"shell 3 and shell 3 are in contact up to a distance of 0.009 m, but .* covers 0.008 m; .* distance of 0.005 m",
         ),
-        ({"thickness": 0.0065, "groups": [0, 0, 0, 1]}, r"rod 0 and rod 0 push .* a reach of 0.0045 m"),
+        (
+            {"thickness": 0.0065, "groups": [0, 0, 0, 1]},
+            r"rod 0 and rod 0 are in contact .* a search distance of 0.0045 m",
+        ),
     ],
 )
 def test_invalid_parameters_are_refused_by_name(device, options, message):

@@ -36,7 +36,7 @@ def test_load_increments_are_split_by_rotation(device, drive):
 def test_unresolved_increments_are_refused_with_sufficient_load_steps(device):
     motion = ddg.Motion(angle=lambda t: 80.0 * np.pi * t)
     model = rod_before_blade(motion, polar_point(0.1, 1.0), reach=2e-5).build(device=device)
-    with pytest.raises(ddg.SolverError, match=r"obstacle 0 \('blade'\) turns by 40 turns in a step") as error:
+    with pytest.raises(ddg.SolverError, match=r"obstacle 0 \('blade'\) rotates by 40 turns in a step") as error:
         ddg.statics.solve(model)
     assert error.value.outcome == "turned_too_far"
     load_steps = int(str(error.value).split("load_steps = ")[1].split()[0])

@@ -242,7 +242,7 @@ def test_straight_motion_is_never_split(device):
 
 def test_unresolved_rotations_are_refused_with_a_sufficient_step(device):
     made = scene("capsule", rotating(40.0), polar_point(0.1, -1.5), reach=2e-5)
-    with pytest.raises(ddg.SolverError, match=r"turned_too_far: obstacle 0 \('blade'\) turns by 40 turns") as error:
+    with pytest.raises(ddg.SolverError, match=r"turned_too_far: obstacle 0 \('blade'\) rotates by 40 turns") as error:
         step(made, device)
     assert error.value.outcome == "turned_too_far"
     dt = float(str(error.value).split("dt = ")[1].split()[0])
@@ -282,7 +282,7 @@ def test_unresolved_grip_fails_its_world_alone(device):
     assert substeps(integrator) == [1, MAX_SUBSTEPS]
     turns[1, 0, 5] = np.pi
     integrator = ddg.Integrator(model)
-    with pytest.raises(ddg.SolverError, match="turns farther in a step than 1024 substeps resolve"):
+    with pytest.raises(ddg.SolverError, match="rotates farther in a step than 1024 substeps resolve"):
         integrator.check(integrator.step(model.state(), DT, ddg.Controls(poses=turns)))
 
 

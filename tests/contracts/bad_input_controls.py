@@ -86,7 +86,7 @@ refuse("Controls", {
 })
 each("Grip", "pivot", [1.0, (0.0, 1.0), "there", (NAN, 0.0, 0.0)], ddg.Grip, "Grip: pivot", "three finite")
 refuse("Grip", {
-    "of a plane of symmetry": (_symmetry, "symmetry", "does not turn", "Motion(translation"),
+    "of a plane of symmetry": (_symmetry, "symmetry", "does not rotate", "Motion(translation"),
     "a class": (lambda: rods().clamp(1, motion=ddg.Grip), "clamp: motion", "Grip(pivot=...)"),
 })
 each("reset", "mask", [True, (True,), (1, 0), (0.0, 1.0), "all", None], _reset, "reset: the mask", "bools (2,)")

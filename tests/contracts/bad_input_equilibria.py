@@ -49,7 +49,7 @@ refuse("statics", {
     "free": (lambda: _solve_underconstrained(""), "rod 1", "along x", "supports", "clamp"),
     "free along z": (lambda: _solve_underconstrained("xy"), "rod 1", "along z", "supports"),
     "free along x": (lambda: _solve_underconstrained("yz"), "rod 1", "along x", "supports"),
-    "free sheet": (lambda: statics.solve(built(sheet())), "held along x", "scene.hold"),
+    "free sheet": (lambda: statics.solve(built(sheet())), "supported along x", "scene.hold"),
     "pcg of rods": (lambda: statics.solve(model(), solver="pcg"), "'pcg'", "solver='direct'"),
     "pcg follows": (lambda: statics.solve(model("net"), solver="pcg", mode="follow"), "'follow'", "solver='direct'"),
     "amplitude that ends": (lambda: _solve(_force(lambda t: t if t < 0.5 else NAN), load_steps=4), "amplitude", "t = 0.5"),

@@ -118,8 +118,8 @@ refuse(
             "not made by calling",
         ),
         "call of a number": (lambda: read_pickle(b"\x80\x02K\x01)R."), "a.pkl", "damaged"),
-        "set": (lambda: read_pickle(pickle.dumps({1, 2}, 4)), "a.pkl", "EMPTY_SET", "nothing of it has run"),
-        "class": (lambda: read_pickle(pickle.dumps(Path, 4)), "a.pkl", "pathlib", "nothing of it has run"),
+        "set": (lambda: read_pickle(pickle.dumps({1, 2}, 4)), "a.pkl", "EMPTY_SET", "none of it has run"),
+        "class": (lambda: read_pickle(pickle.dumps(Path, 4)), "a.pkl", "pathlib", "none of it has run"),
         "name of many lines": (lambda: read_pickle(b"\x80\x04X\x03\x00\x00\x00a\nbX\x01\x00\x00\x00c\x93."), "a b.c"),
         "array larger than its bytes": (
             lambda: read_pickle(pickle.dumps(np.zeros(4), 2).replace(b"K\x04\x85", b"K\x7f\x85")),

@@ -290,7 +290,7 @@ refuse(
             lambda: folder(lambda d: (os.symlink(d / "x", d / "y"), RunDirectory(d / "y"))),
             "leads nowhere",
         ),
-        "a system's": (lambda: RunDirectory("/proc/x"), "/proc/x", "give another place"),
+        "a system's": (lambda: RunDirectory("/proc/x"), "/proc/x", "give another path"),
         "a long name": (lambda: RunDirectory("a" * 300), "shorter name"),
         "held": (
             lambda: folder(lambda d: (RunDirectory(d), ddg.Recorder(model(), d))),
@@ -740,7 +740,7 @@ refuse(
         "out of the system": (
             lambda: fail_command("run DIR/fall.py --device cpu --out /proc/x"),
             "/proc/x",
-            "give another place",
+            "give another path",
         ),
         "a run is there": (lambda: fail_command(START), "holds 3 frames", "--force"),
         "summary below a file": (lambda: fail_command(f"{START} --force --json DIR/file/a.json"), "file/a.json"),

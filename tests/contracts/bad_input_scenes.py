@@ -194,16 +194,16 @@ SUPPORTS = {
         *("fix", "t = 0", "(0.0, 0.2, 0.0)"),
     ),
     "still and moving node": (
-        lambda s: (s.fix(1, [0]), s.fix(1, [0], "x", SWING)), "node 0 of rod 1", "held still", "moved", "along x"
+        lambda s: (s.fix(1, [0]), s.fix(1, [0], "x", SWING)), "node 0 of rod 1", "fixed by one", "moved", "along x"
     ),
     "moving and still node": (
-        lambda s: (s.fix(1, [0], "x", SWING), s.fix(1, [0])), "node 0 of rod 1", "held still", "moved", "along x"
+        lambda s: (s.fix(1, [0], "x", SWING), s.fix(1, [0])), "node 0 of rod 1", "fixed by one", "moved", "along x"
     ),
     "still and moving clamps that touch": (
-        lambda s: (s.clamp(1, [0]), s.clamp(1, [1], SWING)), "node 1 of rod 1", "held still", "same motion"
+        lambda s: (s.clamp(1, [0]), s.clamp(1, [1], SWING)), "node 1 of rod 1", "fixed by one", "same motion"
     ),
     "still and moving edge": (
-        lambda s: (s.fix_twist(1, [2]), s.fix_twist(1, [2], SWING)), "edge 2 of rod 1", "held still", "moved"
+        lambda s: (s.fix_twist(1, [2]), s.fix_twist(1, [2], SWING)), "edge 2 of rod 1", "fixed by one", "moved"
     ),
     "two motions of a node": (
         lambda s: (s.fix(1, [0], motion=STILL), s.fix(1, [0], "z", SWING)), "node 0 of rod 1", "two motions along z"
@@ -222,13 +222,13 @@ refuse("supports", {name: (lambda a=add: built(rods(), a), *words) for name, (ad
 JOINED = lambda s: s.join([(0, 0), (1, 0)])  # noqa: E731
 refuse("supports", {
     "net, still and moving node": (
-        lambda: built(rods(), JOINED, lambda s: (s.fix(1, [-1]), s.fix(1, [-1], "x", SWING))), "point at (1, 0, 0)", "held still"),
+        lambda: built(rods(), JOINED, lambda s: (s.fix(1, [-1]), s.fix(1, [-1], "x", SWING))), "point at (1, 0, 0)", "fixed by one"),
     "net, still and moving at a joint": (
-        lambda: built(rods(), JOINED, lambda s: (s.fix(0, [0]), s.fix(1, [0], "x", SWING))), "point at (0, 0, 0)", "held still"),
+        lambda: built(rods(), JOINED, lambda s: (s.fix(0, [0]), s.fix(1, [0], "x", SWING))), "point at (0, 0, 0)", "fixed by one"),
     "net, two motions of an edge": (
         lambda: built(rods(), JOINED, lambda s: (s.fix_twist(1, [2], STILL), s.fix_twist(1, [2], SWING))), "edge 2 of rod 1", "two"),
     "net, still and moving edge": (
-        lambda: built(rods(), JOINED, lambda s: (s.fix_twist(1, [2]), s.fix_twist(1, [2], SWING))), "edge 2 of rod 1", "still"),
+        lambda: built(rods(), JOINED, lambda s: (s.fix_twist(1, [2]), s.fix_twist(1, [2], SWING))), "edge 2 of rod 1", "fixed by one"),
     "end of a closed rod": (lambda: rods(RING, closed=True).clamp_end([0, 1]), "rod 1", "closed", "no end"),
     "angle of a rod without twist": (lambda: rods(twist=False).fix_twist(1, [0]), "rod 1", "no twist", "twist=True"),
     "angle in the plane": (lambda: rods(scene=ddg.Scene(dimension=2)).fix_twist(1, [0]), "no twist", "dimension 3"),

@@ -88,7 +88,7 @@ ON_SHELLS = {
     "hold each of others": (lambda s: s.hold(0, [0, 1], motion=M(MOVED)), "3 displacements of 2 vertices"),
     "hold away": (lambda s: s.hold(0, [0], motion=M(lambda t: (0.0, 0.0, 1.0))), "hold", "t = 0", "subtract"),
     "hold still and moving": (
-        lambda s: (s.hold(0, [0, 1]), s.hold(0, [1, 2], "z", SWING)), "(0.333333, 0, 0)", "held still", "along z"),
+        lambda s: (s.hold(0, [0, 1]), s.hold(0, [1, 2], "z", SWING)), "(0.333333, 0, 0)", "fixed by one", "along z"),
     "hold by two motions": (
         lambda s: (s.hold(0, [1], motion=STILL), s.hold(0, [1, 2], "z", SWING)), "(0.333333, 0, 0)", "two motions along z"),
     "clamp one vertex": (lambda s: s.clamp_boundary(0, [5]), "clamp_boundary", "vertex 5", "use hold"),
@@ -183,7 +183,7 @@ refuse("meridians", {
     "hold turning": (lambda: dome().hold_ring(0, 5, motion=M(angle=lambda t: t)), "hold_ring", "axis=(0, 1, 0)"),
     "hold away": (lambda: built(dome(), lambda s: s.hold_ring(0, 5, motion=M(lambda t: (0.0, 0.0, 1.0)))), "hold_ring", "t = 0"),
     "hold still and moving": (
-        lambda: built(dome(), lambda s: (s.hold_ring(0, 5), s.hold_ring(0, 5, "z", SWING))), "held still", "along z"),
+        lambda: built(dome(), lambda s: (s.hold_ring(0, 5), s.hold_ring(0, 5, "z", SWING))), "fixed by one", "along z"),
     "clamp end": (lambda: dome().clamp_ring(0, "middle"), "'middle'", "'first'", "'last'"),
     "clamp pole": (lambda: dome().clamp_ring(0, "first"), "pole", "hold_ring"),
     "clamp tangent": (lambda: dome().clamp_ring(0, "last", tangent=(0.0, 0.0)), "tangent", "not zero"),

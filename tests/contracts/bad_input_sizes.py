@@ -162,14 +162,14 @@ each("sizes: contact", "gap that is too small for an equilibrium", [1e-12], lamb
      "of rod 0", "of rod 1", "too close for a barrier", "resolve_overlaps")
 refuse("sizes: steps", {"dt of too many digits": (lambda: integrator().step(model().state(), 10**5000), "dt is", "positive")})
 refuse("sizes: contact", {
-    "no gap": (lambda: step(crossed_rods(0.0)), "of rod 0", "of rod 1", "touch at the start", "resolve_overlaps"),
+    "no gap": (lambda: step(crossed_rods(0.0)), "of rod 0", "of rod 1", "have no gap at the start", "resolve_overlaps"),
     "no radius": (lambda: built(rods(section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, radius=0.0), name="thin"),
                                 lambda s: s.contact()), "rod 1 ('thin')", "radius", "positive"),
-    "held through held": (lambda: step(driven_through(), 2), "both held", "motion of support 2 (clamp)", "change that motion"),
-    "held through held, penalty": (lambda: step(driven_through(law="penalty"), 4), "both held", "motion of support 2 (clamp)"),
-    "a plane through what is held": (lambda: step(driven_through("plane"), 2), "both held", "motion of obstacle 'floor'"),
+    "held through held": (lambda: step(driven_through(), 2), "both fixed", "motion of support 2 (clamp)", "change that motion"),
+    "held through held, penalty": (lambda: step(driven_through(law="penalty"), 4), "both fixed", "motion of support 2 (clamp)"),
+    "a plane through what is held": (lambda: step(driven_through("plane"), 2), "both fixed", "motion of obstacle 'floor'"),
     "held through held in an equilibrium": (lambda: statics.solve(built(driven_through()), max_cuts=1),
-                                            "in_the_way", "both held", "support 2 (clamp)"),
+                                            "in_the_way", "both fixed", "support 2 (clamp)"),
 })
 
 

@@ -60,7 +60,7 @@ REFUSED = {
         **dict.fromkeys((*SHELLS, "shells of both kinds"), ("shell 0", "name the rods")),
         "shell of revolution": ("shell of revolution 0", "name the rods"),
     },
-    "continuation": {"rod without bending": ("singular_start", "hold what can move without any stiffness")},
+    "continuation": {"rod without bending": ("singular_start", "support dofs that move without any stiffness")},
 }
 for _question in (
     *("turned clamp", "load", "pressure", "mass damping", "strain rate damping"),
@@ -70,11 +70,11 @@ for _question in (
 for _question in ("contact", "moved obstacle"):
     REFUSED[_question] = {
         **dict.fromkeys(("planar rod", "planar rods joined rigidly"), ("dimension 3", "leave dimension=2")),
-        **dict.fromkeys(("shell of revolution", "shells of both kinds"), ("shell of revolution 0", "can not touch")),
+        **dict.fromkeys(("shell of revolution", "shells of both kinds"), ("shell of revolution 0", "has no contact")),
         **dict.fromkeys(IN_CONTACT, ("has contact already", "use contact_between")),
         "shell, curved membrane": ("shell 0", "'curved'", "statics", "membrane='flat'"),
     }
-REFUSED["rolls"] = dict.fromkeys(SHELLS, ("contact: rolling", "no rod touches anything", "leave rolling out")) | {
+REFUSED["rolls"] = dict.fromkeys(SHELLS, ("contact: rolling", "no rod is in contact", "leave rolling out")) | {
     name: words for name, words in REFUSED["contact"].items() if name != "shell, curved membrane"
 }
 for _name in ("rod without twist", "rod without bending"):
@@ -86,7 +86,7 @@ REFUSED["continuation"] |= dict.fromkeys(
 )
 REFUSED["path onto a ball"] = REFUSED["rests"] | {"rod without bending": REFUSED["continuation"]["rod without bending"]}
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
-REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))
+REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "separate them"))
 # questions refused for several worlds, and objects with an earlier refusal
 ALONE = {"continuation": {}, "path onto a ball": REFUSED["rests"]}
 

@@ -144,7 +144,7 @@ def test_edge_couples_need_free_boundary_angles(device):
     scene = sheet()
     scene.clamp_boundary(0, [0, 1])
     scene.add_edge_couple(0, [0, 1], 1.0)
-    with pytest.raises(ddg.SceneError, match="vertices 0 and 1 of shell 0 is held"):
+    with pytest.raises(ddg.SceneError, match="vertices 0 and 1 of shell 0 is fixed"):
         scene.build(device)
 
 
@@ -348,7 +348,7 @@ def test_repr_names_object_and_counts(device):
     state = model.state()
     texts = [
         (scene, "Scene", "3 rods of 27 nodes", "1 joints", "1 supports, 1 loads"),
-        (model, "Model", "float64", "2 worlds of 27 points", "1 rods of their own", "net of 2 rods"),
+        (model, "Model", "float64", "2 worlds of 27 points", "1 rods of their own", "coupled system of 2 rods"),
         (state, "State", "t = 0 s", "2 worlds of 27 points"),
         (Result(scene, model, state, [0.0, 0.5], {"tip": [0.0, 1.0]}), "Result", "2 states", "0 to 0.5", "tip"),
     ]

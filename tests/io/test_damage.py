@@ -110,7 +110,7 @@ def test_truncated_files_are_refused_by_name(run, name, read_it, error, fraction
     """A truncated copy is refused with the file, the fault and the remedy."""
     path = run / name
     path.write_bytes(path.read_bytes()[: int(fraction * path.stat().st_size)])
-    with pytest.raises(error, match=rf"{path}.*cut short or damaged.*(export it again|record the run anew)") as caught:
+    with pytest.raises(error, match=rf"{path}.*cut short or damaged.*(export it again|record the run again)") as caught:
         read_it(path)
     assert "\n" not in str(caught.value)
 

@@ -143,7 +143,7 @@ def test_the_load_path_has_to_be_known():
     model, state, _, difference = equilibrium_with_friction("plane", "barrier", 1e-3)
     state.sliding = None
     with pytest.raises(
-        SceneError, match=r"contact: by friction an equilibrium depends on the way there.*statics.solve"
+        SceneError, match=r"contact: an equilibrium with friction depends on its load path.*statics.solve"
     ):
         EquilibriumAdjoint(model).vjp(state, cotangent(model, difference.weights))
 

@@ -171,7 +171,7 @@ def test_invalid_inputs_are_refused():
     ):
         sim.step(start, {"contact.range": wide})
     with pytest.raises(
-        SceneError, match=r"nothing has 'contact.friction'; this model has .*contact.stiffness, contact.range"
+        SceneError, match=r"no object has 'contact.friction'; this model has .*contact.stiffness, contact.range"
     ):
         sim.step(start, {"contact.friction": 0.1})
     with pytest.raises(SceneError, match=r"contact.radius.*positive"):

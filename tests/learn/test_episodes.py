@@ -133,7 +133,7 @@ def test_a_folder_of_others_is_refused(tmp_path):
         EpisodeWriter(tmp_path / "own", fractions=(0.8, 0.1, 0.1))
     with pytest.raises(DataError, match="seed"):
         EpisodeWriter(tmp_path / "own", seed=1)
-    with pytest.raises(DataError, match="1 together"):
+    with pytest.raises(DataError, match="sum to 1"):
         EpisodeWriter(tmp_path / "new", fractions=(0.8, 0.1, 0.2))
     with pytest.raises(DataError, match="no episode 'run_7'"):
         Episodes(tmp_path / "own")["run_7"]

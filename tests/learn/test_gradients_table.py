@@ -136,6 +136,6 @@ def test_an_equilibrium_refuses_a_history():
     simulator = Simulator(built(SCENES["planar"]()), DT)
     points = torch.tensor(simulator.model.state().points()).requires_grad_()
     state = simulator.initial_state(positions=points)
-    with pytest.raises(SceneError, match=r"no gradient goes to the state where the search begins.*detach"):
+    with pytest.raises(SceneError, match=r"no gradient goes to the initial state of the search.*detach"):
         simulator.equilibrium(state=state)
     assert torch.isfinite(simulator.equilibrium(state=state.detach()).positions).all()

@@ -219,8 +219,8 @@ def test_densities_that_are_none_are_refused():
         ({"rod.mass": [[np.nan]]}, "rod.mass: value 0 is nan; it is finite and positive"),
         ({"rod.inertia": -1.0}, "rod.inertia: value 0 is -1; it is finite and not negative"),
         ({"rod.mass": torch.ones(4)}, r"rod.mass has shape \(4,\); give \(\), \(1, 1\) for each world, \(1, 6\)"),
-        ({"shell.mass": 1.0}, "nothing has 'shell.mass'; this model has .*rod.mass, rod.inertia, drag.tangential"),
-        ({"drag.speed": 1.0}, "nothing has 'drag.speed'"),
+        ({"shell.mass": 1.0}, "no object has 'shell.mass'; this model has .*rod.mass, rod.inertia, drag.tangential"),
+        ({"drag.speed": 1.0}, "no object has 'drag.speed'"),
         ({"drag.normal": "thick"}, "drag.normal is 'thick', no array of numbers; give numbers"),
     ],
 )

@@ -455,7 +455,7 @@ def test_stiffnesses_are_identified():
 @pytest.mark.parametrize(
     ("parameters", "controls", "message"),
     [
-        ({"rod_bend.stiffness": 1.0}, None, "nothing has 'rod_bend.stiffness'; this model has rod_bend_twist"),
+        ({"rod_bend.stiffness": 1.0}, None, "no object has 'rod_bend.stiffness'; this model has rod_bend_twist"),
         (
             {"rod_stretch.stiffness": torch.ones(4)},
             None,
@@ -466,7 +466,7 @@ def test_stiffnesses_are_identified():
         (None, {"poses": torch.zeros((0, 6))}, "poses of no grip"),
         ([1.0], None, r"parameters are \[1.0\]; give a dictionary"),
         (None, torch.zeros(3), "controls are tensor.*give a dictionary"),
-        ({"rod_stretch": 1.0}, None, "nothing has 'rod_stretch'; this model has"),
+        ({"rod_stretch": 1.0}, None, "no object has 'rod_stretch'; this model has"),
         (
             {"rod_stretch.stiffness": "stiff"},
             None,

@@ -134,7 +134,7 @@ def test_hair_island_matches_float64(device, nodes, backwards, scheme):
 
 def test_report_names_linear_algebra_of_islands(device):
     """Uncoupled islands take mixed tensions; islands with a free joint are solved in float64."""
-    said = "over steps of 0.0166667 s: edges turned, second derivatives, linear algebra in "
+    said = "over steps of 0.0166667 s: edge-rotation update, exact Hessian, linear algebra in "
     assert said + "float32 with tensions" in hair_island(32).build(device, "mixed").report()
     scene = hair_island(32)
     tip = scene.batches[0].points[0, -1]

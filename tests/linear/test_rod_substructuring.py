@@ -316,8 +316,8 @@ def truss() -> ddg.Scene:
 @pytest.mark.parametrize(
     ("scene", "linear", "message"),
     [
-        (lambda: sheet("hinge"), "chain", "nets with rods; this one has none"),
-        (truss, "chain", "no rod of the net has a node between its joints"),
+        (lambda: sheet("hinge"), "chain", "coupled systems with rods; this one has none"),
+        (truss, "chain", "no rod of the coupled system has a node between its joints"),
         (bent_frame, "chains", "block_jacobi or chain or multilevel or chain_multilevel"),
     ],
     ids=["sheet", "truss", "name"],

@@ -269,8 +269,8 @@ def test_bending_beyond_float32_is_solved_in_float64(device):
 
 def test_report_names_linear_algebra_of_steps(device, monkeypatch):
     """The report names float32, float32 with tensions or float64 for the steps of the scene's analysis."""
-    prefix = "over steps of 0.0166667 s: edges turned, second derivatives"
-    for solver, reduced in (("chain sweep", False), ("cyclic reduction", True)):
+    prefix = "over steps of 0.0166667 s: edge-rotation update, exact Hessian"
+    for solver, reduced in (("block LDL^T sweep", False), ("cyclic reduction", True)):
         monkeypatch.setattr(solver_selection, "long_and_few", lambda *_arguments, reduced=reduced: reduced)
         for precision, linear in (("mixed", ", linear algebra in float32 with tensions"), ("float64", "")):
             report = hair(32).build(device, precision).report()

@@ -85,7 +85,7 @@ def _edge_couple(shell, description) -> EdgeCouple:
     surface, edges = shell.surface, description.edges
     for edge in edges[shell.kinds.kind[edges] != FREE_EDGE][:1]:
         raise SceneError(
-            "add_edge_couple: the normal at the edge between the vertices {} and {} of shell {} is held, by a clamp or a plane of "
+            "add_edge_couple: the normal at the edge between the vertices {} and {} of shell {} is fixed, by a clamp or a plane of "
             "symmetry, which would take the couple; load a free edge".format(*surface.edges[edge], description.shell)
         )
     side = np.where(surface.edge_triangles[edges, 0] >= 0, 0, 1)  # orientation of the edge in its triangle

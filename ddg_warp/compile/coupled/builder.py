@@ -217,7 +217,7 @@ class _Builder:
         gap = np.linalg.norm(points[first] - points[second], axis=1)
         size = np.abs(points[np.array(pairs)]).max(axis=(1, 2))
         for i in np.flatnonzero(gap > COINCIDE * np.maximum(1e-300, size))[:1]:
-            raise SceneError(f"{labels[i]} lie {gap[i]:.3g} m apart at rest; what is joined starts at one point")
+            raise SceneError(f"{labels[i]} lie {gap[i]:.3g} m apart at rest; joined nodes start at one point")
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 

@@ -65,7 +65,7 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
         bodies.append(Body(*geometry, still=True, markers=markers))
     result = _numbers(scene, law, bodies, *scale_mass)
     if law.rolling and not (result.has_friction and any(body.angles.size for body in bodies)):
-        lacking = "no rod touches anything" if result.has_friction else "there is no friction"
+        lacking = "no rod is in contact" if result.has_friction else "there is no friction"
         raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
     return result
 
@@ -79,7 +79,7 @@ def _radius(batch, row: int, rod: int) -> float:
     radius = batch.section.radius
     if radius is None or not np.all(np.asarray(radius) > 0.0):
         raise SceneError(
-            f"contact: rod {rod} ('{batch.name}') touches by a radius, and that of its section is {radius}; give "
+            f"contact: rod {rod} ('{batch.name}') needs a contact radius, and its section has {radius}; give "
             f"Stiffness(radius=...), positive, or contact(radius={{{batch.name!r}: ...}})"
         )
     return float(np.max(_of_rod(batch, "radius", row)))

@@ -140,7 +140,7 @@ class CollisionMesh:
         """
         name, nodes = self.names[number], self._checked(nodes, 1, self.names[number])
         if number not in self.obstacle or len(nodes) != 1 + MARKERS:
-            raise SceneError(f"{name} spins: that is of an obstacle, and told by {1 + MARKERS} nodes, not {len(nodes)}")
+            raise SceneError(f"{name} spins: only obstacles spin, given by {1 + MARKERS} nodes, not {len(nodes)}")
         arms = self.points[nodes[1:]] - self.points[nodes[0]]
         square = arms @ arms.T
         if not np.allclose(square, square[0, 0] * np.eye(MARKERS), atol=1e-9 * square[0, 0]) or square[0, 0] <= 0.0:

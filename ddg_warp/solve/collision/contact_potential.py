@@ -247,7 +247,7 @@ class ContactPotential:
     def _start_anew(self) -> None:
         """Reset the smallest gaps, and refuse lists that have grown since `fit`."""
         if self._version != self.search.version:
-            raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
+            raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs again")
         self.gap.fill_(self.search.reach)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
@@ -305,7 +305,7 @@ class ContactPotential:
                 f" not {rate.shape} of {rate.dtype.__name__}"
             )
         if self.frictions and self._lagged != self._version:
-            raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
+            raise SolverError("friction has no pairs of the step's start; call lag() there, and again after fit()")
 
     def _with_friction(self, rubs: bool, multipliers, law: str, velocity: float, silent) -> list[FrictionSet]:
         """Return the friction of each list, none without friction."""

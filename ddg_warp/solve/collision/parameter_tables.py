@@ -73,8 +73,8 @@ def _within_reach(search, within: np.ndarray, thickness: np.ndarray, groups: np.
             excess = within[g, h] + (thickness[g, h] - both if thickness[g, h] >= 0.0 else 0.0)
             if excess > search.reach * (1.0 + ROUNDING):
                 raise SceneError(
-                    f"{shapes.names[first]} and {shapes.names[second]} push each other up to {both + excess:.6g} m apart, but are"
-                    f" searched for within {both + search.reach:.6g}; give the search a reach of {excess:.6g} m"
+                    f"{shapes.names[first]} and {shapes.names[second]} are in contact up to a distance of {both + excess:.6g} m, but"
+                    f" the broad phase covers {both + search.reach:.6g} m; give a search distance of {excess:.6g} m"
                 )
 
 

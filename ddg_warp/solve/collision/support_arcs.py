@@ -136,7 +136,7 @@ class Arcs:
         turns = [(largest_rotation(self.moved[i], self._allowed[i][world]), i) for i in self._of_grip if i >= 0]
         turn, i = min(turns)
         return (
-            f"{self.moved[i].label} turns farther in a step than {MAX_SUBSTEPS} substeps resolve; turn its grip by at most "
+            f"{self.moved[i].label} rotates farther in a step than {MAX_SUBSTEPS} substeps resolve; rotate its grip by at most "
             f"{_rounded_down(MAX_SUBSTEPS * turn):g} rad in a step, or give contact a larger range"
         )
 
@@ -180,7 +180,7 @@ def _levels_of(
 
 
 def _refusal(swept: Swept, turn: float, remedy: str) -> SolverError:
-    move = f"turns by {turn / (2.0 * math.pi):.3g} turns" if turn else "moves along arcs"
+    move = f"rotates by {turn / (2.0 * math.pi):.3g} turns" if turn else "moves along arcs"
     return SolverError(
         f"turned_too_far: {swept.label} {move} in a step, farther than {MAX_SUBSTEPS} substeps resolve; take {remedy}, "
         "or give contact a "

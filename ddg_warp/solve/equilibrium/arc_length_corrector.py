@@ -314,7 +314,7 @@ class Corrector:
             outcome = "singular_start" if str(failed) == "singular" else "no_start"
             raise SolverError(
                 f"no equilibrium at load parameter {load:g} to begin with: {outcome} ({failed}); give a state nearer to one, "
-                "found by statics.solve, or hold what can move without any stiffness",
+                "found by statics.solve, or support dofs that move without any stiffness",
                 state=state,
                 outcome=outcome,
             ) from None

@@ -266,15 +266,15 @@ class Continuation:
         if parts:
             part, bound = max(parts)
             warnings.warn(
-                f"the path ends after {stop.steps} steps, {100.0 * min(part, 1.0):.2g} % of the way to {bound}: give Stop more steps, "
-                "or Continuation a larger max_step or load_scale",
+                f"the path ends after {stop.steps} steps, at {100.0 * min(part, 1.0):.2g} % of the distance to {bound}: give "
+                "StopCriterion more steps, or Continuation a larger max_step or load_scale",
                 stacklevel=5,
             )
 
     def _next(self, path: Path, step: float, stop: StopCriterion) -> tuple[Point, list[Point], str, float]:
         """Return (next point, events before it, bound of `stop` reached or "", step length)."""
         current, options = path.points[-1], self.options
-        failed: object = f"rotation_cap, a step of {step:.2g} turns edges by all that it allows"
+        failed: object = f"rotation_cap, a step of {step:.2g} reaches the cap"
         while step >= options.min_step:
             try:
                 following = self.corrector.at(current, step)

@@ -37,7 +37,7 @@ def relax(
         SolverError: `max_steps` or `non_finite`; carries the last state.
     """
     if model.touch:
-        raise SceneError("contact: relaxation keeps nothing apart; take statics.solve, which does")
+        raise SceneError("contact: dynamic relaxation has no contact; use statics.solve, which has")
     equilibrium = Equilibrium(model, StaticsOptions())
     tangent = equilibrium.tangent
     state = tangent.with_prescribed((state or model.state()).copy(), at)

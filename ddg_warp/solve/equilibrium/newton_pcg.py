@@ -409,7 +409,7 @@ class CoupledEquilibrium:
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
             remedy = self.newton.contact.closest_pair(state.coupled.q, status) if self.newton.contact else ""
             if rubs:
-                remedy += "what slides may come to no rest"
+                remedy += "sliding bodies may have no equilibrium"
             message = owner.residuals.where(name, residual, load_factor, remedy)
             raise SolverError(message, state=state, outcome=name, gaining=name == "max_iterations")
         # In contact the last matrix may be projected without a trial of the exact one, which is no sign of instability.
@@ -457,7 +457,7 @@ class CoupledEquilibrium:
         if displacement[farthest] > ADRIFT * self._size:
             raise SolverError(
                 f"no equilibrium at load parameter {load_factor:g}: adrift, {self.tangent.where(farthest)} is carried away, as neither "
-                "supports nor contact hold it; hold it, or put something in its way",
+                "supports nor contact support it; fix it, or add an obstacle",
                 state=state,
                 outcome="adrift",
             )

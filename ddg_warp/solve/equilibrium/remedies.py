@@ -16,7 +16,7 @@ def of_search(equilibrium, error, before, load_factor: float) -> str:
     `equilibrium` is the `Equilibrium` of the search.
     """
     if error.outcome == "non_finite":
-        return "begin nearer to rest, or take parameters that are less far apart"
+        return "begin nearer to rest, or take parameters of a smaller range"
     free = ""
     if _factored(equilibrium.model):
         free = unresisted(equilibrium.tangent, error.state, load_factor) or unresisted(
@@ -41,7 +41,7 @@ def unresisted(tangent, state, load_factor: float) -> str:
         return ""
     for mode in rigid_modes(tangent, state, stiffness).T:
         if abs(mode @ residual) > LOADED * np.linalg.norm(mode) * np.linalg.norm(residual):
-            return f"hold {tangent.where(int(np.argmax(np.abs(mode))))}, which nothing keeps from moving"
+            return f"support {tangent.where(int(np.argmax(np.abs(mode))))}, which can move freely"
     return ""
 
 

@@ -93,7 +93,7 @@ def spectrum(
     weights = tangent.mass if metric == "mass" else np.where(tangent.angle, tangent.edge_length() ** 2, 1.0)
     weights = weights[free]
     if not (weights > 0.0).any():
-        raise SceneError("nothing that can move has a mass: give the material a density, or ask with metric='unit'")
+        raise SceneError("no free dof has a mass: give the material a density, or use metric='unit'")
     zero_modes = rigid_modes(tangent, state, stiffness)[free]
     matrix = sparse.csc_matrix(stiffness[free][:, free])
     rigid = _normalised(zero_modes, weights)

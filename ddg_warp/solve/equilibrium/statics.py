@@ -191,13 +191,13 @@ class Equilibrium:
             validate.refuse_friction(self.model)
         elif self.options.solver == "direct":
             raise SceneError(
-                "contact: statics solver 'direct' stops all where two things come close, and serves mode 'follow' alone; take "
+                "contact: statics solver 'direct' stops all bodies at the first CCD limit, and supports mode 'follow' only; take "
                 "solver='auto' or 'pcg'"
             )
         if obstacle:
             raise SceneError(
-                "contact: an equilibrium needs all rods among the objects that touch, and some are on their own; leave objects out of "
-                "scene.contact(), and let them pass by contact_between(..., ignore=True)"
+                "contact: an equilibrium needs all rods among the objects of contact, and some are uncoupled; leave objects out of "
+                "scene.contact(), and exclude pairs by contact_between(..., ignore=True)"
             )
 
     def load(
@@ -220,7 +220,7 @@ class Equilibrium:
             )
         if self._rubs and start == end:
             raise SceneError(
-                f"contact: friction acts against what slides along an increment of the load parameter, and from {start:g} to {end:g} "
+                f"contact: friction needs an increment of the load parameter, and from {start:g} to {end:g} "
                 "there is none; give start other than end, or friction=0"
             )
         inputs = checked(controls, self.model, "statics")
@@ -340,7 +340,7 @@ class Equilibrium:
             tangent.move_supports(state, before, load_factor)
             if self.share(begun, state) < 1.0:
                 text = self._blocked(begun, before, load_factor) or (
-                    "motions drive what they hold through each other: change these motions, or let them pass by "
+                    "motions drive supported bodies through each other: change these motions, or exclude the pair by "
                     "contact_between(..., ignore=True)"
                 )
                 raise SolverError(
@@ -371,7 +371,7 @@ class Equilibrium:
             state = self._minimum(candidate, load_factor, state, abs(load_factor - before))
         raise SolverError(
             f"no stable equilibrium at load parameter {load_factor:g}: saddle, {DESCENTS} descents from saddles led to others; begin "
-            "from a state without symmetry, or take mode='follow' to accept what is unstable",
+            "from a state without symmetry, or take mode='follow' to accept unstable equilibria",
             state=state,
             outcome="saddle",
         )
@@ -381,8 +381,8 @@ class Equilibrium:
         if self._descends:
             if self.share(before, state) < 1.0:
                 raise SolverError(
-                    f"no equilibrium at load parameter {load_factor:g}: in_the_way, supports and what follows them would pass through "
-                    "something; take more load steps, or mode='minimise', whose supports wait until it has yielded",
+                    f"no equilibrium at load parameter {load_factor:g}: in_the_way, supports and dofs that follow them would pass "
+                    "through another body; take more load steps, or mode='minimise', whose supports wait until it has moved",
                     state=before,
                     outcome="in_the_way",
                 )

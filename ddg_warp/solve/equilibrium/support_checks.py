@@ -14,7 +14,7 @@ def require_supports(model) -> None:
             loose = np.flatnonzero((fixed >> d) & 1 == 0)
             if loose.size:
                 raise SceneError(
-                    f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
+                    f"rod {host.rods[loose[0]]} is not supported along {axis}: a static solve needs supports; "
                     "add scene.clamp(...) or scene.fix(...)"
                 )
     if model.coupled is not None:
@@ -22,13 +22,13 @@ def require_supports(model) -> None:
         for i, shell in enumerate(host.meridians):
             if not host.fixed[shell.nodes, 2].any():
                 raise SceneError(
-                    f"axisymmetric shell {i} is not held along z: a static solve needs scene.hold_ring(...) or "
+                    f"axisymmetric shell {i} is not supported along z: a static solve needs scene.hold_ring(...) or "
                     "scene.clamp_ring(...)"
                 )
         spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
         loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(
-                f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "
+                f"no node of the shells and joined rods is supported along {'xyz'[loose[0]]}: a static solve needs supports; "
                 "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
             )

@@ -25,7 +25,7 @@ def poses(model, t0: float, t1: float, start: float = 0.0, part: float = 1.0) ->
     rows = np.concatenate([motion.pose(t0, t1, start, part) for motion in model.motions])
     if model.scene.dimension == 2 and rows[:, 19].any():
         raise SolverError(
-            f"a motion's translation has a part along y at t = {t1:g}: {tuple(rows[np.argmax(np.abs(rows[:, 19])), 18:].tolist())}; "
+            f"a motion's translation has a y component at t = {t1:g}: {tuple(rows[np.argmax(np.abs(rows[:, 19])), 18:].tolist())}; "
             "a scene of dimension 2 stays in the plane of x and z, give 0",
             outcome=argument_checks.PRESCRIBED,
         )
@@ -65,8 +65,8 @@ def rotations_between(begin: np.ndarray, ends: np.ndarray) -> np.ndarray:
         world = f" of world {long[0] // grips}" if len(first) > grips else ""
         raise SolverError(
             f"turned_too_far: poses of grip {long[0] % grips}{world} differ by {turns:.3g} turns, from the rotation vector "
-            f"{np.round(first[long[0]], 6).tolist()} to {np.round(last[long[0]], 6).tolist()}, and a grip takes the shorter way, half "
-            f"a turn at most; go in {int(np.ceil(2.0 * turns))} steps or more, or give the rotation vector of the shorter way",
+            f"{np.round(first[long[0]], 6).tolist()} to {np.round(last[long[0]], 6).tolist()}, and a grip takes the shorter rotation, "
+            f"half a turn at most; go in {int(np.ceil(2.0 * turns))} steps or more, or give the shorter rotation vector",
             outcome=outcome.NAMES[outcome.ROTATED_TOO_FAR],
         )
     turn = (Rotation.from_rotvec(last) * Rotation.from_rotvec(first).inv()).as_rotvec()

@@ -40,7 +40,7 @@ class RodSubstructuring:
 
     def __init__(self, coupled, banded: bool, split: bool = False):
         if not coupled.host.rods:
-            raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
+            raise SceneError("preconditioner 'chain' is for coupled systems with rods; this one has none")
         self.coupled, self.device, self.split = coupled, coupled.device, split
         self.plan = SubstructuringPlan(coupled.host, split)
         self.along = [i for i, part in enumerate(coupled.sets) if part.host.along]

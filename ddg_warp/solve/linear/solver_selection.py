@@ -77,7 +77,7 @@ def large_static(model) -> bool:
 def why_not_pcg(model) -> str:
     """Return the reason against equilibria by conjugate gradients; empty without."""
     if model.coupled is None or model.groups:
-        return "it is for shells and joined rods alone, and the model has rods on their own"
+        return "it is for shells and joined rods only, and the model has uncoupled rods"
     return ""
 
 

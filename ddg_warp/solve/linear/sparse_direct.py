@@ -93,7 +93,7 @@ def regular(matrix: csc_matrix, mass: np.ndarray) -> tuple[Factorisation, float]
             return Factorisation(csc_matrix(matrix + diags(added))), -shift * rate
         except SingularError:
             continue
-    raise SingularError("the tangent is singular whatever is added to it: it is not finite")
+    raise SingularError("the tangent is not finite, and stays singular with any shift")
 
 
 def shortest(matrix: csr_matrix, rhs: np.ndarray) -> np.ndarray:

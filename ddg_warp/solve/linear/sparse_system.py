@@ -48,7 +48,9 @@ class SparseSystem:
         position = slices[row // SLICE] + rank * SLICE + row % SLICE
         self.positions = int(slices[-1])
         if self.positions * coupled.worlds >= 2**31:
-            raise SceneError("the net is too large: its matrix has more than 2^31 entries; build fewer worlds at once")
+            raise SceneError(
+                "the coupled system is too large: its matrix has more than 2^31 entries; build fewer worlds at once"
+            )
         rows, columns = np.full(self.positions, -1), np.full(self.positions, -1)
         rows[position], columns[position] = row, column
 
@@ -110,7 +112,9 @@ class Sums:
     def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
         tiles = -(-n // coupled_pcg.TILE)
         if tiles > coupled_pcg.TILES:
-            raise SceneError(f"the net has {n} blocks or edges; there may be {coupled_pcg.TILE * coupled_pcg.TILES}")
+            raise SceneError(
+                f"the coupled system has {n} dof blocks or edges; the limit is {coupled_pcg.TILE * coupled_pcg.TILES}"
+            )
         self.worlds, self.tiles, self.device = worlds, tiles, wp.get_device(device)
         cuda = self.device.is_cuda
         self._own = coupled_pcg.sum_kernels(real, largest) if cuda else (coupled_pcg.serial_sum_kernel(real, largest),)

@@ -55,7 +55,7 @@ class SubstructuringPlan:
         node, angle = (np.where((block >= 0) & ~self._out[block], block, -1) for block in (node, angle))
         kept = (node >= 0) | (angle >= 0)
         if not kept.any():
-            raise SceneError("preconditioner 'chain': no rod of the net has a node between its joints")
+            raise SceneError("preconditioner 'chain': no rod of the coupled system has a node between its joints")
         continues = np.zeros(len(node), bool)  # continues the path of the previous path node
         for step in (1, 2):
             continues[later_node[distance == 2] - step + 1] = True

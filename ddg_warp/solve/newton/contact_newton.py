@@ -350,12 +350,12 @@ class NewtonContact:
         gap, pair = self.touch.closest(x)
         least = self._least if self.touch.keep else -self.touch.search.reach
         if gap <= least:
-            meet = f"overlap by {-gap:.3g} m" if gap < 0.0 else "touch"
+            meet = f"overlap by {-gap:.3g} m" if gap < 0.0 else "have no gap"
             if gap > 0.0:
                 meet = f"are {gap:.3g} m apart, too close for a barrier, which needs {least:.3g} m,"
             raise SceneError(
-                f"contact: {pair} {meet} at the start; move them apart, as model.resolve_overlaps(state) does, give "
-                "them a smaller radius, or let them pass by contact_between(..., ignore=True)"
+                f"contact: {pair} {meet} at the start; separate them, as model.resolve_overlaps(state) does, give "
+                "them a smaller radius, or exclude the pair by contact_between(..., ignore=True)"
             )
 
     def closest_pair(self, x: wp.array, reason: int) -> str:
@@ -396,18 +396,18 @@ class NewtonContact:
         if not moved:
             return ""
         return (
-            f"{pair} are both held, and the motion of {' and of '.join(sorted(moved))} drives them into each other: change "
-            "that motion, free what holds one of them, or let them pass by contact_between(..., ignore=True), "
+            f"{pair} are both fixed, and the motion of {' and of '.join(sorted(moved))} drives them into each other: change "
+            "that motion, free one of them, or exclude the pair by contact_between(..., ignore=True), "
         )
 
     def _widen(self, gap: float) -> str:
         """Return remedies for a minimum gap reached, the best first; `gap` [m] is the smallest before the step."""
         if gap < self._least:
-            return "move them apart, as model.resolve_overlaps(state) does, "
+            return "separate them, as model.resolve_overlaps(state) does, "
         if self.terms.heavy:
             return f"give their contact a larger stiffness, such as {STIFFER * self._stiffest:.3g} N/m, or a larger range, "
         return (
-            f"give their contact a larger stiffness, {STIFFER:g} times as much or none, by which it is as large as steps need, or a "
+            f"give their contact a larger stiffness, {STIFFER:g} times as much, or none for an automatic one, or a "
             "larger range, "
         )
 

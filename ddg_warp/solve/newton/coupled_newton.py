@@ -65,7 +65,9 @@ class CoupledNewton:
         if reuse and options.psd not in FROZEN:
             raise SceneError(FROZEN_ONLY.format(options.psd))
         if preconditioner not in PRECONDITIONERS:
-            raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
+            raise SceneError(
+                f"preconditioner {preconditioner!r}: for a coupled system it is one of {', '.join(PRECONDITIONERS)}"
+            )
         coupled = model.coupled
         self.coupled, self.options, self.device = coupled, options, coupled.device
         self.real, self.linear = model.types.real, linear or model.types.linear
@@ -180,7 +182,7 @@ class CoupledNewton:
         for part in self.coupled.sets:
             if not (part.term.measure.packed or part.term.measure.tensions):
                 raise SceneError(
-                    f"psd 'none': second derivatives of {part.term.name} are left out of the matrix of a net; "
+                    f"psd 'none': second derivatives of {part.term.name} are left out of the matrix of a coupled system; "
                     "use 'auto', 'gauss_newton' or 'progressive'"
                 )
 

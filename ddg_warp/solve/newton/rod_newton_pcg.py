@@ -25,7 +25,7 @@ class PcgNewton(AssembledNewton):
             raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(rod_pcg.PRECONDITIONERS)}")
         if preconditioner != "chain" and options.psd in ("progressive", "none"):
             raise SceneError(
-                f"psd {options.psd!r}: preconditioner {preconditioner!r} cannot tell an indefinite matrix; use 'chain'"
+                f"psd {options.psd!r}: preconditioner {preconditioner!r} does not detect an indefinite matrix; use 'chain'"
             )
         by_chain = self._by_chain = preconditioner == "chain"
         super().__init__(model, group, options, linear, midpoint)

@@ -119,7 +119,7 @@ class AdaptiveStepper:
         if self.model.version != self._version:
             self._version, self._mass = self.model.version, self._changes.masses()
             if not (self._mass > 0.0).all():
-                raise SceneError("AdaptiveStepper weighs errors by mass, and nothing in the model has any")
+                raise SceneError("AdaptiveStepper weights errors by mass, and the model has none")
         self.estimate = 0.5 * math.sqrt((self._changes.squares() / self._mass).max())
         if not self.estimate <= self.error:
             times = math.ceil(math.log2(self.estimate / self.error)) if math.isfinite(self.estimate) else self.halvings

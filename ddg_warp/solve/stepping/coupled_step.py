@@ -45,7 +45,9 @@ class CoupledStep(StepDriver):
             ("psd", options.psd, ("auto", "gauss_newton", "progressive", "none")),
         ):
             if value not in only:
-                raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")
+                raise SceneError(
+                    f"{name} = {value!r} is for uncoupled rods; with a coupled system it is {' or '.join(only)}"
+                )
         bare = ((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1)
         if host.drag:
             ends, _, coefficients = host.drag
@@ -78,7 +80,7 @@ class CoupledStep(StepDriver):
         )
         if solver.contact and self.midpoint:
             raise SceneError(
-                "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
+                "contact: by the midpoint rule steps overshoot equilibrium and end in overlaps; use 'implicit_euler'"
             )
         self._lagged = model.coupled.lagged() if model.coupled.edges else None
         self._take = coupled_frames.take_kernel(real)
@@ -349,7 +351,7 @@ class CoupledStep(StepDriver):
 
     def island_label(self, world: int) -> str:
         """Return the label of the coupled system of a world."""
-        return f"the net (world {world})"
+        return f"the coupled system (world {world})"
 
     def rods_of(self, worlds: np.ndarray) -> list[int]:
         """Return an empty list: a failure belongs to no single rod."""

@@ -273,5 +273,5 @@ def _evenly(indices: np.ndarray) -> tuple[int, int]:
     if len(indices) < 2:
         return (int(indices[0]) if len(indices) else 0), 0
     strides = np.diff(indices)
-    assert (strides == strides[0]).all(), "a net numbers what lies along a rod evenly"
+    assert (strides == strides[0]).all(), "the numbering of a coupled system is not even along a rod"
     return int(indices[0]), int(strides[0])

@@ -103,7 +103,9 @@ class Integrator:
         argument_checks.choice("scheme", scheme, SCHEMES)
         argument_checks.choice("solver", solver, SOLVERS)
         if model.coupled is None and linear in COUPLED_ONLY:
-            raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
+            raise SceneError(
+                f"linear = {linear!r} is for coupled systems; uncoupled rods take 'auto', or see `Integrator`"
+            )
         self.failures = argument_checks.choice("failures", failures, FAILURES)
         self.gyroscopic = None if gyroscopic is None else argument_checks.flag("gyroscopic", gyroscopic)
         if check_every is not None:
@@ -112,8 +114,8 @@ class Integrator:
         self.options = argument_checks.options("Integrator", NewtonOptions, options, argument_checks.names(Integrator))
         if self.options.unconverged_fraction and not model.scene.touching:
             raise SceneError(
-                f"unconverged_fraction = {self.options.unconverged_fraction!r} is of scenes with contact, whose bodies wait for "
-                "each other; this one has none"
+                f"unconverged_fraction = {self.options.unconverged_fraction!r} is for scenes with contact; "
+                "this one has none"
             )
         self.retry_limit = argument_checks.count("retry_limit (0 for no retry)", retry_limit, 0)
         self.energy_bound = energy_drift.bound(energy_bound, scheme)

@@ -244,7 +244,7 @@ class StepDriver:
         k, after = k - first, (k + 1) % lengths.shape[1] - first
         return (
             f"edges {k} and {after}{suffix} fold back by 180 degrees in the last good state, where curvature is infinite or has no "
-            f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
+            f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded during the step"
         )
 
     def advice(self, state) -> str:

@@ -146,7 +146,7 @@ class WorldReset:
         if values.dtype != bool or values.shape != (self.model.worlds,):
             raise SceneError(
                 f"reset: the mask is {values.dtype} of shape {values.shape}; give bools ({self.model.worlds},), True for worlds that "
-                "start anew"
+                "restart"
             )
         self._mask.assign(values.astype(np.int32))
         return self._mask
@@ -169,8 +169,8 @@ class WorldReset:
                 )
         if len(self.model.grips) < len(self.model.motions) and to.time != state.time:
             raise SceneError(
-                f"reset: to is of t = {to.time:g} s, and the state of {state.time:g} s, a time that all worlds share: supports that a "
-                "Motion moves are elsewhere by now; give a state of that time, or hold them by Grip"
+                f"reset: to is of t = {to.time:g} s, and the state of {state.time:g} s, a time common to all worlds: supports that a "
+                "Motion moves are elsewhere by now; give a state of that time, or move them by a Grip"
             )
 
     def reset(self, parts: list, mask: wp.array, to: State, target: State) -> None:
