@@ -64,6 +64,7 @@ class CoupledStep(StepDriver):
             options = replace(options, psd="progressive")
         solver = CoupledNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse, means.split)
         super().__init__(integrator, model, solver, means, counts_of)
+        self.contact = solver.contact
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
             if solver.contact:
@@ -233,16 +234,15 @@ class CoupledStep(StepDriver):
         contact = self.newton.contact
         return contact.search.more_read[: len(self.tally)] if contact else super()._counted()
 
-    def attempt(self, before, after) -> None:
-        """Launch one solve of every world that has not finished the step, from state `before` to `after`."""
+    def predict(self, before):
+        """Launch the predictor, with supports at their prescribed positions; return the state of `_start_frames`."""
         coupled, solver, islands = self.coupled, self.newton, self.islands
-        blocks = coupled.blocks
-        if solver.contact:
-            solver.contact.brace(self.integrator._dt)
+        if self.contact:
+            self.contact.brace(self.integrator._dt)
         self._sweep(
             self._begin,
             [before.q, before.v, solver.held, coupled.moves]
-            + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
+            + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, coupled.blocks],
             [solver.q, solver.base, solver.target],
         )
         if self.motion:
@@ -252,33 +252,38 @@ class CoupledStep(StepDriver):
         start = self._start_frames(before)
         if self.motion:
             self.motion.direct(islands, solver.q, start.frame)
+        return start
+
+    def apply_loads(self) -> None:
+        """Launch the loads in time."""
+        coupled, solver = self.coupled, self.newton
         if self.loads:
             self.loads.apply(coupled.points(solver.q), coupled.points(solver.load), coupled.angles(solver.load))
-        if self.drag:
-            self.drag.resist(before, solver, islands)
-        if not self.midpoint:
-            self._foresight.start(before)
-        if solver.contact:
-            solver.contact.place()
-            solver.contact.lag(before.q, rate=before.rate)
-        solver.solve(start)
-        if solver.contact:
-            for solution in solver.contact.solutions:
-                solver.contact.lag_again(solution)
-                solver.solve(start)
-            solver.contact.finish(before.q)
-        if self.energy:
-            self.energy.judge(before, start)
+
+    def warm_start(self, before) -> None:
+        """Warm-start from the predictor by the last correction, and store the start."""
+        self._foresight.start(before)
+
+    def solve(self, start) -> None:
+        """Launch Newton's method."""
+        self.newton.solve(start)
+
+    def finish(self, before, after) -> None:
+        """Launch positions and rates at the end of accepted substeps."""
+        solver = self.newton
         self._foresight.weigh(before)
-        rate = solver.contact.terms.law.rate if solver.contact else after.rate
+        rate = self.contact.terms.law.rate if self.contact else after.rate
         inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
-        self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a, after.rate])
-        if self.drag:
-            self.drag.settle(before, after, solver, islands)
-        self.coupled.carry(start, after, kept=before, moved=islands.substep_accepted)
+        outputs = [after.q, after.v, after.a, after.rate]
+        self._sweep(self._finish, [*inputs, *self.islands.arrays, self.coupled.blocks], outputs)
+
+    def complete(self, start, before, after) -> None:
+        """Update frames, magnetic field and strains to the positions."""
+        accepted = self.islands.substep_accepted
+        self.coupled.carry(start, after, kept=before, moved=accepted)
         if self.motion:
-            self.motion.turn(islands, before, after)
-        self.field.finish(islands.substep_accepted, before, after)
+            self.motion.turn(self.islands, before, after)
+        self.field.finish(accepted, before, after)
         self.coupled.update_strains(after)
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:

@@ -177,7 +177,7 @@ class DecoupledStep:
     def _complete(self, after, chain, state, places, rod_kernels) -> None:
         """Write all results of a rod group but positions."""
         *_, scatter = rod_kernels
-        chain.complete(state, state)
+        chain.complete(state, state, state)
         group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.coupled.host.nodes]
         inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
         self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])

@@ -102,15 +102,15 @@ class RodEnergy(_Energy):
         """Kernels to load before a capture."""
         return [self._measure, self._judge]
 
-    def judge(self, before) -> None:
-        """Test the energy drift of the step solved from the state `before`."""
+    def judge(self, before, start) -> None:
+        """Test the energy drift of the step from the state `before`, with the lagged data of `start`."""
         step, group, newton = self.step, self.step.group, self.step.newton
         if self._follows:
             step.loads.apply(newton.x, *self._loads)
         wp.launch(
             self._measure,
             (self.ranges, group.columns),
-            [group.element_inputs(state, before.last, step.islands.inverse_step) for state in (before, newton)]
+            [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, newton)]
             + [before.v, before.omega, *step.islands.arrays, newton.mass, group.rotary]
             + [
                 *self._loads,

@@ -59,13 +59,8 @@ class RodStep(StepDriver):
         """Index of the group in the model."""
         return self.model.groups.index(self.group)
 
-    def attempt(self, before, after) -> None:
-        """Launch one solve of every rod that has not finished the step, from state `before` to `after`."""
-        self.move(before, after)
-        self.complete(before, after)
-
-    def move(self, before, after) -> None:
-        """Launch the positions of an attempt, and their rates."""
+    def predict(self, before):
+        """Launch the predictor, with supports at their prescribed positions; return `before`, whose data the solve lags."""
         group, newton = self.group, self.newton
         self._launch(
             self._begin,
@@ -79,16 +74,32 @@ class RodStep(StepDriver):
         newton.predict(before)
         if self.motion:
             self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
+        return before
+
+    def apply_loads(self) -> None:
+        """Launch the loads in time."""
         if self.loads:
-            self.loads.apply(newton.x, newton.load, newton.load_angle)
-        if self.drag:
-            self.drag.resist(before, newton, self.islands)
-        if not self.midpoint:
-            self._start_further(before)
+            self.loads.apply(self.newton.x, self.newton.load, self.newton.load_angle)
+
+    def warm_start(self, before) -> None:
+        """Warm-start from the predictor by the last correction, and store the start."""
+        group, newton = self.group, self.newton
+        self._launch(
+            self._foresee,
+            group.node_threads,
+            [before.a, before.alpha, group.fixed, group.count, *self.islands.arrays],
+            [newton.x, newton.theta, self._predicted, self._predicted_angle, newton.direction],
+        )
+        newton.go_further(before, self._predicted)
+
+    def solve(self, start) -> None:
+        """Launch Newton's method."""
         self.islands.rotate_predictor.zero_()
-        newton.solve(before.last)
-        if self.energy:
-            self.energy.judge(before)
+        self.newton.solve(start.last)
+
+    def finish(self, before, after) -> None:
+        """Launch positions and rates at the end of accepted substeps."""
+        group, newton = self.group, self.newton
         self._launch(
             self._nodes,
             group.node_threads,
@@ -96,10 +107,8 @@ class RodStep(StepDriver):
             + [self._predicted, self._predicted_angle, group.count, *self.islands.arrays],
             [after.x, after.v, after.theta, after.omega, after.a, after.alpha],
         )
-        if self.drag:
-            self.drag.settle(before, after, newton, self.islands)
 
-    def complete(self, before, after) -> None:
+    def complete(self, start, before, after) -> None:
         """Update frames and strains to the positions."""
         group, newton = self.group, self.newton
         if self._frames:
@@ -111,17 +120,6 @@ class RodStep(StepDriver):
             )
         if group.kind.viscous:
             self.model.strains(group, after, after.last)
-
-    def _start_further(self, before) -> None:
-        """Warm-start from the predictor by the last correction, and store the start."""
-        group, newton = self.group, self.newton
-        self._launch(
-            self._foresee,
-            group.node_threads,
-            [before.a, before.alpha, group.fixed, group.count, *self.islands.arrays],
-            [newton.x, newton.theta, self._predicted, self._predicted_angle, newton.direction],
-        )
-        newton.go_further(before, self._predicted)
 
     @property
     def own_kernels(self) -> list:

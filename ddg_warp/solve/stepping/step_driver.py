@@ -1,4 +1,4 @@
-"""Time stepper of a rod group or of the coupled system: attempts, retries, outcomes."""
+"""Time stepper of a rod group or of the coupled system: the algorithm of a step, retries, outcomes."""
 
 import warnings
 from typing import NamedTuple
@@ -52,9 +52,12 @@ def choose_solver(precision: str, before: LinearSolverChoice, errors: float, spl
 class StepDriver:
     """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.rod_step`.
 
-    Subclasses define the attempt (`attempt`) and its kernels (`own_kernels`). For a failed island they return its label
-    (`island_label`), its rods (`rods_of`) and the location of the failure (`where`). `float32_errors` returns the float32 errors of
-    the islands of a world over a solve.
+    A step is `step`: attempts (`attempt`), each with one solve, until every island has finished the step or failed. An iteration of
+    the solve is `RodNewton.iterate` or `CoupledNewton.iterate`.
+
+    Subclasses define the phases of `attempt` (`predict`, `apply_loads`, `warm_start`, `solve`, `finish`, `complete`) and their kernels
+    (`own_kernels`). For a failed island they return its label (`island_label`), its rods (`rods_of`) and the location of the failure
+    (`where`). `float32_errors` returns the float32 errors of the islands of a world over a solve.
 
     Args:
         integrator: owner of the stepper; model: model to step.
@@ -63,12 +66,13 @@ class StepDriver:
         counts_of: replaced stepper, which passes on counters, the rounding outcome and the state of the islands.
 
     Attributes:
-        energy, motion, loads, field, drag: energy watch, motion of supports, loads in time, magnetic field, drag; None without.
+        energy, motion, loads, field, drag, contact: energy watch, motion of supports, loads in time, magnetic field, drag, contact;
+            None without.
         rounded: outcome of solves that end by rounding.
         tally, work: counts of outcomes and of work; see `kernels.stepping.rod_step.advance_kernel`.
     """
 
-    energy = motion = loads = field = drag = None
+    energy = motion = loads = field = drag = contact = None
 
     def __init__(self, integrator, model, newton, means: LinearSolverChoice, counts_of: "StepDriver | None" = None):
         self.means = means._replace(linear=newton.linear)
@@ -155,10 +159,47 @@ class StepDriver:
     def _try(self, before, after) -> None:
         """Launch one solve of every unfinished island, and the retry logic."""
         self.attempt(before, after)
+        self._decide_retry()
+
+    def _decide_retry(self) -> None:
+        """Launch the retry logic."""
         self.remaining.zero_()
         limit = self.integrator.retry_limit
         inputs = [*self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
         self._launch(self._advance, len(self.islands), inputs, [self.tally, self.work, self.remaining])
+
+    def attempt(self, before, after) -> None:
+        """Launch one solve of every unfinished island, from state `before` to `after`."""
+        start = self.move(before, after)
+        self.complete(start, before, after)
+
+    def move(self, before, after):
+        """Launch the positions of an attempt, and their rates; return the state with the time-lagged data of its solve."""
+        contact = self.contact
+        # inertial target, prescribed motion of supports
+        start = self.predict(before)
+        self.apply_loads()
+        if self.drag:
+            self.drag.resist(before, self.newton, self.islands)
+        if not self.midpoint:
+            # the last correction, extrapolated
+            self.warm_start(before)
+        if contact:
+            contact.place()  # CCD filter of the predictor
+            contact.lag(before.q, rate=before.rate)
+        self.solve(start)
+        for solution in contact.solutions if contact else ():  # further friction iterations
+            contact.lag_again(solution)
+            self.solve(start)
+        if contact:
+            contact.finish(before.q)  # interpenetration check
+        if self.energy:
+            self.energy.judge(before, start)
+        # positions, velocities and accelerations of accepted substeps
+        self.finish(before, after)
+        if self.drag:
+            self.drag.settle(before, after, self.newton, self.islands)
+        return start
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
