@@ -16,6 +16,7 @@ from ddg_warp.solve.collision.bvh import Primitives
 from ddg_warp.solve.collision.candidate_list import CandidateList
 from ddg_warp.solve.collision.collision_mesh import BALLS, PLANES, CollisionMesh
 from ddg_warp.solve.collision.step_filter import StepFilter
+from ddg_warp.timers import timer
 
 SLACK = 1e-3  # relative excess of the skin margin in searches, for rounding
 NONE = np.iinfo(np.int64).max
@@ -141,6 +142,7 @@ class BroadPhase:
     def limited(self) -> wp.array:
         return self._filter.limited
 
+    @timer("BVH rebuild")
     def rebuild(self, x: wp.array) -> None:
         """Rebuild the BVHs, not the lists. On CUDA searches refit these until the next call, on the CPU they build their own.
 
@@ -170,6 +172,7 @@ class BroadPhase:
         self._watch(base, base if q is None else q, self._stale)
         wp.capture_if(self._stale, anew)
 
+    @timer("broad phase")
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
         """Find all candidates at x or, with `move`, anywhere on the straight motion from x by `move`.
 

@@ -7,6 +7,7 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.broad_phase.rod_culling import AHEAD, DOUBT, KNOWN, run_kernels
 from ddg_warp.solve.collision.bvh import Aabbs
+from ddg_warp.timers import timer
 
 EDGES = 64  # largest number of edges of a run
 LONGER = 1e-5  # relative margin of arc lengths, above the rounding of float32
@@ -69,10 +70,12 @@ class RodCulling:
         self._clear, self._enclose, self._meet, self._settle, self._hold, self._follow = made
         self.kernels = [self._common, *made]
 
+    @timer("BVH rebuild")
     def build(self) -> None:
         """Rebuild the BVH of bounds, as `Aabbs.build`."""
         self._boxes.build()
 
+    @timer("culling of rods")
     def hold(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
         """Mark worlds as in doubt where bounds do not prove gaps above the search distance in the straight motion from x to y.
 
@@ -85,6 +88,7 @@ class RodCulling:
         inputs = [self._sides, self._ahead, *where, self._longest, self._loose, *about]
         self._sweep(self._follow, inputs, [self._seen])
 
+    @timer("bounds of rods")
     def look(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
         """Make bounds for the motion, and as much more as possible, in worlds in doubt, and test again."""
         for positions, mean in ((x, self._mean), (y, self._mean_after)):

@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.step_fractions import fraction_kernels, limit_kernels
+from ddg_warp.timers import timer
 
 
 class StepFilter:
@@ -47,6 +48,7 @@ class StepFilter:
         if not 1 <= units <= self._nodes:
             raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
 
+    @timer("additive CCD")
     def __call__(self, base, move, q, unit, together, units: int, keep: float, reach: float, search) -> None:
         """Lower step fractions round by round, and limit q accordingly.
 

@@ -11,6 +11,7 @@ from ddg_warp.kernels.linear import coupled_pcg
 from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.solve.linear.multilevel import Multilevel
 from ddg_warp.solve.linear.sparse_system import Sums
+from ddg_warp.timers import timer
 
 SPARE = 0.5  # safety factor of the last linear solve of a step: of the tolerance, and of the bodies that may exceed it
 
@@ -71,6 +72,7 @@ class PCG:
         levels = self.levels.kernels if self.levels else []
         return [self._invert, self._start, self._begin, *self._cycle, *self.sum.kernels, *levels]
 
+    @timer("pcg")
     def solve(self) -> None:
         """Compute directions. Worlds with an indefinite H or preconditioner are marked and keep the present approximation."""
         newton = self.newton
@@ -110,6 +112,7 @@ class PCG:
         """Iterate until the residual is small in the norm of the preconditioner."""
         wp.capture_while(self.busy, self.cycle)
 
+    @timer("preconditioner")
     def precondition(self, z: wp.array) -> None:
         """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
         newton = self.newton
@@ -143,6 +146,7 @@ class PCG:
             device=newton.device,
         )
 
+    @timer("product")
     def multiply(self, p: wp.array) -> None:
         """Write H p on active dofs, and p . H p block by block; no matrix has the contact terms."""
         newton, contact = self.newton, self.newton.contact

@@ -17,6 +17,7 @@ from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction
 from ddg_warp.solve.linear.solver_selection import long_and_few
 from ddg_warp.solve.linear.substructuring_plan import SubstructuringPlan
 from ddg_warp.solve.linear.twisted_factorisation import TwistedFactorisation
+from ddg_warp.timers import timer
 
 SERIAL = 32  # block size of sweeps with one thread a rod path: few paths spread over the multiprocessors
 
@@ -223,6 +224,7 @@ class RodSubstructuring:
             threads = of_places + coupled.worlds * len(self._at_none)
         self._launch(self._product, threads, inputs, [product, dots])
 
+    @timer("factorise and solve")
     def direct(
         self, matrix, mass, islands, updated_islands, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots
     ) -> None:
@@ -248,6 +250,7 @@ class RodSubstructuring:
             self._prepare_joints(matrix, fixed, islands.needs_direction, lost)
             self._apply_joints(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
 
+    @timer("factorise")
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
         """Factorise rod paths and joints of the worlds that need a direction; raise `lost` where one is indefinite."""
         self._lost = lost

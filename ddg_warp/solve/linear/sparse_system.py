@@ -8,6 +8,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.linear import coupled_pcg, sliced_ell
 from ddg_warp.kernels.linear.sliced_ell import SLICE
 from ddg_warp.kernels.residual.coupled_residual import ITEM
+from ddg_warp.timers import timer
 
 
 class SparseSystem:
@@ -121,6 +122,7 @@ class Sums:
         self.kernels = [(kernel, coupled_pcg.THREADS) for kernel in self._own]
         self._partial = wp.zeros((worlds, tiles), dtype=real, device=device)
 
+    @timer("reductions")
     def __call__(self, values: wp.array, out: wp.array) -> None:
         """Write the sums to `out` (worlds,)."""
         if not self.device.is_cuda:

@@ -21,6 +21,7 @@ from ddg_warp.solve.collision.statistics import ContactStatistics
 from ddg_warp.solve.linear.contact_bands import ContactBands
 from ddg_warp.solve.linear.sparse_system import Sums
 from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION
+from ddg_warp.timers import timer
 
 FAR = 16.0  # margins that a node moves, from which on a world has a single step fraction: candidates of longer motions are too many
 # Where candidates still do not fit, motions are limited to LONGEST margins, then to a fraction SHORTER until they do.
@@ -156,6 +157,7 @@ class NewtonContact:
         """Update the candidates at positions x, without a motion."""
         self.search.update(x)
 
+    @timer("friction lag")
     def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None) -> None:
         """Update the friction lag (normal forces, tangents) at positions x, which belong to the motion that was limited last.
 
@@ -184,6 +186,7 @@ class NewtonContact:
             outputs = [self._braced, self.terms.law.rate]
             self._launch(self._brace, self.coupled.worlds, [*self.newton.islands.arrays, dt], outputs)
 
+    @timer("CCD filter")
     def place(self) -> None:
         """Limit the predictor by CCD, once supports are at their prescribed positions."""
         newton = self.newton
@@ -197,6 +200,7 @@ class NewtonContact:
         self._launch(self._find_short, self.coupled.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
         self._let_go()
 
+    @timer("contact")
     def evaluate(self) -> None:
         """Evaluate energies, forces and factors of contact at the limited iterate."""
         q, islands = self.newton.q, self.newton.islands
@@ -211,6 +215,7 @@ class NewtonContact:
         inputs += [self.newton.islands.arrays[0], self._kept, change, noise]
         self._launch(self._account, self.coupled.worlds, inputs, [])
 
+    @timer("contact")
     def assemble(self) -> None:
         """Prepare the data that products and the preconditioner take from the last evaluation."""
         newton = self.newton
@@ -222,6 +227,7 @@ class NewtonContact:
         if self._bands:
             self.terms.join()
 
+    @timer("contact")
     def join(self) -> None:
         """Add contact to the preconditioner, once both are assembled."""
         if self._bands:
@@ -258,6 +264,7 @@ class NewtonContact:
         newton = self.newton
         self.terms.settle(p, product, newton.inactive_mask, newton.islands.needs_direction, newton.krylov_dots)
 
+    @timer("CCD filter")
     def hold(self) -> None:
         """Limit the trial step by CCD, and write its predicted decrease."""
         newton = self.newton
@@ -314,6 +321,7 @@ class NewtonContact:
         inputs = [self.newton.q, self.newton.islands.arrays[0], self.coupled.blocks]
         self._sweep(self._part, inputs, [self.bound, self._going])
 
+    @timer("interpenetration check")
     def finish(self, before: wp.array) -> None:
         """Refuse substeps with interpenetration."""
         newton = self.newton

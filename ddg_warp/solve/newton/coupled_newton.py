@@ -28,6 +28,7 @@ from ddg_warp.solve.newton.residual import ResidualAssembler
 from ddg_warp.solve.newton.residual_tolerance import ResidualTolerances
 from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
+from ddg_warp.timers import timer
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 STRAIGHT = 1e-9  # rest turning angle between edges that may be rounding [rad]
@@ -245,6 +246,7 @@ class CoupledNewton:
         """Return the iterations of all solves so far."""
         return int(self.pcg_work.numpy()[0])
 
+    @timer("newton")
     def solve(self, state) -> None:
         """Iterate until no world is active, with the lagged data of `state`; can be captured."""
         if self.frozen:
@@ -278,6 +280,7 @@ class CoupledNewton:
         self.direct()
         self.take()
 
+    @timer("evaluate")
     def evaluate(self, state) -> None:
         """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate, `here`."""
         parts = [partial(self._evaluate_set, state, index) for index in range(len(self.coupled.sets))]
@@ -296,6 +299,7 @@ class CoupledNewton:
             block_dim=128,
         )
 
+    @timer("residual")
     def balance(self) -> None:
         """Compute residuals, the change of the energy, and the worlds that are out of equilibrium."""
         islands = self.islands
@@ -303,6 +307,7 @@ class CoupledNewton:
         flags = islands.not_converged, islands.below_rounding_floor
         self.allowed.sum_up(self.rhs, self.options.rtol, islands, *flags, self._direct and not self.frozen)
 
+    @timer("line search")
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or request a direction."""
         options = self.options
@@ -324,6 +329,7 @@ class CoupledNewton:
             device=self.device,
         )
 
+    @timer("assemble")
     def assemble(self) -> None:
         """Assemble H of the worlds that need a direction."""
         if self.frozen:
@@ -342,6 +348,7 @@ class CoupledNewton:
         if self.chains and not self._direct:
             self.chains.assemble(self.matrix, self.mass, updated_islands)
 
+    @timer("direction")
     def direct(self) -> None:
         """Compute directions: by elimination if exact, otherwise by conjugate gradients."""
         if self._direct:
@@ -384,6 +391,7 @@ class CoupledNewton:
     def watch(self) -> None:
         """Do nothing: hook that runs after every iteration of conjugate gradients."""
 
+    @timer("step length")
     def take(self) -> None:
         """Compute the step lengths along the directions."""
         blocks = self.coupled.blocks
@@ -413,6 +421,7 @@ class CoupledNewton:
         )
         self._largest(self.squares, self.turn)
 
+    @timer("update")
     def move(self) -> None:
         """Move the iterates by the step, or by the fraction that the line search has left."""
         islands = self.islands

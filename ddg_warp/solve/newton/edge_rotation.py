@@ -6,6 +6,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.coupled_edge_rotation import rotation_kernels
 from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, REPEAT_ROTATION
+from ddg_warp.timers import timer
 
 BLOCK = 32  # threads a block for pieces of rods: few, since their reads are far apart
 
@@ -77,6 +78,7 @@ class EdgeRotations:
         self.place(EXTRAPOLATE_ROTATED, predicted, before.q)
         self.newton.direction.zero_()
 
+    @timer("edge rotation")
     def turn(self, state) -> None:
         """Position the nodes of rods with edge rotations, and update the frames of `state` where required."""
         self.place()

@@ -13,6 +13,7 @@ from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.kernels.newton import rod_sweep as sweep
 from ddg_warp.kernels.residual import rod_residual
 from ddg_warp.kernels.stepping import rod_step, rod_warm_start
+from ddg_warp.timers import timer
 
 FIRST_EXACT_ITERATION = 2  # Gauss-Newton iterations of "progressive": far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
@@ -215,6 +216,7 @@ class RodNewton:
             device=self.device,
         )
 
+    @timer("newton")
     def solve(self, last: wp.array) -> None:
         """Iterate until no rod is active; can be captured. `last` holds the strains of the last step."""
         wp.capture_while(self.islands.any_active, lambda: self.iterate(last))
@@ -225,6 +227,7 @@ class RodNewton:
         self.check()
         self.sweep()
 
+    @timer("evaluate")
     def evaluate(self, last: wp.array) -> None:
         """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate."""
         group = self.group
@@ -245,6 +248,7 @@ class RodNewton:
                 device=self.device,
             )
 
+    @timer("residual")
     def check(self) -> None:
         """Compute residuals, the change of the energy, and the rods that are out of equilibrium."""
         group, options = self.group, self.options
@@ -263,14 +267,16 @@ class RodNewton:
         """Factorise, decide, and take the next step."""
         self.eliminate()
         group = self.group
-        wp.launch(
-            self._adjust,
-            group.columns,
-            [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
-            [self.x, self.theta, self.frame, self.base],
-            device=self.device,
-        )
+        with timer("edge rotation"):
+            wp.launch(
+                self._adjust,
+                group.columns,
+                [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
+                [self.x, self.theta, self.frame, self.base],
+                device=self.device,
+            )
 
+    @timer("block LDL^T sweep")
     def eliminate(self) -> None:
         """Factorise, decide, find a direction and take a straight update along it."""
         group, options = self.group, self.options

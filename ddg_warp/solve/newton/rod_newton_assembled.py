@@ -5,6 +5,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import rod_matrix
 from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
+from ddg_warp.timers import timer
 
 
 class AssembledNewton(RodNewton):
@@ -38,6 +39,7 @@ class AssembledNewton(RodNewton):
         group = self.group
         return device_arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.stored, self.device)
 
+    @timer("assemble")
     def assemble_blocks(self) -> None:
         """Assemble the blocks of active rods."""
         group = self.group

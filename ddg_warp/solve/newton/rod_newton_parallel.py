@@ -12,6 +12,7 @@ from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, REPEAT_RO
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, TensionReduction
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
+from ddg_warp.timers import timer
 
 
 class RodNewtonParallel(AssembledNewton):
@@ -83,6 +84,7 @@ class RodNewtonParallel(AssembledNewton):
         self.take()
         self.move()
 
+    @timer("line search")
     def judge(self) -> None:
         """Stop rods, reject their iterates, or request a direction."""
         options = self.options
@@ -100,6 +102,7 @@ class RodNewtonParallel(AssembledNewton):
             device=self.device,
         )
 
+    @timer("cyclic reduction")
     def direct(self) -> None:
         """Compute directions by cyclic reduction."""
         islands = self.islands
@@ -110,6 +113,7 @@ class RodNewtonParallel(AssembledNewton):
                 self.blocks, self.rhs, self.group.count, islands.needs_direction, self.direction, islands.lost_pivots
             )
 
+    @timer("step length")
     def take(self) -> None:
         """Compute the step lengths along the directions."""
         group = self.group
@@ -126,6 +130,7 @@ class RodNewtonParallel(AssembledNewton):
             device=self.device,
         )
 
+    @timer("edge rotation")
     def move(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
         """Apply the pending update of every rod: a step, straight or by rotating edges, or a frame update of the iterate.
 

@@ -8,6 +8,7 @@ from ddg_warp.kernels.linear import rod_matrix, rod_pcg
 from ddg_warp.kernels.newton import line_search
 from ddg_warp.solve.newton.rod_newton import FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
+from ddg_warp.timers import timer
 
 
 class PcgNewton(AssembledNewton):
@@ -108,6 +109,7 @@ class PcgNewton(AssembledNewton):
         if self._factor:
             self.factorise()
 
+    @timer("factorise")
     def factorise(self) -> None:
         """Factorise the open rods, without closure, that need a direction."""
         group, islands = self.group, self.islands
@@ -119,6 +121,7 @@ class PcgNewton(AssembledNewton):
             device=self.device,
         )
 
+    @timer("pcg")
     def direct(self) -> None:
         """Compute directions by conjugate gradients."""
         group = self.group
@@ -176,6 +179,7 @@ class RodModifiedNewton(PcgNewton):
         """Kernels to load before a capture."""
         return [*self.kernels_around, self._assemble, self._judge, self._factor, self._direct, self._take]
 
+    @timer("direction")
     def direct(self) -> None:
         """Compute directions by the factors of the first iterate."""
         wp.launch(

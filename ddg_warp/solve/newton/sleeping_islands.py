@@ -16,6 +16,7 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.newton.sleeping_islands import resting_kernels
+from ddg_warp.timers import timer
 
 SLEEP = 0.1
 
@@ -51,6 +52,7 @@ class SleepingIslands:
         made = resting_kernels(newton.real, newton.linear, device_arrays.serial(device))
         self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 
+    @timer("sleeping islands")
     def __call__(self, products) -> None:
         """Find sleeping islands by the residuals of the iterate and the pairs of a `PairProduct`."""
         newton, device = self.newton, self.newton.device

@@ -26,6 +26,7 @@ from ddg_warp.solve.stepping.decoupled_step import DecoupledStep, is_decoupled, 
 from ddg_warp.solve.stepping.energy_drift import CoupledEnergy
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 from ddg_warp.solve.stepping.warm_start import WarmStart
+from ddg_warp.timers import timer
 
 RUNS, TREES = 1, 2  # rebuilt before some steps: BVHs of rod culling alone, or all BVHs
 # Steps between rebuilds of BVHs on CUDA, with refits in between; also the culling queries between rebuilds of the culling BVHs.
@@ -218,6 +219,7 @@ class CoupledStep(StepDriver):
             self.alone = DecoupledStep(self, self._groups)
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s, parameters_changed))
 
+    @timer("capacity check")
     def has_overflow(self, before) -> bool:
         """Return True if the last step, from the state `before`, overflowed the pair lists and must be repeated.
 

@@ -21,6 +21,7 @@ from ddg_warp.model.rod_elements import RodElements
 from ddg_warp.model.rod_group import RodGroup
 from ddg_warp.solve.collision.rod_culling import RodCulling
 from ddg_warp.solve.stepping.rod_step import RodStep
+from ddg_warp.timers import timer
 
 
 class DecoupledStep:
@@ -138,6 +139,7 @@ class DecoupledStep:
         if self.runs:
             self.runs.look(before.q, after.q, self._tried)
 
+    @timer("decoupled rods")
     def _try(self, before, after, test_runs=None) -> None:
         """Solve the rods of tried worlds once; `test_runs` reads positions only and runs in parallel with the remaining launches."""
         rod_steps = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))

@@ -9,6 +9,7 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.stepping import coupled_energy_drift, rod_energy_drift
 from ddg_warp.solve.linear.sparse_system import Sums
+from ddg_warp.timers import timer
 
 BOUND = 0.1  # see `Integrator`
 
@@ -102,6 +103,7 @@ class RodEnergy(_Energy):
         """Kernels to load before a capture."""
         return [self._measure, self._judge]
 
+    @timer("energy")
     def judge(self, before, start) -> None:
         """Test the energy drift of the step from the state `before`, with the lagged data of `start`."""
         step, group, newton = self.step, self.step.group, self.step.newton
@@ -151,6 +153,7 @@ class CoupledEnergy(_Energy):
         sums = [kernel for add in self._add for kernel in add.kernels]
         return [*self._elements, self._blocks, self._judge, *sums]
 
+    @timer("energy")
     def judge(self, before, middle) -> None:
         """Test the energy drift of the step from `before`, with the lagged data of `middle`."""
         step, coupled, solver = self.step, self.step.coupled, self.step.newton

@@ -6,6 +6,7 @@ from contextlib import nullcontext
 
 import warp as wp
 
+from ddg_warp import timers
 from ddg_warp.capture_lock import capturing
 
 
@@ -25,10 +26,20 @@ class Graphs:
         self._graphs.clear()
 
     def replay(self, name: Hashable, launch: Callable[[], None]) -> None:
-        """Replay the graph of a name; capture it first if missing or after a reallocation of model memory."""
+        """Replay the graph of a name; capture it first if missing or after a reallocation of model memory.
+
+        Within timers, launch without a capture: see `timers`.
+        """
         if self._model.layout != self._layout:
             self.clear()
             self._layout = self._model.layout
+        if timers.current():
+            if not self._graphs:
+                with timers.timer(timers.LOADING):
+                    self._load()
+            self._graphs[name] = None
+            launch()
+            return
         if name not in self._graphs:
             with capturing():
                 self._capture(name, launch)

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import argument_checks, device_arrays
+from ddg_warp import argument_checks, device_arrays, timers
 from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.compile import memory
 from ddg_warp.compile.precision import lost_in_rounding
@@ -24,6 +24,7 @@ from ddg_warp.solve.stepping.local_error import VelocityChange
 from ddg_warp.solve.stepping.rod_step import COUPLED_ONLY, RodStep
 from ddg_warp.solve.stepping.state_buffers import StateBuffer
 from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
+from ddg_warp.timers import timer
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
@@ -47,7 +48,7 @@ class Integrator:
     further iterations do not reduce them, the step counts as `converged_to_rounding`, and one warning is issued.
 
     A step is one captured graph without allocation or host synchronisation. On CUDA, outcomes are read every `check_every` steps. Until
-    then a failed rod stays at its last good state while others continue.
+    then a failed rod stays at its last good state while others continue. `ddg_warp.timers` measures the phases of a step.
 
     Args:
         model: model to integrate.
@@ -141,6 +142,7 @@ class Integrator:
         self._spinning = False  # True if the current step has gyroscopic couples
         self._doubted = False  # True once the rounding warning is issued
 
+    @timers.root("step")
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """Return the state after a step of dt [s]. States that the caller keeps stay unchanged: see `State`.
 
@@ -199,6 +201,7 @@ class Integrator:
             self._gyroscope = Gyroscope(self.model, self._dt)
             self._graphs.clear()
 
+    @timer("solver selection")
     def _prepare(self, dt: float, state: State) -> None:
         """Set the step length, the solver selection and the limits for steps of dt [s]."""
         changed = dt != self._dt_host or self.model.version != self._version
@@ -211,6 +214,7 @@ class Integrator:
             for part in self._parts:
                 part.limit(self._solved(dt))
 
+    @timers.root("step")
     def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
         """Step from one buffer at the time `start` to the other; `anew` for an outside state: see `forget`."""
         for part in self._parts:
@@ -240,6 +244,7 @@ class Integrator:
             self._graphs.clear()
             replay()
 
+    @timer("outcomes")
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.
 
@@ -336,6 +341,7 @@ class Integrator:
             result["contact"] = self._coupled.newton.contact.statistics()
         return result
 
+    @timer("controls")
     def _control(self, inputs: dict[str, np.ndarray], source: int) -> None:
         """Upload the controls of a step from a buffer; rebuild the steppers with the first control load."""
         if self.given is None and any(name in inputs for name in LOADS):
@@ -453,9 +459,11 @@ class Integrator:
                 part.loads.give()
         start = self._gyroscope.begin(before, self._chains, self._coupled) if self._spinning else before
         for chain in self._chains:
-            chain.step(start.groups[chain.index], after.groups[chain.index])
+            with timer("rod group"):
+                chain.step(start.groups[chain.index], after.groups[chain.index])
         if self._coupled is not None:
-            self._coupled.step(start.coupled, after.coupled)
+            with timer("coupled system"):
+                self._coupled.step(start.coupled, after.coupled)
         if self._spinning:
             self._gyroscope.finish(after, self._chains, self._coupled)
         if self.failures == "flag":

@@ -15,6 +15,7 @@ from ddg_warp.kernels.core.islands import LEAST, MAX_PROJECTED_ITERATIONS
 from ddg_warp.kernels.newton.line_search import ROUNDED
 from ddg_warp.kernels.stepping import rod_step as step
 from ddg_warp.solve.forces.prescribed_motion import jump_between
+from ddg_warp.timers import timer
 
 CACHED = 16  # number of step lengths with cached limits
 FOLDED = 1e-5  # angle to opposite edges [rad] that messages call folded
@@ -145,6 +146,7 @@ class StepDriver:
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
         return {"straight_rotation_limit": np.resize(straight_turns(self.float32_errors(s)), len(self.islands))}
 
+    @timer("prescribe")
     def prescribe(self, t0: float, t1: float) -> None:
         """Upload supports, loads, magnetic field and flow between t0 and t1."""
         for part in filter(None, (self.motion, self.loads, self.field, self.drag)):
@@ -161,6 +163,7 @@ class StepDriver:
         self.attempt(before, after)
         self._decide_retry()
 
+    @timer("retry test")
     def _decide_retry(self) -> None:
         """Launch the retry logic."""
         self.remaining.zero_()
@@ -171,19 +174,21 @@ class StepDriver:
     def attempt(self, before, after) -> None:
         """Launch one solve of every unfinished island, from state `before` to `after`."""
         start = self.move(before, after)
-        self.complete(start, before, after)
+        with timer("frames"):
+            self.complete(start, before, after)
 
     def move(self, before, after):
         """Launch the positions of an attempt, and their rates; return the state with the time-lagged data of its solve."""
         contact = self.contact
-        # inertial target, prescribed motion of supports
-        start = self.predict(before)
-        self.apply_loads()
-        if self.drag:
-            self.drag.resist(before, self.newton, self.islands)
+        with timer("predictor"):  # inertial target, prescribed motion of supports
+            start = self.predict(before)
+        with timer("loads"):
+            self.apply_loads()
+            if self.drag:
+                self.drag.resist(before, self.newton, self.islands)
         if not self.midpoint:
-            # the last correction, extrapolated
-            self.warm_start(before)
+            with timer("warm start"):  # the last correction, extrapolated
+                self.warm_start(before)
         if contact:
             contact.place()  # CCD filter of the predictor
             contact.lag(before.q, rate=before.rate)
@@ -195,10 +200,10 @@ class StepDriver:
             contact.finish(before.q)  # interpenetration check
         if self.energy:
             self.energy.judge(before, start)
-        # positions, velocities and accelerations of accepted substeps
-        self.finish(before, after)
-        if self.drag:
-            self.drag.settle(before, after, self.newton, self.islands)
+        with timer("finish"):  # positions, velocities and accelerations of accepted substeps
+            self.finish(before, after)
+            if self.drag:
+                self.drag.settle(before, after, self.newton, self.islands)
         return start
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
