@@ -177,7 +177,7 @@ def _add(path: tuple[str, ...], *values) -> None:
 
 
 def _tree(measured: dict, top: tuple[str, ...], path: tuple[str, ...], lines: list) -> None:
-    """Append the lines of a phase and its children."""
+    """Append the lines of a phase, then of children."""
     calls, cpu, gpu = measured[path]
     steps, *whole = measured[top]
     percent = 100.0 * (gpu / whole[1] if whole[1] else cpu / whole[0])

@@ -192,7 +192,7 @@ class StepDriver:
         if contact:
             contact.place()  # CCD filter of the predictor
             contact.lag(before.q, rate=before.rate)
-        self.solve(start)
+        self.solve(start)  # Newton's method
         for solution in contact.solutions if contact else ():  # further friction iterations
             contact.lag_again(solution)
             self.solve(start)
